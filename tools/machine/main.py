@@ -1,0 +1,157 @@
+"""`tools/dtsa`: the commands that concern the machine; all others are passed on to `python -m dtsa_bench`."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from machine import layout, prepare, workspace
+from machine.layout import SetupError
+
+OWN_COMMANDS = {
+    "setup": "set the machine up; --extra NAME adds optional packages",
+    "shell": "a shell with everything sourced; arguments go to bash",
+    "test": "run the whole test suite; arguments go to pytest",
+    "ros2": "the ros2 command, or a small stand-in: run, pkg, interface",
+    "clean": "remove what the build made; --all: the virtual environment, too",
+}
+TEST_EXTRAS = {"test", "dev", "cflib", "benchmark", "cluster"}
+BENCH = layout.SOURCES / "dtsa_bench"
+
+
+def main(arguments: list[str]) -> int:
+    """Run one command.
+
+    :param arguments: command line without the program's name.
+    :returns: exit code; most commands replace this process instead.
+    """
+    command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
+    try:
+        if command in ("-h", "--help", "help"):
+            print(help_text())
+            return 0
+        if command in OWN_COMMANDS:
+            own = (run_setup, run_shell, run_test, run_ros2, run_clean)
+            return dict(zip(OWN_COMMANDS, own, strict=True))[command](rest)
+        known = bench_commands()
+        if command not in known:
+            raise SetupError(f"command: got {command!r}; allowed: {', '.join([*known, *OWN_COMMANDS])}", code=2)
+        prepare.prepare(set())
+        return start(python(), ["-m", "dtsa_bench", command, *rest])
+    except SetupError as error:
+        print(f"dtsa: error: {error}", file=sys.stderr)
+        return error.code
+    except KeyboardInterrupt:
+        print("\ndtsa: interrupted", file=sys.stderr)
+        return 130
+
+
+def bench_commands() -> dict[str, str]:
+    """Commands of dtsa_bench that exist, with what they do; nothing has to be installed for that."""
+    sys.path.insert(0, str(BENCH))
+    from dtsa_bench.registry import available  # type: ignore[import-not-found, unused-ignore]
+
+    return dict(available())
+
+
+def help_text() -> str:
+    """Usage and all commands."""
+    lines = ["usage: tools/dtsa COMMAND [ARGUMENTS]        (tools/dtsa COMMAND --help says more)", ""]
+    for title, commands in (("flights and experiments:", bench_commands()), ("machine:", OWN_COMMANDS)):
+        lines += [title, *(f"  {name:<16} {text}" for name, text in commands.items()), ""]
+    lines += [
+        "The first command on a machine makes .venv, installs the pinned packages and builds the workspace;",
+        "later ones rebuild only what changed. ROS 2 Jazzy from apt is used where ROS_DISTRO=jazzy is set.",
+    ]
+    return "\n".join(lines)
+
+
+def python() -> str:
+    """Interpreter that the commands run with."""
+    return layout.base_python() if layout.has_ros_installation() else str(layout.PYTHON)
+
+
+def start(program: str, arguments: list[str]) -> int:
+    """Replace this process by a program in the workspace's environment."""
+    environment = workspace.environment()
+    path = shutil.which(program, path=environment["PATH"])
+    if path is None:
+        raise SetupError(f"program: got {program!r}; allowed: a program in PATH", code=2)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execve(path, [program, *arguments], environment)
+
+
+def run_setup(arguments: list[str]) -> int:
+    """`tools/dtsa setup [--extra NAME]... [--all]`."""
+    extras: set[str] = set()
+    words = iter(arguments)
+    allowed = f"--extra {'|'.join(layout.EXTRAS)}, --all"
+    for word in words:
+        name = next(words, "") if word == "--extra" else word.removeprefix("--extra=")
+        if word in ("-h", "--help"):
+            print("usage: tools/dtsa setup [--extra NAME]... [--all]\n\nextras:")
+            print("\n".join(f"  {name:<16} {text}" for name, text in layout.EXTRAS.items()))
+            return 0
+        if word == "--all":
+            extras |= set(layout.EXTRAS)
+        elif name in layout.EXTRAS and word.startswith("--extra"):
+            extras.add(name)
+        else:
+            raise SetupError(f"setup: got {(name or word)!r}; allowed: {allowed}", code=2)
+    prepare.prepare(extras)
+    workspace.environment()
+    print("dtsa: ready", file=sys.stderr)
+    return 0
+
+
+def run_test(arguments: list[str]) -> int:
+    """`tools/dtsa test [PYTEST ARGUMENTS]`."""
+    prepare.prepare(TEST_EXTRAS)
+    os.chdir(layout.ROOT)
+    return start(python(), ["-m", "pytest", *arguments])
+
+
+def run_shell(arguments: list[str]) -> int:
+    """`tools/dtsa shell [BASH ARGUMENTS]`."""
+    prepare.prepare(set())
+    if arguments:
+        return start("bash", arguments)
+    start_file = layout.STATE / "bashrc"
+    layout.write(
+        start_file,
+        "[ -f ~/.bashrc ] && . ~/.bashrc\n"
+        f"export PATH='{workspace.environment()['PATH']}'\n"
+        f". '{layout.INSTALL}/local_setup.bash'\n"
+        f"dtsa() {{ '{layout.ROOT}/tools/dtsa' \"$@\"; }}\n"
+        f"command -v ros2 >/dev/null || ros2() {{ '{layout.ROOT}/tools/dtsa' ros2 \"$@\"; }}\n"
+        'PS1="(dtsa) ${PS1-}"\n',
+    )
+    return start("bash", ["--rcfile", str(start_file), "-i"])
+
+
+def run_ros2(arguments: list[str]) -> int:
+    """`tools/dtsa ros2 ...`: the real command where it exists."""
+    prepare.prepare(set())
+    environment = workspace.environment()
+    if shutil.which("ros2", path=environment["PATH"]):
+        return start("ros2", arguments)
+    from machine import ros2
+
+    return ros2.main(arguments, environment)
+
+
+def run_clean(arguments: list[str]) -> int:
+    """`tools/dtsa clean [--all]`."""
+    if not set(arguments) <= {"--all"}:
+        raise SetupError(f"clean: got {' '.join(arguments)!r}; allowed: --all", code=2)
+    directories: list[Path] = [layout.BUILD, layout.INSTALL, layout.COLCON_LOG]
+    if arguments:
+        directories.append(layout.VENV)
+    with prepare.lock():
+        for directory in directories:
+            shutil.rmtree(directory, ignore_errors=True)
+        workspace.remove_kernel()
+    return 0
