@@ -1,0 +1,1 @@
+"""One quadcopter of a swarm that shares a radio channel."""

@@ -1,0 +1,14 @@
+"""The protocol and flight logic of DTSA: no ROS, no clock, no I/O."""
+
+from .agent import Agent, Decision
+from .config import SwarmConfig
+from .errors import ConfigError, DtsaError, LocalProtocolError, RemoteProtocolError
+from .frame import Frame, decode_frame, encode_frame
+from .priority import priority, select
+from .scenario import Scenario, make_scenario
+from .swarm import REASONS, Swarm
+
+__all__ = [
+    "REASONS", "Agent", "ConfigError", "Decision", "DtsaError", "Frame", "LocalProtocolError", "RemoteProtocolError",
+    "Scenario", "Swarm", "SwarmConfig", "decode_frame", "encode_frame", "make_scenario", "priority", "select",
+]  # fmt: skip

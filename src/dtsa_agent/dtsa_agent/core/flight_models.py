@@ -1,0 +1,219 @@
+"""Named flight models: how an agent avoids the others, how its vehicle answers, what room a swarm needs.
+
+Formulas and the reasons for the values: ``docs/avoiders.md``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ConfigError
+
+Array = NDArray[np.float64]
+
+# Numbers of the avoiders in the compiled kernel (avoider.h).
+KINDS = ("orca", "potential", "bvc", "none")
+
+
+def _value(default: float, unit: str, help: str, minimum: float, maximum: float) -> Any:
+    metadata = {"unit": unit, "help": help, "minimum": minimum, "maximum": maximum}
+    return field(default=default, metadata=metadata)
+
+
+def _check(params: Any) -> None:
+    """Makes floats of all fields and checks them against their ranges.
+
+    :raises ConfigError: naming the field, the value and what is allowed.
+    """
+    for spec in dataclasses.fields(params):
+        value, meta = getattr(params, spec.name), spec.metadata
+        unit = f" {meta['unit']}" if meta["unit"] != "1" else ""
+        allowed = f"{meta['minimum']:g} to {meta['maximum']:g}{unit}"
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigError(spec.name, value, "a number, " + allowed)
+        if not math.isfinite(value) or not meta["minimum"] <= value <= meta["maximum"]:
+            raise ConfigError(spec.name, value, allowed)
+        object.__setattr__(params, spec.name, float(value))
+
+
+@dataclass(frozen=True, slots=True)
+class AvoiderParams:
+    """Parameters of the avoiders; which of them count depends on the avoider.
+
+    :raises ConfigError: for values outside their range.
+    """
+
+    v_max: float = _value(1.5, "m/s", "largest commanded speed", 0.01, 20)
+    gain: float = _value(2.0, "1/s", "K_P: speed towards the goal per distance to it", 0.01, 100)
+    radius: float = _value(0.336, "m", "orca: R_c, of a pair; bvc: of one agent", 0.01, 10)
+    horizon: float = _value(1.0, "s", "orca: T, look-ahead; bvc: the cell ends at horizon * v_max", 0.05, 60)
+    softness: float = _value(30.0, "1", "orca: rho, weight of a violated half-plane", 0.01, 1e6)
+    bias: float = _value(0.2, "1", "orca: beta, share by which all keep to the right", -1, 1)
+    period: float = _value(0.2, "s", "orca: T_s, time in which an overlap is resolved", 0.001, 10)
+    influence: float = _value(1.31, "m", "potential: r_inf, range of the field", 0.03, 100)
+    strength: float = _value(0.33, "m^2/s", "potential: k, strength of the field", 0, 100)
+    core: float = _value(0.1, "m", "potential: d_c, distance of infinite repulsion", 0, 100)
+    tangential: float = _value(0.3, "1", "potential: share of the force that acts sideways", -2, 2)
+    margin_rate: float = _value(0.0, "m/s", "growth of a safety margin with the age of the news", 0, 10)
+    margin_max: float = _value(0.3, "m", "largest such margin", 0, 10)
+    sidestep: float = _value(0.25, "m", "bvc: closer to the wall than this, step to the right", 1e-6, 10)
+    stretch_z: float = _value(1.0, "1", "bvc: height of an agent over its width (downwash)", 0.1, 20)
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if self.core >= self.influence:
+            raise ConfigError("core", self.core, f"less than influence, {self.influence:g} m")
+
+    def to_dict(self) -> dict[str, float]:
+        """All values by name, as the compiled kernel reads them."""
+        return {spec.name: getattr(self, spec.name) for spec in dataclasses.fields(self)}
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleParams:
+    """Point mass that follows a velocity command: a = clip((v_cmd - v) / tau, a_max).
+
+    :raises ConfigError: for values outside their range.
+    """
+
+    tau: float = _value(0.25, "s", "time constant of the velocity response", 0.01, 10)
+    a_max: float = _value(2.0, "m/s^2", "largest acceleration (norm)", 0.01, 200)
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    def step(self, dt: float, position: Array, velocity: Array, command: Array) -> None:
+        """Moves vehicles on by one step; ``position`` and ``velocity`` are updated in place.
+
+        :param dt: step, s; not longer than ``tau``.
+        :param position: (3,) or (3, N), m, frame map.
+        :param velocity: same shape, m/s.
+        :param command: commanded velocity, same shape, m/s.
+        """
+        from . import _kernel
+
+        _kernel.vehicle_step(self.tau, self.a_max, dt, position, velocity, command)
+
+
+@dataclass(frozen=True, slots=True)
+class FlightModel:
+    """An avoider with its parameters, a vehicle, and the room an exchange of places needs.
+
+    :param name: what ``SwarmConfig.avoider`` calls it.
+    :param avoider_kind: the avoider's name, one of :data:`KINDS`.
+    :param avoider: its parameters.
+    :param vehicle: the vehicle's parameters.
+    :param spacing: s, m: agents on the start circle are this far apart.
+    :param min_radius: r0, m: smallest start circle; R = max(r0, s N / 2 pi).
+    :raises ConfigError: for an unknown avoider or values outside their range.
+    """
+
+    name: str
+    avoider_kind: str
+    avoider: AvoiderParams
+    vehicle: VehicleParams
+    spacing: float
+    min_radius: float
+
+    def __post_init__(self) -> None:
+        if self.avoider_kind not in KINDS:
+            raise ConfigError("avoider_kind", self.avoider_kind, ", ".join(KINDS))
+        for name, value in (("spacing", self.spacing), ("min_radius", self.min_radius)):
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= 1000:
+                raise ConfigError(name, value, "more than 0, up to 1000 m")
+
+    @property
+    def kind(self) -> int:
+        """The avoider's number in the compiled kernel."""
+        return KINDS.index(self.avoider_kind)
+
+    def command(
+        self,
+        self_index: int,
+        position: Array,
+        velocity: Array,
+        goal: Array,
+        others_position: Array,
+        others_velocity: Array,
+        age_s: Array | None = None,
+    ) -> Array:
+        """Commanded velocity of one agent, (3,), m/s, frame map.
+
+        :param self_index: the agent's place in the arrays of the others (its id - 1); that entry is ignored.
+        :param position: own true position, (3,), m, frame map.
+        :param velocity: own true velocity, (3,), m/s.
+        :param goal: where it wants to go, (3,), m.
+        :param others_position: where it believes everybody is, (3, N), m; whoever is not finite is ignored.
+        :param others_velocity: their velocities, (3, N), m/s.
+        :param age_s: age of each one's news, (N,), s; None: no margins.
+        """
+        from . import _kernel
+
+        result = np.empty(3)
+        given = (position, velocity, goal, others_position, others_velocity)
+        p, v, target, others_p, others_v = (np.ascontiguousarray(a, dtype=np.float64) for a in given)
+        ages = None if age_s is None else np.ascontiguousarray(age_s, dtype=np.float64)
+        params = self.avoider.to_dict()
+        _kernel.avoid_command(self.kind, params, self_index, p, v, target, others_p, others_v, ages, result)
+        return result
+
+
+_ORCA = AvoiderParams(v_max=1.5, radius=0.336, horizon=1.0, softness=30.0, bias=0.2)
+_POTENTIAL = AvoiderParams(v_max=1.0, influence=1.31, strength=0.33, core=0.1, tangential=0.3)
+_JERKY = AvoiderParams(v_max=1.0, influence=0.43, strength=0.541, core=0.2, tangential=0.3)
+_BVC = AvoiderParams(v_max=1.5, radius=0.163, horizon=1.0, sidestep=0.25)
+_BVC_FIRMWARE = AvoiderParams(v_max=0.5, radius=0.3, horizon=1.0, sidestep=0.25, stretch_z=3.0)
+
+FLIGHT_MODELS: Mapping[str, FlightModel] = MappingProxyType(
+    {
+        model.name: model
+        for model in (
+            FlightModel("orca", "orca", _ORCA, VehicleParams(0.25, 2.0), 0.9, 2.2),
+            FlightModel("potential", "potential", _POTENTIAL, VehicleParams(0.1, 2.0), 0.55, 1.8),
+            FlightModel("jerky", "potential", _JERKY, VehicleParams(0.05, 15.0), 0.55, 1.8),
+            FlightModel("bvc", "bvc", _BVC, VehicleParams(0.25, 2.0), 0.9, 2.2),
+            FlightModel("bvc-firmware", "bvc", _BVC_FIRMWARE, VehicleParams(0.25, 2.0), 0.9, 2.2),
+            FlightModel("none", "none", AvoiderParams(v_max=1.5), VehicleParams(0.25, 2.0), 0.9, 2.2),
+        )
+    }
+)
+
+
+def flight_model(name: str, options: Mapping[str, float] | None = None) -> FlightModel:
+    """A named flight model, possibly with some values replaced.
+
+    :param name: a key of :data:`FLIGHT_MODELS`.
+    :param options: values by the names of the fields of :class:`AvoiderParams` and :class:`VehicleParams`, or
+        ``spacing`` and ``min_radius``.
+        Names with a dot belong to plug-ins and are not looked at.
+    :raises ConfigError: for unknown names and values outside their range.
+    """
+    model = FLIGHT_MODELS.get(name)
+    if model is None:
+        from .plugins import avoider_model
+
+        model = avoider_model(name)
+    groups: dict[str, dict[str, Any]] = {"avoider": {}, "vehicle": {}, "room": {}}
+    owners = {spec.name: "avoider" for spec in dataclasses.fields(AvoiderParams)}
+    owners |= {spec.name: "vehicle" for spec in dataclasses.fields(VehicleParams)}
+    owners |= {"spacing": "room", "min_radius": "room"}
+    for key, value in (options or {}).items():
+        if "." in key:  # a plug-in's own
+            continue
+        if key not in owners:
+            raise ConfigError(f"options.{key}", value, "one of the values " + ", ".join(owners))
+        groups[owners[key]][key] = value
+    return dataclasses.replace(
+        model,
+        avoider=dataclasses.replace(model.avoider, **groups["avoider"]),
+        vehicle=dataclasses.replace(model.vehicle, **groups["vehicle"]),
+        **groups["room"],
+    )

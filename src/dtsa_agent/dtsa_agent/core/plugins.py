@@ -1,0 +1,267 @@
+"""Policies, estimators and avoiders from other packages, found by entry point. See docs/bench.md.
+
+A package announces them in its metadata::
+
+    [project.entry-points."dtsa.policies"]
+    reverse = "my_package:Reverse"
+
+and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. What is announced is
+a factory; it is called once for every observer, as ``factory(config, agent)`` (agent: its id, 0 for tables
+that hear everything).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import AVOIDERS, ESTIMATORS, POLICIES, SwarmConfig
+from .errors import ConfigError, LocalProtocolError
+from .flight_models import FLIGHT_MODELS, FlightModel
+from .frame import PROFILE_PAPER_INTENT
+from .scenario import Scenario
+from .swarm import REASONS, Swarm
+
+Array = NDArray[np.float64]
+
+GROUPS = {"policy": "dtsa.policies", "estimator": "dtsa.estimators", "avoider": "dtsa.avoiders"}
+BUILT_IN = {"policy": POLICIES, "estimator": ESTIMATORS, "avoider": AVOIDERS}
+_PLUGIN_REASON = REASONS.index("plugin")
+
+
+class View:
+    """What one observer knows; arrays are read-only windows on its table and are always up to date.
+
+    Positions are m, velocities m/s, frame map, with shape (3, N); agent ``id`` is column ``id - 1``.
+    """
+
+    __slots__ = (
+        "agent",
+        "config",
+        "estimate_position",
+        "estimate_velocity",
+        "goal",
+        "in_ap",
+        "last_turn",
+        "own_position",
+        "own_velocity",
+        "scenario",
+        "sent_intent",
+        "sent_position",
+        "sent_slot",
+        "sent_velocity",
+    )
+
+    def __init__(self, swarm: Swarm, view: int) -> None:
+        self.agent = int(swarm.observer[view]) + 1  # id of the observer, 0: one that hears everything
+        self.config = swarm.config
+        self.scenario = swarm.scenario
+        self.sent_position = _window(swarm.sent_position[view])  # last heard (own: last sent) state
+        self.sent_velocity = _window(swarm.sent_velocity[view])
+        self.sent_intent = _window(swarm.sent_intent[view])  # commanded velocity, zero unless frames carry it
+        self.sent_slot = _window(swarm.sent_slot[view])  # (N,) slot of that state, -1: never heard
+        self.last_turn = _window(swarm.last_turn[view])  # (N,) slot of the last turn; h = slot - 1 - last_turn
+        self.in_ap = _window(swarm.in_ap[view])  # (N,) A_p
+        self.estimate_position = _window(swarm.estimate_position[view])  # as the estimator last filled them
+        self.estimate_velocity = _window(swarm.estimate_velocity[view])
+        here = view < len(swarm.ids)
+        self.own_position = _window(swarm.position[:, view]) if here else None  # (3,) own true state
+        self.own_velocity = _window(swarm.velocity[:, view]) if here else None
+        self.goal = _window(swarm.goal[:, view]) if here else None
+
+
+class Policy(Protocol):
+    """Who sends next."""
+
+    def choose(self, view: View, slot: int) -> int:
+        """The id that this observer takes for the sender of a slot, 0:
+
+        nobody. It sends if that is its own.
+        """
+
+
+class Estimator(Protocol):
+    """Where the others are by now. ``needs_intent = True`` makes frames carry the commanded velocity."""
+
+    needs_intent: ClassVar[bool] = False
+
+    def estimate(self, view: View, slot: int, step: int, position: Array, velocity: Array) -> None:
+        """Writes the estimates for control instant ``step`` of a slot into (3, N) arrays, m and m/s."""
+
+
+class Avoider(Protocol):
+    """Where to fly. ``model`` names the built-in flight model whose vehicle and spacing are used."""
+
+    model: ClassVar[str] = "orca"
+
+    def command(self, view: View, slot: int, step: int) -> Sequence[float]:
+        """Commanded velocity, (3,), m/s, frame map; the estimates in ``view`` are those of this instant."""
+
+
+def available(kind: str) -> dict[str, EntryPoint]:
+    """The plug-ins installed on this machine, by name.
+
+    :param kind: ``policy``, ``estimator`` or ``avoider``.
+    """
+    return {point.name: point for point in entry_points(group=GROUPS[kind]) if point.name not in BUILT_IN[kind]}
+
+
+def find(kind: str, name: str) -> Any:
+    """The factory of a plug-in.
+
+    :param kind: ``policy``, ``estimator`` or ``avoider``.
+    :param name: the name it was announced by.
+    :raises ConfigError: if there is none, or it does not import.
+    """
+    points = available(kind)
+    if name not in points:
+        raise ConfigError(kind, name, ", ".join((*BUILT_IN[kind], *sorted(points))))
+    try:
+        return points[name].load()
+    except Exception as error:
+        source = f"{points[name].value} ({type(error).__name__}: {error})"
+        raise ConfigError(kind, name, f"a plug-in that can be imported, unlike {source}") from error
+
+
+def check(config: SwarmConfig) -> None:
+    """Looks for the plug-ins that a configuration names.
+
+    :raises ConfigError: if one of them does not exist.
+    """
+    for kind, names in BUILT_IN.items():
+        if getattr(config, kind) not in names:
+            find(kind, getattr(config, kind))
+
+
+def avoider_model(name: str) -> FlightModel:
+    """The flight model of an avoider plug-in: vehicle and spacing of the built-in model that it names.
+
+    :param name: name of the plug-in.
+    :raises ConfigError: if there is none, or its model is unknown.
+    """
+    base = getattr(find("avoider", name), "model", "orca")
+    if base not in FLIGHT_MODELS:
+        raise ConfigError(f"{name}.model", base, ", ".join(FLIGHT_MODELS))
+    model = FLIGHT_MODELS[base]
+    return FlightModel(name, "none", model.avoider, model.vehicle, model.spacing, model.min_radius)
+
+
+def uses_plugins(config: SwarmConfig) -> bool:
+    """Whether a configuration names anything that is not built in."""
+    return any(getattr(config, kind) not in names for kind, names in BUILT_IN.items())
+
+
+# Policies by which all agents decide the same as long as they have heard the same.
+SHAREABLE = ("tdma", "dtsa", "age")
+
+
+def shareable(config: SwarmConfig) -> bool:
+    """Whether agents of such a swarm may share one table for as long as all hear the same.
+
+    :param config: the swarm's settings.
+    """
+    return config.policy in SHAREABLE and not uses_plugins(config)
+
+
+def make_swarm(
+    config: SwarmConfig,
+    scenario: Scenario | None = None,
+    local: Sequence[int] | None = None,
+    shared_view: bool = False,
+    observers: Sequence[int] | None = None,
+) -> Swarm:
+    """A :class:`Swarm`, or one that asks plug-ins if the configuration names any.
+
+    Parameters are those of ``Swarm``.
+
+    :raises ConfigError: for ids and plug-ins that do not exist.
+    """
+    if not uses_plugins(config):
+        return Swarm(config, scenario, local, shared_view, observers)
+    return PluginSwarm(config, scenario, local, False, observers)
+
+
+class PluginSwarm(Swarm):
+    """A swarm some of whose parts are Python objects from other packages.
+
+    Every agent has its own instances.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        ids = [int(index) + 1 for index in self.observer]
+        self._views = [View(self, view) for view in range(len(ids))]
+        self._policies = self._instances("policy", ids)
+        self._estimators = self._instances("estimator", ids)
+        self._avoiders = self._instances("avoider", ids)
+        if self._policies:
+            self.decide, self.begin = self._decide, self._begin
+        if self._estimators:
+            self.estimate, self.end = self._estimate, self._end
+        if self._estimators or self._avoiders:
+            self.steer, self.fly = self._steer, self._fly
+
+    def _instances(self, kind: str, ids: list[int]) -> list[Any]:
+        name = getattr(self.config, kind)
+        if name in BUILT_IN[kind]:
+            return []
+        factory = find(kind, name)
+        return [factory(self.config, agent) for agent in ids]
+
+    def _parameters(self, count: int) -> dict[str, Any]:
+        parameters = super()._parameters(count)
+        foreign = self.config.estimator not in ESTIMATORS and self.config.policy != "lease"
+        if foreign and getattr(find("estimator", self.config.estimator), "needs_intent", False):
+            parameters["profile"] = PROFILE_PAPER_INTENT
+        return parameters
+
+    def _decide(self, slot: int) -> None:
+        for index, agent in enumerate(self.ids):
+            chosen = self._policies[index].choose(self._views[index], slot)
+            if not 0 <= chosen <= self.config.agents:
+                raise LocalProtocolError(
+                    f"policy {self.config.policy}: chose agent {chosen} in slot {slot}; "
+                    f"allowed: 0 (nobody) to {self.config.agents}"
+                )
+            self.chosen[index] = chosen
+            self.sends[index] = chosen == agent and self.present[index]
+        self.reason[:] = _PLUGIN_REASON
+        self.score[:] = 0.0
+        self.digest[:] = self._view_hash[: len(self.ids)]
+
+    def _begin(self, slot: int) -> tuple[int, ...]:
+        self._decide(slot)
+        senders: tuple[int, ...] = self.kernel.emit(slot)
+        return senders
+
+    def _estimate(self, slot: int, step: int = 0) -> None:
+        for index, view in enumerate(self._views):
+            position, velocity = self.estimate_position[index], self.estimate_velocity[index]
+            self._estimators[index].estimate(view, slot, step, position, velocity)
+
+    def _end(self, slot: int) -> None:
+        self.kernel.end(slot)
+        self._estimate(slot + 1)  # what the metrics compare with the truth
+
+    def _steer(self, slot: int, step: int, estimate: bool = True) -> None:
+        if estimate and self._estimators:
+            self._estimate(slot, step)
+        self.kernel.steer(slot, step, estimate and not self._estimators)
+        for index, avoider in enumerate(self._avoiders):
+            if index < len(self.ids) and self.active[index] and self.present[index]:
+                self.command[:, index] = avoider.command(self._views[index], slot, step)
+
+    def _fly(self, slot: int) -> None:
+        for step in range(self.config.steps):
+            self._steer(slot, step)
+            self.kernel.move(step)
+
+
+def _window(array: NDArray[Any]) -> NDArray[Any]:
+    window: NDArray[Any] = array.view()
+    window.flags.writeable = False
+    return window

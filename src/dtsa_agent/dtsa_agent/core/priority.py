@@ -1,0 +1,60 @@
+"""The paper's priority value g and its selection function, on plain arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import _kernel
+from .config import SELECTIONS
+from .errors import ConfigError
+
+
+def priority(position: ArrayLike, velocity: ArrayLike, slot_s: float) -> NDArray[np.float64]:
+    """Priority values of all agents (eq:permission_d_p_ang).
+
+    ``g_k = sum over j != k of |v_jk| t_s / |p_kj| * (pi - alpha_jk) / pi``. An agent at rest has g = 0; a pair without
+    relative velocity adds nothing.
+
+    :param position: (N, 3), m, any common frame.
+    :param velocity: (N, 3), m/s.
+    :param slot_s: t_s, s.
+    :returns: g, (N,), dimensionless.
+    """
+    p = np.ascontiguousarray(np.asarray(position, dtype=np.float64).T)
+    v = np.ascontiguousarray(np.asarray(velocity, dtype=np.float64).T)
+    if p.ndim != 2 or p.shape[0] != 3 or p.shape != v.shape:
+        raise ConfigError("position, velocity", (p.T.shape, v.T.shape), "two arrays of shape (N, 3)")
+    g = np.empty(p.shape[1])
+    _kernel.priority(p, v, float(slot_s), g, np.empty(7 * len(g)))
+    return g
+
+
+def select(
+    g: ArrayLike, counter: ArrayLike, in_ap: ArrayLike, epsilon: float = 0.5, selection: str = "candidates"
+) -> tuple[int, NDArray[np.bool_], int]:
+    """The selection function (eq:pfs), with the counters h as tie-break (eq:secondary).
+
+    ``candidates``: all of A_p with ``g >= (1 - epsilon) max g``; among them the largest h, then the lowest id.
+    ``pairwise``: the text read literally, one scan in id order that keeps the significantly greater of two.
+
+    :param g: (N,) priority values.
+    :param counter: (N,) slots since each agent last sent.
+    :param in_ap: (N,) whether each agent is a potential sender.
+    :param epsilon: least relative difference that counts.
+    :param selection: ``candidates`` or ``pairwise``.
+    :returns: index of the next sender (-1: nobody), the candidates (N,), index into ``REASONS``.
+    """
+    if selection not in SELECTIONS:
+        raise ConfigError("selection", selection, ", ".join(SELECTIONS))
+    values = np.ascontiguousarray(g, dtype=np.float64)
+    candidates = np.zeros(len(values), dtype=np.uint8)
+    index, reason = _kernel.select(
+        values,
+        np.ascontiguousarray(counter, dtype=np.int64),
+        np.ascontiguousarray(in_ap, dtype=np.uint8),
+        float(epsilon),
+        SELECTIONS.index(selection),
+        candidates,
+    )
+    return index, candidates.astype(np.bool_), reason

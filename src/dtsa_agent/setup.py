@@ -1,0 +1,60 @@
+"""Build of dtsa_agent: Python packages, the compiled kernel of the protocol core, executables, plugins."""
+
+from glob import glob
+
+from setuptools import Extension, find_packages, setup
+
+NAME = "dtsa_agent"
+
+# The same bits on every x86_64 machine: nothing here may reorder, contract or approximate floating-point
+# operations, and nothing may depend on the machine that compiles. -fno-math-errno and -fno-trapping-math
+# change no result: sqrt becomes one instruction, and comparisons may be computed without branches.
+COMPILE_FLAGS = [
+    "-std=c11",
+    "-O3",
+    "-fno-fast-math",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fvisibility=hidden",
+    "-Wno-psabi",  # vectors are passed between inlined functions only
+]
+
+KERNEL = "dtsa_agent/core/_kernel"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*"]),
+    ext_modules=[
+        Extension(
+            "dtsa_agent.core._kernel",
+            sources=sorted(glob(f"{KERNEL}/*.c")),
+            depends=[*sorted(glob(f"{KERNEL}/*.h")), "setup.py"],
+            include_dirs=[KERNEL],
+            extra_compile_args=COMPILE_FLAGS,
+            libraries=["m"],
+        )
+    ],
+    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *([(f"share/{NAME}/config", sorted(glob("config/*.yaml")))] if glob("config/*.yaml") else []),
+        *([(f"share/{NAME}/launch", sorted(glob("launch/*.py")))] if glob("launch/*.py") else []),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="DTSA maintainers",
+    maintainer_email="maintainers@dtsa.example",
+    description="One quadcopter of a swarm that shares a radio channel: core, ROS nodes, bridge.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "agent = dtsa_agent.ros.agent_node:main",
+            "swarm_host = dtsa_agent.ros.swarm_host:main",
+            "crazyflie_bridge = dtsa_agent.crazyflie.bridge_node:main",
+            "crazyflie_agents = dtsa_agent.crazyflie.agents_node:main",
+        ],
+    },
+)
