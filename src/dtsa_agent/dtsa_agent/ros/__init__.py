@@ -1,0 +1,1 @@
+"""The ROS 2 nodes around the protocol core."""

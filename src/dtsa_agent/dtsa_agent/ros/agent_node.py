@@ -1,0 +1,67 @@
+"""``ros2 run dtsa_agent agent``: one quadcopter."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from dtsa_agent.core.config import MAX_AGENTS
+from dtsa_agent.core.errors import ConfigError
+
+from . import names
+from .hosting import declare_swarm, host_agents
+from .loop import Stop
+from .process import node_options, run_node
+
+_UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
+
+
+def _make_node(supervised: bool) -> tuple[Node, int]:
+    """The node in its agent's namespace, and the agent's id: parameter ``id``, or the namespace's number."""
+    plain = node_options(supervised)
+    node = Node("agent", namespace=_UNNAMED, **plain)
+    namespace = node.get_namespace()
+    digits = namespace.rpartition("cf")[2]
+    agent = _own_id(node, int(digits) if digits.isdigit() and namespace != _UNNAMED else 1)
+    if namespace == _UNNAMED:
+        node.destroy_node()
+        node = Node("agent", namespace=names.agent_namespace(agent), **plain)
+        _own_id(node, agent)
+    return node, agent
+
+
+def _own_id(node: Node, default: int) -> int:
+    span = IntegerRange(from_value=1, to_value=MAX_AGENTS, step=1)
+    info = ParameterDescriptor(
+        description="id of this agent, 1 .. agents; default: the number in the namespace",
+        read_only=True,
+        integer_range=[span],
+    )
+    try:
+        return int(node.declare_parameter("id", default, info).value)
+    except Exception as error:  # rclpy has no common base for wrong types and values out of range
+        value = node._parameter_overrides["id"].value
+        raise ConfigError("id", value, f"a whole number, 1 to {MAX_AGENTS}") from error
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    node, agent = _make_node(supervised)
+    try:
+        config = declare_swarm(node)
+        if agent > config.agents:
+            raise ConfigError("id", agent, f"1 to {config.agents}, the number of agents")
+        host_agents(node, [agent], config, stop, spaces=[node.get_namespace()])
+    finally:
+        node.destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node."""
+    return run_node("agent", _body, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""The inner loop of a node that lives on one topic: waits, takes, calls back; nothing else on the way.
+
+rclpy's executors build their wait set anew for every message, which takes longer than a whole slot of the protocol.
+This loop keeps one wait set on one subscription. Whatever else the node has (parameter services, timers) is served by
+an ordinary executor a few times a second.
+"""
+
+from __future__ import annotations
+
+import gc
+import signal
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import FrameType
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from dtsa_agent.core.errors import LocalProtocolError
+
+_POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
+HOUSEKEEPING_S = 0.1
+
+
+class Stop:
+    """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that whoever runs ends in good order.
+
+    A context manager that puts the old handlers back.
+    """
+
+    def __init__(self) -> None:
+        self.signal = 0
+        self._old: dict[int, Any] = {}
+
+    def __enter__(self) -> Stop:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            self._old[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def __bool__(self) -> bool:
+        return self.signal != 0
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.signal = self.signal or number
+
+
+class _OwnHands(CallbackGroup):
+    """Keeps ordinary executors away from a subscription."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class Loop:
+    """Serves one subscription as fast as Python can, and the rest of its node now and then.
+
+    :param node: the node that subscribes.
+    :param msg_type: type of the messages.
+    :param topic: what it subscribes to.
+    :param qos: quality of service.
+    :param raw: messages are taken as serialised bytes.
+    """
+
+    def __init__(self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, raw: bool = False) -> None:
+        self._node = node
+        self.subscription = node.create_subscription(
+            msg_type, topic, self._never, qos, callback_group=_OwnHands(), raw=raw
+        )
+        self._handle = self.subscription.handle
+        self._type, self._raw = msg_type, raw
+        self._executor: SingleThreadedExecutor | None = None
+        self._stack = ExitStack()
+        context = node.context.handle
+        for handle in (self._handle, context):
+            self._stack.enter_context(handle)
+        self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, context)
+        self._next_housekeeping = 0.0
+        gc.freeze()  # nothing made so far is garbage: do not look at it again and again
+
+    def _never(self, message: Any) -> None:
+        raise LocalProtocolError("an executor took a message that is not its own")
+
+    def wait(self, timeout_ns: int = _POLL_NS) -> Any:
+        """The next message, or None after a while.
+
+        :param timeout_ns: longest time to wait, ns.
+        """
+        wait_set = self._wait_set
+        wait_set.clear_entities()
+        wait_set.add_subscription(self._handle)
+        wait_set.wait(timeout_ns)
+        return self.take()
+
+    def take(self) -> Any:
+        """A message that is there already, or None."""
+        taken = self._handle.take_message(self._type, self._raw)
+        return None if taken is None else taken[0]
+
+    def housekeeping(self) -> bool:
+        """Serves parameters and timers if it is time; whether it did."""
+        now = time.monotonic()
+        if now < self._next_housekeeping:
+            return False
+        self._next_housekeeping = now + HOUSEKEEPING_S
+        node = self._node
+        if any(True for _ in node.services) or any(True for _ in node.timers):
+            if self._executor is None:
+                self._executor = SingleThreadedExecutor(context=node.context)
+                self._executor.add_node(node)
+            for _ in range(2):
+                self._executor.spin_once(timeout_sec=0.0)
+        return True
+
+    def run(self, on_message: Callable[[Any], bool], idle: Callable[[], None], stop: Stop) -> None:
+        """Calls back until ``on_message`` says False or a signal comes.
+
+        :param on_message: gets each message; says whether to go on.
+        :param idle: called about ten times a second.
+        :param stop: the flag.
+        """
+        while not stop:
+            message = self.wait()
+            if message is not None and not on_message(message):
+                return
+            if self.housekeeping():
+                idle()
+            if not self._node.context.ok():
+                raise ExternalShutdownException
+
+    def close(self) -> None:
+        """Gives the handles back."""
+        if self._executor is not None:
+            self._executor.shutdown(timeout_sec=0)
+        self._stack.close()

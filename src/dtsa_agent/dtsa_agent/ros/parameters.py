@@ -1,0 +1,116 @@
+"""ROS parameters made from the configuration dataclasses: name, description, range and default stand there, once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.settings import Setting, format_values, settings_of
+
+_UNBOUNDED = 2.0**62
+_NOTHING = -1  # stands for None in a parameter that may be left open
+
+
+def descriptor(setting: Setting, read_only: bool) -> ParameterDescriptor:
+    """The description that ``ros2 param describe`` shows.
+
+    :param setting: the setting.
+    :param read_only: whether it is fixed once the node runs.
+    """
+    result = ParameterDescriptor(description=setting.description, read_only=read_only)
+    low = -_UNBOUNDED if setting.minimum is None else setting.minimum
+    high = _UNBOUNDED if setting.maximum is None else setting.maximum
+    if setting.optional:
+        low = _NOTHING
+        result.description += f"; {_NOTHING}: the default"
+    if setting.kind == "int":
+        result.integer_range = [IntegerRange(from_value=int(low), to_value=min(int(high), 2**63 - 1), step=0)]
+    elif setting.kind == "float":
+        result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)]
+        result.dynamic_typing = True  # `-p slot_ms:=10` shall do as well as 10.0
+    elif setting.choices:
+        result.additional_constraints = "one of: " + ", ".join(setting.choices)
+    return result
+
+
+def declare_from_dataclass(
+    node: Node, cls: type, skip: Iterable[str] = (), changeable: bool = False, defaults: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Declares a parameter for every setting of a dataclass and gives the values that the node was started with.
+
+    :param node: the node.
+    :param cls: the configuration dataclass.
+    :param skip: fields that become no parameter.
+    :param changeable: settings that say so may be changed while the node runs; all others are read-only.
+    :param defaults: values that replace the dataclass's defaults.
+    :returns: values by field name, for the class's ``from_dict``.
+    :raises ConfigError: for a value of the wrong type or out of range.
+    """
+    values: dict[str, Any] = {}
+    for setting in settings_of(cls):
+        if setting.kind == "structure" or setting.name in skip:
+            continue
+        default = (defaults or {}).get(setting.name, setting.default)
+        parameter = _declare(node, setting, default, not (changeable and setting.changeable))
+        values[setting.name] = from_parameter(setting, parameter.value)
+    return values
+
+
+def _declare(node: Node, setting: Setting, default: Any, read_only: bool) -> Parameter:
+    if default is None:
+        default = _NOTHING
+    elif setting.kind == "values":
+        default = format_values(default)
+    try:
+        return node.declare_parameter(setting.name, default, descriptor(setting, read_only))
+    except Exception as error:  # rclpy has no common base for wrong types and values out of range
+        given = node._parameter_overrides.get(setting.name)
+        value = given.value if given is not None else default
+        raise ConfigError(setting.name, value, allowed_text(setting)) from error
+
+
+def from_parameter(setting: Setting, value: Any) -> Any:
+    """The setting's value from that of its parameter.
+
+    :raises ConfigError: if it is none.
+    """
+    if setting.optional and value == _NOTHING:
+        return None
+    if setting.kind == "values":
+        return setting.parse(value)
+    if setting.kind == "float" and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value
+
+
+def allowed_text(setting: Setting) -> str:
+    """What a setting may be, in words."""
+    if setting.choices:
+        return ", ".join(setting.choices)
+    words = {"int": "a whole number", "float": "a number", "bool": "true or false", "values": "name=number, ..."}
+    text = words.get(setting.kind, "a text")
+    if setting.minimum is not None and setting.maximum is not None:
+        text += f", {setting.minimum:g} to {setting.maximum:g}"
+    return f"{text} {setting.unit}".rstrip()
+
+
+def to_parameters(values: Mapping[str, Any], cls: type) -> dict[str, Any]:
+    """Parameters, as a parameter file holds them, that make a node read back these settings.
+
+    :param values: values by field name, as the class's ``to_dict`` gives them.
+    :param cls: the configuration dataclass.
+    """
+    result = {}
+    for setting in settings_of(cls):
+        if setting.kind == "structure" or setting.name not in values:
+            continue
+        value = values[setting.name]
+        if value is None:
+            continue
+        result[setting.name] = format_values(value) if setting.kind == "values" else value
+    return result

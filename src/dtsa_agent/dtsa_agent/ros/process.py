@@ -1,0 +1,76 @@
+"""What all node processes have in common: start, exit codes, one clear line for what went wrong, and their parent."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+
+from dtsa_agent.core.errors import ConfigError, DtsaError
+
+from .loop import Stop
+
+_PR_SET_PDEATHSIG = 1
+SUPERVISOR = "DTSA_SUPERVISOR"  # process id of the supervisor that started this node, if one did
+
+
+def follow_supervisor() -> bool:
+    """Lets the kernel end this process when its supervisor ends, however that ends.
+
+    :returns: whether a supervisor started this process; it then answers for names and parameters, too.
+    """
+    parent = os.environ.get(SUPERVISOR)
+    if not parent:
+        return False
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != int(parent):  # it was gone before we asked
+        sys.exit(1)
+    return True
+
+
+def node_options(supervised: bool) -> dict[str, Any]:
+    """Arguments for ``Node``: a supervised node goes without the services that nobody would ask, and starts faster.
+
+    :param supervised: whether a supervisor started this process.
+    """
+    if not supervised:
+        return {}
+    silent = Parameter("start_type_description_service", value=False)
+    return {"start_parameter_services": False, "enable_rosout": False, "parameter_overrides": [silent]}
+
+
+def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None) -> int:
+    """Runs a node until it ends by itself or by SIGINT or SIGTERM.
+
+    :param name: what it calls itself in error messages.
+    :param body: creates the node and runs it; gets the signal flag and whether a supervisor started this process.
+    :param args: command line, default ``sys.argv``.
+    :returns: exit code: 0 for a clean end (by a signal, too), 2 for settings that are not usable, 1 for other errors.
+    """
+    supervised = follow_supervisor()
+    with Stop() as stop:
+        try:
+            rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # rclpy's errors for a wrong command line have no common base
+            print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
+            return 2
+        try:
+            return body(stop, supervised) or 0
+        except ConfigError as error:
+            print(f"{name}: error: {error}", file=sys.stderr)
+            return 2
+        except DtsaError as error:
+            print(f"{name}: error: {error}", file=sys.stderr)
+            return 1
+        except ExternalShutdownException:
+            return 0
+        finally:
+            rclpy.try_shutdown()

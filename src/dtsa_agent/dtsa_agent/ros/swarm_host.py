@@ -1,0 +1,46 @@
+"""``ros2 run dtsa_agent swarm_host``: several quadcopters in one process, behind one subscription and one publisher."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from rcl_interfaces.msg import ParameterDescriptor, ParameterType
+from rclpy.node import Node
+
+from . import names
+from .hosting import declare_swarm, host_agents
+from .loop import Stop
+from .process import node_options, run_node
+from .swarm_node import parse_ids
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    plain = node_options(supervised)
+    node = Node("swarm_host", namespace=names.SWARM, **plain)
+    try:
+        config = declare_swarm(node)
+        listed = ParameterDescriptor(
+            description="ids of the agents in this process; [0]: all",
+            read_only=True,
+            type=ParameterType.PARAMETER_INTEGER_ARRAY,
+        )
+        ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
+        share = ParameterDescriptor(
+            read_only=True,
+            description="one table serves all agents here, for as long as all "
+            "hear the same; policies tdma, dtsa and age; only faster, changes no flight",
+        )
+        shared = node.declare_parameter("shared_view", False, share).value
+        host_agents(node, parse_ids(ids, config.agents), config, stop, shared)
+    finally:
+        node.destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node."""
+    return run_node("swarm_host", _body, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,244 @@
+"""The node behind ``agent`` and ``swarm_host``: one or many agents behind one subscription and one publisher."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from dtsa_msgs.msg import Slot, Transmission
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import qos_profile_sensor_data
+
+from dtsa_agent.core import Scenario, Swarm, SwarmConfig
+from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
+from dtsa_agent.core.plugins import make_swarm, shareable
+from dtsa_agent.keys import with_key
+
+from . import names
+from .loop import Loop, Stop
+from .wire import split_frames, unpack_received
+
+
+class SwarmNode:
+    """Agents that answer every slot message of the channel with one transmission message.
+
+    On the message that opens slot i: hear what the air carried in slot i-1, close that slot, decide for slot i, answer,
+    and only then fly through slot i, while the channel is already at work.
+
+    :param node: the ROS node.
+    :param config: the settings that all agents share.
+    :param ids: ids of the agents that live here.
+    :param shared_view: one table serves all agents here, for as long as all hear the same.
+    :param swarm_namespace: namespace of the swarm's topics.
+    :param scenario: starts and goals; default: made from ``config``.
+    :param waiting: a quarter of the messages that may wait to be read: 1 is enough in lockstep.
+    :raises ConfigError: for ids that do not exist, or a policy whose agents cannot share a table.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        config: SwarmConfig,
+        ids: Sequence[int],
+        shared_view: bool = False,
+        swarm_namespace: str = names.SWARM,
+        scenario: Scenario | None = None,
+        waiting: int = 1,
+    ) -> None:
+        if shared_view and not shareable(config):
+            raise ConfigError("shared_view", True, f"false with policy {config.policy}")
+        self.node = node
+        self.config = config
+        self.swarm = with_key(make_swarm(config, scenario, local=sorted(ids), shared_view=shared_view))
+        self.slot = -1  # the slot that has been answered
+        self._goal = np.full_like(self.swarm.goal, np.nan)
+        self._message = Transmission()
+        self._message.agent = array("H", self.swarm.ids)
+        self._message.steps = config.steps
+        self._odometry: list[tuple[int, Publisher]] = []
+        self._watched: list[tuple[int, Publisher]] = []
+        qos = names.lockstep_qos(waiting)
+        self._publisher = node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
+        self.loop = Loop(node, Slot, f"{swarm_namespace}/{names.SLOT}", qos)
+
+    def offer_odometry(self, namespaces: Sequence[str] | None = None) -> None:
+        """Offers each agent's true motion as ``odom``; published only while somebody subscribes.
+
+        :param namespaces: one an agent; default: ``/cf1``, ``/cf2``, ...
+        """
+        for index, space in enumerate(namespaces or map(names.agent_namespace, self.swarm.ids)):
+            topic = f"{space.rstrip('/')}/{names.ODOMETRY}"
+            publisher = self.node.create_publisher(Odometry, topic, qos_profile_sensor_data)
+            self._odometry.append((index, publisher))
+
+    def idle(self) -> None:
+        """Looks around; called about ten times a second."""
+        self._watched = [entry for entry in self._odometry if entry[1].get_subscription_count()]
+
+    def run(self, stop: Stop) -> None:
+        """Answers slot messages until the run is over or a signal comes."""
+        self.loop.run(self.on_slot, self.idle, stop)
+
+    def on_slot(self, message: Slot) -> bool:
+        """Answers a slot message.
+
+        :returns: False when the run is over.
+        :raises LocalProtocolError: when slot messages were missed.
+        """
+        if message.phase == Slot.END:
+            return False
+        slot = message.slot
+        if slot != self.slot + 1:
+            if slot == self.slot:  # asked again: the answer was given before the channel could hear it
+                self._publisher.publish(self._message)
+            elif slot > self.slot:
+                raise LocalProtocolError(f"slot {slot} follows slot {self.slot}: this node has missed slots")
+            return True
+        if slot:
+            self._hear(message, slot - 1)
+            self.swarm.end(slot - 1)
+        swarm = self.swarm
+        swarm.scenario.advance(slot, swarm)
+        senders = swarm.begin(slot)
+        self._answer(slot, message.stamp, senders)
+        self.slot = slot
+        if self._watched:
+            self._publish_odometry(message.stamp)
+        swarm.fly(slot)
+        return True
+
+    def _hear(self, message: Slot, slot: int) -> NDArray[np.uint8] | None:
+        """Takes in frames that the air carried.
+
+        :param slot: the slot in which they are heard.
+        :returns: (F, L) who of the local agents received them; None if they share a table, or there are none.
+        """
+        count = len(message.sender)
+        if self.swarm.shared:
+            sent = [self.swarm.ids[index] for index in np.flatnonzero(self.swarm.sends)]
+            if any(agent not in message.sender for agent in sent):
+                self._unshare(slot)  # nobody heard it: only its sender knows what it said
+        if not count:
+            return None
+        swarm, agents = self.swarm, self.config.agents
+        try:
+            heard = unpack_received(memoryview(message.received), count, agents)
+            frames = split_frames(memoryview(message.data), message.length)
+        except ValueError as error:
+            raise RemoteProtocolError(f"the channel's message for slot {message.slot} is unusable: {error}") from None
+        if swarm.shared:
+            received = heard.copy()
+            received[np.arange(count), np.array(message.sender) - 1] = 1  # its own sender does not need to hear it
+            if received[:, swarm.local].all():
+                for frame in frames:
+                    swarm.hear(slot, frame)
+                return None
+            swarm = self._unshare(slot)
+        local = np.ascontiguousarray(heard[:, swarm.local])
+        for frame, mask in zip(frames, local, strict=True):
+            swarm.hear(slot, frame, mask)
+        return local
+
+    def _unshare(self, slot: int) -> Swarm:
+        """From the first frame on that not all have heard every agent keeps a table of its own."""
+        self.swarm = separate_tables(self.swarm, slot)
+        return self.swarm
+
+    def _answer(self, slot: int, stamp: Time, senders: Sequence[int]) -> None:
+        swarm, message = self.swarm, self._message
+        message.stamp = stamp
+        message.slot = slot
+        frames = [swarm.frame(index) for index in senders]
+        message.length = array("B", bytes(len(swarm.ids)))
+        for index, frame in zip(senders, frames, strict=True):
+            message.length[index] = len(frame)
+        message.data = array("B", b"".join(frames))
+        message.chosen = array("H", swarm.chosen.tobytes())
+        message.reason = array("B", swarm.reason.tobytes())
+        message.digest = array("Q", swarm.digest.tobytes())
+        message.score = array("d", swarm.score.tobytes())
+        message.track = array("d", swarm.track.tobytes())
+        message.velocity = array("d", swarm.velocity.tobytes())
+        message.command = array("d", swarm.command.tobytes())
+        if np.array_equal(self._goal, swarm.goal):
+            message.goal = array("d")
+        else:
+            self._goal[:] = swarm.goal
+            message.goal = array("d", swarm.goal.tobytes())
+        self._publisher.publish(message)
+
+    def _publish_odometry(self, stamp: Time) -> None:
+        message = Odometry()
+        message.header.frame_id = names.FRAME
+        message.header.stamp = stamp
+        place, speed = message.pose.pose.position, message.twist.twist.linear
+        for index, publisher in self._watched:
+            # The attitude is not modelled, it is the identity: the body's axes are those of the map.
+            message.child_frame_id = f"cf{self.swarm.ids[index]}/base_link"
+            place.x, place.y, place.z = self.swarm.position[:, index].tolist()
+            speed.x, speed.y, speed.z = self.swarm.velocity[:, index].tolist()
+            publisher.publish(message)
+
+
+def separate_tables(shared: Swarm, slot: int) -> Swarm:
+    """The same agents in the same state, each with a table of its own.
+
+    :param shared: agents that share a table, between ``fly(slot)`` and ``end(slot)``.
+    :param slot: the slot that is not closed yet.
+    """
+    swarm = Swarm(shared.config, shared.scenario, local=shared.ids)
+    if shared.authenticator:
+        swarm.authenticate(shared.authenticator)
+    # Lists the senders of the open slot; the state that they sent is copied over what this encodes.
+    swarm.sends[:] = shared.sends
+    swarm.emit(slot)
+    for name in (
+        "position",
+        "velocity",
+        "command",
+        "goal",
+        "known_goal",
+        "track",
+        "active",
+        "final",
+        "present",
+        "chosen",
+        "reason",
+        "digest",
+        "score",
+        "frame_length",
+        "frames",
+    ):
+        getattr(swarm, name)[...] = getattr(shared, name)
+    swarm.course = shared.course
+    for name in (
+        "sent_position",
+        "sent_velocity",
+        "sent_intent",
+        "sent_slot",
+        "last_turn",
+        "in_ap",
+        "estimate_position",
+        "estimate_velocity",
+        "_entry_hash",
+        "_view_hash",
+    ):
+        getattr(swarm, name)[...] = getattr(shared, name)[:1]
+    return swarm
+
+
+def parse_ids(value: Any, agents: int) -> list[int]:
+    """Ids from a parameter: a list of numbers, or an empty one for all.
+
+    :raises ConfigError: if there are others.
+    """
+    ids = [int(item) for item in value] or list(range(1, agents + 1))
+    if len(set(ids)) != len(ids) or min(ids) < 1 or max(ids) > agents:
+        raise ConfigError("ids", list(value), f"different ids from 1 to {agents}; none: all")
+    return sorted(ids)

@@ -1,0 +1,43 @@
+"""How frames and receiver bits lie in the messages of dtsa_msgs. Needs no ROS: recorders and verifiers use it too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def pack_received(mask: NDArray[np.bool_]) -> bytes:
+    """The field ``received``: one bit an agent and frame.
+
+    :param mask: (F, N): the agent with id column + 1 received the frame.
+    """
+    return np.packbits(mask, axis=1, bitorder="little").tobytes()
+
+
+def unpack_received(data: bytes | memoryview, frames: int, agents: int) -> NDArray[np.uint8]:
+    """The mask (F, N), 0 or 1, that :func:`pack_received` packed.
+
+    :param data: the field.
+    :param frames: number of frames F.
+    :param agents: number of agents N.
+    :raises ValueError: if the field's length does not fit.
+    """
+    rows = np.frombuffer(data, dtype=np.uint8).reshape(frames, (agents + 7) // 8)
+    return np.unpackbits(rows, axis=1, count=agents, bitorder="little")
+
+
+def split_frames(data: bytes | memoryview, lengths: Sequence[int]) -> list[bytes]:
+    """The frames that lie one after the other in ``data``.
+
+    :param lengths: bytes, length of each; 0 gives an empty one.
+    :raises ValueError: if the lengths do not add up to the data.
+    """
+    frames, at, whole = [], 0, bytes(data)
+    for length in lengths:
+        frames.append(whole[at : at + length])
+        at += length
+    if at != len(whole):
+        raise ValueError(f"{len(whole)} bytes of frames, {at} in their lengths")
+    return frames
