@@ -1,0 +1,153 @@
+"""The same agents on vehicles that fly elsewhere: state from `/cfN/odom`, commands to `/cfN/cmd_velocity_world`.
+
+    python -m dtsa_agent.crazyflie.agents_node --ros-args -p agents:=12 -p policy:=lease ...
+
+The node is a `swarm_host` whose vehicles are flown by somebody else. Protocol, estimator and avoider are untouched:
+only the two places at which a simulated vehicle would move are replaced.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from dtsa_msgs.msg import Slot, VelocityWorld
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.crazyflie.units import rotate
+from dtsa_agent.ros import names
+from dtsa_agent.ros.hosting import declare_swarm
+from dtsa_agent.ros.loop import Stop
+from dtsa_agent.ros.process import run_node
+from dtsa_agent.ros.realtime import RealtimeNode
+from dtsa_agent.ros.swarm_node import parse_ids
+
+LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+STALE_S = 0.3  # an agent that does not know where it is gives no commands: the bridge then holds its vehicle
+LONGEST_PREDICTION_S = 0.15
+HOLD_GAIN = 1.0  # 1/s, for agents that hover: real air does not leave them where they are
+HOLD_MPS = 0.3
+
+
+class ExternalVehicles(RealtimeNode):
+    """Agents that open their slots by the station's clock and whose vehicles are flown elsewhere.
+
+    :param node: the ROS node.
+    :param config: the settings that all agents share.
+    :param ids: ids of the agents that live here.
+    :param command_hz: rate of the commands, Hz; at most one a slot.
+    """
+
+    def __init__(
+        self, node: Node, config: SwarmConfig, ids: Sequence[int], *args: Any, command_hz: float, **more: Any
+    ) -> None:
+        super().__init__(node, config, ids, *args, **more)
+        self.swarm.fly = self._fly
+        count = len(self.swarm.ids)
+        self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
+        self._measured = np.zeros((3, count))  # m, where each was by its last odometry
+        self._stamp = np.zeros(count)  # s, system clock, of that
+        self._every = max(1, round(1.0 / command_hz / config.slot_s))
+        self._inputs, self._outputs = [], []
+        for index, agent in enumerate(self.swarm.ids):
+            space = names.agent_namespace(agent)
+
+            def keep(message: Odometry, index: int = index) -> None:
+                self._note(index, message)
+
+            self._inputs.append(node.create_subscription(Odometry, f"{space}/{names.ODOMETRY}", keep, LATEST))
+            self._outputs.append(node.create_publisher(VelocityWorld, f"{space}/cmd_velocity_world", 1))
+        self._hold = self.swarm.scenario.start[:, self.swarm.local].copy()
+
+    @property
+    def _blind(self) -> bool:
+        """Whether some agent does not know yet where it is."""
+        return bool(np.isinf(self._heard).any())
+
+    def _sense(self) -> None:
+        for index, subscription in enumerate(self._inputs):
+            taken = subscription.handle.take_message(Odometry, False)
+            if taken is not None:
+                self._note(index, taken[0])
+        # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
+        age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
+        self.swarm.position[:] = self._measured + self.swarm.velocity * age
+        self.swarm.track[:] = self.swarm.position
+
+    def _note(self, index: int, message: Odometry) -> None:
+        place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
+        self._measured[:, index] = place.x, place.y, place.z
+        self._stamp[index] = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        # The twist of an odometry message is in the body's frame (REP-103).
+        self.swarm.velocity[:, index] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
+        self._heard[index] = time.monotonic()
+
+    def _fly(self, slot: int) -> None:
+        """In place of simulated motion: commands to the vehicles."""
+        swarm = self.swarm
+        if slot % self._every:
+            return
+        swarm.steer(slot, 0, True)
+        still = swarm.active == 0
+        if still.any():
+            swarm.command[:, still] = np.clip(
+                HOLD_GAIN * (self._hold[:, still] - swarm.position[:, still]), -HOLD_MPS, HOLD_MPS
+            )
+        now = time.monotonic()
+        message = VelocityWorld()
+        for index, publisher in enumerate(self._outputs):
+            if now - self._heard[index] < STALE_S:
+                v = message.vel
+                v.x, v.y, v.z = swarm.command[:, index].tolist()
+                publisher.publish(message)
+
+    def _prepare(self, message: Slot) -> bool:
+        self._sense()
+        if message.phase == Slot.PREPARE and self._blind:
+            return True
+        return super()._prepare(message)
+
+    def _open(self, slot: int) -> None:
+        self._sense()
+        super()._open(slot)
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    plain = {"start_parameter_services": False, "enable_rosout": False} if supervised else {}
+    node = Node("crazyflie_agents", namespace=names.SWARM, **plain)
+    try:
+        config = declare_swarm(node)
+        shared = ParameterDescriptor(description="namespace of what the whole swarm shares", read_only=True)
+        swarm = str(node.declare_parameter("swarm_namespace", names.SWARM, shared).value).rstrip("/")
+        listed = ParameterDescriptor(description="ids of the agents in this process; [0]: all", read_only=True)
+        ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
+        span = FloatingPointRange(from_value=1.0, to_value=100.0, step=0.0)
+        rate = ParameterDescriptor(description="rate of the commands (Hz)", read_only=True, floating_point_range=[span])
+        command_hz = float(node.declare_parameter("command_hz", 50.0, rate).value)
+        ids = parse_ids(ids, config.agents)
+        zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
+        agents = ExternalVehicles(
+            node, config, ids, False, swarm, command_hz=command_hz, offset_ns=zero, drift_ppb=zero, align=False
+        )
+        try:
+            agents.run(stop)
+        finally:
+            agents.loop.close()
+    finally:
+        node.destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node."""
+    return run_node("crazyflie_agents", _body, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,67 @@
+"""What one worker thread has to send: orders in sequence, of streamed commands only the latest."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from dtsa_agent.crazyflie.units import Setpoint
+
+Order = Callable[[], None]
+
+
+class Mailbox:
+    """Orders (all, in sequence) and one setpoint (the latest). Orders go first; an urgent one empties the box."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._orders: deque[Order] = deque()
+        self._setpoint: Setpoint | None = None
+        self._closed = False
+        self.replaced = 0  # setpoints that were overtaken by a newer one before they were sent
+
+    def put_setpoint(self, setpoint: Setpoint) -> None:
+        """Replace the setpoint that waits, if any."""
+        with self._condition:
+            if self._setpoint is not None:
+                self.replaced += 1
+            self._setpoint = setpoint
+            self._condition.notify()
+
+    def put_order(self, order: Order, *, urgent: bool = False) -> None:
+        """Append an order, and forget the setpoint that waits: an order ends the stream before it.
+
+        :param urgent: forget all orders that wait, too.
+        """
+        with self._condition:
+            if urgent:
+                self._orders.clear()
+            self._setpoint = None
+            self._orders.append(order)
+            self._condition.notify()
+
+    def put_background(self, order: Order) -> None:
+        """Append an order that leaves the stream of setpoints alone."""
+        with self._condition:
+            self._orders.append(order)
+            self._condition.notify()
+
+    def get(self) -> Order | Setpoint | None:
+        """Wait for the next thing to send; None once the box is closed and empty."""
+        with self._condition:
+            while True:
+                if self._orders:
+                    return self._orders.popleft()
+                if self._setpoint is not None:
+                    setpoint, self._setpoint = self._setpoint, None
+                    return setpoint
+                if self._closed:
+                    return None
+                self._condition.wait()
+
+    def close(self) -> None:
+        """Nothing more will come."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify()

@@ -1,0 +1,367 @@
+"""One Crazyflie as the bridge knows it: link, state machine, orders, and the age of everything."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
+from dtsa_agent.crazyflie.link import Link
+from dtsa_agent.crazyflie.safety import Watched
+from dtsa_agent.crazyflie.state_machine import State, StateMachine
+from dtsa_agent.crazyflie.units import Setpoint, VehicleState, to_map, velocity_world, yaw_of
+
+# A path that is planned from high speed swings out by metres: before a landing and before holding a place the vehicle
+# is first braked by streamed setpoints of zero velocity.
+SLOW_MPS = 0.25
+BRAKE_LIMIT_S = 1.5
+HOLD_S = 0.5  # s, duration of the path to the place that is held
+MIN_LAND_S = 1.0
+BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
+BLIND_REPEATS = 3
+QUALITY_WINDOW_S = 1.0
+WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
+ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """State of one vehicle for those who watch."""
+
+    name: str
+    id: int
+    state: State
+    reason: str
+    vehicle: VehicleState | None
+    log_age: float  # s; infinite before the first packet
+    command_age: float  # s; infinite before the first command
+    link_quality: float  # 0..1
+    rssi: int
+    sent: int
+    received: int
+    refused: int  # streamed commands that were not for this state
+    replaced: int  # streamed commands that a newer one overtook
+    latency_p99: float  # s; 0 before the first command
+    command_hz: float
+
+
+class Vehicle:
+    """One Crazyflie.
+
+    :param robot: its settings.
+    :param station: the ground station's settings.
+    :param cache: folder for cflib's tables.
+    :param log: called with a level (info, warn, error) and a line.
+    :param on_state: called with this vehicle and each new state of it, in a thread of cflib's.
+    """
+
+    def __init__(
+        self,
+        robot: RobotSettings,
+        station: StationSettings,
+        cache: Path,
+        log: Callable[[str, str], None],
+        on_state: Callable[[Vehicle, VehicleState], None] | None = None,
+    ) -> None:
+        self.robot = robot
+        self.station = station
+        self.name = robot.name
+        self.lock = threading.RLock()
+        self.machine = StateMachine(self._changed)
+        self.action = "not connected yet"  # the last action taken with it, and why
+        self.last: VehicleState | None = None
+        self.refused = 0
+        self.guarded = False  # the firmware's emergency watchdog is running
+        self._log = log
+        self._publish = on_state
+        self._log_times: deque[float] = deque(maxlen=200)
+        self._command_time: float | None = None
+        self._streaming = False  # the firmware follows streamed commands, not the high-level commander
+        self._held = False  # the stream of commands broke off and the place is being held
+        self._brake: tuple[float, Callable[[], None]] | None = None  # until when to brake, and what comes then
+        self._guard_until = 0.0  # a take-off or go-to is flown to its end before streamed commands count again
+        self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
+        self._blind: list[float] = []  # when to repeat a landing that may not have been heard
+        self.link = Link(robot, cache, self._received, self._broken)
+
+    # -- what comes in ----------------------------------------------------------------------------------------------
+    def _changed(self, before: State, state: State, reason: str) -> None:
+        level = "error" if state in (State.EMERGENCY, State.LOST) else "info"
+        self._log(level, f"{self.name}: {before.name.lower()} -> {state.name.lower()} ({reason})")
+        self.action = reason
+        if before == State.LANDING and state == State.ARMED:
+            self.link.order(lambda cf: cf.supervisor.send_arming_request(False))
+
+    def _received(self, state: VehicleState, now: float) -> None:
+        with self.lock:
+            self.last = state
+            self._log_times.append(now)
+            if self.machine.state not in (State.DISCONNECTED, State.CONNECTING):
+                self.machine.observe(state.info)
+                if self._blind and self.machine.state != State.LOST:
+                    self._blind.clear()
+        if self._publish is not None:
+            self._publish(self, state)
+
+    def _broken(self, reason: str) -> None:
+        with self.lock:
+            self.machine.silent(reason)
+
+    # -- connection -------------------------------------------------------------------------------------------------
+    def connect(self, done: Callable[[], None]) -> None:
+        """Connect in the background; `done` is called when it has worked out or not."""
+        with self.lock:
+            self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
+            self._streaming = self._held = self._deaf = self.guarded = False
+            self._command_time = None
+
+        def finished(reason: str) -> None:
+            try:
+                with self.lock:
+                    if reason:
+                        self._log("error", f"{self.name}: no connection: {reason}")
+                        self.machine.go(State.DISCONNECTED, reason)
+                    else:
+                        self.machine.go(State.READY, "connected")
+                        if self.last is not None:
+                            self.machine.observe(self.last.info)
+            finally:
+                done()
+
+        self.link.connect(finished)
+
+    @property
+    def state(self) -> State:
+        """Where the state machine stands."""
+        return self.machine.state
+
+    def log_age(self, now: float) -> float:
+        """Seconds since the last log packet; infinite before the first one."""
+        return now - self._log_times[-1] if self._log_times else math.inf
+
+    # -- orders -----------------------------------------------------------------------------------------------------
+    def command(self, setpoint: Setpoint) -> bool:
+        """Stream a command; False when it is not for the present state."""
+        with self.lock:
+            if self.state not in ACCEPTS_COMMANDS or self._deaf or setpoint.stamp < self._guard_until:
+                self.refused += 1
+                return False
+            self._command_time = setpoint.stamp
+            if self._held:
+                self._log("info", f"{self.name}: commands again")
+            self._streaming, self._held, self._brake = True, False, None
+            self.link.mailbox.put_setpoint(setpoint)
+            return True
+
+    def _high_level(self, action: Callable[[Any], None], duration: float) -> None:
+        """An order to the high-level commander; the stream of setpoints is declared over before it."""
+        streaming, self._streaming, self._held = self._streaming, False, False
+        self._guard_until = time.monotonic() + duration
+        self._brake = None
+
+        def run(cf: Any) -> None:
+            if streaming:
+                cf.commander.send_notify_setpoint_stop()
+            action(cf)
+
+        self.link.order(run)
+
+    def arm(self, arm: bool) -> str:
+        """Let the motors run, or lock them; why not, or an empty text."""
+        with self.lock:
+            if self.state not in (State.READY, State.ARMED):
+                return f"{self.name} is {self.state.name.lower()}"
+            self.action = "arming" if arm else "disarming"
+            self.link.order(lambda cf: cf.supervisor.send_arming_request(arm))
+            return ""
+
+    def takeoff(self, height: float, duration: float) -> str:
+        """Climb to a height (m above the floor) within a duration (s); why not, or an empty text."""
+        with self.lock:
+            if self.state not in (State.ARMED, State.FLYING, State.LANDING):
+                return f"{self.name} is {self.state.name.lower()}, not armed"
+            if self.last is not None and self.last.battery < self.robot.battery_critical_v:
+                return f"{self.name}: battery {self.last.battery:.2f} V"
+            self._deaf = False
+            self.machine.takeoff(f"take-off to {height:.2f} m")
+            self.action = self.machine.reason
+            self._high_level(lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration)
+            return ""
+
+    def go_to(self, place: tuple[float, float, float], yaw: float, duration: float, relative: bool) -> str:
+        """Fly to a place (m, world; relative: an offset) within a duration (s); why not, or an empty text."""
+        with self.lock:
+            if self.state != State.FLYING or self._deaf:
+                return f"{self.name} is {self.state.name.lower()}" + (f" ({self.action})" if self._deaf else "")
+            self.action = "go_to"
+            x, y, z = place
+            self._high_level(lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative), duration)
+            return ""
+
+    def hold(self, reason: str, *, stale: bool = False) -> None:
+        """Stop where it is; the next streamed command takes over again.
+
+        :param stale: because the stream broke off: the age of the last command goes on counting.
+        """
+        with self.lock:
+            if self.state != State.FLYING or self.last is None:
+                return
+            self.action = f"hold: {reason}"
+
+            def stay() -> None:
+                if self.last is None:
+                    return
+                x, y, z = self.last.position
+                z, yaw = max(z, 0.1), yaw_of(self.last.orientation)
+                self._high_level(lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
+                self._held = stale
+
+            self._held = stale
+            self._brake_then(stay)
+
+    def _brake_then(self, action: Callable[[], None]) -> None:
+        """Slow down, then do something."""
+        if self.last is None or self.state not in (State.FLYING, State.LANDING):
+            action()
+        else:
+            self._brake = (time.monotonic() + BRAKE_LIMIT_S, action)
+            self._slow_down(time.monotonic())
+
+    def _slow_down(self, now: float) -> None:
+        if self._brake is None or self.last is None:
+            return
+        end, action = self._brake
+        if math.hypot(*self.last.velocity) < SLOW_MPS or now > end:
+            self._brake = None
+            action()
+        else:
+            self._streaming = True
+            self.link.mailbox.put_setpoint(velocity_world((0.0, 0.0, 0.0), 0.0, now))
+
+    def land(self, reason: str, height: float = 0.0, duration: float = 0.0) -> str:
+        """Sink and stop the motors; why not, or an empty text.
+
+        :param height: m above the floor. :param duration: s; 0: at the station's landing speed.
+        """
+        with self.lock:
+            if self.state not in (State.ARMED, State.FLYING, State.LANDING, State.LOST):
+                return f"{self.name} is {self.state.name.lower()}"
+            self._deaf = True
+            if self.state == State.LANDING:
+                return ""
+            self.action = f"land: {reason}"
+            # A blind landing must end a stream that the firmware may still follow.
+            self._streaming = self._streaming or self.state == State.LOST
+            self.machine.land(f"land: {reason}")
+
+            def sink() -> None:
+                z = self.last.position[2] if self.last is not None else 1.0
+                seconds = duration or max(MIN_LAND_S, (z - height) / self.station.land_speed_mps)
+                self._high_level(lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
+
+            self._brake_then(sink)
+            return ""
+
+    def stop(self, reason: str) -> None:
+        """Emergency stop: motors off for good."""
+        with self.lock:
+            if self.state in (State.DISCONNECTED, State.CONNECTING):
+                return
+            self.action = f"emergency stop: {reason}"
+            self._deaf = True
+            self._brake = None
+
+            def run(cf: Any) -> None:
+                for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
+                    cf.supervisor.send_emergency_stop()
+
+            self.link.order(run, urgent=True)
+            self.machine.emergency(self.action)
+
+    def notify_setpoints_stop(self, remain_ms: int) -> str:
+        """End the stream of setpoints and hold; why not, or an empty text."""
+        with self.lock:
+            if self.state not in ACCEPTS_COMMANDS:
+                return f"{self.name} is {self.state.name.lower()}"
+            self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop(remain_ms))
+            self._streaming = False
+            self.hold("the stream of commands was declared over")
+            return ""
+
+    def lose(self, reason: str, now: float) -> None:
+        """It is silent. Nothing may be heard, but a landing is ordered all the same."""
+        with self.lock:
+            was_in_air = self.state in (State.FLYING, State.LANDING)
+            self.machine.silent(reason)
+            if was_in_air and self.link.connected:
+                self.land(reason)
+                self._blind = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
+
+    def tick(self, now: float) -> None:
+        """Called 50 times a second: goes on braking."""
+        with self.lock:
+            if self._brake is not None:
+                self._slow_down(now)
+
+    def keep_alive(self, now: float, watchdog: bool) -> None:
+        """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
+        with self.lock:
+            if self._blind and now >= self._blind[0]:
+                self._blind.pop(0)
+                self._streaming = True
+                self._high_level(lambda cf: cf.high_level_commander.land(0.0, 2.0, yaw=None), math.inf)
+            # From the first arming on: once it has begun, the firmware locks itself when it ends.
+            self.guarded |= watchdog and self.state in WATCHED_OVER
+            if self.guarded and self.state not in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY):
+                self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
+
+    # -- for those who watch ----------------------------------------------------------------------------------------
+    def watched(self, now: float) -> Watched:
+        """What the safety rules need."""
+        with self.lock:
+            last = self.last
+            return Watched(
+                self.name,
+                self.state,
+                None if last is None else to_map(last.position, self.station.room_origin_in_world),
+                math.inf if last is None else last.battery,
+                self.robot.battery_warning_v,
+                self.robot.battery_critical_v,
+                self.log_age(now),
+                now - self._command_time
+                if (self._streaming or self._held) and self._command_time is not None
+                else None,
+            )
+
+    def snapshot(self, now: float) -> Snapshot:
+        """Everything for the status."""
+        with self.lock:
+            recent = sum(1 for t in self._log_times if now - t <= QUALITY_WINDOW_S)
+            quality = min(1.0, recent / (self.robot.log_rate_hz * QUALITY_WINDOW_S))
+            if self.link.radio_quality is not None:
+                quality = min(quality, self.link.radio_quality)
+            delays = sorted(self.link.latencies.copy())
+            sends = [t for t in self.link.send_times.copy() if now - t <= QUALITY_WINDOW_S]
+            return Snapshot(
+                self.name,
+                self.robot.id,
+                self.state,
+                self.action,
+                self.last,
+                self.log_age(now),
+                math.inf if self._command_time is None else now - self._command_time,
+                quality,
+                self.link.rssi,
+                self.link.sent,
+                self.link.received,
+                self.refused,
+                self.link.mailbox.replaced,
+                delays[int(0.99 * (len(delays) - 1))] if delays else 0.0,
+                len(sends) / QUALITY_WINDOW_S,
+            )

@@ -1,0 +1,155 @@
+"""Simulated Crazyflies in a process of their own, and bridges that fly them, for the tests of the bridge."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.crazyflie import units
+from dtsa_agent.crazyflie.bridge import Bridge
+from dtsa_agent.crazyflie.config import parse_swarm
+from dtsa_agent.crazyflie.state_machine import State
+from dtsa_bench.fake_crazyflie import send_fault
+from dtsa_bench.fake_crazyflie.truth import read_truth
+
+
+def free_ports(count: int) -> int:
+    """First of `count` + 1 UDP ports in a row that are free; the one before it is free, too."""
+    for base in range(20100, 60000, count + 7):
+        with contextlib.ExitStack() as stack:
+            try:
+                for port in range(base - 1, base + count):
+                    sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                    sock.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return base
+    raise RuntimeError("no free ports")
+
+
+@dataclass
+class FakeFleet:
+    """Simulated Crazyflies that run."""
+
+    process: subprocess.Popen[str]
+    base_port: int
+    count: int
+    truth: Path
+
+    def uri(self, cf: int) -> str:
+        return f"udp://127.0.0.1:{self.base_port + cf - 1}"
+
+    def fault(self, name: str, cf: object = "all", **numbers: Any) -> float:
+        """Let one fail; the fleet's time."""
+        return float(send_fault(("127.0.0.1", self.base_port - 1), fault=name, cf=cf, **numbers)["t"])
+
+    def events(self, cf: int | None = None, name: str | None = None) -> list[dict[str, Any]]:
+        """What has happened so far."""
+        found = read_truth(self.truth)[2]
+        return [e for e in found if (cf is None or e["cf"] == cf) and (name is None or e["event"] == name)]
+
+    def state_event(self, cf: int, state: str) -> dict[str, Any]:
+        """The first time that a supervisor entered a state."""
+        return next(e for e in self.events(cf, "state") if e["state"] == state)
+
+
+@contextlib.contextmanager
+def fake_fleet(folder: Path, count: int, *options: str) -> Iterator[FakeFleet]:
+    """Simulated Crazyflies in a process of their own."""
+    base = free_ports(count)
+    truth = folder / f"truth-{base}.jsonl"
+    command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--count", str(count), "--base-port", str(base)]
+    command += ["--truth", str(truth), "--quiet", *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert any("Ctrl-C" in line for line in process.stdout), "the simulated Crazyflies did not start"
+        yield FakeFleet(process, base, count, truth)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0
+    finally:
+        end_process(process)
+
+
+def end_process(process: subprocess.Popen[str]) -> None:
+    """Whatever it does, it ends now."""
+    process.kill()
+    process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+@dataclass
+class Flight:
+    """A bridge, its log, and a pilot that streams velocity commands at 50 Hz."""
+
+    bridge: Bridge
+    lines: list[tuple[float, str, str]]
+    velocity: dict[str, tuple[float, float, float] | None] = field(default_factory=dict)  # None: no commands
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    def logged(self, pattern: str, after: float = 0.0) -> float:
+        """Time (s, monotonic) of the first line that matches."""
+        for when, _, line in self.lines:
+            if when >= after and re.search(pattern, line):
+                return when
+        raise AssertionError(f"no line matches {pattern!r} in\n" + "\n".join(line for _, _, line in self.lines))
+
+    def state(self, cf: int) -> State:
+        return self.bridge.vehicles[f"cf{cf}"].state
+
+    def pilot(self) -> None:
+        while not self.stop.wait(0.02):
+            for name, velocity in self.velocity.items():
+                if velocity is not None:
+                    self.bridge.vehicles[name].command(units.velocity_world(velocity, 0.0, time.monotonic()))
+
+    def take_off(self) -> None:
+        """Arm, climb to the middle of the room, and begin to stream zero velocity."""
+        names = list(self.bridge.vehicles)
+        ready = [n for n in names if self.bridge.vehicles[n].state == State.READY]
+        self.bridge.each(ready, lambda v: v.arm(True))
+        wait_for(lambda: all(self.bridge.vehicles[n].state == State.ARMED for n in ready))
+        assert self.bridge.each(ready, lambda v: v.takeoff(0.95, 1.5)) == (True, "")
+        time.sleep(1.8)
+        self.velocity = dict.fromkeys(ready, (0.0, 0.0, 0.0))
+        threading.Thread(target=self.pilot, daemon=True).start()
+
+
+def settings(fleet: FakeFleet, station: dict[str, Any] | None = None, **common: Any) -> dict[str, Any]:
+    """A swarm's YAML, as data, for simulated Crazyflies."""
+    robots = {f"cf{k}": {"uri": fleet.uri(k)} for k in range(1, fleet.count + 1)}
+    cache = str(fleet.truth.parent / "cache")
+    common = {"connect_timeout_s": 3.0, "estimator_timeout_s": 5.0} | common
+    return {"robots": robots, "all": common, "station": {"toc_cache": cache} | (station or {})}
+
+
+@contextlib.contextmanager
+def flight(data: dict[str, Any]) -> Iterator[Flight]:
+    """A bridge that is closed at the end."""
+    lines: list[tuple[float, str, str]] = []
+    bridge = Bridge(parse_swarm(data), lambda level, line: lines.append((time.monotonic(), level, line)))
+    result = Flight(bridge, lines)
+    try:
+        yield result
+    finally:
+        result.stop.set()
+        bridge.close()
+
+
+def wait_for(condition: Callable[[], bool], limit: float = 20.0) -> None:
+    """Wait until something is so; fails after `limit` seconds."""
+    end = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)

@@ -1,0 +1,84 @@
+"""A ROS graph for one test alone, and node processes in it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from dtsa_bench.fly.domain import ros_domain
+
+PATIENCE_S = 60.0
+
+
+class Graph:
+    """A node of the test, and processes in the same domain."""
+
+    def __init__(self, node: Node, executor: SingleThreadedExecutor, environment: dict[str, str]) -> None:
+        self.node, self.executor, self.environment = node, executor, environment
+        self.processes: list[subprocess.Popen[str]] = []
+
+    def start(self, module: str, *arguments: str) -> subprocess.Popen[str]:
+        """Starts ``python -m module --ros-args arguments``."""
+        command = [sys.executable, "-m", module, "--ros-args", *arguments]
+        process = subprocess.Popen(
+            command, env=self.environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        )
+        self.processes.append(process)
+        return process
+
+    def until(self, condition: Callable[[], object], act: Callable[[], object] = lambda: None) -> None:
+        """Serves the test's node until a condition holds, and acts again and again meanwhile."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            ended = [process.stderr.read() for process in self.processes if process.poll() and process.stderr]
+            assert not ended, ended
+            assert time.monotonic() < deadline, "nothing happened"
+            act()
+            self.executor.spin_once(timeout_sec=0.05)
+
+
+@contextmanager
+def ros_graph(logs: Path) -> Iterator[Graph]:
+    """A free domain with a node in it; all processes started in it end with it."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with ros_domain() as domain:
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs)}
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        node = Node("test", context=context, enable_rosout=False, start_parameter_services=False)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        graph = Graph(node, executor, environment)
+        try:
+            yield graph
+        finally:
+            for process in graph.processes:
+                if process.poll() is None:
+                    process.kill()
+                process.communicate()
+            executor.shutdown()
+            node.destroy_node()
+            context.try_shutdown()
+
+
+def end_of(process: subprocess.Popen[str], number: int | None = None) -> tuple[int, str]:
+    """Exit code and what was printed to standard error.
+
+    :param number: signal to send first.
+    """
+    if number is not None:
+        process.send_signal(signal.Signals(number))
+    _, said = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, said

@@ -1,0 +1,230 @@
+"""Faults in flight: the real cflib over UDP, simulated Crazyflies that fail, and the bridge that must react."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cflib")
+
+from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings, wait_for
+
+from dtsa_agent.crazyflie.state_machine import State
+from dtsa_bench.fake_crazyflie.truth import read_truth
+
+pytestmark = pytest.mark.slow
+SLACK_S = 0.4  # what a loaded machine may add to a reaction
+
+
+@dataclass
+class FaultFlight:
+    """Eight Crazyflies in the air, six faults at once."""
+
+    fleet: FakeFleet
+    flight: Flight
+    monotonic: float  # when the faults came, this process's clock
+    fleet_time: float  # ... and the fleet's
+    states: dict[int, State]  # seven seconds later
+
+    def reacted(self, pattern: str) -> float:
+        return self.flight.logged(pattern, self.monotonic) - self.monotonic
+
+
+@pytest.fixture(scope="module")
+def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultFlight]:
+    with fake_fleet(tmp_path_factory.mktemp("faults"), 8) as fleet, flight(settings(fleet)) as pilot:
+        assert pilot.bridge.connect() == []
+        pilot.take_off()
+        time.sleep(0.5)
+        began = time.monotonic()
+        t = fleet.fault("freeze", 1)
+        fleet.fault("close", 2)
+        fleet.fault("tumble", 3)
+        fleet.fault("battery", 4, voltage=3.0)
+        pilot.velocity["cf5"] = None
+        pilot.velocity["cf6"] = (-1.0, 0.0, 0.0)
+        time.sleep(7)
+        states = {k: pilot.state(k) for k in range(1, 9)}
+        result = FaultFlight(fleet, pilot, began, t, states)
+        pilot.bridge.land_all("test over")
+        pilot.bridge.wait_landed(lambda: False)
+        yield result
+
+
+def test_frozen_link_is_lost_within_half_a_second(fault_flight: FaultFlight) -> None:
+    assert fault_flight.reacted("cf1: flying -> lost") < 0.5 + SLACK_S
+    assert fault_flight.states[1] is State.LOST
+    # The Crazyflie by itself: level after 0.5 s without setpoints, motors off 1 s after the last watchdog packet.
+    level = fault_flight.fleet.state_event(1, "level out")
+    assert level["t"] - fault_flight.fleet_time == pytest.approx(0.5, abs=0.15)
+    assert fault_flight.fleet.state_event(1, "locked")["reason"] == "emergency watchdog"
+
+
+def test_closed_socket_is_lost(fault_flight: FaultFlight) -> None:
+    assert fault_flight.reacted("cf2: flying -> lost") < 0.5 + SLACK_S
+    assert fault_flight.states[2] is State.LOST
+
+
+def test_tumbled_vehicle_is_an_emergency(fault_flight: FaultFlight) -> None:
+    assert fault_flight.reacted(r"cf3: flying -> emergency \(tumbled") < SLACK_S
+    assert not any(e["event"] == "streaming" and e["t"] > fault_flight.fleet_time for e in fault_flight.fleet.events(3))
+
+
+def test_empty_battery_lands(fault_flight: FaultFlight) -> None:
+    assert fault_flight.reacted("cf4: battery: .* critical .*: land") < 1.0 + SLACK_S
+    assert fault_flight.fleet.events(4, "land")
+    assert fault_flight.states[4] in (State.READY, State.ARMED)
+
+
+def test_commands_that_cease_hold_then_land(fault_flight: FaultFlight) -> None:
+    assert fault_flight.reacted("cf5: commands: .*: hold") < 0.25 + SLACK_S
+    assert 2.5 < fault_flight.reacted("cf5: commands: .*: land") < 3.0 + SLACK_S
+    names = [e["event"] for e in fault_flight.fleet.events(5) if e["t"] > fault_flight.fleet_time]
+    assert names[:3] == ["stream ended", "go_to", "land"]
+    assert "level out" not in [e.get("state") for e in fault_flight.fleet.events(5)]  # the firmware never had to help
+
+
+def test_geofence_lands_at_once(fault_flight: FaultFlight) -> None:
+    times, track, events = read_truth(fault_flight.fleet.truth)
+    x = track[:, 0, 5]
+    assert x.min() < -1.5
+    assert x.min() > -1.5 - 0.8
+    crossed = times[np.argmax(x < -1.55)]
+    (landing,) = (e["t"] for e in events if e["cf"] == 6 and e["event"] == "land")
+    assert landing - crossed < 1.5  # it is braked first: a landing from full speed would swing out far
+    assert fault_flight.reacted("cf6: geofence: .* outside the geofence in x") > 0
+
+
+def test_nobody_else_is_harmed(fault_flight: FaultFlight) -> None:
+    assert (fault_flight.states[7], fault_flight.states[8]) == (State.FLYING, State.FLYING)
+    times, track, events = read_truth(fault_flight.fleet.truth)
+    during = (times > fault_flight.fleet_time) & (times < fault_flight.fleet_time + 6.9)
+    for k in (6, 7):
+        moved = np.linalg.norm(track[during][:, :, k] - track[during][0, :, k], axis=1)
+        assert moved.max() < 0.1
+    assert not [e for e in events if e["event"] in ("collision", "crash")]
+    assert [e["state"] for cf in (7, 8) for e in fault_flight.fleet.events(cf, "state")] == 2 * [
+        "ready to fly", "flying", "landed", *(["pre-flight checks not passed", "pre-flight checks passed"])
+    ]  # fmt: skip
+
+
+def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> None:
+    with (
+        fake_fleet(tmp_path, 3, "--layout", "line", "--half-axes", "1.2", "0.6") as fleet,
+        flight(settings(fleet, {"safety": {"min_distance_m": 0.35}})) as pilot,
+    ):
+        pilot.bridge.connect()
+        pilot.take_off()
+        pilot.velocity["cf1"] = (0.0, 0.8, 0.0)
+        wait_for(lambda: pilot.state(1) is State.LANDING and pilot.state(2) is State.LANDING)
+        assert pilot.state(3) is State.FLYING
+        pilot.logged("cf1: distance: 0.3. m from cf2")
+        assert not fleet.events(name="collision")
+        pilot.bridge.heartbeat()
+        silent = time.monotonic()
+        time.sleep(0.7)
+        assert pilot.state(3) is State.FLYING
+        wait_for(lambda: pilot.state(3) is State.EMERGENCY)
+        assert 0.7 < time.monotonic() - silent < 1.0 + SLACK_S
+        pilot.logged("all: heartbeat: no heartbeat of the ground station")
+        wait_for(lambda: any(e["state"] == "locked" for e in fleet.events(3, "state")), 3)
+        assert fleet.state_event(3, "locked")["reason"] == "emergency stop"
+
+
+@pytest.mark.parametrize("protocol", ["10"])
+def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, protocol: str) -> None:
+    with fake_fleet(tmp_path, 4, "--protocol", protocol) as fleet:
+        data = settings(fleet, connect_attempts=2, connect_timeout_s=1.0)
+        fleet.fault("close", 1)
+        fleet.fault("freeze", 2)
+        fleet.fault("refuse_arming", 3)
+        with flight(data) as pilot:
+            assert sorted(pilot.bridge.connect()) == ["cf1", "cf2"]
+            assert pilot.bridge.connected == 2
+            pilot.bridge.each(["cf3", "cf4"], lambda v: v.arm(True))
+            wait_for(lambda: pilot.state(4) is State.ARMED)
+            done, why = pilot.bridge.each(pilot.bridge.vehicles, lambda v: v.takeoff(0.5, 1.0))
+            assert (done, "cf3 is ready, not armed" in why) == (False, True)
+            wait_for(lambda: pilot.state(4) is State.FLYING)
+            assert fleet.events(3, "arming refused")
+            # The one that was frozen is heard again and can be connected while another flies.
+            fleet.fault("heal", 2)
+            assert pilot.bridge.reconnect("cf4") == "cf4 is flying"
+            assert pilot.bridge.reconnect("cf2") == ""
+            wait_for(lambda: pilot.state(2) is State.READY)
+            pilot.bridge.vehicles["cf4"].stop("test")
+            wait_for(lambda: any(e["state"] == "locked" for e in fleet.events(4, "state")), 3)
+
+
+def test_a_lossy_link_still_connects(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2) as fleet:
+        with flight(settings(fleet)) as pilot:  # fills the cache of tables
+            assert pilot.bridge.connect() == []
+        fleet.fault("drop", 1, rate=0.005)
+        with flight(settings(fleet, connect_attempts=20, connect_timeout_s=1.0)) as pilot:
+            assert pilot.bridge.connect() == []
+
+
+def test_min_connected(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2) as fleet:
+        fleet.fault("close", 1)
+        with flight(settings(fleet, {"min_connected": 2}, connect_attempts=1)) as pilot:
+            assert pilot.bridge.connect() == ["cf1"]
+            assert "min_connected is 2" in pilot.bridge.enough()
+
+
+PILOT = """
+import sys, time, json
+sys.path.insert(0, {helpers!r})
+from bridge_helpers import flight
+data = json.loads(sys.argv[1])
+with flight(data) as pilot:
+    pilot.bridge.connect()
+    pilot.take_off()
+    time.sleep(0.5)
+    print("flying", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_killed_bridge_leaves_it_to_the_firmware(tmp_path: Path) -> None:
+    """One bridge with and one without the emergency watchdog, both killed."""
+    import json
+
+    with fake_fleet(tmp_path, 2) as fleet:
+        data = settings(fleet)
+        processes = []
+        for cf, watchdog in ((1, True), (2, False)):
+            one: dict[str, Any] = data | {"robots": {f"cf{cf}": data["robots"][f"cf{cf}"]}}
+            one["station"] = data["station"] | {"safety": {"emergency_watchdog": watchdog}}
+            code = PILOT.format(helpers=str(Path(__file__).parent))
+            processes.append(
+                subprocess.Popen([sys.executable, "-c", code, json.dumps(one)], stdout=subprocess.PIPE, text=True)
+            )
+        try:
+            for process in processes:
+                assert process.stdout is not None
+                assert process.stdout.readline() == "flying\n"
+        finally:
+            for process in processes:
+                process.kill()
+        killed = fleet.fault("heal")
+        for process in processes:
+            end_process(process)
+        time.sleep(2.8)
+        assert fleet.state_event(1, "level out")["t"] - killed == pytest.approx(0.5, abs=0.2)
+        locked = fleet.state_event(1, "locked")
+        assert locked["reason"] == "emergency watchdog"
+        assert 0.7 < locked["t"] - killed < 1.2
+        assert fleet.state_event(2, "level out")["t"] - killed == pytest.approx(0.5, abs=0.2)
+        fallen = fleet.state_event(2, "crashed")
+        assert fallen["reason"] == "setpoints ceased"
+        assert fallen["t"] - killed == pytest.approx(2.0, abs=0.2)

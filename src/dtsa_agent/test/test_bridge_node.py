@@ -1,0 +1,217 @@
+"""The bridge as a ROS node: names, units on the graph, services, Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("cflib")
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs.srv")
+
+from bridge_helpers import FakeFleet, end_process, fake_fleet, settings, wait_for  # noqa: E402
+from builtin_interfaces.msg import Duration  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from dtsa_msgs.msg import Position, Status, VelocityWorld  # noqa: E402
+from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff  # noqa: E402
+from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from std_srvs.srv import Empty, Trigger  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.ros]
+COUNT = 3
+PATIENT = {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}}  # not what is tested here
+
+
+class Graph:
+    """A node of the test that listens, calls and commands."""
+
+    def __init__(self, domain: int) -> None:
+        self.context = rclpy.Context()
+        self.context.init(domain_id=domain)
+        self.node = rclpy.create_node("test", context=self.context, enable_rosout=False)
+        self.last: dict[str, Any] = {}
+        self.clients: dict[str, Any] = {}
+        for k in range(1, COUNT + 1):
+            self._listen(Odometry, f"/cf{k}/odom")
+            self._listen(PoseStamped, f"/cf{k}/pose")
+            self._listen(Status, f"/cf{k}/status")
+        self._listen(DiagnosticArray, "/diagnostics")
+        self.velocity = {
+            k: self.node.create_publisher(VelocityWorld, f"/cf{k}/cmd_velocity_world", 1) for k in (1, 2, 3)
+        }
+        self.position = self.node.create_publisher(Position, "/cf1/cmd_position", 1)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.thread.start()
+
+    def _listen(self, kind: type, topic: str) -> None:
+        self.node.create_subscription(kind, topic, lambda message: self.last.__setitem__(topic, message), 10)
+
+    def call(self, kind: Any, name: str, **fields: Any) -> Any:
+        if name not in self.clients:
+            self.clients[name] = self.node.create_client(kind, name)
+        client = self.clients[name]
+        assert client.wait_for_service(15), name
+        future = client.call_async(kind.Request(**fields))
+        wait_for(future.done)
+        return future.result()
+
+    def state(self, k: int) -> str:
+        status = self.last.get(f"/cf{k}/status")
+        return status.state_name if status else ""
+
+    def place(self, k: int) -> tuple[float, float, float]:
+        p = self.last[f"/cf{k}/odom"].pose.pose.position
+        return p.x, p.y, p.z
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.thread.join(5)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
+    domain = random.randrange(10, 100)
+    with fake_fleet(tmp_path, COUNT) as fleet:
+        config = tmp_path / "swarm.yaml"
+        config.write_text(yaml.safe_dump(settings(fleet, PATIENT)))
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        command = [sys.executable, "-m", "dtsa_agent.crazyflie.bridge_node", "--ros-args", "-p", f"config:={config}"]
+        process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        graph = Graph(domain)
+        try:
+            yield fleet, process, graph
+        finally:
+            graph.close()
+            end_process(process)
+
+
+def up(graph: Graph) -> None:
+    # all/emergency is the last service to come: everything else is there.
+    client = graph.node.create_client(Empty, "/all/emergency")
+    assert client.wait_for_service(20)
+    names = {name for name, _ in graph.node.get_service_names_and_types()}
+    for prefix in ("/all", "/cf1", "/cf2", "/cf3"):
+        for service in ("takeoff", "land", "go_to", "arm", "emergency", "notify_setpoints_stop"):
+            assert f"{prefix}/{service}" in names
+    assert graph.call(Arm, "/all/arm", arm=True).success
+    wait_for(lambda: all(graph.state(k) == "armed" for k in (1, 2, 3)))
+    assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=1, nanosec=500_000_000)).success
+    wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2]) < 0.1 for k in (1, 2, 3)))
+
+
+def test_a_flight_over_the_graph_and_ctrl_c_lands(swarm: tuple[FakeFleet, subprocess.Popen[str], Graph]) -> None:
+    fleet, process, graph = swarm
+    up(graph)
+    odometry = graph.last["/cf1/odom"]
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "cf1/base_link")
+    assert graph.last["/cf1/pose"].header.frame_id == "map"
+    x = graph.place(1)[0]
+    # go_to in the frame map; commands are not taken before it has been flown.
+    goal = Point(x=x - 0.3, y=0.2, z=0.1)
+    assert graph.call(GoTo, "/cf1/go_to", goal=goal, duration=Duration(sec=1)).success
+    wait_for(lambda: graph.place(1) == pytest.approx((x - 0.3, 0.2, 0.1), abs=0.05))
+    # Streamed commands, with yaw: cf2 by velocity, cf1 by position.
+    y = graph.place(2)[1]
+    for _ in range(50):
+        message = VelocityWorld(yaw_rate=1.0)
+        message.vel.y = -0.4
+        graph.velocity[2].publish(message)
+        place = Position(x=x - 0.3, y=0.0, z=0.0, yaw=1.0)
+        graph.position.publish(place)
+        time.sleep(0.02)
+    assert graph.place(2)[1] < y - 0.2
+    turned = graph.last["/cf2/odom"].pose.pose.orientation
+    assert turned.z > 0.2  # counter-clockwise
+    assert graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.0), abs=0.15)
+    status = graph.last["/cf2/status"]
+    assert status.supervisor_info & Status.SUPERVISOR_INFO_IS_FLYING
+    assert 3.0 < status.battery_voltage < 4.2
+    assert not graph.call(Trigger, "/cf2/reconnect").success
+    diagnostics = {s.hardware_id: s for s in graph.last["/diagnostics"].status}
+    assert {"cf1", "cf2", "cf3"} == set(diagnostics)
+    assert "battery [V]" in {v.key for v in diagnostics["cf1"].values}
+    # The stream ends: the bridge holds. Landing one by service, the others by Ctrl-C.
+    assert graph.call(Land, "/cf3/land", height=0.0, duration=Duration(sec=3)).success
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=25)
+    assert process.returncode == 0, output
+    assert "landing" in output
+    for k in (1, 2, 3):
+        assert fleet.events(k, "land")
+        assert [e["state"] for e in fleet.events(k, "state")][2] == "landed"
+    assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
+
+
+def test_second_ctrl_c_is_the_emergency_stop(swarm: tuple[FakeFleet, subprocess.Popen[str], Graph]) -> None:
+    fleet, process, graph = swarm
+    up(graph)
+    process.send_signal(signal.SIGINT)
+    wait_for(lambda: len(fleet.events(name="land")) == COUNT)
+    assert not any(e["state"] == "locked" for e in fleet.events(name="state"))
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=25)
+    assert process.returncode == 1
+    assert "EMERGENCY STOP of all: second Ctrl-C" in output
+    for k in (1, 2, 3):
+        assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
+
+
+def test_emergency_service(swarm: tuple[FakeFleet, subprocess.Popen[str], Graph]) -> None:
+    fleet, _, graph = swarm
+    up(graph)
+    graph.call(Empty, "/cf1/emergency")
+    wait_for(lambda: graph.state(1) == "emergency")
+    assert graph.state(2) == "flying"
+    graph.call(Empty, "/all/emergency")
+    wait_for(lambda: graph.state(2) == graph.state(3) == "emergency")
+    for k in (1, 2, 3):
+        assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
+
+
+def run_bridge(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dtsa_agent.crazyflie.bridge_node", "--ros-args"]
+    for argument in arguments:
+        command += ["-p", argument]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    result = run_bridge("config:=/nowhere/swarm.yaml")
+    assert (result.returncode, len(result.stderr.splitlines())) == (2, 1)
+    assert "config" in result.stderr
+    config = tmp_path / "swarm.yaml"
+    config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9"}}}))
+    result = run_bridge(f"config:={config}", "safety.heartbeat_s:=-1.0")
+    assert result.returncode == 2
+    assert "safety.heartbeat_s" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_too_few_connected_ends_the_bridge(tmp_path: Path) -> None:
+    config = tmp_path / "swarm.yaml"
+    robots = {"cf1": {"uri": "udp://127.0.0.1:9"}}
+    common = {"connect_attempts": 1, "connect_timeout_s": 0.3}
+    config.write_text(yaml.safe_dump({"robots": robots, "all": common, "station": {"toc_cache": str(tmp_path)}}))
+    result = run_bridge(f"config:={config}")
+    assert result.returncode == 1
+    assert "0 connected, min_connected is 1" in result.stdout + result.stderr

@@ -1,0 +1,159 @@
+"""The extended frame: golden bytes, round trips, what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
+from dtsa_agent.core.frame import Frame, encode_frame
+from dtsa_agent.core.frame_extended import (
+    EXTENDED_LENGTH,
+    ExtendedFrame,
+    Gossip,
+    decode_extended,
+    decode_head,
+    encode_extended,
+)
+
+OWN = Frame(3, 17, 1, (1.0, 2.0, -3.0), (0.5, -0.5, 0.0), (1.0, 0.0, 0.0))
+FULL = ExtendedFrame(
+    OWN,
+    2,
+    False,
+    True,
+    (Gossip(7, 5, True, (1.0, 1.0, 1.0), (0.0, 0.0, -1.0)),),
+    b"\x01\xff" + bytes(9),
+    ((1, 4), (24, 255)),
+)
+GOLDEN = [
+    (ExtendedFrame(OWN), "1203000111000000f401e80324fa32e0fc004006000000" + "00" * 33),
+    (FULL, "1203022711000000f401e80324fa32e0fc004006000000" + "01ff000000000000000000" + "01008004ff000000000000"
+           + "070bfa803ea00f000080f3"),
+    (ExtendedFrame(OWN, leaving=True), "1203ff0111000000f401e80324fa32e0fc004006000000" + "00" * 33),
+]  # fmt: skip
+
+metres = st.integers(-8000, 8000).map(lambda q: q * 0.004)
+speeds = st.integers(-500, 500).map(lambda q: q * 0.02)
+vectors = st.tuples(metres, metres, metres)
+velocities = st.tuples(speeds, speeds, speeds)
+gossips = st.builds(Gossip, st.integers(1, 254), st.integers(1, 127), st.booleans(), vectors, velocities)
+relays = st.dictionaries(st.integers(1, 24), st.integers(1, 255), max_size=8).map(lambda d: tuple(sorted(d.items())))
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> ExtendedFrame:
+    relay = draw(relays)
+    lease_sections = draw(st.integers(0, 2))
+    leases = draw(st.binary(min_size=11 * lease_sections, max_size=11 * lease_sections))
+    room = 3 - lease_sections - bool(relay)
+    own = Frame(
+        draw(st.integers(1, 254)),
+        draw(st.integers(0, 2**32 - 1)),
+        draw(st.integers(0, 1)),
+        draw(vectors),
+        draw(velocities),
+        draw(velocities),
+    )
+    leaving = draw(st.booleans())
+    c_s = 0 if leaving else draw(st.integers(0, 253))
+    return ExtendedFrame(
+        own, c_s, leaving, draw(st.booleans()), tuple(draw(st.lists(gossips, max_size=room))), leases, relay
+    )
+
+
+def close(a: ExtendedFrame, b: ExtendedFrame) -> bool:
+    """Equal but for the last bits of the vectors, which steps of 4 mm and 2 cm/s do not hold exactly."""
+
+    def bare(frame: ExtendedFrame) -> ExtendedFrame:
+        zero = (0.0, 0.0, 0.0)
+        own = dataclasses.replace(frame.own, position=zero, velocity=zero, intent=zero)
+        gossip = tuple(dataclasses.replace(g, position=zero, velocity=zero) for g in frame.gossip)
+        return dataclasses.replace(frame, own=own, gossip=gossip)
+
+    def numbers(frame: ExtendedFrame) -> list[float]:
+        parts = [frame.own.position, frame.own.velocity, frame.own.intent or ()]
+        return [x for part in [*parts, *(p for g in frame.gossip for p in (g.position, g.velocity))] for x in part]
+
+    return bare(a) == bare(b) and numbers(a) == pytest.approx(numbers(b), abs=1e-9)
+
+
+@pytest.mark.parametrize(("frame", "text"), GOLDEN)
+def test_golden_bytes(frame: ExtendedFrame, text: str) -> None:
+    assert encode_extended(frame).hex() == text
+    assert decode_extended(bytes.fromhex(text)) == frame
+
+
+@given(frames())
+def test_round_trip(frame: ExtendedFrame) -> None:
+    data = encode_extended(frame)
+    assert len(data) == EXTENDED_LENGTH
+    assert close(decode_extended(data), frame)
+    assert encode_extended(decode_extended(data)) == data
+
+
+@given(frames(), st.integers(23, 56))
+def test_the_first_bytes_hold_the_senders_state(frame: ExtendedFrame, heard: int) -> None:
+    data = encode_extended(frame)
+    assert decode_head(data[:heard]) == decode_extended(data).own
+    with pytest.raises(RemoteProtocolError):
+        decode_head(data[:22])
+
+
+def test_the_state_has_the_bytes_of_the_papers_frame() -> None:
+    paper = encode_frame(OWN)
+    assert encode_extended(ExtendedFrame(OWN))[4:23] == paper[4:23]
+
+
+def test_fields_saturate() -> None:
+    far = Gossip(1, 1, True, (1e9, -1e9, 40.0), (99.0, -99.0, 0.0))
+    own = dataclasses.replace(OWN, position=(1e9, -1e9, 0.0), velocity=(1e9, -1e9, 0.0))
+    heard = decode_extended(encode_extended(ExtendedFrame(own, gossip=(far,))))
+    assert heard.gossip[0].position == pytest.approx((32.764, -32.768, 32.764))
+    assert heard.gossip[0].velocity == pytest.approx((10.22, -10.24, 0.0))
+    assert heard.own.position == pytest.approx((65.534, -65.536, 0.0))
+    assert heard.own.velocity == pytest.approx((20.47, -20.48, 0.0))
+
+
+@pytest.mark.parametrize("change", [
+    {"c_s": 254}, {"c_s": -1}, {"leases": bytes(34)}, {"relay": ((0, 1),)}, {"relay": ((25, 1),)},
+    {"relay": ((2, 1), (1, 1))},
+    {"relay": ((1, 0),)}, {"relay": tuple((d, 1) for d in range(1, 10))},
+    {"gossip": (Gossip(255, 1, True, (0.0,) * 3, (0.0,) * 3),)},
+    {"gossip": (Gossip(1, 0, True, (0.0,) * 3, (0.0,) * 3),)},
+    {"gossip": (Gossip(1, 128, True, (0.0,) * 3, (0.0,) * 3),)},
+    {"gossip": (Gossip(1, 1, True, (float("nan"),) * 3, (0.0,) * 3),)},
+    {"gossip": FULL.gossip * 3}, {"own": dataclasses.replace(OWN, sender=255)},
+    {"own": dataclasses.replace(OWN, sender=0)},
+])  # fmt: skip
+def test_what_cannot_be_said(change: dict[str, object]) -> None:
+    with pytest.raises(LocalProtocolError):
+        encode_extended(dataclasses.replace(FULL, **change))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("at", "value"), [
+    (0, 0x22), (0, 0x13), (1, 0), (1, 255), (2, 254), (3, 0x2B), (3, 0x29), (3, 0x0F), (34, 0xFF), (39, 9), (37, 0),
+    (46, 0), (45, 255), (46, 1),
+])  # fmt: skip
+def test_what_is_no_frame(at: int, value: int) -> None:
+    """Version, profile, ids, c_s, kinds of sections (two relays, an unknown one), a relay that does not add up."""
+    data = bytearray(encode_extended(FULL))
+    data[at] = value
+    with pytest.raises(RemoteProtocolError):
+        decode_extended(bytes(data))
+
+
+@pytest.mark.parametrize("length", [0, 1, 22, 23, 55, 57, 60])
+def test_wrong_lengths(length: int) -> None:
+    with pytest.raises(RemoteProtocolError, match="wrong length"):
+        decode_extended((encode_extended(FULL) + bytes(4))[:length])
+
+
+def test_empty_gossip_is_empty() -> None:
+    data = bytearray(encode_extended(ExtendedFrame(OWN)))
+    data[50] = 1
+    with pytest.raises(RemoteProtocolError):
+        decode_extended(bytes(data))

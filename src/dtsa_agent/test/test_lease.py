@@ -1,0 +1,328 @@
+"""Policy lease, agent by agent: who may send when, who gives turns away, and what each takes from the air."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dtsa_agent.core import ConfigError, Scenario, Swarm, SwarmConfig
+from dtsa_agent.core.frame import Frame
+from dtsa_agent.core.frame_extended import (
+    OPEN,
+    ExtendedFrame,
+    Gossip,
+    decode_extended,
+    encode_extended,
+)
+
+FAR = 1e6
+OWN = {"position": (0.0, 0.0, 0.0), "velocity": (0.0, 0.0, 0.0), "intent": (0.0, 0.0, 0.0)}
+
+
+def still(agents: int) -> Scenario:
+    places = np.round(np.random.default_rng(agents).uniform(-6, 6, (3, agents)), 3)
+    return Scenario(places, places.copy(), np.zeros(agents, dtype=np.bool_), goals_known=False)
+
+
+def make(agents: int = 12, movers: int = 6, local: list[int] | None = None, **settings: Any) -> Swarm:
+    """Agents that stand still; the first ``movers`` ids have something to say."""
+    config = SwarmConfig(agents=agents, **{"policy": "lease", "avoider": "none", **settings})
+    swarm = Swarm(config, still(agents), local=local)
+    swarm.active[:] = 0
+    swarm.goal[0, np.array(swarm.ids) <= movers] = FAR
+    return swarm
+
+
+class Air:
+    """A channel for a swarm: draws who receives what; keeps what was sent."""
+
+    def __init__(self, swarm: Swarm, loss: float = 0.0, seed: int = 1) -> None:
+        self.swarm, self.loss = swarm, loss
+        self.random = np.random.default_rng(seed)
+        self.slot = 0
+        self.sent: list[tuple[int, ...]] = []
+        self.frames: dict[int, ExtendedFrame] = {}
+        self.also: list[Callable[[int, bytes, np.ndarray], object]] = []
+
+    def run(self, slots: int, jam: bool = False) -> Air:
+        swarm = self.swarm
+        for slot in range(self.slot, self.slot + slots):
+            senders = swarm.begin(slot)
+            mask = (self.random.random(len(swarm.ids)) >= self.loss).astype(np.uint8)
+            if len(senders) == 1:
+                data = swarm.frame(senders[0])
+                self.frames[slot] = decode_extended(data)
+                if not jam:
+                    swarm.hear(slot, data, mask)
+                    for hear in self.also:
+                        hear(slot, data, mask)
+            swarm.end(slot)
+            self.sent.append(tuple(swarm.ids[k] for k in senders))
+        self.slot += slots
+        return self
+
+    def leases(self, first: int, last: int) -> int:
+        """Lease bytes said in slots first .. last - 1."""
+        return sum(sum(b > 0 for b in self.frames[t].leases) for t in range(first, last) if t in self.frames)
+
+
+def is_anchor(slot: int, agents: int, every: int = 5) -> bool:
+    return (slot // agents + slot % agents) % every == 0
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_all_moving_is_tdma_bit_for_bit(loss: float) -> None:
+    lease = Air(make(10, 10), loss).run(600)
+    tdma = Air(make(10, 10, policy="tdma", frame="extended"), loss).run(600)
+    assert lease.sent == tdma.sent == [(slot % 10 + 1,) for slot in range(600)]
+    np.testing.assert_array_equal(lease.swarm.sent_slot, tdma.swarm.sent_slot)
+    np.testing.assert_array_equal(lease.swarm.sent_position, tdma.swarm.sent_position)
+
+
+def test_idle_agents_give_their_turns_to_movers() -> None:
+    air = Air(make(12, 4, open_every=0)).run(1200)
+    late = air.sent[600:]
+    share = sum(1 for senders in late if senders and senders[0] <= 4) / len(late)
+    assert share > 0.8  # 4 of 12 own a third
+    for slot in range(600, 1200):
+        if is_anchor(slot, 12):
+            assert air.sent[slot] == (slot % 12 + 1,)
+    reasons = {air.swarm.reason_name(k) for k in range(12)}
+    assert reasons <= {"own", "anchor", "leased"}
+
+
+@pytest.mark.parametrize("movers", [0, 12])
+def test_nothing_to_give_or_nobody_to_take(movers: int) -> None:
+    air = Air(make(12, movers)).run(600)
+    assert air.leases(0, 600) == 0
+
+
+def test_no_leases_above_the_share() -> None:
+    assert Air(make(12, 8, lease_share=0.5)).run(600).leases(0, 600) == 0
+    assert Air(make(12, 6, lease_share=0.5)).run(600).leases(0, 600) > 0
+
+
+def test_who_may_get_another_goal_gives_away_little_by_little() -> None:
+    swarm = make(12, 6, depth_rate=0.1, open_every=0)
+    swarm.final[:] = 0
+    air = Air(swarm).run(12 * 100)
+    first = next(slot for slot in range(1200) if air.leases(slot, slot + 1))
+    assert 12 * 10 <= first <= 12 * 12  # one turn after ten idle rounds
+    assert air.leases(1000, 1200) > air.leases(200, 400) > 0
+
+
+def test_deaf_agents_give_nothing_away() -> None:
+    air = Air(make(12, 6)).run(600)
+    air.run(300, jam=True)
+    # What is still said at first was given away before the jam.
+    later = [slot for slot in range(600 + 6 * 12, 900) if slot in air.frames and any(air.frames[slot].leases)]
+    assert later == []
+    before = len(air.sent)
+    air.run(600)
+    assert all(len(senders) <= 1 for senders in air.sent[before:])
+    assert air.leases(1200, 1500) > 0
+
+
+def test_a_goodbye_frees_the_turns_at_once() -> None:
+    air = Air(make(12, 12)).run(240)
+    air.swarm.leave(3)
+    air.run(12)
+    last = next(slot for slot in range(240, 252) if air.sent[slot] == (4,))
+    assert air.frames[last].leaving
+    assert air.swarm.present[3] == 0
+    air.run(120)
+    turns = [slot for slot in range(last + 13, 372) if slot % 12 == 3]
+    used = [slot for slot in turns if air.sent[slot]]
+    assert used == [slot for slot in turns if not is_anchor(slot, 12)]
+    assert air.frames[next(slot for slot in range(last + 1, 372) if air.sent[slot] == (5,))].c_s == 1
+
+
+def test_a_dead_agents_turns_are_adopted() -> None:
+    air = Air(make(12, 12), loss=0.1).run(300)
+    air.swarm.present[3] = 0
+    limit = 1000 + 2 * 5 * 12
+    air.run(limit + 60)
+    turns = [slot for slot in range(300 + limit, 360 + limit) if slot % 12 == 3 and not is_anchor(slot, 12)]
+    assert all(len(air.sent[slot]) == 1 for slot in turns)
+    assert all(len(senders) <= 1 for senders in air.sent)
+
+
+def test_without_adoption_a_dead_agents_turns_stay_empty() -> None:
+    air = Air(make(12, 12, adoption=False)).run(300)
+    air.swarm.present[3] = 0
+    air.run(1500)
+    assert {senders for slot, senders in enumerate(air.sent) if slot > 300 and slot % 12 == 3} == {()}
+
+
+@pytest.mark.parametrize("adoption", [False, True])
+@pytest.mark.parametrize("restart_at", range(600, 660, 7))
+def test_a_restarted_agent_uses_anchors_only_at_first(adoption: bool, restart_at: int) -> None:
+    """It may have given turns away that it has forgotten."""
+    swarm = make(12, 6, adoption=adoption, open_every=0)
+    air = Air(swarm, loss=0.2).run(restart_at)
+    swarm.restart(11)
+    swarm.goal[0, 11] = FAR
+    air.run(240)
+    own = [slot for slot in range(restart_at, restart_at + 240) if 12 in air.sent[slot] and slot % 12 == 11]
+    assert is_anchor(own[0], 12)
+    assert own[0] - restart_at < 5 * 12
+    assert any(not is_anchor(slot, 12) for slot in own)
+    assert air.frames[own[0]].probation
+    assert not swarm.lease_status(11)["probation"]
+    assert all(len(senders) <= 1 for senders in air.sent)
+
+
+def test_joining_late() -> None:
+    swarm = make(12, 12)
+    swarm.present[6] = 0
+    air = Air(swarm, loss=0.1).run(1700)
+    assert all(7 not in senders for senders in air.sent)
+    swarm.present[6] = 1
+    air.run(400)
+    first = next(slot for slot, senders in enumerate(air.sent) if senders == (7,))
+    assert first - 1700 <= (5 + 2) * 12
+    assert all(len(senders) <= 1 for senders in air.sent)
+    assert (swarm.sent_slot[:, 6] > 1700).all()
+    assert not swarm.lease_status(6)["probation"]
+
+
+def test_what_was_known_is_gone_after_an_absence() -> None:
+    swarm = make(12, 6)
+    air = Air(swarm).run(200)
+    swarm.present[2] = 0
+    air.run(1)
+    swarm.present[2] = 1
+    air.run(1)
+    assert (np.delete(swarm.sent_slot[2], 2) < 0).sum() >= 8  # but for one frame and its gossip
+    assert swarm.lease_status(2)["probation"]
+
+
+def test_waking_takes_the_next_open_turn() -> None:
+    swarm = make(40, 10)
+    air = Air(swarm).run(2000)
+    swarm.goal[0, 30] = FAR
+    air.run(200)
+    first = next(slot for slot in range(2000, 2200) if 31 in air.sent[slot])
+    assert first - 2000 < 60
+    assert swarm.lease_status(30)["woke"] == -1
+    assert swarm.in_ap[:, 30].all()
+
+
+def test_many_that_wake_together_get_out_of_each_others_way() -> None:
+    swarm = make(40, 10)
+    air = Air(swarm).run(2000)
+    swarm.goal[0, 20:] = FAR
+    air.run(5 * 40)
+    assert sum(len(senders) > 1 for senders in air.sent) <= 6
+    assert (swarm.sent_slot[:, 20:] >= 2000).all()
+
+
+def test_a_listener_believes_what_each_agent_believes() -> None:
+    swarm = make(12, 6)
+    listener = Swarm(swarm.config, swarm.scenario, local=[], observers=list(swarm.ids))
+    air = Air(swarm, loss=0.3)
+    air.also.append(listener.hear)
+    for _ in range(40):
+        air.run(15)
+        for name in ("sent_slot", "sent_position", "sent_velocity", "sent_intent", "in_ap", "last_turn"):
+            np.testing.assert_array_equal(getattr(listener, name), getattr(swarm, name), err_msg=name)
+
+
+def test_processes_with_some_agents_each_do_what_one_process_does() -> None:
+    whole = Air(make(12, 6), loss=0.2)
+    parts = [make(12, 6, local=list(range(1, 6))), make(12, 6, local=list(range(6, 13)))]
+    random = np.random.default_rng(1)
+    for slot in range(900):
+        whole.run(1)
+        frames = [(part.ids[k], part.frame(k)) for part in parts for k in part.begin(slot)]
+        mask = (random.random(12) >= 0.2).astype(np.uint8)
+        assert tuple(sender for sender, _ in frames) == whole.sent[slot]
+        for part in parts:
+            if len(frames) == 1:
+                part.hear(slot, frames[0][1], np.ascontiguousarray(mask[part.local]))
+            part.end(slot)
+    for part in parts:
+        np.testing.assert_array_equal(part.sent_slot, whole.swarm.sent_slot[part.local])
+        np.testing.assert_array_equal(part.digest, whole.swarm.digest[part.local])
+
+
+def frame_of(sender: int, slot: int, **more: Any) -> bytes:
+    return encode_extended(ExtendedFrame(Frame(sender, slot, 1, **OWN), **more))
+
+
+def test_gossip_replaces_only_what_is_older() -> None:
+    swarm = make(4, 4)
+    swarm.begin(50)
+
+    def gossip(age: int, x: float) -> tuple[Gossip, ...]:
+        return (
+            Gossip(2, age, True, (x, 0.0, 0.0), (0.0, 0.0, 0.0)),
+            Gossip(1, 1, True, (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        )
+
+    swarm.hear(50, frame_of(3, 50, gossip=gossip(10, 1.0)))
+    assert swarm.sent_slot[0, 1] == 40
+    assert swarm.sent_position[0, 0, 1] == pytest.approx(1.0)
+    for age, x, expected in ((10, 2.0, 1.0), (20, 3.0, 1.0), (9, 4.0, 4.0)):
+        swarm.hear(50, frame_of(3, 50, gossip=gossip(age, x)))
+        assert swarm.sent_position[0, 0, 1] == pytest.approx(expected)
+    assert swarm.sent_slot[0, 0] == -1  # an agent knows better what it has said itself
+    assert swarm.sent_slot[1, 0] == 49
+
+
+def test_gossip_can_be_switched_off() -> None:
+    with_gossip = Air(make(12, 12), loss=0.3).run(600)
+    without = Air(make(12, 12, gossip=False), loss=0.3).run(600)
+    assert all(not frame.gossip for frame in without.frames.values())
+    assert (600 - with_gossip.swarm.sent_slot).mean() < (600 - without.swarm.sent_slot).mean()
+
+
+@pytest.mark.parametrize("data", [
+    frame_of(13, 100), frame_of(3, 98), frame_of(3, 101), frame_of(3, 100, c_s=12),
+    frame_of(3, 100, leases=b"\x01" + bytes(10)), frame_of(5, 100, leases=b"\x0d" + bytes(10)),
+    frame_of(5, 100, relay=((1, 13),)),
+    frame_of(5, 100, gossip=(Gossip(13, 1, True, (0.0,) * 3, (0.0,) * 3),)),
+])  # fmt: skip
+def test_frames_of_others_are_counted_and_ignored(data: bytes) -> None:
+    """Unknown agents, other times, and leases said in somebody else's turn (slot 100 is agent 5's)."""
+    swarm = make(12, 6)
+    swarm.begin(100)
+    before = swarm.sent_slot.copy()
+    assert not swarm.hear(100, data)
+    assert swarm.foreign == 1
+    np.testing.assert_array_equal(swarm.sent_slot, before)
+    assert swarm.hear(100, frame_of(5, 100, leases=bytes([6, OPEN]) + bytes(9)))
+
+
+def test_paper_frames_do_not_reach_an_extended_swarm_nor_the_other_way_round() -> None:
+    lease, tdma = make(4, 4), make(4, 4, policy="tdma", frame="paper")
+    lease.begin(0), tdma.begin(0)
+    assert not lease.hear(0, tdma.frame(0))
+    assert not tdma.hear(0, lease.frame(0))
+    assert lease.malformed == tdma.malformed == 1
+
+
+@pytest.mark.parametrize(("settings", "field"), [
+    ({"frame": "paper"}, "frame"), ({"agents": 255, "moving": 0}, "agents"), ({"anchor_every": 0}, "anchor_every"),
+    ({"open_every": -1}, "open_every"), ({"depth_rate": -0.1}, "depth_rate"), ({"lease_share": 1.5}, "lease_share"),
+])  # fmt: skip
+def test_settings_that_are_refused(settings: dict[str, Any], field: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        SwarmConfig(**{"policy": "lease", **settings})
+    assert caught.value.field == field
+
+
+def test_every_agent_needs_a_table_of_its_own() -> None:
+    with pytest.raises(ConfigError, match="shared_view"):
+        Swarm(SwarmConfig(policy="lease"), shared_view=True)
+
+
+def test_open_turns_visit_all_owners() -> None:
+    for agents in range(2, 255):
+        period = SwarmConfig(agents=agents, moving=0, policy="lease").open_period
+        assert period >= 11
+        assert np.gcd(period, agents) == 1
+    assert SwarmConfig(policy="lease", open_every=0).open_period == 0

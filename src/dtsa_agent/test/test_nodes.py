@@ -1,0 +1,237 @@
+"""The agents' nodes as real processes: parameters, answers, ends. The test plays the channel."""
+
+from __future__ import annotations
+
+import signal
+from array import array
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from node_helpers import Graph, end_of, ros_graph
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from dtsa_msgs.msg import Slot, Transmission
+from rcl_interfaces.srv import DescribeParameters, GetParameters
+
+from dtsa_agent.core import Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros import names
+from dtsa_agent.ros.swarm_node import separate_tables
+from dtsa_agent.ros.wire import pack_received, split_frames, unpack_received
+from dtsa_agent.settings import format_values, parse_values, settings_of
+
+AGENT, HOST = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host"
+
+
+class Channel:
+    """The channel, played by the test."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.answers: list[Transmission] = []
+        qos = names.lockstep_qos()
+        self.publisher = graph.node.create_publisher(Slot, "/swarm/slot", qos)
+        graph.node.create_subscription(Transmission, "/swarm/transmission", self._put, qos)
+
+    def _put(self, message: Transmission) -> None:
+        self.answers.append(message)
+
+    def ask(self, slot: int, phase: int = Slot.RUN, **fields: object) -> Transmission:
+        """Opens a slot and waits for the answer; slot 0 is repeated until the node is there."""
+        message = Slot(slot=slot, phase=phase, heard_slot=max(0, slot - 1), **fields)
+        before = len(self.answers)
+        if slot:
+            self.publisher.publish(message)
+        repeat = (lambda: None) if slot else (lambda: self.publisher.publish(message))
+        self.graph.until(lambda: len(self.answers) > before and self.answers[-1].slot == slot, repeat)
+        return self.answers[-1]
+
+
+@pytest.mark.ros
+def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3", "-p", "moving:=2", "-p", "seed:=5")
+        scenario = make_scenario(SwarmConfig(agents=3, moving=2, seed=5))
+        first = channel.ask(0)
+        assert list(first.agent) == [2]
+        assert list(first.chosen) == [1]
+        assert list(first.length) == [0]
+        assert np.array_equal(first.track, scenario.start[:, 1])
+        second = channel.ask(1)
+        assert list(second.chosen) == [2]
+        frame = decode_frame(bytes(second.data))
+        assert (frame.sender, frame.slot) == (2, 1)
+        count = len(channel.answers)
+        channel.publisher.publish(Slot(slot=1, heard_slot=0))
+        graph.until(lambda: len(channel.answers) > count)
+        assert channel.answers[-1] == second  # asked again: the same answer, nothing has moved
+        channel.publisher.publish(Slot(slot=2, phase=Slot.END))
+        assert end_of(agent) == (0, "")
+
+
+@pytest.mark.ros
+def test_a_node_that_missed_slots_says_so_and_ends(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-p", "id:=1", "-p", "agents:=2")
+        channel.ask(0)
+        channel.publisher.publish(Slot(slot=7, heard_slot=6))
+        assert end_of(agent) == (1, "agent: error: slot 7 follows slot 0: this node has missed slots\n")
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number: int) -> None:
+    with ros_graph(tmp_path) as graph:
+        agent = graph.start(AGENT, "-p", "id:=3", "-p", "agents:=4", "-p", "slot_ms:=20")
+        describe = graph.node.create_client(DescribeParameters, "/cf3/agent/describe_parameters")
+        get = graph.node.create_client(GetParameters, "/cf3/agent/get_parameters")
+        graph.until(lambda: describe.service_is_ready() and get.service_is_ready())
+        fields = [setting for setting in settings_of(SwarmConfig) if setting.kind != "structure"]
+        asked = describe.call_async(DescribeParameters.Request(names=[setting.name for setting in fields]))
+        values = get.call_async(GetParameters.Request(names=["slot_ms", "id"]))
+        graph.until(lambda: asked.done() and values.done())
+        for setting, found in zip(fields, asked.result().descriptors, strict=True):
+            assert setting.help in found.description
+            assert found.read_only
+            if setting.kind == "int":
+                assert found.integer_range
+            if setting.kind == "float":
+                assert found.floating_point_range[0].from_value == setting.minimum
+            if setting.choices:
+                assert ", ".join(setting.choices) in found.additional_constraints
+        assert values.result().values[1].integer_value == 3
+        assert end_of(agent, number) == (0, "")
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("module", "arguments", "said"),
+    [
+        (AGENT, ["policy:=fifo"], "agent: error: policy: got 'fifo'; allowed: tdma, dtsa"),
+        (AGENT, ["agents:=0"], "agent: error: agents: got 0; allowed: a whole number, 1 to 1024"),
+        (AGENT, ["id:=13"], "agent: error: id: got 13; allowed: 1 to 12"),
+        (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
+        (HOST, ["policy:=aloha", "shared_view:=true"], "swarm_host: error: shared_view: got True; allowed: false"),
+    ],
+)
+def test_bad_parameters_are_one_line_and_exit_code_2(
+    tmp_path: Path, module: str, arguments: list[str], said: str
+) -> None:
+    with ros_graph(tmp_path) as graph:
+        code, error = end_of(graph.start(module, *[word for value in arguments for word in ("-p", value)]))
+        assert code == 2
+        assert error.startswith(said)
+        assert error.count("\n") == 1
+
+
+@pytest.mark.ros
+def test_a_host_answers_for_all_its_agents_in_one_message(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        host = graph.start(HOST, "-p", "agents:=6", "-p", "ids:=[2, 4, 5]", "-p", "seed:=9")
+        config = SwarmConfig(agents=6, seed=9)
+        swarm = Swarm(config, local=[2, 4, 5])
+        frames: dict[int, bytes] = {}
+        for slot in range(12):
+            heard = {
+                "sender": array("H", frames),
+                "length": array("B", map(len, frames.values())),
+                "data": array("B", b"".join(frames.values())),
+            }
+            mask = np.array([[agent in (2, 5) for agent in range(1, 7)]] * len(frames), dtype=np.bool_).reshape(-1, 6)
+            if slot:
+                for frame in frames.values():
+                    swarm.hear(slot - 1, frame, np.array([1, 0, 1], dtype=np.uint8))
+                swarm.end(slot - 1)
+            swarm.begin(slot)
+            answer = channel.ask(slot, **heard, received=array("B", pack_received(mask) if frames else b""))
+            assert list(answer.agent) == [2, 4, 5]
+            assert list(answer.digest) == swarm.digest.tolist()
+            assert list(answer.chosen) == swarm.chosen.tolist()
+            assert np.array_equal(answer.track, swarm.track.ravel())
+            sent = split_frames(bytes(answer.data), answer.length)
+            frames = {agent: frame for agent, frame in zip(answer.agent, sent, strict=True) if frame}
+            swarm.fly(slot)
+        assert swarm.digest[0] != swarm.digest[1]  # agent 4 heard nothing
+        assert end_of(host, signal.SIGTERM)[0] == 0
+
+
+@pytest.mark.parametrize(("policy", "scenario"), [("tdma", "exchange"), ("dtsa", "exchange"), ("age", "stop-and-go")])
+def test_agents_that_shared_a_table_go_on_alone_as_if_they_never_had(policy: str, scenario: str) -> None:
+    config = SwarmConfig(agents=6, policy=policy, scenario=scenario, seed=4)
+    shared, alone = Swarm(config, shared_view=True), Swarm(config)
+    random = np.random.default_rng(1)
+    for slot in range(300):
+        alone.scenario.advance(slot, alone)
+        shared.scenario.advance(slot, shared)
+        senders = alone.begin(slot)
+        assert shared.begin(slot) == senders
+        for name in ("chosen", "reason", "digest", "score", "position", "velocity", "command"):
+            assert np.array_equal(getattr(shared, name), getattr(alone, name)), (slot, name)
+        alone.fly(slot)
+        shared.fly(slot)
+        lossy = slot >= 97
+        if slot == 97:
+            shared = separate_tables(shared, slot)
+        for index in senders:
+            mask = (random.random(6) < 0.6).astype(np.uint8) if lossy else np.ones(6, dtype=np.uint8)
+            mask[index] = 0
+            alone.hear(slot, alone.frame(index), mask)
+            shared.hear(slot, shared.frame(index), mask if lossy else None)
+        alone.end(slot)
+        shared.end(slot)
+    assert len(set(alone.digest.tolist())) > 1
+
+
+@given(st.integers(1, 70), st.integers(0, 5), st.randoms(use_true_random=False))
+def test_receiver_bits_survive_the_message(agents: int, frames: int, random: object) -> None:
+    mask = np.array([[random.random() < 0.5 for _ in range(agents)] for _ in range(frames)], dtype=np.bool_)  # type: ignore[attr-defined]
+    mask = mask.reshape(frames, agents)
+    data = pack_received(mask)
+    assert len(data) == frames * ((agents + 7) // 8)
+    assert np.array_equal(unpack_received(data, frames, agents), mask)
+
+
+@given(st.lists(st.binary(max_size=60), max_size=8))
+def test_frames_survive_the_message(frames: list[bytes]) -> None:
+    assert split_frames(b"".join(frames), [len(frame) for frame in frames]) == frames
+    with pytest.raises(ValueError, match="bytes of frames"):
+        split_frames(b"".join(frames) + b"x", [len(frame) for frame in frames])
+
+
+@given(st.dictionaries(st.from_regex(r"[a-z_]{1,8}", fullmatch=True), st.floats(allow_nan=False, allow_infinity=False)))
+def test_named_values_survive_their_text(values: dict[str, float]) -> None:
+    assert parse_values(format_values(values)) == values
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("agents", "1.5"), ("slot_ms", "fast"), ("boot_round", "maybe"), ("options", "tau")]
+)
+def test_texts_of_another_kind_are_refused_by_name(name: str, text: str) -> None:
+    setting = next(setting for setting in settings_of(SwarmConfig) if setting.name == name)
+    with pytest.raises(ConfigError, match=name):
+        setting.parse(text)
+
+
+def test_every_setting_says_what_it_is() -> None:
+    for setting in settings_of(SwarmConfig):
+        assert setting.help
+        assert setting.kind in ("int", "float", "bool", "text", "values", "structure")
+        if setting.kind in ("int", "float"):
+            assert setting.minimum is not None
+            assert setting.maximum is not None
+
+
+def test_a_scenario_is_handed_through() -> None:
+    """What a node flies is what the scenario says, also where it is not the configuration's own."""
+    config = SwarmConfig(agents=2, moving=2)
+    plain = make_scenario(config)
+    other = Scenario(plain.start, plain.start.copy(), plain.moving)
+    swarm = Swarm(config, other)
+    assert np.array_equal(swarm.goal, plain.start)
