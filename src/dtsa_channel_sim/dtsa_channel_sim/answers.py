@@ -1,0 +1,155 @@
+"""What the agents answered to one slot: collected from the transmission messages of all processes, as arrays."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.errors import RemoteProtocolError
+from dtsa_agent.ros.wire import split_frames
+
+Array = NDArray[np.float64]
+
+
+class Answers:
+    """One entry an agent; vectors are planes of N.
+
+    :param agents: number of agents N.
+    :param steps: control instants in a slot, S.
+    """
+
+    def __init__(self, agents: int, steps: int) -> None:
+        self.agents, self.steps = agents, steps
+        self.answered = np.zeros(agents, dtype=np.bool_)
+        self.missing = agents
+        self.frames: dict[int, bytes] = {}  # by id, of those that send
+        self.chosen = np.zeros(agents, dtype=np.uint16)
+        self.reason = np.zeros(agents, dtype=np.uint8)
+        self.digest = np.zeros(agents, dtype=np.uint64)
+        self.score = np.zeros(agents)
+        self.track = np.zeros((steps, 3, agents))  # m, positions at the control instants of the slot before
+        self.velocity = np.zeros((3, agents))  # m/s, now
+        self.command = np.zeros((3, agents))  # m/s, now
+        self.goal = np.zeros((3, agents))  # m
+        self._told = np.zeros(agents, dtype=np.bool_)  # whose goals have been told
+        self._layouts: dict[bytes, tuple[int, slice | NDArray[np.intp]]] = {}
+        # Numbers an agent in each field of a message.
+        self._lengths = (
+            ("length", 1),
+            ("chosen", 1),
+            ("reason", 1),
+            ("digest", 1),
+            ("score", 1),
+            ("track", 3 * steps),
+            ("velocity", 3),
+            ("command", 3),
+            ("goal", 3),
+        )
+
+    @property
+    def position(self) -> Array:
+        """(3, N) m: true positions now, at the start of the slot that is answered."""
+        return self.track[-1]
+
+    @property
+    def silent(self) -> list[int]:
+        """Ids of the agents that have not answered."""
+        return (np.flatnonzero(~self.answered) + 1).tolist()
+
+    def open(self) -> None:
+        """Begins a new slot."""
+        self.answered[:] = False
+        self.missing = self.agents
+        self.frames = {}
+
+    def add(self, message: Any) -> bool:
+        """Takes in one transmission message.
+
+        :param message: a dtsa_msgs/Transmission.
+        :returns: False if its agents have answered already (a message sent twice); nothing is changed then.
+        :raises RemoteProtocolError: if its fields do not fit together, naming the agents as far as it does.
+        """
+        count, at = self._where(message.agent)
+        if self.answered[at].any():
+            return False
+        try:
+            self._check(message, count)
+            frames = split_frames(memoryview(message.data), message.length) if len(message.data) else []
+        except ValueError as error:
+            raise RemoteProtocolError(f"{named(message.agent)} sent an unusable answer: {error}") from None
+        self.track[:, :, at] = np.frombuffer(message.track).reshape(self.steps, 3, count)
+        self.velocity[:, at] = np.frombuffer(message.velocity).reshape(3, count)
+        self.command[:, at] = np.frombuffer(message.command).reshape(3, count)
+        if len(message.goal):
+            self.goal[:, at] = np.frombuffer(message.goal).reshape(3, count)
+            self._told[at] = True
+        self.chosen[at] = message.chosen
+        self.reason[at] = message.reason
+        self.digest[at] = message.digest
+        self.score[at] = message.score
+        for agent, frame in zip(message.agent, frames, strict=False):
+            if frame:
+                self.frames[agent] = frame
+        self.answered[at] = True
+        self.missing -= count
+        return True
+
+    def _check(self, message: Any, count: int) -> None:
+        """Whether the fields of a message fit together.
+
+        :raises ValueError: if they do not.
+        """
+        if message.steps != self.steps:
+            raise ValueError(f"{message.steps} control instants a slot instead of {self.steps}")
+        for name, length in self._lengths:
+            found = len(getattr(message, name))
+            if found != length * count and (name != "goal" or found):
+                raise ValueError(f"{found} numbers in {name} for {count} agents")
+        if not len(message.data) and any(message.length):
+            raise ValueError(f"0 bytes of frames, {sum(message.length)} in their lengths")
+        # A sum is finite only if all its terms are.
+        if not math.isfinite(sum(message.track) + sum(message.velocity) + sum(message.command) + sum(message.goal)):
+            raise ValueError("positions, velocities or goals that are no numbers")
+
+    def carry(self, before: Answers) -> None:
+        """Takes over from the slot before what nobody has told about this one: who is silent stays where it was.
+
+        :param before: the slot before.
+        """
+        gone = ~self.answered
+        if gone.any():
+            self.track[:, :, gone] = before.position[:, gone]
+            self.digest[gone], self.chosen[gone] = before.digest[gone], 0
+        # A goal is told when it changes.
+        untold = ~self._told
+        self.goal[:, untold] = before.goal[:, untold]
+
+    def _where(self, ids: Any) -> tuple[int, slice | NDArray[np.intp]]:
+        """Number and indices of a message's agents, and a slice instead where they are consecutive."""
+        key = ids.tobytes()
+        known = self._layouts.get(key)
+        if known is None:
+            index = np.array(ids, dtype=np.intp) - 1
+            if not len(index) or index[0] < 0 or index[-1] >= self.agents or (np.diff(index) <= 0).any():
+                raise RemoteProtocolError(
+                    f"a message for agents {list(ids)}; allowed: ascending ids from 1 to {self.agents}"
+                )
+            run = index[-1] - index[0] + 1 == len(index)
+            known = len(index), slice(int(index[0]), int(index[-1]) + 1) if run else index
+            self._layouts[key] = known
+        return known
+
+
+def named(ids: Any) -> str:
+    """Agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row."""
+    listed = sorted(ids)
+    parts, start = [], 0
+    for end in range(1, len(listed) + 1):
+        if end == len(listed) or listed[end] != listed[end - 1] + 1:
+            first, last = listed[start], listed[end - 1]
+            parts.append(f"cf{first}" if first == last else f"cf{first} .. cf{last}")
+            start = end
+    return ", ".join(parts) or "nobody"

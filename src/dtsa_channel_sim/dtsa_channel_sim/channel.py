@@ -1,0 +1,246 @@
+"""The channel: takes what is sent in a slot and says who receives it.
+
+Pure code: no clock, no I/O. The node, the Monte Carlo engine and the verifier use this one implementation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.errors import ConfigError, LocalProtocolError
+
+from .airtime import LONGEST_FRAME
+from .config import Change, ChannelConfig
+from .losses import Losses, NoiseSource
+from .medium import Medium, OnAir
+from .timeline import Epoch, Timeline
+from .verdict import COLLISION, IDLE, SUCCESS, Verdict
+
+Positions = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+_FOREVER = 2**63
+
+
+class Channel:
+    """One radio channel that all agents share.
+
+    Same settings, same changes, same calls: same verdicts. The losses of a slot depend on the seed, the slot
+    and the link alone, so slots may be skipped or looked at again.
+
+    :param config: the settings.
+    """
+
+    __slots__ = (
+        "_airtime", "_alone", "_changes", "_end", "_epoch", "_first", "_idle", "_last", "_losses", "_medium",
+        "_plain", "_shared", "_simple", "_source", "_spills", "_tail", "_timeline", "config",
+    )  # fmt: skip
+
+    def __init__(self, config: ChannelConfig) -> None:
+        self.config = config
+        self._timeline = Timeline(config)
+        self._source = NoiseSource(config.seed, config.agents)
+        self._airtime = config.airtime
+        self._changes: list[Change] = []
+        self._tail: list[OnAir] = []
+        self._last = -1
+        # A frame sent at the slot's start may be longer than the slot.
+        self._spills = self._airtime.total_ns(LONGEST_FRAME) > config.slot_ns
+        self._idle = Verdict(IDLE, (), None, None, None)
+        self._alone = {i: Verdict(SUCCESS, (i,), None, None, None) for i in range(1, config.agents + 1)}
+        self._use(0)
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """All changes made by :meth:`set`, in the order they were made."""
+        return tuple(self._changes)
+
+    @property
+    def settings(self) -> ChannelConfig:
+        """Settings that hold in the slot after the last one arbitrated."""
+        return self.settings_at(self._last + 1)
+
+    def settings_at(self, slot: int) -> ChannelConfig:
+        """Return the settings that hold in a slot (their schedule is empty: it is worked in)."""
+        return self._timeline.at(slot).config
+
+    def set(self, *, slot: int | None = None, **values: Any) -> Change:
+        """Change settings while the channel runs; return the change, to be recorded and made again.
+
+        :param slot: first slot with the new values; None: the one after the last slot arbitrated.
+        :param values: new values by name, of :data:`~dtsa_channel_sim.config.CHANGEABLE` settings.
+        :raises ConfigError: when a value is not allowed, or the slot has already been arbitrated. Nothing is
+            changed then.
+        """
+        if slot is None:
+            slot = self._last + 1
+        elif slot <= self._last:
+            raise ConfigError("slot", slot, f"a slot that is still to come, {self._last + 1} or later")
+        if not values:
+            raise ConfigError("channel.set", values, "at least one setting to change")
+        now = self._timeline.at(slot).config.changed(values)
+        change = Change(slot, tuple((name, getattr(now, name)) for name in values))
+        self._timeline.add(change)
+        self._changes.append(change)
+        self._end = self._first  # look the settings up again
+        return change
+
+    def advance(self, slot: int) -> None:
+        """Note that a slot has been dealt with (with :meth:`judge`): later changes begin after it.
+
+        :param slot: number of the slot.
+        """
+        self._last = max(self._last, slot)
+
+    def arbitrate(
+        self,
+        slot: int,
+        senders: Sequence[int],
+        lengths: Sequence[int] | None = None,
+        positions: Positions | None = None,
+        offsets_ns: Sequence[int] | None = None,
+    ) -> Verdict:
+        """Return who received what in one slot.
+
+        :param slot: number of the slot, 0 or more; usually one after the other.
+        :param senders: ids (1 to N) of the agents that send in it, each once.
+        :param lengths: bytes of each frame; None: nothing outlasts its slot.
+        :param positions: (3, N), m, frame map; needed with a limited range or capture.
+        :param offsets_ns: ns, start of each transmission from the slot's start by the channel's clock; None:
+            all start with the slot and any two overlap. Needs ``lengths``. What is still on air when its slot
+            ends disturbs the next slot's frames; its own verdict has been given by then (settle frames in
+            real time with
+            :class:`~dtsa_channel_sim.realtime.RealtimeArbiter` where that matters).
+        :raises LocalProtocolError: when the arguments do not go together.
+        """
+        if not self._first <= slot < self._end:
+            self._use(slot)
+        last, self._last = self._last, slot
+        if self._simple and offsets_ns is None and not self._tail:
+            if len(senders) == 1:
+                alone = self._alone.get(senders[0])
+                if alone is not None:
+                    return alone if self._plain else self._one(slot, senders[0], alone)
+            elif not len(senders):
+                return self._idle
+        return self._many(slot, slot > last, self._checked(senders), lengths, positions, offsets_ns)
+
+    def judge(
+        self, slot: int, frame: OnAir, others: Iterable[OnAir], positions: Positions | None = None
+    ) -> tuple[Mask, int, int]:
+        """Return (received (N,), lost, collided) of one transmission among others, on a time line of its own.
+
+        :param slot: slot whose settings and random numbers count.
+        :param frame: the transmission.
+        :param others: transmissions that may overlap it.
+        :param positions: (3, N), m, frame map; needed with a limited range or capture.
+        """
+        if not self._first <= slot < self._end:
+            self._use(slot)
+        reach, collided = self._medium.judge(frame, others, positions)
+        clear = reach & ~collided
+        received = self._noisy(slot, frame.sender, clear)
+        return (
+            received,
+            int(np.count_nonzero(clear) - np.count_nonzero(received)),
+            int(np.count_nonzero(collided)),
+        )
+
+    def _use(self, slot: int) -> None:
+        """Make the settings of a slot the present ones."""
+        if slot < 0:
+            raise LocalProtocolError(f"slot {slot}: slots count from 0")
+        epoch: Epoch = self._timeline.at(slot)
+        self._epoch = epoch
+        self._first, self._end = epoch.first, _FOREVER if epoch.end is None else epoch.end
+        self._losses = Losses(epoch.config, self._source)
+        self._medium = Medium(epoch.config)
+        # Frames that start with their slot and do not outlast it, everybody in reach: no look at times and
+        # places.
+        self._shared = self._medium.everywhere and not self._spills
+        self._simple = self._shared and not epoch.config.jam
+        self._plain = self._simple and self._losses.none
+
+    def _one(self, slot: int, sender: int, alone: Verdict) -> Verdict:
+        """Return the verdict on the only frame of a slot, everybody in reach."""
+        lost = self._losses.lost(slot, sender)
+        received = ~lost
+        received[0, sender - 1] = False
+        missing = len(self._alone) - 1 - int(np.count_nonzero(received))
+        if not missing:
+            return alone
+        return Verdict(SUCCESS, alone.senders, received, (missing,), (0,))
+
+    def _noisy(self, slot: int, sender: int, clear: Mask) -> Mask:
+        """Return who receives a frame of those where nothing else disturbs it, (N,)."""
+        if self._epoch.config.jam:
+            return np.zeros_like(clear)
+        return clear if self._losses.none else clear & ~self._losses.lost(slot, sender)[0]
+
+    def _many(
+        self,
+        slot: int,
+        follows: bool,
+        senders: tuple[int, ...],
+        lengths: Sequence[int] | None,
+        positions: Positions | None,
+        offsets_ns: Sequence[int] | None,
+    ) -> Verdict:
+        """Return the verdict on any number of frames, in full generality."""
+        tail = self._tail if follows else []
+        self._tail = []
+        agents = len(self._alone)
+        if self._shared and offsets_ns is None and not tail and len(senders) > 1:
+            others = (agents - 1,) * len(senders)
+            return Verdict(COLLISION, senders, np.zeros((len(senders), agents), np.bool_), (0,) * len(senders), others)
+        frames = self._laid(slot, senders, lengths, offsets_ns)
+        end_ns = (slot + 1) * self.config.slot_ns
+        # A frame of the next slot may begin before that slot does, so keep what ends shortly before it, too.
+        self._tail = [f for f in (*tail, *frames) if f.end_ns > end_ns or (offsets_ns is not None and f in frames)]
+        if not senders:
+            return self._idle
+        received = np.zeros((len(senders), agents), dtype=np.bool_)
+        lost, collided = [], []
+        for row, frame in enumerate(frames):
+            others_on_air = [*tail, *(f for f in frames if f is not frame)]
+            received[row], missing, destroyed = self.judge(slot, frame, others_on_air, positions)
+            lost.append(missing)
+            collided.append(destroyed)
+        outcome = COLLISION if any(collided) else SUCCESS
+        return Verdict(outcome, senders, received, tuple(lost), tuple(collided))
+
+    def _laid(
+        self,
+        slot: int,
+        senders: tuple[int, ...],
+        lengths: Sequence[int] | None,
+        offsets_ns: Sequence[int] | None,
+    ) -> list[OnAir]:
+        """Lay the frames of a slot on the channel's time line."""
+        for name, values in (("lengths", lengths), ("offsets_ns", offsets_ns)):
+            if values is not None and len(values) != len(senders):
+                raise LocalProtocolError(f"{name}: {len(values)} values for {len(senders)} frames")
+        start = slot * self.config.slot_ns
+        if lengths is None:
+            if offsets_ns is not None and senders:
+                raise LocalProtocolError("offsets_ns: the lengths of the frames are needed with them")
+            return [OnAir(sender, start, start, start + self.config.slot_ns) for sender in senders]
+        offsets = offsets_ns if offsets_ns is not None else (0,) * len(senders)
+        airtime = self._airtime
+        frames = []
+        for sender, length, offset in zip(senders, lengths, offsets, strict=True):
+            begin = start + int(offset)
+            frames.append(OnAir(sender, begin, begin + airtime.ramp_up_ns, begin + airtime.total_ns(int(length))))
+        return frames
+
+    def _checked(self, senders: Sequence[int]) -> tuple[int, ...]:
+        ids = tuple(int(sender) for sender in senders)
+        for sender in ids:
+            if sender not in self._alone:
+                raise LocalProtocolError(f"sender {sender}: ids run from 1 to {self.config.agents}")
+        if len(set(ids)) != len(ids):
+            raise LocalProtocolError(f"senders {ids}: an agent sends once in a slot")
+        return ids

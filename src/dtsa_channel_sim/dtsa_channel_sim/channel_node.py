@@ -1,0 +1,164 @@
+"""``ros2 run dtsa_channel_sim channel``: the radio channel as a node, without a recorder.
+
+It runs until SIGINT or SIGTERM, or for a given number of slots. `recorded_channel` of dtsa_bench adds the recording,
+the metrics and the end of a flight.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros import names
+from dtsa_agent.ros.loop import Stop
+from dtsa_agent.ros.parameters import declare_from_dataclass, from_parameter
+from dtsa_agent.ros.process import run_node
+from dtsa_agent.settings import settings_of
+
+from .answers import Answers
+from .channel import Channel
+from .config import CHANGEABLE, Change, ChannelConfig
+from .lockstep import LockstepChannel
+from .verdict import OUTCOMES, Verdict
+
+DERIVED = ("agents", "slot_ns", "seed")  # of the channel's settings: the swarm's settings say the same
+
+
+def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str, Any]:
+    """Declares the channel's settings as parameters and reads them.
+
+    :param node: the node.
+    :param config: settings that are the parameters' defaults.
+    :raises ConfigError: for values that are not allowed.
+    """
+    defaults = {} if config is None else config.to_dict()
+    return declare_from_dataclass(node, ChannelConfig, changeable=True, defaults=defaults)
+
+
+def follow_parameters(node: Node, channel: Channel, changed: Callable[[Change], None] | None = None) -> None:
+    """Lets ``ros2 param set`` change the channel in flight, from the next slot on.
+
+    :param node: the node, with the parameters of :func:`declare_channel`.
+    :param channel: the channel.
+    :param changed: is told each change.
+    """
+    known = {setting.name: setting for setting in settings_of(ChannelConfig) if setting.name in CHANGEABLE}
+
+    def apply(parameters: list[Parameter]) -> SetParametersResult:
+        values = {p.name: from_parameter(known[p.name], p.value) for p in parameters if p.name in known}
+        if values:
+            try:
+                change = channel.set(**values)
+            except ConfigError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            if changed:
+                changed(change)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(apply)
+
+
+def declare_limits(node: Node) -> tuple[float, float]:
+    """Declares how long the channel waits for its agents; s of wall time for slot 0 and for later ones."""
+    values = []
+    for name, default, text in (
+        ("startup_s", 60.0, "wall time that all agents have to answer slot 0"),
+        ("answer_s", 10.0, "wall time that all agents have to answer any later slot"),
+    ):
+        span = FloatingPointRange(from_value=0.1, to_value=86400.0, step=0.0)
+        info = ParameterDescriptor(description=text + " (s)", floating_point_range=[span], read_only=True)
+        values.append(float(node.declare_parameter(name, default, info).value))
+    return values[0], values[1]
+
+
+class ChannelStatus:
+    """What the channel tells on ``/diagnostics`` once a second, while somebody listens."""
+
+    def __init__(self, node: Node) -> None:
+        self.counts = [0, 0, 0]  # slots by outcome
+        self._node = node
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._ticks = 0
+
+    def tick(self, slot: int, unusable: int, missing: list[int]) -> None:
+        """To be called about ten times a second."""
+        self._ticks += 1
+        if self._ticks % 10 or not self._publisher.get_subscription_count():
+            return
+        level = DiagnosticStatus.WARN if unusable else DiagnosticStatus.OK
+        values = {
+            "slot": slot,
+            "unusable messages": unusable,
+            "agents awaited": missing,
+            **{f"slots: {name}": count for name, count in zip(OUTCOMES, self.counts, strict=True)},
+        }
+        status = DiagnosticStatus(
+            level=level,
+            name="channel",
+            message=f"slot {slot}",
+            hardware_id="simulated",
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)
+
+
+class PlainChannel(LockstepChannel):
+    """A channel that counts, and ends after a given number of slots."""
+
+    def __init__(self, node: Node, channel: Channel, steps: int, slots: int, **more: Any) -> None:
+        super().__init__(node, channel, steps, **more)
+        self._slots = slots
+        self._status = ChannelStatus(node)
+
+    def judged(self, slot: int, frames: dict[int, bytes], verdict: Verdict) -> None:
+        self._status.counts[verdict.outcome] += 1
+
+    def answered(self, slot: int, answers: Answers) -> bool:
+        return not self._slots or slot < self._slots
+
+    def idle(self) -> None:
+        self._status.tick(self.slot, self.unusable, self.answers.silent)
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    node = Node("channel", namespace=names.SWARM)
+    try:
+        values = declare_channel(node, ChannelConfig(agents=12))
+        count = ParameterDescriptor(
+            description="the run ends after so many slots; 0: by a signal only",
+            read_only=True,
+            integer_range=[IntegerRange(from_value=0, to_value=2**31, step=1)],
+        )
+        slots = node.declare_parameter("slots", 0, count).value
+        control = ParameterDescriptor(
+            description="control instants in a slot, as the agents have",
+            read_only=True,
+            integer_range=[IntegerRange(from_value=1, to_value=255, step=1)],
+        )
+        steps = node.declare_parameter("steps", 1, control).value
+        startup_s, answer_s = declare_limits(node)
+        medium = Channel(ChannelConfig.from_dict(values))
+        channel = PlainChannel(node, medium, steps, slots, startup_s=startup_s, answer_s=answer_s)
+        follow_parameters(node, medium)
+        channel.run(stop)
+        channel.close()
+    finally:
+        node.destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node."""
+    return run_node("channel", _body, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,275 @@
+"""The channel's settings: described, validated once, read from YAML, changed by a schedule."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
+
+from .airtime import Airtime
+from .config_fields import FieldInfo, checked, fields_of, option
+from .gilbert import GilbertElliott
+from .topology import LinkLoss, format_partition, parse_matrix, parse_partition
+
+_NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelConfig:
+    """Everything that the channel's behaviour depends on. Models and formulas: docs/channel.md.
+
+    :raises ConfigError: when a setting, or a combination of settings, is not usable.
+    """
+
+    agents: int = option(kind="int", help="number of agents; their ids are 1 to this number", minimum=1, maximum=65535)
+    slot_ns: int = option(10_000_000, kind="int", help="length of a slot", unit="ns", minimum=1, maximum=10**12)
+    seed: int = option(0, kind="int", help="seed of all losses", minimum=0, maximum=2**63 - 1)
+    loss: float = option(
+        0.0, kind="float", minimum=0.0, maximum=1.0, changeable=True,
+        help="mean share of frames that a receiver loses, each receiver for itself",
+    )  # fmt: skip
+    burst_length: float = option(
+        0.0, kind="float", unit="slots", minimum=0.0, maximum=1e9, changeable=True,
+        help="mean length of a bad phase (Gilbert-Elliott); 0: every loss is independent",
+    )  # fmt: skip
+    burst_scope: str = option(
+        "receiver", kind="text", choices=("receiver", "link"),
+        help="what has bad phases: a receiver (it loses all senders) or each directed link",
+    )  # fmt: skip
+    p_good: float = option(
+        0.0, kind="float", minimum=0.0, maximum=1.0, changeable=True, help="loss within a good phase"
+    )
+    p_bad: float = option(1.0, kind="float", minimum=0.0, maximum=1.0, changeable=True, help="loss within a bad phase")
+    jam: bool = option(False, kind="bool", changeable=True, help="all frames are lost")
+    partition: str = option(
+        "", kind="text", changeable=True,
+        help='groups that do not hear each other, as "1-6 | 7-12"; empty: all together',
+    )  # fmt: skip
+    range_m: float = option(
+        0.0, kind="float", unit="m", minimum=0.0, maximum=1e6, changeable=True,
+        help="distance up to which a frame is received; 0: everywhere",
+    )  # fmt: skip
+    interference_factor: float = option(
+        1.0, kind="float", minimum=1.0, maximum=100.0,
+        help="a frame disturbs others up to this many times range_m",
+    )  # fmt: skip
+    capture_db: float = option(
+        0.0, kind="float", unit="dB", minimum=0.0, maximum=100.0,
+        help="a frame this much stronger than all that overlap it is received; 0: no capture",
+    )  # fmt: skip
+    path_loss_exponent: float = option(
+        2.0,
+        kind="float",
+        minimum=1.0,
+        maximum=6.0,
+        help="power falls with this power of the distance (capture)",
+    )
+    bitrate: int = option(
+        2_000_000, kind="int", unit="bit/s", minimum=1000, maximum=10**9, help="bits on air per second"
+    )
+    ramp_up_ns: int = option(
+        130_000,
+        kind="int",
+        unit="ns",
+        minimum=0,
+        maximum=10**9,
+        help="from the order to send to the first bit",
+    )
+    link_delay_ns: int = option(
+        300_000, kind="int", unit="ns", minimum=0, maximum=10**9,
+        help="between radio and flight processor, on each side (arrival times in real time)",
+    )  # fmt: skip
+    loss_matrix: tuple[tuple[float, ...], ...] = option(
+        (), kind="structure", help="loss of each link on top of loss: row = sender, column = receiver"
+    )
+    link_loss: tuple[LinkLoss, ...] = option(
+        (), kind="structure", changeable=True, help="loss of some links, laid over loss_matrix"
+    )
+    schedule: tuple[Change, ...] = option((), kind="structure", help="changes at known slots")
+
+    def __post_init__(self) -> None:
+        for info in self.fields():
+            value = getattr(self, info.name)
+            if info.kind in ("int", "float", "bool"):
+                object.__setattr__(self, info.name, checked(info, value))
+            elif info.choices and value not in info.choices:
+                raise ConfigError(info.name, value, info.allowed)
+        groups = parse_partition(self.partition, self.agents)
+        object.__setattr__(self, "partition", format_partition(groups))
+        object.__setattr__(self, "loss_matrix", parse_matrix(self.loss_matrix, self.agents))
+        links = _listed(self.link_loss, "link_loss")
+        object.__setattr__(
+            self,
+            "link_loss",
+            tuple(LinkLoss.from_dict(entry, self.agents, f"link_loss[{i}]") for i, entry in enumerate(links)),
+        )
+        if self.burst_length:
+            GilbertElliott.from_means(self.loss, self.burst_length, self.p_good, self.p_bad)
+        entries = _listed(self.schedule, "schedule")
+        object.__setattr__(
+            self,
+            "schedule",
+            tuple(Change.from_dict(entry, self, f"schedule[{i}]") for i, entry in enumerate(entries)),
+        )
+        if self.schedule:
+            # Entries may be fine one by one and wrong together: try every state that the channel will be in.
+            from .timeline import check
+
+            check(self)
+
+    @classmethod
+    def fields(cls) -> tuple[FieldInfo, ...]:
+        """Return the description of every setting (for ROS parameters and the command line)."""
+        return fields_of(cls)
+
+    @property
+    def airtime(self) -> Airtime:
+        """The radio's times."""
+        return Airtime(self.bitrate, self.ramp_up_ns)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers, text and lists that :meth:`from_dict` and YAML read back."""
+        result = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        result["loss_matrix"] = [list(row) for row in self.loss_matrix]
+        result["link_loss"] = [link.to_dict() for link in self.link_loss]
+        result["schedule"] = [change.to_dict() for change in self.schedule]
+        return result
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> ChannelConfig:
+        """Return the settings, validated. ``slot_ms`` may stand for ``slot_ns``.
+
+        :raises ConfigError: when a name is unknown or a value is not allowed.
+        """
+        values = dict(settings)
+        if "slot_ms" in values:
+            if "slot_ns" in values:
+                raise ConfigError("slot_ms", values["slot_ms"], "either slot_ms or slot_ns, not both")
+            info = FieldInfo("slot_ms", "float", None, "", unit="ms", minimum=1e-6, maximum=1e6)
+            values["slot_ns"] = round(checked(info, values.pop("slot_ms")) * 1_000_000)
+        known = [field.name for field in dataclasses.fields(cls)]
+        for name in values:
+            if name not in known:
+                raise ConfigError(str(name), values[name], f"one of the settings {', '.join(known)}")
+        if "agents" not in values:
+            raise ConfigError("agents", None, "a whole number from 1 to 65535")
+        return cls(**values)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, **overrides: Any) -> ChannelConfig:
+        """Return the settings of a YAML file.
+
+        :param path: the file: a mapping of settings, or a mapping with such a mapping under ``channel``.
+        :param overrides: settings that win over the file's; those that are None are ignored.
+        :raises ConfigError: when the file cannot be read or a setting is not usable.
+        """
+        from .yaml_file import read_mapping
+
+        settings = read_mapping(path, "channel")
+        given = {name: value for name, value in overrides.items() if value is not None}
+        if "slot_ns" in given or "slot_ms" in given:
+            settings.pop("slot_ns", None)
+            settings.pop("slot_ms", None)
+        return cls.from_dict({**settings, **given})
+
+    def changed(self, values: Mapping[str, Any]) -> ChannelConfig:
+        """Return these settings with some changed, without the schedule.
+
+        :param values: names and values of changeable settings.
+        :raises ConfigError: when a setting cannot change in flight or its value is not allowed.
+        """
+        for name in values:
+            if name not in CHANGEABLE:
+                raise ConfigError(str(name), values[name], f"a setting that may change: {', '.join(CHANGEABLE)}")
+        return dataclasses.replace(self, schedule=(), **values)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Settings that change at a slot: an entry of the schedule, or a change made while the channel ran.
+
+    :param slot: first slot with the new values.
+    :param values: pairs of the setting's name and its new value.
+    :param until: first slot without them again; None: they stay.
+    """
+
+    slot: int
+    values: tuple[tuple[str, Any], ...]
+    until: int | None = None
+
+    @classmethod
+    def from_dict(cls, entry: object, config: ChannelConfig, name: str) -> Change:
+        """Return an entry ``{slot | at_s: ..., until | until_s: ..., loss: ..., jam: ...}``, validated.
+
+        Seconds count from the start of slot 0; the change comes with the first slot that starts then or
+        later.
+
+        :param config: the settings it changes.
+        :param name: name of the entry, for the errors.
+        :raises ConfigError: naming the part that is wrong.
+        """
+        if isinstance(entry, Change):
+            entry = entry.to_dict()
+        if not isinstance(entry, Mapping):
+            raise ConfigError(name, entry, "{slot: or at_s:, until:, and what changes: " + ", ".join(CHANGEABLE) + "}")
+        slot = _when(entry, "slot", "at_s", config.slot_ns, name)
+        until = _when(entry, "until", "until_s", config.slot_ns, name)
+        if slot is None:
+            raise ConfigError(f"{name}.slot", None, "a slot (slot: 100) or seconds (at_s: 1.0)")
+        if until is not None and until <= slot:
+            raise ConfigError(f"{name}.until", until, f"a slot after the entry's start, {slot}")
+        values = {key: value for key, value in entry.items() if key not in ("slot", "at_s", "until", "until_s")}
+        if not values:
+            raise ConfigError(name, dict(entry), f"at least one of {', '.join(CHANGEABLE)}")
+        return cls(slot, tuple(_normal(config, key, value, name) for key, value in values.items()), until)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry as :meth:`from_dict` reads it."""
+        result: dict[str, Any] = {"slot": self.slot}
+        if self.until is not None:
+            result["until"] = self.until
+        for name, value in self.values:
+            result[name] = [link.to_dict() for link in value] if name == "link_loss" else value
+        return result
+
+
+def _normal(config: ChannelConfig, name: str, value: object, entry: str) -> tuple[str, Any]:
+    """Return one changed setting as the configuration stores it; the combination is checked later."""
+    info = next((info for info in config.fields() if info.name == name and info.changeable), None)
+    if info is None:
+        raise ConfigError(f"{entry}.{name}", value, f"a setting that may change: {', '.join(CHANGEABLE)}")
+    if info.kind in ("int", "float", "bool"):
+        return name, checked(info, value, f"{entry}.{name}")
+    if name == "partition":
+        return name, format_partition(parse_partition(value, config.agents, f"{entry}.partition"))
+    links = _listed(value, f"{entry}.{name}")
+    return name, tuple(LinkLoss.from_dict(e, config.agents, f"{entry}.{name}[{i}]") for i, e in enumerate(links))
+
+
+def _when(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, name: str) -> int | None:
+    if slot_key in entry and time_key in entry:
+        raise ConfigError(f"{name}.{time_key}", entry[time_key], f"either {slot_key} or {time_key}, not both")
+    if entry.get(slot_key) is not None:
+        info = FieldInfo(slot_key, "int", None, "", minimum=0, maximum=2**53)
+        return int(checked(info, entry[slot_key], f"{name}.{slot_key}"))
+    if entry.get(time_key) is not None:
+        info = FieldInfo(time_key, "float", None, "", unit="s", minimum=0, maximum=1e9)
+        seconds: float = checked(info, entry[time_key], f"{name}.{time_key}")
+        return -(-round(seconds * _NS_PER_S) // slot_ns)
+    return None
+
+
+def _listed(value: object, name: str) -> Sequence[Any]:
+    if value is None:
+        return ()
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise ConfigError(name, value, "a list of entries")
+    return value
+
+
+#: Settings that may change while the channel runs, by the schedule or by :meth:`Channel.set`.
+CHANGEABLE: tuple[str, ...] = tuple(info.name for info in fields_of(ChannelConfig) if info.changeable)

@@ -1,0 +1,96 @@
+"""Random words that depend on (seed, slot, link) and on nothing else.
+
+Words come in blocks of slots; block k has its own generator, spawned from the seed by k, so that any slot can
+be looked at without those before it. One 64-bit word per (slot, receiver) is drawn; the word of the link from
+sender s is that word times an odd 64-bit constant of s, modulo 2^64. An odd factor permutes the words, so
+each link's word is uniform, and two random factors leave no visible dependence between the links of one
+receiver (a two-dimensional lattice of 2^63 points). This costs one multiplication a frame instead of N^2
+draws a slot.
+
+Words are even, so a threshold of 2^64 - 1 means "always" and 0 means "never", exactly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Words = NDArray[np.uint64]
+
+#: Streams of one seed.
+LOSS, STATE, CLOCK = 1, 2, 3
+_FACTORS = 1 << 32
+_BLOCK_WORDS = 1 << 16
+_KEPT_BLOCKS = 8
+
+
+def threshold(probability: float | NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return the number t for which a word is below t with the given probability; 0 and 1 are exact.
+
+    :param probability: scalar or array, 0 to 1.
+    """
+    p = np.asarray(probability, dtype=np.float64)
+    # 2^64 does not fit; the largest double below 1 times 2^64 does.
+    scaled = np.minimum(p, 1.0 - 2.0**-53) * 2.0**64
+    return np.asarray(np.where(p >= 1.0, np.uint64(2**64 - 1), scaled.astype(np.uint64)), dtype=np.uint64)
+
+
+def generator(seed: int, *key: int) -> np.random.Generator:
+    """Return the generator that belongs to a seed and a path of numbers below it."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
+
+
+def sender_factors(seed: int, stream: int, agents: int) -> list[np.uint64]:
+    """Return one odd 64-bit constant per sender, indexed by id (index 0 is not used)."""
+    bits = generator(seed, stream, _FACTORS).bit_generator.random_raw(agents + 1)
+    return [np.uint64(int(word) | 1) for word in bits]
+
+
+class WordBlocks:
+    """Words of one stream by slot.
+
+    :param seed: seed of the channel.
+    :param stream: number of the stream.
+    :param agents: number of receivers N, the length of a row.
+    """
+
+    __slots__ = ("_blocks", "_first", "_last", "_seed", "_stream", "_words", "agents", "rows")
+
+    def __init__(self, seed: int, stream: int, agents: int) -> None:
+        self._seed = seed
+        self._stream = stream
+        self.agents = agents
+        self.rows = max(16, _BLOCK_WORDS // agents)
+        self._blocks: dict[int, Words] = {}
+        self._first = self._last = 0
+        self._words: Words = np.zeros((0, agents), dtype=np.uint64)
+
+    def row(self, slot: int) -> Words:
+        """Return the words of one slot, (1, N)."""
+        if not self._first <= slot < self._last:
+            number = slot // self.rows
+            self._words = self.block(number)
+            self._first = number * self.rows
+            self._last = self._first + self.rows
+        start = slot - self._first
+        return self._words[start : start + 1]
+
+    def span(self, first: int, end: int) -> Words:
+        """Return the words of the slots from ``first`` up to, not including, ``end``, (end - first, N)."""
+        numbers = range(first // self.rows, (end - 1) // self.rows + 1)
+        parts = [self.block(k)[max(0, first - k * self.rows) : min(self.rows, end - k * self.rows)] for k in numbers]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def block(self, number: int) -> Words:
+        """Return all words of a block, (rows, N)."""
+        block = self._blocks.get(number)
+        if block is None:
+            # Raw output: NumPy keeps it the same from version to version, other than that of its
+            # distributions.
+            raw = generator(self._seed, self._stream, number).bit_generator.random_raw(self.rows * self.agents)
+            block = (raw & np.uint64(2**64 - 2)).reshape(self.rows, self.agents)
+            block.setflags(write=False)
+            while len(self._blocks) >= _KEPT_BLOCKS:
+                del self._blocks[next(iter(self._blocks))]
+            self._blocks[number] = block
+        return block

@@ -1,0 +1,175 @@
+"""Losses in bursts: the two-state chain of Gilbert and Elliott, addressable by slot.
+
+A chain is good or bad in each slot. With p = P(good -> bad), r = P(bad -> good) and one uniform word u per
+slot: u < p makes it bad whatever it was, u >= 1 - r makes it good whatever it was, and anything between keeps
+it. So the state of a slot follows from the last word before it that decided: any slot can be looked at
+without walking through all others, and slots without a frame count like any other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.errors import ConfigError
+
+from .draws import WordBlocks, Words, threshold
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class GilbertElliott:
+    """The chain's numbers.
+
+    :param bad_share: share of slots in the bad state.
+    :param enter: P(good -> bad) per slot, p.
+    :param leave: P(bad -> good) per slot, r; 1 / r is the mean length of a bad phase in slots.
+    """
+
+    bad_share: float
+    enter: float
+    leave: float
+
+    @classmethod
+    def from_means(cls, loss: float, burst_length: float, p_good: float = 0.0, p_bad: float = 1.0) -> GilbertElliott:
+        """Return the chain with a given mean loss and mean length of its bad phases.
+
+        share = (loss - p_good) / (p_bad - p_good), r = 1 / burst_length, p = r share / (1 - share).
+
+        :param loss: mean loss, from p_good to p_bad.
+        :param burst_length: mean length of a bad phase, slots; at least 1 / (1 - share), the length of the
+            runs that independent losses have.
+        :param p_good: loss in the good state.
+        :param p_bad: loss in the bad state, more than p_good.
+        :raises ConfigError: when no such chain exists.
+        """
+        if p_bad <= p_good:
+            raise ConfigError("p_bad", p_bad, f"a number above p_good, {p_good:g}")
+        if not p_good <= loss <= p_bad:
+            raise ConfigError("loss", loss, f"in bursts a number from p_good to p_bad, {p_good:g} to {p_bad:g}")
+        share = (loss - p_good) / (p_bad - p_good)
+        if share >= 1.0:
+            return cls(1.0, 1.0, 0.0)
+        shortest = 1.0 / (1.0 - share)
+        if burst_length < shortest * (1.0 - 1e-12):
+            raise ConfigError(
+                "burst_length",
+                burst_length,
+                f"at a loss of {loss:g} at least {shortest:.4g} slots, or 0 for none",
+            )
+        leave = 1.0 / burst_length
+        return cls(share, leave * share / (1.0 - share), leave)
+
+
+class Chains:
+    """States of the chains of all receivers, or of all links, begun at slot 0 in their long-run mixture.
+
+    :param model: the chain's numbers.
+    :param words: the words that drive it.
+    :param factors: one constant per sender, indexed by id: makes the words of its links from those of the
+        receivers.
+    """
+
+    __slots__ = (
+        "_block",
+        "_end",
+        "_enter",
+        "_factors",
+        "_first",
+        "_keep",
+        "_known",
+        "_share",
+        "_step",
+        "_words",
+    )
+
+    def __init__(self, model: GilbertElliott, words: WordBlocks, factors: Sequence[np.uint64]) -> None:
+        self._words = words
+        self._factors = factors
+        self._enter = threshold(model.enter)
+        self._keep = threshold(1.0 - model.leave)
+        self._share = threshold(model.bad_share)
+        # Enough slots to settle all links of a sender most of the time, in one look back.
+        kept = max(0.0, 1.0 - model.leave - model.enter)
+        decay = max(-math.log(kept), 1e-9) if kept > 0.0 else 40.0
+        self._step = int(min(words.rows, max(8.0, (math.log(words.agents) + 2.0) / decay)))
+        self._first = self._end = 0
+        self._block: Mask = np.zeros((0, words.agents), dtype=np.bool_)
+        self._known: dict[int, tuple[int, Mask]] = {}
+
+    def receivers(self, slot: int) -> Mask:
+        """Return which receivers are in a bad phase, (1, N).
+
+        :param slot: the slot, 0 or later.
+        """
+        if not self._first <= slot < self._end:
+            self._fill(slot // self._words.rows)
+        row = slot - self._first
+        return self._block[row : row + 1]
+
+    def links(self, slot: int, sender: int) -> Mask:
+        """Return which links from one sender are in a bad phase, (1, N).
+
+        :param slot: the slot, 0 or later.
+        :param sender: id of the sender.
+        """
+        # Where the last look ended, this one may end too: it saves work and changes nothing.
+        floor, before = self._known.get(sender, (-1, None))
+        if floor == slot and before is not None:
+            return before
+        if floor > slot or before is None:
+            floor, before = -1, None
+        bad = self._look_back(slot, self._factors[sender], floor, before)[None]
+        bad.setflags(write=False)
+        self._known[sender] = (slot, bad)
+        return bad
+
+    def _look_back(self, slot: int, factor: np.uint64, floor: int, before: Mask | None) -> Mask:
+        """Return the states (N,) in a slot, from the last word that decided, or ``before`` in ``floor``."""
+        agents = self._words.agents
+        bad = np.zeros(agents, dtype=np.bool_) if before is None else before[0].copy()
+        todo = np.arange(agents)
+        end, step = slot + 1, self._step
+        while len(todo) and end > floor + 1:
+            first = max(floor + 1, end - step)
+            words = self._words.span(first, end)
+            value, decided = self._decide((words if len(todo) == agents else words[:, todo]) * factor, first)
+            last = len(words) - 1 - np.argmax(decided[::-1], axis=0)
+            columns = np.arange(len(todo))
+            known = decided[last, columns]
+            bad[todo[known]] = value[last, columns][known]
+            todo = todo[~known]
+            end, step = first, min(2 * step, 4 * self._words.rows)
+        return bad
+
+    def _decide(self, words: Words, first: int) -> tuple[Mask, Mask]:
+        """Return (bad, decided) for rows of words that begin with slot ``first``."""
+        bad = words < self._enter
+        decided = bad | (words >= self._keep)
+        if first == 0:
+            bad[0] = words[0] < self._share
+            decided[0] = True
+        return bad, decided
+
+    def _fill(self, number: int) -> None:
+        """Work out the states of all receivers in one block of slots."""
+        rows = self._words.rows
+        first, end = number * rows, (number + 1) * rows
+        bad, decided = self._decide(self._words.span(first, end), first)
+        if first > 0:
+            if first == self._end:
+                before = self._block[-1]
+            else:
+                before = self._look_back(first - 1, np.uint64(1), -1, None)
+            bad[0] = np.where(decided[0], bad[0], before)
+            decided[0] = True
+        last = np.where(decided, np.arange(len(bad))[:, None], 0)
+        np.maximum.accumulate(last, axis=0, out=last)
+        self._block = np.take_along_axis(bad, last, axis=0)
+        self._block.setflags(write=False)
+        self._first, self._end = first, end

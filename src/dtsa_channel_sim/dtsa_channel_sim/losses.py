@@ -1,0 +1,84 @@
+"""Which receivers lose a frame to noise: independent losses, bursts, and losses of single links."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import ChannelConfig
+from .draws import LOSS, STATE, WordBlocks, sender_factors, threshold
+from .gilbert import Chains, GilbertElliott
+from .topology import link_matrix
+
+Mask = NDArray[np.bool_]
+Thresholds = Sequence[NDArray[np.uint64]]
+
+
+class NoiseSource:
+    """The random numbers of a channel: the same for all settings that it goes through.
+
+    :param seed: seed of the channel.
+    :param agents: number of agents N.
+    """
+
+    __slots__ = ("factors", "state_factors", "state_words", "words")
+
+    def __init__(self, seed: int, agents: int) -> None:
+        self.words = WordBlocks(seed, LOSS, agents)
+        self.factors = sender_factors(seed, LOSS, agents)
+        self.state_words = WordBlocks(seed, STATE, agents)
+        self.state_factors = sender_factors(seed, STATE, agents)
+
+
+class Losses:
+    """Losses under one set of settings.
+
+    Noise and the loss of a link are independent causes: P(received) = (1 - loss) (1 - link loss).
+
+    :param config: the settings.
+    :param source: the random numbers.
+    """
+
+    __slots__ = ("_bad", "_certain", "_chains", "_good", "_per_link", "_source", "none")
+
+    def __init__(self, config: ChannelConfig, source: NoiseSource) -> None:
+        self._source = source
+        links = link_matrix(config.loss_matrix, config.link_loss, config.agents)
+        #: True when no frame is ever lost to noise.
+        self.none = config.loss == 0.0 and links is None
+        self._chains: Chains | None = None
+        self._per_link = config.burst_scope == "link"
+        if config.burst_length and config.loss:
+            model = GilbertElliott.from_means(config.loss, config.burst_length, config.p_good, config.p_bad)
+            factors = source.state_factors if self._per_link else ()
+            self._chains = Chains(model, source.state_words, factors)
+            self._good = _thresholds(config.p_good, links, config.agents)
+            self._bad = _thresholds(config.p_bad, links, config.agents)
+        else:
+            self._good = self._bad = _thresholds(config.loss, links, config.agents)
+        # The plain Gilbert channel needs no second draw: bad loses all, good loses none.
+        self._certain = config.p_good == 0.0 and config.p_bad == 1.0 and links is None
+
+    def lost(self, slot: int, sender: int) -> Mask:
+        """Return who would lose a frame to noise, (1, N); the sender's own entry has no meaning.
+
+        :param slot: the slot in which the frame is sent.
+        :param sender: id of the sender.
+        """
+        if self._chains is None:
+            return self._source.words.row(slot) * self._source.factors[sender] < self._good[sender]
+        bad = self._chains.links(slot, sender) if self._per_link else self._chains.receivers(slot)
+        if self._certain:
+            return bad
+        words = self._source.words.row(slot) * self._source.factors[sender]
+        return words < np.where(bad, self._bad[sender], self._good[sender])
+
+
+def _thresholds(loss: float, links: NDArray[np.float64] | None, agents: int) -> Thresholds:
+    """Return thresholds by sender's id (index 0 is not used): scalars, or rows (N,)."""
+    if links is None:
+        return [threshold(loss)] * (agents + 1)
+    both = threshold(1.0 - (1.0 - loss) * (1.0 - links))
+    return [both[0], *both]

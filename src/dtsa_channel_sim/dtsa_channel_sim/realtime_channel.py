@@ -1,0 +1,318 @@
+"""The channel in real time: every agent sends when its own clock says so, and the air decides by overlap."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from dtsa_msgs.msg import Slot, Transmission
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
+from rosgraph_msgs.msg import Clock
+
+from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
+from dtsa_agent.ros import names
+from dtsa_agent.ros.loop import Loop
+from dtsa_agent.ros.wire import pack_received
+
+from .airtime import LONGEST_FRAME
+from .answers import Answers, named
+from .channel import Channel
+from .realtime import FrameVerdict, RealtimeArbiter
+from .verdict import COLLISION, IDLE, SUCCESS, Verdict
+
+_NS = 1_000_000_000
+_TICK_NS = 500_000
+_REPEAT_S = 0.1
+_LEAD_NS = 300_000_000  # from the start message to slot 0
+_GRACE = 0.35  # of a slot: a frame reaches the channel at most this late, or it is late
+_STRIDE = 0.25  # of a slot: time moves on by this much at most before messages are looked for again
+_PATIENCE = 10  # slots that a slot is kept open for agents that have not reported yet
+LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
+
+
+class RealtimeChannel:
+    """Medium of a swarm whose agents have clocks of their own.
+
+    The hooks are those of :class:`~dtsa_channel_sim.lockstep.LockstepChannel`; slots are the channel's own. An
+    agent that falls silent is missed, but nobody waits for it.
+
+    :param node: the ROS node.
+    :param channel: the medium.
+    :param steps: control instants in a slot.
+    :param swarm_namespace: namespace of the swarm's topics.
+    :param startup_s: s of wall time that all agents have to report.
+    :param answer_s: not used: nobody waits.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        channel: Channel,
+        steps: int,
+        swarm_namespace: str = names.SWARM,
+        startup_s: float = 60.0,
+        answer_s: float = 0.0,
+    ) -> None:
+        self.node, self.channel = node, channel
+        self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
+        self.slot = -1  # last slot that is settled
+        self.answers = Answers(self.agents, steps)
+        self.unusable = 0  # messages that could not be read
+        self.missed = 0  # reports of agents that came too late to count
+        self.lost: set[int] = set()  # ids of agents that have fallen silent for good
+        self.arbiter = RealtimeArbiter(channel)
+        self._steps, self._startup_s = steps, startup_s
+        self._zero = 0
+        self._book: dict[int, Answers] = {}
+        self._frames: dict[tuple[int, int], bytes] = {}
+        self._settled: dict[int, list[FrameVerdict]] = {}
+        self._heard_ns = np.zeros(self.agents, dtype=np.int64)
+        self._offset_ns = np.zeros(self.agents, dtype=np.int64)  # of each agent's slots, as last reported
+        self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
+        self._stride_ns = round(_STRIDE * self.slot_ns)
+        self._grace_ns = round(_GRACE * self.slot_ns)
+        self._close_ns = self._grace_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
+        qos = names.lockstep_qos(names.REALTIME_WAITING)
+        self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", qos)
+        self._clock = node.create_publisher(Clock, "/clock", 10)
+        self._clock_watched = False
+        reports = names.lockstep_qos(names.REALTIME_WAITING * self.agents)
+        self.loop = Loop(node, Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", reports, raw=True)
+
+    # Hooks, see LockstepChannel.
+
+    def published(self, slot: int, data: bytes, time_ns: int) -> None:
+        """Frames have been delivered."""
+
+    def received(self, slot: int, ids: bytes, data: bytes) -> None:
+        """A usable report has come in."""
+
+    def reported(self, message: Transmission) -> None:
+        """The same, decoded; late ones too."""
+
+    def answered(self, slot: int, answers: Answers) -> bool:
+        """All agents that still live have reported for a slot. Whether the run goes on."""
+        return True
+
+    def judged(self, slot: int, frames: dict[int, bytes], verdict: Verdict) -> None:
+        """The air has carried a slot's frames."""
+
+    def recorded(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        """A slot is over."""
+
+    def idle(self) -> None:
+        """Called about ten times a second."""
+
+    def silent(self, agent: int) -> None:
+        """An agent has fallen silent for good."""
+
+    # The run.
+
+    def run(self, stop: Any) -> None:
+        """Runs until the run is over or ``stop`` is true.
+
+        :raises LocalProtocolError: when an agent does not report at the start.
+        """
+        try:
+            if self._prepare(stop):
+                self._fly(stop)
+        finally:
+            if self.node.context.ok():
+                self._publisher.publish(Slot(slot=max(0, self.slot + 1), phase=Slot.END))
+
+    def lose(self, agent: int) -> None:
+        """Takes note that an agent is gone."""
+        if agent not in self.lost:
+            self.lost.add(agent)
+            self.silent(agent)
+
+    def _prepare(self, stop: Any) -> bool:
+        """Waits until all agents have reported, and tells them when slot 0 starts."""
+        begin = time.monotonic()
+        repeat = 0.0
+        self.answers.open()
+        while self.answers.missing:
+            if stop:
+                return False
+            now = time.monotonic()
+            if now - repeat > _REPEAT_S:
+                repeat = now
+                self._publisher.publish(Slot(phase=Slot.PREPARE))
+            data = self.loop.wait()
+            if data is not None:
+                message = self._decoded(data)
+                if message is not None:
+                    self.answers.add(message)
+            if self.loop.housekeeping():
+                self.idle()
+            if now - begin > self._startup_s:
+                missing = named(self.answers.silent)
+                raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
+        self._zero = time.monotonic_ns() + _LEAD_NS
+        seconds, nanoseconds = divmod(self._zero, _NS)
+        self._publisher.publish(Slot(phase=Slot.START, stamp=Time(sec=seconds, nanosec=nanoseconds)))
+        self._heard_ns[:] = 0
+        return True
+
+    def _fly(self, stop: Any) -> None:
+        tick = now = 0
+        while not stop:
+            data = self.loop.wait(_TICK_NS)
+            while data is not None:
+                self._take(data)
+                data = self.loop.take()
+            # After a pause of this process, or of the whole machine, time catches up in small steps: what the others
+            # did meanwhile is still on its way.
+            now = min(time.monotonic_ns() - self._zero, now + self._stride_ns)
+            if now >= tick:
+                tick = now + _TICK_NS
+                for verdict in self.arbiter.settle(now - self._grace_ns, self.answers.position):
+                    self._deliver(verdict)
+            while self._due(now):
+                if not self._close_slot():
+                    return
+            if self.loop.housekeeping():
+                self._clock_watched = self._clock.get_subscription_count() > 0
+                self.idle()
+
+    def _decoded(self, data: bytes) -> Any:
+        try:
+            message = deserialize_message(data, Transmission)
+        except Exception:  # rclpy has no common base for what a message can do to it
+            self.unusable += 1
+            return None
+        ids = message.agent
+        if not len(ids) or min(ids) < 1 or max(ids) > self.agents:
+            self.unusable += 1
+            return None
+        return message
+
+    def _take(self, data: bytes) -> None:
+        """Takes in one process's report for one slot."""
+        message = self._decoded(data)
+        if message is None:
+            return
+        slot = message.slot
+        if slot > self.slot + 100:
+            self.missed += len(message.agent)
+            return
+        if slot > self.slot:
+            book = self._entry(slot)
+        else:  # too late for the slot's account; what it sends is on the air nevertheless
+            self.missed += len(message.agent)
+            book = Answers(self.agents, self._steps)
+        try:
+            fresh = len(message.offset_ns) == len(message.agent) and book.add(message)
+        except RemoteProtocolError:
+            self.unusable += 1
+            return
+        if not fresh:
+            return
+        self.received(slot, message.agent.tobytes(), data)
+        self.reported(message)
+        now = time.monotonic_ns() - self._zero
+        for agent, offset, length in zip(message.agent, message.offset_ns, message.length, strict=True):
+            self._heard_ns[agent - 1] = now
+            self._offset_ns[agent - 1] = offset
+            key = (slot, agent)
+            if length and key not in self._frames:
+                self._frames[key] = book.frames[agent]
+                self.arbiter.push(key, agent, slot * self.slot_ns + offset, length)
+
+    def _entry(self, slot: int) -> Answers:
+        book = self._book.get(slot)
+        if book is None:
+            book = self._book[slot] = Answers(self.agents, self._steps)
+        return book
+
+    def _deliver(self, verdict: FrameVerdict) -> None:
+        """Sends a frame that has left the air to those that received it."""
+        slot, sender = verdict.frame_id  # type: ignore[misc]
+        self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
+        if not verdict.received.any():
+            return
+        frame = self._frames[(slot, sender)]
+        seconds, nanoseconds = divmod(names.TIME_ZERO_NS + max(0, verdict.arrival_ns), _NS)
+        message = Slot(
+            stamp=Time(sec=seconds, nanosec=nanoseconds),
+            slot=slot,
+            phase=Slot.RUN,
+            heard_slot=slot,
+            sender=array("H", [sender]),
+            length=array("B", [len(frame)]),
+            data=array("B", frame),
+            received=array("B", pack_received(verdict.received[None])),
+        )
+        data = bytes(serialize_message(message))
+        self._publisher.publish(data)
+        self.published(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, verdict.arrival_ns))
+
+    def _due(self, now: int) -> bool:
+        """Whether the next slot can be closed: its frames are settled, all agents have reported for the one after."""
+        end = (self.slot + 2) * self.slot_ns + self._lag_ns
+        if now < end + self._close_ns:
+            return False
+        if now >= end + round(_PATIENCE * self.slot_ns):
+            return True
+        following = self._book.get(self.slot + 2)
+        return following is not None and not set(following.silent) - self.lost
+
+    def _close_slot(self) -> bool:
+        """Hands a slot over to the hooks; False when the run is over."""
+        slot = self.slot + 1
+        book = self._completed(slot)
+        if not slot and not self.answered(0, book):
+            return False
+        self.answers = book
+        frames, verdict = self._verdict(slot)
+        self.judged(slot, frames, verdict)
+        if self._clock_watched:
+            seconds, nanoseconds = divmod(names.slot_time_ns(slot, self.slot_ns), _NS)
+            self._clock.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+        self.recorded(slot, book, verdict)
+        self.slot = slot
+        self._lag_ns = int(np.median(self._offset_ns[[k for k in range(self.agents) if k + 1 not in self.lost] or [0]]))
+        following = self._completed(slot + 1)
+        self._book.pop(slot, None)
+        return self.answered(slot + 1, following)
+
+    def _completed(self, slot: int) -> Answers:
+        """A slot's reports, those that are missing taken from the slot before."""
+        book = self._entry(slot)
+        book.carry(self.answers)
+        # Compared with the others: if nobody is heard, it may be this process that got no time.
+        newest = int(self._heard_ns.max())
+        for agent in book.silent:
+            if newest - self._heard_ns[agent - 1] > LOST_AFTER_S * _NS:
+                self.lose(agent)
+        return book
+
+    def _verdict(self, slot: int) -> tuple[dict[int, bytes], Verdict]:
+        """What the air did in one slot, frame by frame."""
+        settled = self._settled.pop(slot, [])
+        frames = {}
+        for verdict in settled:
+            key = verdict.frame_id
+            frames[verdict.sender] = self._frames.pop(key)  # type: ignore[arg-type]
+        if not settled:
+            return frames, Verdict(IDLE, (), None, None, None)
+        outcome = COLLISION if any(verdict.collided for verdict in settled) else SUCCESS
+        return frames, Verdict(
+            outcome,
+            tuple(verdict.sender for verdict in settled),
+            np.array([verdict.received for verdict in settled]),
+            tuple(verdict.lost for verdict in settled),
+            tuple(verdict.collided for verdict in settled),
+        )
+
+    def close(self) -> None:
+        """Waits for the last message to leave and gives the handles back."""
+        from rclpy.duration import Duration
+
+        if self.node.context.ok():
+            self._publisher.wait_for_all_acked(Duration(seconds=1.0))
+        self.loop.close()

@@ -1,0 +1,276 @@
+"""The channel: outcomes, reach, hidden senders, capture, jam, partition, airtimes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_channel_sim import COLLISION, IDLE, SUCCESS, Airtime, Channel, ChannelConfig
+
+MS = 1_000_000
+
+
+def line(*x):
+    """Agents on a line, at these x in m."""
+    return np.array([x, np.zeros(len(x)), np.zeros(len(x))], dtype=float)
+
+
+def test_outcomes_without_loss():
+    channel = Channel(ChannelConfig(agents=4))
+    idle = channel.arbitrate(0, ())
+    assert (idle.outcome, idle.senders, idle.mask(4).shape) == (IDLE, (), (0, 4))
+    one = channel.arbitrate(1, [3])
+    assert (one.outcome, one.senders, one.received, one.lost, one.collided) == (
+        SUCCESS,
+        (3,),
+        None,
+        None,
+        None,
+    )
+    assert one.mask(4).tolist() == [[True, True, False, True]]
+    assert channel.arbitrate(2, np.array([3])) is one
+    two = channel.arbitrate(3, (4, 1))
+    assert (two.outcome, two.senders, two.lost, two.collided) == (COLLISION, (4, 1), (0, 0), (3, 3))
+    assert two.received.shape == (2, 4)
+    assert not two.received.any()
+
+
+@pytest.mark.parametrize("senders", [(0,), (5,), (-1,), (2, 2), (1, 5)])
+def test_impossible_senders(senders):
+    with pytest.raises(LocalProtocolError):
+        Channel(ChannelConfig(agents=4)).arbitrate(0, senders)
+
+
+def test_arguments_that_do_not_go_together():
+    channel = Channel(ChannelConfig(agents=4))
+    with pytest.raises(LocalProtocolError, match="slots count from 0"):
+        channel.arbitrate(-1, ())
+    with pytest.raises(LocalProtocolError, match="lengths"):
+        channel.arbitrate(0, (1,), offsets_ns=[0])
+    with pytest.raises(LocalProtocolError, match="lengths: 2 values for 1"):
+        channel.arbitrate(0, (1,), lengths=[10, 10], offsets_ns=[0])
+    with pytest.raises(LocalProtocolError, match="positions"):
+        Channel(ChannelConfig(agents=4, range_m=1.0)).arbitrate(0, (1,))
+
+
+def test_a_lonely_agent_sends_to_nobody():
+    channel = Channel(ChannelConfig(agents=1, loss=0.5))
+    verdict = channel.arbitrate(0, (1,))
+    assert verdict.outcome == SUCCESS
+    assert not verdict.mask(1).any()
+
+
+@given(st.integers(2, 12), st.floats(0, 1), st.integers(0, 99), st.data())
+@settings(max_examples=60, deadline=None)
+def test_books_balance(agents, loss, seed, data):
+    """Without limits of reach every receiver of every frame received it, lost it, or had it collide."""
+    channel = Channel(ChannelConfig(agents=agents, loss=loss, seed=seed, jam=data.draw(st.booleans())))
+    for slot in range(5):
+        senders = data.draw(st.lists(st.integers(1, agents), unique=True, max_size=agents))
+        verdict = channel.arbitrate(slot, senders)
+        assert verdict.outcome == min(len(senders), 2)
+        mask = verdict.mask(agents)
+        assert mask.shape == (len(senders), agents)
+        lost, collided = verdict.lost or (0,) * len(senders), verdict.collided or (0,) * len(senders)
+        for row, sender in enumerate(senders):
+            assert not mask[row, sender - 1]
+            assert mask[row].sum() + lost[row] + collided[row] == agents - 1
+        if len(senders) > 1:
+            assert not mask.any()
+            assert not any(lost)
+
+
+def test_jam():
+    channel = Channel(ChannelConfig(agents=4, schedule=({"slot": 5, "until": 7, "jam": True},)))
+    verdicts = [channel.arbitrate(slot, (2,)) for slot in range(9)]
+    assert [v.mask(4).sum() for v in verdicts] == [3, 3, 3, 3, 3, 0, 0, 3, 3]
+    assert (verdicts[5].outcome, verdicts[5].lost, verdicts[5].collided) == (SUCCESS, (3,), (0,))
+    assert channel.arbitrate(5, (1, 2)).outcome == COLLISION
+
+
+def test_partition_and_merge():
+    channel = Channel(ChannelConfig(agents=5, schedule=({"slot": 2, "until": 4, "partition": "1-2 | 3-4"},)))
+    assert channel.arbitrate(1, (1, 3)).outcome == COLLISION
+    apart = channel.arbitrate(2, (1, 3))
+    assert (apart.outcome, apart.lost, apart.collided) == (SUCCESS, (0, 0), (0, 0))
+    assert apart.received.astype(int).tolist() == [[0, 1, 0, 0, 0], [0, 0, 0, 1, 0]]
+    assert not channel.arbitrate(3, (5,)).mask(5).any()
+    within = channel.arbitrate(3, (3, 4, 1))
+    assert (within.outcome, within.collided) == (COLLISION, (1, 1, 0))
+    assert within.received[2].tolist() == [False, True, False, False, False]
+    assert channel.arbitrate(4, (1,)).received is None
+
+
+def test_hidden_senders_collide_only_where_both_are_heard():
+    channel = Channel(ChannelConfig(agents=5, range_m=10.0))
+    positions = line(0, 8, 16, 24, -9)
+    verdict = channel.arbitrate(0, (1, 3), positions=positions)
+    assert verdict.outcome == COLLISION
+    assert verdict.received.astype(int).tolist() == [[0, 0, 0, 0, 1], [0, 0, 0, 1, 0]]
+    assert (verdict.collided, verdict.lost) == ((1, 1), (0, 0))
+
+
+def test_interference_reaches_further_than_reception():
+    positions = line(0, 8, 22, 30)
+    for factor, expected in ((1.0, (0, 0)), (1.5, (1, 1))):
+        channel = Channel(ChannelConfig(agents=4, range_m=10.0, interference_factor=factor))
+        assert channel.arbitrate(0, (1, 4), positions=positions).collided == (0, 0)
+        verdict = channel.arbitrate(1, (1, 3), positions=line(0, 8, 22, 14))
+        assert verdict.collided == expected
+
+
+def test_capture():
+    positions = line(0, 1, 11, 6)
+    plain = Channel(ChannelConfig(agents=4)).arbitrate(0, (1, 3), positions=positions)
+    assert not plain.received.any()
+    # At agent 2 the ratio is 10 in distance, 20 dB; at agent 4, 5 m from 3 and 6 m from 1, 1.6 dB.
+    for limit, expected in ((19.9, [0, 1, 0, 0]), (20.1, [0, 0, 0, 0])):
+        channel = Channel(ChannelConfig(agents=4, capture_db=limit))
+        verdict = channel.arbitrate(0, (1, 3), positions=positions)
+        assert verdict.received[0].astype(int).tolist() == expected
+        assert not verdict.received[1].any()
+        assert verdict.outcome == COLLISION
+    steep = Channel(ChannelConfig(agents=4, capture_db=20.1, path_loss_exponent=2.5))
+    assert steep.arbitrate(0, (1, 3), positions=positions).received[0, 1]
+
+
+def test_capture_adds_up_all_interference():
+    channel = Channel(ChannelConfig(agents=4, capture_db=18.0))
+    assert channel.arbitrate(0, (1, 3), positions=line(0, 1, 11, 11)).received[0, 1]
+    assert not channel.arbitrate(1, (1, 3, 4), positions=line(0, 1, 11, 11)).received.any()
+
+
+def test_a_sender_never_captures_while_it_sends():
+    channel = Channel(ChannelConfig(agents=2, capture_db=1.0))
+    assert channel.arbitrate(0, (1, 2), positions=line(0, 1)).collided == (1, 1)
+
+
+def brute(config, positions, senders, partition):
+    """Who receives what in lockstep, receiver by receiver, from the definition alone."""
+    count = config.agents
+
+    def distance(a, b):
+        return math.dist(positions[:, a - 1], positions[:, b - 1])
+
+    def group(a):
+        return next((i for i, g in enumerate(partition) if a in g), -1)
+
+    rows = []
+    for frame in senders:
+        row = []
+        for receiver in range(1, count + 1):
+            near = distance(frame, receiver) <= config.range_m and group(frame) == group(receiver)
+            limit = config.range_m * config.interference_factor
+            disturbing = [
+                other
+                for other in senders
+                if other not in (frame, receiver)
+                and distance(other, receiver) <= limit
+                and group(other) == group(receiver)
+            ]
+            clear = not disturbing
+            if disturbing and config.capture_db:
+                noise = sum(distance(other, receiver) ** -2.0 for other in disturbing)
+                signal = distance(frame, receiver) ** -2.0 if receiver != frame else 1.0
+                clear = 10 * math.log10(signal / noise) >= config.capture_db
+            row.append(near and clear and receiver not in senders)
+        rows.append(row)
+    return rows
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None)
+def test_against_the_definition(data):
+    agents = data.draw(st.integers(2, 8))
+    rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
+    positions = rng.uniform(-6, 6, (3, agents))
+    config = ChannelConfig(
+        agents=agents,
+        range_m=data.draw(st.floats(1, 15)),
+        interference_factor=data.draw(st.sampled_from([1.0, 1.7])),
+        capture_db=data.draw(st.sampled_from([0.0, 3.0, 10.0])),
+    )
+    split = data.draw(st.integers(0, agents - 1))
+    partition = [tuple(range(1, split + 1)), tuple(range(split + 1, agents + 1))] if split else []
+    channel = Channel(config)
+    channel.set(partition=partition)
+    senders = data.draw(st.lists(st.integers(1, agents), unique=True, min_size=1))
+    verdict = channel.arbitrate(0, senders, positions=positions)
+    assert verdict.mask(agents).tolist() == brute(config, positions, senders, partition)
+
+
+def test_airtimes_of_the_radio():
+    airtime = Airtime()
+    assert airtime.on_air_ns(24) == 140_500
+    assert airtime.on_air_ns(60) == 284_500
+    assert airtime.total_ns(60) == 414_500
+    assert Airtime(bitrate=3_000_000_0).on_air_ns(1) == -(-97 * 1000 // 30)
+
+
+@pytest.mark.parametrize(("gap_us", "outcome"), [(0, COLLISION), (140, COLLISION), (141, SUCCESS), (3000, SUCCESS)])
+def test_frames_collide_while_they_overlap_on_air(gap_us, outcome):
+    channel = Channel(ChannelConfig(agents=4))
+    verdict = channel.arbitrate(0, (1, 2), lengths=[24, 24], offsets_ns=[0, gap_us * 1000])
+    assert verdict.outcome == (COLLISION if gap_us < 271 else outcome)
+    received = verdict.received.astype(int).tolist()
+    if gap_us == 0 or gap_us == 140:
+        assert received == [[0, 0, 0, 0], [0, 0, 0, 0]]
+        assert verdict.collided == (3, 3)
+    elif gap_us == 141:
+        # Apart on air, but agent 2 had turned to sending while frame 1 was on air.
+        assert received == [[0, 0, 1, 1], [1, 0, 1, 1]]
+        assert verdict.collided == (1, 0)
+    else:
+        assert received == [[0, 1, 1, 1], [1, 0, 1, 1]]
+
+
+def test_a_late_frame_collides_with_the_next_slots_owner():
+    channel = Channel(ChannelConfig(agents=4))
+    late = 10 * MS - 200_000
+    first = channel.arbitrate(0, (1,), lengths=[60], offsets_ns=[late])
+    assert first.outcome == SUCCESS
+    assert first.received.sum() == 3
+    second = channel.arbitrate(1, (2,), lengths=[24], offsets_ns=[0])
+    assert (second.outcome, second.collided) == (COLLISION, (3,))
+    third = channel.arbitrate(2, (3,), lengths=[24], offsets_ns=[0])
+    assert third.outcome == SUCCESS
+    assert third.received.sum() == 3
+
+
+def test_an_early_frame_collides_with_the_slot_before():
+    channel = Channel(ChannelConfig(agents=3))
+    channel.arbitrate(0, (1,), lengths=[60], offsets_ns=[9 * MS])
+    assert channel.arbitrate(1, (2,), lengths=[24], offsets_ns=[-900_000]).collided == (2,)
+    channel.arbitrate(2, (1,), lengths=[60], offsets_ns=[9 * MS])
+    assert channel.arbitrate(3, (2,), lengths=[24], offsets_ns=[-500_000]).collided == (0,)
+
+
+def test_a_long_frame_spills_into_short_slots_even_in_lockstep():
+    channel = Channel(ChannelConfig(agents=3, slot_ns=200_000))
+    assert channel.arbitrate(0, (1,), lengths=[60]).outcome == SUCCESS
+    assert channel.arbitrate(1, (2,), lengths=[24]).outcome == COLLISION
+    assert channel.arbitrate(2, ()).outcome == IDLE
+    assert channel.arbitrate(5, (2,), lengths=[24]).outcome == SUCCESS
+
+
+def test_a_tail_does_not_survive_a_look_back():
+    channel = Channel(ChannelConfig(agents=3))
+    for _ in range(2):
+        assert channel.arbitrate(4, (1,), lengths=[60], offsets_ns=[10 * MS - 1]).outcome == SUCCESS
+    assert channel.arbitrate(0, (2,), lengths=[24], offsets_ns=[0]).outcome == SUCCESS
+
+
+def test_frames_at_different_times_of_one_slot_pass_the_losses_each():
+    slots = 6000
+    channel = Channel(ChannelConfig(agents=12, loss=0.2, seed=3))
+    lost = np.array(
+        [channel.arbitrate(s, (1, 2), lengths=[24, 24], offsets_ns=[0, 5 * MS]).lost for s in range(slots)],
+        dtype=float,
+    )
+    assert np.abs(lost.mean(axis=0) - 2.2).max() < 4.5 * math.sqrt(11 * 0.16 / slots)
+    assert abs(np.corrcoef(lost.T)[0, 1]) < 4.5 / math.sqrt(slots)

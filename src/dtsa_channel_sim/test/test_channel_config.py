@@ -1,0 +1,259 @@
+"""Settings of the channel: validation, YAML, round trips, the schedule."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_channel_sim import CHANGEABLE, Change, Channel, ChannelConfig, LinkLoss
+from dtsa_channel_sim.timeline import Timeline
+from dtsa_channel_sim.topology import format_ids, format_partition, parse_ids, parse_partition
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        ({}, "agents"),
+        ({"agents": 0}, "agents"),
+        ({"agents": -3}, "agents"),
+        ({"agents": 2.5}, "agents"),
+        ({"agents": True}, "agents"),
+        ({"agents": "many"}, "agents"),
+        ({"agents": 4, "slot_ns": 0}, "slot_ns"),
+        ({"agents": 4, "slot_ms": -1}, "slot_ms"),
+        ({"agents": 4, "slot_ms": 1, "slot_ns": 1}, "slot_ms"),
+        ({"agents": 4, "seed": -1}, "seed"),
+        ({"agents": 4, "loss": 1.01}, "loss"),
+        ({"agents": 4, "loss": -0.01}, "loss"),
+        ({"agents": 4, "loss": float("nan")}, "loss"),
+        ({"agents": 4, "loss": True}, "loss"),
+        ({"agents": 4, "loss": 0.5, "burst_length": 1.5}, "burst_length"),
+        ({"agents": 4, "loss": 0.05, "burst_length": 5, "p_good": 0.1}, "loss"),
+        ({"agents": 4, "loss": 0.1, "burst_length": 5, "p_good": 0.2, "p_bad": 0.1}, "p_bad"),
+        ({"agents": 4, "burst_scope": "swarm"}, "burst_scope"),
+        ({"agents": 4, "jam": 1}, "jam"),
+        ({"agents": 4, "jam": "no"}, "jam"),
+        ({"agents": 4, "partition": "1-5"}, "partition"),
+        ({"agents": 4, "partition": "1,2|2,3"}, "partition"),
+        ({"agents": 4, "partition": "a|b"}, "partition"),
+        ({"agents": 4, "partition": 3}, "partition"),
+        ({"agents": 4, "interference_factor": 0.5}, "interference_factor"),
+        ({"agents": 4, "range_m": -1}, "range_m"),
+        ({"agents": 4, "los": 0.1}, "los"),
+        ({"agents": 2, "loss_matrix": [[0, 1]]}, "loss_matrix"),
+        ({"agents": 2, "loss_matrix": [[0, 2], [0, 0]]}, "loss_matrix[0][1]"),
+        ({"agents": 2, "loss_matrix": "much"}, "loss_matrix"),
+        ({"agents": 4, "link_loss": {"from": 1}}, "link_loss"),
+        ({"agents": 4, "link_loss": [{"from": 1, "to": 2}]}, "link_loss[0].loss"),
+        ({"agents": 4, "link_loss": [{"from": 9, "to": 2, "loss": 1}]}, "link_loss[0].from"),
+        ({"agents": 4, "link_loss": [{"from": 1, "to": 2, "loss": 3}]}, "link_loss[0].loss"),
+        ({"agents": 4, "link_loss": [{"from": 1, "to": 2, "los": 3}]}, "link_loss[0].los"),
+        ({"agents": 4, "schedule": [{"jam": True}]}, "schedule[0].slot"),
+        ({"agents": 4, "schedule": [{"slot": 3}]}, "schedule[0]"),
+        ({"agents": 4, "schedule": [{"slot": 3, "at_s": 1, "jam": True}]}, "schedule[0].at_s"),
+        ({"agents": 4, "schedule": [{"slot": 3, "until": 3, "jam": True}]}, "schedule[0].until"),
+        ({"agents": 4, "schedule": [{"slot": 3, "seed": 3}]}, "schedule[0].seed"),
+        ({"agents": 4, "schedule": [{"slot": 3, "loss": 3}]}, "schedule[0].loss"),
+        ({"agents": 4, "schedule": [{"slot": 3, "partition": "9"}]}, "schedule[0].partition"),
+        (
+            {"agents": 4, "schedule": [{"slot": 3, "burst_length": 1.5}, {"slot": 5, "loss": 0.8}]},
+            "schedule: burst_length",
+        ),
+    ],
+)
+def test_bad_settings_name_the_field(settings, field):
+    with pytest.raises(ConfigError) as caught:
+        ChannelConfig.from_dict(settings)
+    assert caught.value.field == field
+    assert "\n" not in str(caught.value)
+
+
+def test_every_setting_describes_itself():
+    infos = {info.name: info for info in ChannelConfig.fields()}
+    assert set(CHANGEABLE) <= set(infos)
+    for info in infos.values():
+        assert info.help
+        assert info.allowed
+        if info.kind in ("int", "float") and info.default is not None:
+            assert info.minimum <= info.default <= info.maximum
+    assert (infos["loss"].minimum, infos["loss"].maximum) == (0.0, 1.0)
+    assert infos["agents"].default is None
+    assert infos["burst_scope"].choices == ("receiver", "link")
+
+
+FULL = {
+    "agents": 12,
+    "slot_ms": 20,
+    "seed": 7,
+    "loss": 0.1,
+    "burst_length": 5,
+    "link_loss": [{"from": 1, "to": [2, 3], "loss": 0.4, "both_ways": True}],
+    "schedule": [
+        {"slot": 100, "until": 200, "jam": True},
+        {"at_s": 5.01, "partition": [[1, 2, 3], [4, 5]]},
+        {"at_s": 8, "until_s": 9, "loss": 0.3},
+    ],
+}
+
+
+def test_dict_round_trip_through_json():
+    config = ChannelConfig.from_dict(FULL)
+    assert config.slot_ns == 20_000_000
+    assert [change.slot for change in config.schedule] == [100, 251, 400]
+    assert config.schedule[1].values == (("partition", "1-3 | 4-5 | 6-12"),)
+    assert config.link_loss == (LinkLoss("1", "2-3", 0.4, True),)
+    assert ChannelConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert hash(config) == hash(ChannelConfig.from_dict(config.to_dict()))
+
+
+def test_yaml(tmp_path):
+    path = tmp_path / "radio.yaml"
+    path.write_text(
+        textwrap.dedent(
+            """
+            channel:
+              agents: 6
+              loss: 5e-2
+              partition: 1-3 | 4-6
+              schedule:
+                - {slot: 10, until: 20, jam: true}
+            """
+        )
+    )
+    config = ChannelConfig.from_yaml(path, seed=3, loss=None)
+    assert (config.agents, config.seed, config.loss, config.partition) == (6, 3, 0.05, "1-3 | 4-6")
+    assert ChannelConfig.from_yaml(path, agents=12).partition == "1-3 | 4-6 | 7-12"
+    with pytest.raises(ConfigError, match="partition"):
+        ChannelConfig.from_yaml(path, agents=5)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("agents: [", "valid YAML"),
+        ("- 1\n- 2\n", "a mapping of settings"),
+        ("agents: 3\nagents: 4\n", "every setting once"),
+        ("agents: 3\nloss: lots\n", "loss: got 'lots'"),
+    ],
+)
+def test_yaml_errors_are_one_line(tmp_path, text, part):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=part) as caught:
+        ChannelConfig.from_yaml(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_yaml_file_missing(tmp_path):
+    with pytest.raises(ConfigError, match="No such file"):
+        ChannelConfig.from_yaml(tmp_path / "none.yaml")
+
+
+@given(st.sets(st.integers(1, 40), min_size=1))
+def test_ids_round_trip(ids):
+    assert parse_ids(format_ids(sorted(ids)), 40, "ids") == tuple(sorted(ids))
+
+
+@given(st.lists(st.integers(0, 3), min_size=2, max_size=20))
+def test_partition_round_trip(numbers):
+    groups = [[i + 1 for i, n in enumerate(numbers) if n == k] for k in range(4)]
+    groups = [group for group in groups if group]
+    parsed = parse_partition(groups, len(numbers))
+    assert parse_partition(format_partition(parsed), len(numbers)) == parsed
+    assert parsed == (tuple(map(tuple, groups)) if len(groups) > 1 else ())
+
+
+def test_huge_range_is_refused_quickly():
+    with pytest.raises(ConfigError):
+        parse_ids("1-99999999999", 12, "ids")
+
+
+def jam_slots(config, end):
+    timeline = Timeline(config)
+    return [slot for slot in range(end) if timeline.at(slot).config.jam]
+
+
+def test_overlapping_entries():
+    config = ChannelConfig(
+        agents=3,
+        schedule=(
+            {"slot": 2, "until": 6, "jam": True},
+            {"slot": 4, "until": 9, "jam": True},
+            {"slot": 12, "jam": True},
+            {"slot": 14, "until": 16, "jam": False},
+        ),
+    )
+    assert jam_slots(config, 18) == [2, 3, 4, 5, 6, 7, 8, 12, 13, 16, 17]
+
+
+@given(st.lists(st.tuples(st.integers(0, 12), st.one_of(st.none(), st.integers(1, 12)), st.integers(1, 9)), max_size=6))
+def test_schedule_against_its_definition(entries):
+    """In every slot the entry that began last and has not ended counts, of equals the later one."""
+    schedule = [
+        {"slot": slot, "loss": loss / 10, **({} if length is None else {"until": slot + length})}
+        for slot, length, loss in entries
+    ]
+    timeline = Timeline(ChannelConfig(agents=2, schedule=tuple(schedule)))
+    for slot in range(30):
+        live = [(e["slot"], i) for i, e in enumerate(schedule) if e["slot"] <= slot < e.get("until", 10**9)]
+        expected = schedule[max(live)[1]]["loss"] if live else 0.0
+        epoch = timeline.at(slot)
+        assert epoch.config.loss == expected
+        assert epoch.first <= slot
+        assert epoch.end is None or slot < epoch.end
+
+
+def test_set_takes_effect_from_the_next_slot_and_replays():
+    channel = Channel(ChannelConfig(agents=4, schedule=({"slot": 8, "jam": False},)))
+    seen = []
+    for slot in range(12):
+        if slot == 5:
+            channel.set(jam=True)
+        if slot == 6:
+            channel.set(partition=[[1, 2], [3, 4]], loss=0.5)
+        seen.append(channel.arbitrate(slot, (1,)).mask(4).tolist())
+    assert seen[4] == [[False, True, True, True]]
+    assert not any(seen[5][0])
+    assert not any(seen[7][0])
+    assert not any(seen[slot][0][2] for slot in range(5, 12))
+    assert [change.slot for change in channel.changes] == [5, 6]
+    replay = Channel(channel.config)
+    for change in channel.changes:
+        replay.set(slot=change.slot, **dict(change.values))
+    assert replay.changes == channel.changes
+    assert [replay.arbitrate(slot, (1,)).mask(4).tolist() for slot in range(12)] == seen
+    assert Change.from_dict(channel.changes[1].to_dict(), channel.config, "change") == channel.changes[1]
+
+
+def test_set_refuses_and_changes_nothing():
+    channel = Channel(ChannelConfig(agents=4, schedule=({"slot": 50, "loss": 0.8},)))
+    channel.arbitrate(9, (1,))
+    for bad in (
+        {"loss": 2},
+        {"seed": 3},
+        {"partition": "1-9"},
+        {},
+        {"slot": 9, "jam": True},
+        {"burst_length": 2.0},
+    ):
+        with pytest.raises(ConfigError):
+            channel.set(**bad)
+    assert channel.changes == ()
+    assert channel.settings == channel.config.changed({})
+    assert channel.set(burst_length=5.0).slot == 10
+    assert channel.settings_at(50).burst_length == 5.0
+
+
+def test_the_example_is_usable():
+    path = Path(__file__).parents[1] / "config" / "rough_radio.yaml"
+    config = ChannelConfig.from_yaml(path, agents=12, slot_ns=20_000_000, seed=3)
+    assert [change.slot for change in config.schedule] == [500, 1000, 1500]
+    assert config.schedule[1].values == (("partition", "1-6 | 7-12"),)
+    with pytest.raises(ConfigError, match=r"link_loss\[0\]\.to"):
+        ChannelConfig.from_yaml(path, agents=6)
