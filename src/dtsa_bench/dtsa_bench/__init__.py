@@ -1,0 +1,1 @@
+"""Flights, experiments and their analysis."""

@@ -1,0 +1,7 @@
+"""`python -m dtsa_bench COMMAND ...`: see :mod:`dtsa_bench.cli`."""
+
+import sys
+
+from dtsa_bench.cli import main
+
+sys.exit(main())

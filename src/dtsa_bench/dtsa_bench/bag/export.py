@@ -1,0 +1,232 @@
+"""Tables of a recorded run for pandas, polars and spreadsheets: Parquet or CSV, with documented columns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
+from dtsa_agent.core.frame import decode_frame
+from dtsa_bench.bag.errors import BagError
+from dtsa_bench.bag.reader import Bag
+from dtsa_bench.bag.run import OUTCOMES, RecordedRun, load_run
+
+FORMATS = ("parquet", "csv")
+ROWS = 65536  # rows that are in memory as a table at once
+AXES = "xyz"
+
+# Columns by table: name, unit, meaning. Also written beside the tables and to the Parquet files' own metadata.
+COLUMNS: dict[str, list[tuple[str, str, str]]] = {
+    "slots": [
+        ("slot", "1", "number of the slot, from 0"),
+        ("time_s", "s", "start of the slot, counted from the start of slot 0"),
+        ("outcome", "", "the channel's verdict: idle, success or collision"),
+        ("senders", "1", "agents that sent"),
+    ],
+    "frames": [
+        ("slot", "1", "slot in which the frame was sent"),
+        ("time_s", "s", "start of that slot"),
+        ("sender", "", "id of the agent that sent it"),
+        ("received", "1", "agents that received it"),
+        ("lost", "1", "agents that lost it to noise"),
+        ("collided", "1", "agents at which it collided with another frame"),
+        ("length", "byte", "length of the frame"),
+        ("data", "", "the frame, hexadecimal"),
+        ("c_r", "1", "transmission parameter in the frame; 0: arrived; empty if the frame cannot be decoded"),
+        *((f"position_{axis}_m", "m", f"position {axis} in the frame, frame map") for axis in AXES),
+        *((f"velocity_{axis}_mps", "m/s", f"velocity {axis} in the frame") for axis in AXES),
+    ],
+    "decisions": [
+        ("slot", "1", "slot that was decided about"),
+        ("time_s", "s", "start of that slot"),
+        ("agent", "", "id of the agent that decided"),
+        ("chosen", "", "id of the agent that it takes for the sender; 0: nobody"),
+        ("reason", "", "why, by name"),
+        ("score", "1", "priority value g of the chosen agent, 0 where the policy has none"),
+        ("digest", "", "digest of the agent's view: equal digests, equal tables"),
+    ],
+    "states": [
+        ("time_s", "s", "time of the state, counted from the start of slot 0"),
+        ("agent", "", "id"),
+        *((f"position_{axis}_m", "m", f"true position {axis}, frame map") for axis in AXES),
+        *((f"velocity_{axis}_mps", "m/s", f"true velocity {axis}") for axis in AXES),
+    ],
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """One table that was written."""
+
+    path: Path
+    rows: int
+
+
+def export(
+    path: str | Path,
+    directory: str | Path,
+    kind: str = "parquet",
+    tables: Collection[str] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> list[Exported]:
+    """Write the tables of a bag and a description of their columns.
+
+    :param path: the bag.
+    :param directory: where they go; must not exist, or be empty.
+    :param kind: "parquet" or "csv".
+    :param tables: names from `COLUMNS`; None: all.
+    :param progress: called with the name of each table before it is written.
+    :raises ConfigError: for unusable settings and bags.
+    :raises BagError: if the files cannot be written.
+    """
+    if kind not in FORMATS:
+        raise ConfigError("to", kind, " or ".join(FORMATS))
+    for name in tables or ():
+        if name not in COLUMNS:
+            raise ConfigError("tables", name, ", ".join(COLUMNS))
+    target = Path(directory)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ConfigError("out", str(directory), "a directory that is empty or does not exist yet")
+    with Bag(path) as bag:
+        run = load_run(bag)
+    written = []
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        for name, rows in _TABLES.items():
+            if tables is not None and name not in tables:
+                continue
+            if progress:
+                progress(name)
+            file = target / f"{name}.{kind}"
+            written.append(Exported(file, _write(file, kind, name, rows(run))))
+        (target / "columns.md").write_text(describe(), encoding="utf-8")
+    except OSError as error:
+        raise BagError(f"cannot export to {target}: {error.strerror or error}") from error
+    return written
+
+
+def describe() -> str:
+    """The columns of all tables as Markdown."""
+    parts = ["# Columns of the exported tables\n"]
+    for table, columns in COLUMNS.items():
+        parts.append(f"\n## {table}\n\n| column | unit | meaning |\n|---|---|---|\n")
+        parts.extend(f"| `{name}` | {unit} | {meaning} |\n" for name, unit, meaning in columns)
+    return "".join(parts)
+
+
+def _write(file: Path, kind: str, name: str, batches: Iterator[dict[str, Any]]) -> int:
+    notes = {column: {"unit": unit, "meaning": meaning} for column, unit, meaning in COLUMNS[name]}
+    writer: Any = None
+    rows = 0
+    try:
+        for batch in batches:
+            table = pa.table(batch)
+            if writer is None:
+                fields = [field.with_metadata(notes[field.name]) for field in table.schema]
+                schema = pa.schema(fields)
+                make = pyarrow.parquet.ParquetWriter if kind == "parquet" else pyarrow.csv.CSVWriter
+                writer = make(str(file), schema)
+            writer.write_table(table.cast(schema))
+            rows += table.num_rows
+    finally:
+        if writer is not None:
+            writer.close()
+    return rows
+
+
+def _pieces(count: int, width: int = 1) -> Iterator[slice]:
+    """Slices that together cover `count` steps of `width` rows each, about `ROWS` rows in each slice.
+
+    Without any rows there is one empty slice, so that the columns are written anyway.
+    """
+    step = max(1, ROWS // max(1, width))
+    for start in range(0, max(count, 1), step):
+        yield slice(start, start + step)
+
+
+def _slots(run: RecordedRun) -> Iterator[dict[str, Any]]:
+    counts = np.zeros(len(run.slots), np.int64)
+    places = np.searchsorted(run.slots, run.frames.slot)
+    np.add.at(counts, places[places < len(counts)], 1)
+    names = np.array(OUTCOMES)
+    for piece in _pieces(len(run.slots)):
+        yield {
+            "slot": run.slots[piece],
+            "time_s": run.time_s(run.slots[piece]),
+            "outcome": pa.array(names[run.outcome[piece]].tolist(), pa.string()),
+            "senders": counts[piece],
+        }
+
+
+def _frames(run: RecordedRun) -> Iterator[dict[str, Any]]:
+    frames = run.frames
+    for piece in _pieces(len(frames.slot)):
+        decoded = [_decode(data) for data in frames.data[piece]]
+        batch: dict[str, Any] = {
+            "slot": frames.slot[piece],
+            "time_s": run.time_s(frames.slot[piece]),
+            "sender": frames.sender[piece],
+            "received": frames.received[piece].sum(axis=1),
+            "lost": frames.lost[piece],
+            "collided": frames.collided[piece],
+            "length": np.array([len(data) for data in frames.data[piece]], np.int64),
+            "data": pa.array([data.hex() for data in frames.data[piece]], pa.string()),
+            "c_r": pa.array([values[0] for values in decoded], pa.int64()),
+        }
+        names = [f"position_{axis}_m" for axis in AXES] + [f"velocity_{axis}_mps" for axis in AXES]
+        for index, name in enumerate(names, 1):
+            batch[name] = pa.array([values[index] for values in decoded], pa.float64())
+        yield batch
+
+
+def _decode(data: bytes) -> tuple[Any, ...]:
+    try:
+        frame = decode_frame(data)
+    except RemoteProtocolError:
+        return (None,) * 7
+    return (frame.c_r, *frame.position, *frame.velocity)
+
+
+def _decisions(run: RecordedRun) -> Iterator[dict[str, Any]]:
+    decisions = run.decisions
+    names = np.array(decisions.names or ("",), dtype=object)
+    for piece in _pieces(len(decisions.slot), decisions.agent.shape[1]):
+        slots = np.repeat(decisions.slot[piece], decisions.agent.shape[1])
+        yield {
+            "slot": slots,
+            "time_s": run.time_s(slots),
+            "agent": decisions.agent[piece].ravel(),
+            "chosen": decisions.chosen[piece].ravel(),
+            "reason": pa.array(names[decisions.reason[piece].ravel()].tolist(), pa.string()),
+            "score": decisions.score[piece].ravel(),
+            "digest": decisions.digest[piece].ravel(),
+        }
+
+
+def _states(run: RecordedRun) -> Iterator[dict[str, Any]]:
+    motion = run.motion
+    for piece in _pieces(len(motion.time_ns), len(motion.ids)):
+        time_s = (motion.time_ns[piece] - run.start_ns) / 1e9
+        batch: dict[str, Any] = {
+            "time_s": np.repeat(time_s, len(motion.ids)),
+            "agent": np.tile(motion.ids, len(time_s)),
+        }
+        for values, form in ((motion.position, "position_{}_m"), (motion.velocity, "velocity_{}_mps")):
+            for index, axis in enumerate(AXES):
+                batch[form.format(axis)] = values[piece, index].ravel()
+        yield batch
+
+
+_TABLES: dict[str, Callable[[RecordedRun], Iterator[dict[str, Any]]]] = {
+    "slots": _slots,
+    "frames": _frames,
+    "decisions": _decisions,
+    "states": _states,
+}

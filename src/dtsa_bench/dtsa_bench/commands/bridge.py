@@ -1,0 +1,101 @@
+"""`dtsa bridge`: connect the swarm to real or simulated Crazyflies."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import subprocess
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+DESCRIPTION = """\
+The bridge to the Crazyflies of a swarm.yaml: topics /cfN/..., services /cfN/... and /all/..., as in Crazyswarm2.
+The first Ctrl-C lands all, the second stops all motors."""
+SIM_BASE_PORT = 19850
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    parser = subparsers.add_parser(
+        "bridge",
+        help="connect the swarm to real or simulated Crazyflies",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", type=Path, required=True, help="swarm.yaml: robots, types, defaults, station")
+    parser.add_argument(
+        "--backend",
+        choices=("cflib", "sim"),
+        default="cflib",
+        help="cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
+    )
+    parser.add_argument("--check", action="store_true", help="check the file, print the radio budget, and end")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the bridge until Ctrl-C."""
+    from dtsa_agent.crazyflie.budget import check_budget, radio_loads
+    from dtsa_agent.crazyflie.config import load_swarm
+    from dtsa_agent.crazyflie.link import require_cflib
+
+    settings = load_swarm(args.config)
+    if args.check:
+        loads = radio_loads([(r.name, r.uri, r.command_rate_hz, r.log_rate_hz) for r in settings.robots])
+        print(f"{args.config}: {len(settings.robots)} Crazyflies")
+        for load in loads:
+            print(load)
+        check_budget(loads, force=settings.station.force_budget)
+        return 0
+    require_cflib()
+    with ExitStack() as stack:
+        config = simulated(args.config, stack) if args.backend == "sim" else args.config
+        return run_bridge(config)
+
+
+def run_bridge(config: Path) -> int:
+    """The bridge in this process.
+
+    :param config: the swarm's YAML.
+    """
+    from dtsa_agent.crazyflie import bridge_node
+
+    return bridge_node.main(["crazyflie_bridge", "--ros-args", "-p", f"config:={config.resolve()}"])
+
+
+def simulated(config: Path, stack: ExitStack) -> Path:
+    """Start simulated Crazyflies in place of a file's real ones.
+
+    :param config: the swarm's YAML.
+    :param stack: ends them.
+    :return: the YAML with their addresses.
+    """
+    import yaml
+
+    from dtsa_agent.crazyflie.config import load_swarm
+
+    data = yaml.safe_load(config.read_text(encoding="utf-8"))
+    for index, robot in enumerate(load_swarm(config).robots):
+        data["robots"][robot.name]["uri"] = f"udp://127.0.0.1:{SIM_BASE_PORT + index}"
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dtsa-bridge-")))
+    path = folder / config.name
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--config", str(path), "--quiet"]
+    # A process group of its own: Ctrl-C is for the bridge, which still has to land them.
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    stack.callback(_end, process)
+    assert process.stdout is not None
+    for line in process.stdout:  # the addresses, then one line that says that they are there
+        if "Ctrl-C" in line:
+            return path
+    raise SystemExit(process.wait())
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(5)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

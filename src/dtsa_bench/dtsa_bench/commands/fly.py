@@ -1,0 +1,146 @@
+"""`fly`: one flight with real ROS 2 nodes, recorded to a bag."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from dtsa_bench.options import add_mode_options, add_run_options, run_config, whole_number
+
+INTERRUPTED = 130
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the command's parser."""
+    parser = subparsers.add_parser(
+        "fly",
+        help="one flight with real ROS 2 nodes, recorded to a bag",
+        description="Starts the channel and the agents as ROS 2 nodes, records the flight, and ends them all.",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", required=True, help="new directory for the bag, summary.json and trajectories.png"
+    )
+    parser.add_argument(
+        "--processes",
+        metavar="per-agent|K",
+        default="per-agent",
+        help="one process an agent, or all agents in K processes [per-agent]",
+    )
+    parser.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the flight [a free one]")
+    parser.add_argument(
+        "--backend",
+        choices=("sim", "cflib"),
+        default="sim",
+        help="cflib: the Crazyflies of --config, in real time [sim]",
+    )
+    parser.add_argument(
+        "--config", metavar="FILE", default=None, help="swarm.yaml of the Crazyflies, for --backend cflib"
+    )
+    parser.add_argument(
+        "--answer-s",
+        metavar="X",
+        type=float,
+        default=10.0,
+        help="wall time in which every node must answer a slot, s [10]",
+    )
+    parser.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
+    add_mode_options(parser)
+    add_run_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Flies.
+
+    :returns: 0, or 130 when interrupted.
+    """
+    if args.backend == "cflib":
+        return run_crazyflies(args)
+    config = run_config(args)
+    from dtsa_agent.core.errors import ConfigError
+
+    if args.config is not None:
+        raise ConfigError("config", args.config, "a swarm.yaml together with --backend cflib")
+
+    processes = None
+    if args.processes != "per-agent":
+        try:
+            processes = whole_number(args.processes, "processes", 1, config.swarm.agents)
+        except ConfigError as error:
+            raise ConfigError("processes", args.processes, f"per-agent, or {error.allowed}") from None
+    domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
+    directory = Path(args.out)
+
+    from dtsa_agent.ros.loop import Stop
+    from dtsa_bench.fly.flight import FlightOptions, fly
+
+    options = FlightOptions(processes=processes, domain=domain, answer_s=args.answer_s, pictures=args.picture)
+    with Stop() as stop:
+        flight = fly(config, directory, options, stop)
+    print(describe(flight.summary))
+    print(f"bag:     {flight.bag}\nresults: {directory / 'summary.json'}")
+    if args.picture and not stop:
+        print(f"picture: {directory / 'trajectories.png'}")
+    if stop:
+        print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def run_crazyflies(args: argparse.Namespace) -> int:
+    """A mission with Crazyflies.
+
+    :returns: 0; 1 when the exchange was cut short by a vehicle; 130 when interrupted.
+    """
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_agent.crazyflie.config import load_swarm
+
+    if args.config is None:
+        raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
+    path = Path(args.config)
+    settings = load_swarm(path)
+    from dtsa_agent.ros.loop import Stop
+    from dtsa_bench.fly.crazyflie import fly_crazyflies, mission_defaults
+    from dtsa_bench.fly.flight import FlightOptions
+
+    args.mode = args.mode or "realtime"
+    given = {key.partition(".")[2]: value for key, value in vars(args).items() if key.startswith("swarm.")}
+    config = run_config(args, **mission_defaults(settings, given))
+    domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
+    options = FlightOptions(domain=domain, pictures=args.picture)
+    with Stop() as stop:
+        flight, cut_short = fly_crazyflies(config, settings, path, args.out, options, stop)
+    print(describe(flight.summary))
+    print(f"bag:     {flight.bag}\nresults: {Path(args.out) / 'summary.json'}")
+    if cut_short:
+        print(f"dtsa: the exchange was cut short: {cut_short}; all have landed", file=sys.stderr)
+        return 1
+    return INTERRUPTED if stop else 0
+
+
+def describe(summary: dict[str, Any]) -> str:
+    """A flight's results in two lines."""
+    slots = summary["slots"]
+    end = summary["end"]
+    if end == "completed":
+        end += f" after {summary['completion_time_s']:.2f} s"
+    if summary["collided"]:
+        end += " (cf{} and cf{})".format(*summary["collided_pair"])
+    lines = [
+        f"{summary['agents']} agents, {summary['moving']} moving, {summary['policy']}, {summary['estimator']}, "
+        f"{summary['avoider']}: {end}"
+    ]
+    parts = [
+        f"slots {slots['total']} (success {slots['success']}, collision {slots['collision']}, idle {slots['idle']})"
+    ]
+    for name, key, form in (
+        ("closest", "min_distance_m", "{:.3f} m"),
+        ("efficiency", "efficiency_mean", "{:.3f}"),
+        ("mean age", "age_mean_slots", "{:.2f} slots"),
+        ("real-time factor", "realtime_factor", "{:.2f}"),
+    ):
+        if summary[key] is not None:
+            parts.append(f"{name} {form.format(summary[key])}")
+    return "\n".join([*lines, ", ".join(parts)])

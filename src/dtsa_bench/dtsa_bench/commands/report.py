@@ -1,0 +1,41 @@
+"""`dtsa report`: one HTML page about recorded runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+DESCRIPTION = """\
+Writes one self-contained HTML page about one recorded run, or several side by side: the flight in 3D, the
+slots,
+distances, ages, estimate errors, channel use, decisions and the configuration. It opens without a network
+and prints."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    parser = subparsers.add_parser(
+        "report",
+        help="HTML page about one recorded run, or several side by side",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("bags", nargs="+", metavar="BAG", help="bag directories or .mcap files, up to 6")
+    parser.add_argument("--out", metavar="FILE", help="the page (default: report.html beside the first bag)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the report."""
+    from dtsa_bench.report.page import write_report
+
+    first = Path(args.bags[0]).resolve()
+    out = Path(args.out) if args.out else first.parent / "report.html"
+
+    def progress(bag: str) -> None:
+        if sys.stderr.isatty():
+            print(f"reading {bag}", file=sys.stderr, flush=True)
+
+    path = write_report(args.bags, out, progress)
+    print(f"{path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")
+    return 0

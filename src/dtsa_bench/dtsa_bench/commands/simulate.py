@@ -1,0 +1,58 @@
+"""`dtsa simulate`: one flight without ROS, the same bit for bit as `dtsa fly` in lockstep."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+DESCRIPTION = """\
+Flies one run without ROS, as fast as this machine allows, over the same core as the nodes. For equal options
+and seed
+every slot has the same sender and every quadcopter the same positions as with `fly`, bit for bit."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    from dtsa_bench.options import add_run_options
+
+    parser = subparsers.add_parser("simulate", help="one flight without ROS", description=DESCRIPTION)
+    parser.add_argument(
+        "--out", metavar="DIR", help="directory for summary.json and config.json; default: only printed"
+    )
+    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    add_run_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly and print what came of it."""
+    from dtsa_bench.options import new_directory, run_config
+    from dtsa_bench.simulate import simulate
+
+    config = run_config(args)
+    directory = None if args.out is None else new_directory(args.out)
+    summary = simulate(config).summary()
+    text = json.dumps(summary, indent=2) + "\n"
+    if directory is not None:
+        _write(directory, text, json.dumps(config.to_dict(), indent=2) + "\n")
+    print(text if args.json else describe(summary), end="")
+    return 0
+
+
+def _write(directory: Path, summary: str, config: str) -> None:
+    (directory / "summary.json").write_text(summary, encoding="utf-8")
+    (directory / "config.json").write_text(config, encoding="utf-8")
+
+
+def describe(summary: dict[str, object]) -> str:
+    """A summary in a few lines."""
+    lines = []
+    for key, value in summary.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{count} {name}" for name, count in value.items())
+        elif isinstance(value, float):
+            value = f"{value:.6g}"
+        elif isinstance(value, list):
+            value = " and ".join(str(item) for item in value)
+        lines.append(f"{key.replace('_', ' '):24}{'-' if value is None else value}\n")
+    return "".join(lines)

@@ -1,0 +1,173 @@
+"""Command line of the simulated fleet: `dtsa fake-crazyflie`, and the executable `fake_crazyflie`."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.fake_crazyflie import layout
+from dtsa_bench.fake_crazyflie.control import FAULTS, send_fault
+from dtsa_bench.fake_crazyflie.fleet import MAX_COUNT, Fleet, FleetConfig
+from dtsa_bench.fake_crazyflie.peer import PROTOCOLS
+
+DESCRIPTION = """\
+Simulated Crazyflies over UDP: cflib, its client and the Crazyflie bridge connect to them as to real ones.
+They fly, drain their batteries and fail on command; Ctrl-C ends them."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("--count", type=int, help=f"number of vehicles, 1 to {MAX_COUNT} (default 12)")
+    parser.add_argument("--config", type=Path, help="swarm.yaml: count, ports and start positions come from its robots")
+    parser.add_argument("--base-port", type=int, default=19850, help="UDP port of the first (default %(default)s)")
+    parser.add_argument("--control-port", type=int, default=0, help="UDP port for faults (default: base port - 1)")
+    parser.add_argument("--layout", choices=layout.LAYOUTS, default="ellipse", help="start positions (%(default)s)")
+    parser.add_argument(
+        "--half-axes", type=float, nargs=2, default=(1.2, 2.0), metavar=("X", "Y"), help="m, of the layout (1.2 2.0)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of noise and loss (default %(default)s)")
+    parser.add_argument("--protocol", type=int, default=12, choices=PROTOCOLS, help="version told to the host")
+    parser.add_argument("--model", default="orca", help="flight model whose vehicle they are (%(default)s)")
+    parser.add_argument("--no-noise", action="store_true", help="perfect sensors")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="record of what really happened (JSON lines)")
+    parser.add_argument("--quiet", action="store_true", help="no status line")
+    faults = parser.add_argument_group("faults", "sent to a fleet that is already running, instead of starting one")
+    faults.add_argument("--fault", choices=FAULTS, help="; ".join(f"{k}: {v}" for k, v in FAULTS.items()))
+    faults.add_argument("--cf", default="all", help="id of the vehicle (default: all)")
+    faults.add_argument("--rate", type=float, help="drop: share of the datagrams that is lost")
+    faults.add_argument("--direction", choices=("up", "down", "both"), help="drop: up is from the host")
+    faults.add_argument("--voltage", type=float, help="battery: V")
+    faults.add_argument("--seconds", type=float, help="heals by itself after that long")
+
+
+def fleet_config(args: argparse.Namespace) -> FleetConfig:
+    """Configuration from the command line.
+
+    :raises ConfigError: a value is out of range.
+    """
+    options: dict[str, Any] = {
+        "control_port": args.control_port,
+        "seed": args.seed,
+        "protocol": args.protocol,
+        "noise": not args.no_noise,
+        "truth": args.truth,
+        "model": args.model,
+    }
+    if args.config is not None:
+        return _from_swarm(args, options)
+    count = 12 if args.count is None else args.count
+    if not 1 <= count <= MAX_COUNT:
+        raise ConfigError("count", count, f"1 to {MAX_COUNT}")
+    start = layout.positions(args.layout, count, tuple(args.half_axes))
+    return FleetConfig(count=count, base_port=args.base_port, start=start, **options)
+
+
+def _from_swarm(args: argparse.Namespace, options: dict[str, Any]) -> FleetConfig:
+    import numpy as np
+
+    from dtsa_agent.crazyflie.config import load_swarm
+
+    robots = load_swarm(args.config).robots
+    ports = []
+    for robot in robots:
+        if not robot.uri.startswith("udp://"):
+            raise ConfigError(f"robots.{robot.name}.uri", robot.uri, "udp://HOST:PORT for a simulated Crazyflie")
+        ports.append(int(robot.uri.rpartition(":")[2]))
+    if ports != list(range(ports[0], ports[0] + len(ports))):
+        raise ConfigError("robots", ports, "ports that follow each other, in the order of the robots")
+    if args.count not in (None, len(ports)):
+        raise ConfigError("count", args.count, f"{len(ports)}, as in {args.config}")
+    start = np.array([robot.initial_position for robot in robots]).T
+    return FleetConfig(count=len(ports), base_port=ports[0], start=start, **options)
+
+
+def request_fault(args: argparse.Namespace) -> None:
+    """Send a fault to a running fleet.
+
+    :raises ConfigError: nobody listens, or it was refused.
+    """
+    cf: object = args.cf
+    if args.cf != "all":
+        try:
+            cf = int(args.cf)
+        except ValueError:
+            raise ConfigError("cf", args.cf, "an id, or all") from None
+    names = ("rate", "direction", "voltage", "seconds")
+    numbers = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    port = args.control_port or args.base_port - 1
+    send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **numbers)
+    print(f"{args.fault}: cf {args.cf}")
+
+
+def status_line(fleet: Fleet) -> str:
+    """One line about the fleet."""
+    states: dict[str, int] = {}
+    for firmware in fleet.firmware:
+        states[firmware.supervisor.state] = states.get(firmware.supervisor.state, 0) + 1
+    lowest = min(firmware.battery.voltage for firmware in fleet.firmware)
+    text = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
+    return f"{fleet.time:7.1f} s  {text}; lowest battery {lowest:.2f} V"
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly the fleet until Ctrl-C; exit code."""
+    if args.fault is not None:
+        request_fault(args)
+        return 0
+    fleet = Fleet(fleet_config(args))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: fleet.stop())
+    for uri in fleet.config.uris:
+        print(uri)
+    print(
+        f"{fleet.config.count} simulated Crazyflies, protocol {fleet.config.protocol}; faults: UDP port "
+        f"{fleet.config.control_port}; Ctrl-C ends",
+        flush=True,
+    )
+    if not args.quiet:
+        _show_status(fleet)
+    fleet.run()
+    if not args.quiet:
+        print(status_line(fleet))
+    return 0
+
+
+def _show_status(fleet: Fleet) -> None:
+    """Refresh the status line every half second on a terminal, every ten seconds in a file."""
+    terminal = sys.stdout.isatty()
+    period = 0.5 if terminal else 10.0
+    last = [time.monotonic()]
+    step = fleet.step
+
+    def step_and_show() -> None:
+        step()
+        if time.monotonic() - last[0] >= period:
+            last[0] = time.monotonic()
+            print(
+                "\r" + status_line(fleet) + " " * 10 if terminal else status_line(fleet), end="" if terminal else "\n"
+            )
+            sys.stdout.flush()
+
+    fleet.step = step_and_show  # type: ignore[method-assign]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the executable."""
+    parser = argparse.ArgumentParser(
+        prog="fake_crazyflie", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_arguments(parser)
+    try:
+        return run(parser.parse_args(argv))
+    except ConfigError as error:
+        print(f"fake_crazyflie: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,345 @@
+"""A fleet of simulated Crazyflies: one UDP port each, one process and one thread for all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import selectors
+import socket
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.flight_models import flight_model
+from dtsa_bench.fake_crazyflie import layout
+from dtsa_bench.fake_crazyflie.control import check_fault
+from dtsa_bench.fake_crazyflie.estimate import Estimate
+from dtsa_bench.fake_crazyflie.firmware import OFF, Firmware
+from dtsa_bench.fake_crazyflie.peer import PROTOCOLS, Peer
+from dtsa_bench.fake_crazyflie.truth import TruthLog
+from dtsa_bench.fake_crazyflie.vehicles import Vehicles
+
+TICK_S = 0.01
+MAX_COUNT = 200
+MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record says so
+POSITION_NOISE_M = 0.002
+VELOCITY_NOISE_MPS = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class FleetConfig:
+    """What the fleet is made of."""
+
+    count: int = 12
+    base_port: int = 19850  # vehicle k (from 1) listens on base_port + k - 1
+    control_port: int = 0  # 0: base_port - 1
+    host: str = "127.0.0.1"
+    start: Any = field(default=None, compare=False)  # (3, count), m, world; None: an ellipse
+    seed: int = 1
+    protocol: int = 12
+    noise: bool = True
+    model: str = "orca"  # flight model whose vehicle they are
+    collision_m: float = 0.2  # the record notes two flying vehicles closer than this ...
+    crash_m: float = 0.12  # ... and closer than this they fall
+    truth: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= MAX_COUNT:
+            raise ConfigError("count", self.count, f"1 to {MAX_COUNT}")
+        if not 1024 <= self.base_port <= 65536 - self.count:
+            raise ConfigError("base_port", self.base_port, f"1024 to {65536 - self.count} for {self.count} vehicles")
+        flight_model(self.model)
+        if self.protocol not in PROTOCOLS:
+            raise ConfigError("protocol", self.protocol, " or ".join(str(p) for p in PROTOCOLS))
+        if self.start is None:
+            object.__setattr__(self, "start", layout.positions("ellipse", self.count))
+        elif np.shape(self.start) != (3, self.count):
+            raise ConfigError("start", np.shape(self.start), f"an array of shape (3, {self.count})")
+        if not self.control_port:
+            object.__setattr__(self, "control_port", self.base_port - 1)
+
+    @property
+    def uris(self) -> list[str]:
+        """Where cflib finds them."""
+        return [f"udp://{self.host}:{self.base_port + k}" for k in range(self.count)]
+
+
+@dataclass(slots=True)
+class _Link:
+    """Socket and link faults of one vehicle."""
+
+    socket: socket.socket | None
+    host: tuple[str, int] | None = None  # who sent last
+    drop_up: float = 0.0
+    drop_down: float = 0.0
+    frozen: bool = False
+    heal_at: float | None = None
+
+
+class Fleet:
+    """The fleet. `run()` flies it until `stop()` is called from anywhere.
+
+    :raises ConfigError: a port is in use.
+    """
+
+    def __init__(self, config: FleetConfig) -> None:
+        self.config = config
+        self._selector = selectors.DefaultSelector()
+        self._links: list[_Link] = []
+        self._control: socket.socket | None = None
+        self._open_sockets()
+        header = {
+            "count": config.count,
+            "uris": config.uris,
+            "seed": config.seed,
+            "protocol": config.protocol,
+            "start": np.asarray(config.start).tolist(),
+            "unix_time": time.time(),
+        }
+        try:
+            self.truth = TruthLog(config.truth, header)
+        except OSError as error:
+            self.close()
+            raise ConfigError("truth", str(config.truth), f"a file that can be written ({error.strerror})") from error
+        self.tick = 0
+        vehicle = flight_model(config.model).vehicle
+        self.vehicles = Vehicles(config.start, vehicle)
+        self.firmware = [Firmware(partial(self._report, k), vehicle.tau) for k in range(config.count)]
+        self.estimates = [Estimate() for _ in range(config.count)]
+        self.peers = [Peer(f, e, config.protocol) for f, e in zip(self.firmware, self.estimates, strict=True)]
+        streams = np.random.SeedSequence(config.seed).spawn(2)
+        self._noise = np.random.default_rng(streams[0])
+        self._loss = np.random.default_rng(streams[1])
+        self._close_pairs: set[tuple[int, int]] = set()
+        self._running = True
+        self._estimate()
+
+    # -- life cycle -------------------------------------------------------------------------------------------------
+    def _bind(self, port: int) -> socket.socket:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        try:
+            sock.bind((self.config.host, port))
+        except OSError as error:
+            sock.close()
+            self.close()
+            raise ConfigError("port", port, f"a free UDP port ({error.strerror})") from error
+        return sock
+
+    def _open_sockets(self) -> None:
+        for k in range(self.config.count):
+            sock = self._bind(self.config.base_port + k)
+            self._links.append(_Link(sock))
+            self._selector.register(sock, selectors.EVENT_READ, k)
+        self._control = self._bind(self.config.control_port)
+        self._selector.register(self._control, selectors.EVENT_READ, -1)
+
+    def close(self) -> None:
+        """Release the ports and end the record."""
+        for link in self._links:
+            if link.socket is not None:
+                link.socket.close()
+                link.socket = None
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+        self._selector.close()
+        if hasattr(self, "truth"):
+            self.truth.close()
+
+    def stop(self) -> None:
+        """End `run()` soon. May be called from another thread or a signal handler."""
+        self._running = False
+
+    def run(self) -> None:
+        """Fly in real time until `stop()`; then release everything."""
+        origin = time.monotonic()
+        try:
+            while self._running:
+                now = time.monotonic() - origin
+                if now < (self.tick + 1) * TICK_S:
+                    self._serve((self.tick + 1) * TICK_S - now)
+                    continue
+                if now - self.tick * TICK_S > MAX_LAG_S:
+                    skipped = now - self.tick * TICK_S
+                    origin += skipped
+                    self.truth.event(self.time, 0, "machine too slow", skipped_s=round(skipped, 3))
+                self.step()
+        finally:
+            self.close()
+
+    @property
+    def time(self) -> float:
+        """Seconds that the fleet has lived."""
+        return self.tick * TICK_S
+
+    # -- motion -----------------------------------------------------------------------------------------------------
+    def step(self) -> None:
+        """Fly for one tick of 10 ms and send what is due."""
+        t = self.time
+        modes, command = [], np.zeros_like(self.vehicles.position)
+        for k, firmware in enumerate(self.firmware):
+            mode, wanted = firmware.step(t, TICK_S, self.estimates[k].position)
+            modes.append(mode)
+            command[:, k] = wanted
+        for k in self.vehicles.step(TICK_S, modes, command):
+            self._report(k, "hard landing")
+            self.firmware[k].supervisor.tumbled = True
+        self.tick += 1
+        self._estimate()
+        self._proximity(modes)
+        self.truth.positions(self.time, self.vehicles.position)
+        self._send_logs()
+        for k, link in enumerate(self._links):
+            if link.heal_at is not None and self.time >= link.heal_at:
+                self._apply("heal", k, {})
+
+    def _estimate(self) -> None:
+        state = np.concatenate([self.vehicles.position, self.vehicles.velocity])
+        if self.config.noise:
+            noise = self._noise.standard_normal(state.shape)
+            state[:3] += POSITION_NOISE_M * noise[:3]
+            state[3:] += VELOCITY_NOISE_MPS * noise[3:]
+        acceleration = self.vehicles.acceleration.T.tolist()
+        for k, (row, a) in enumerate(zip(state.T.tolist(), acceleration, strict=True)):
+            estimate = self.estimates[k]
+            estimate.position = tuple(row[:3])
+            estimate.velocity = tuple(row[3:])
+            estimate.acceleration = tuple(a)
+
+    def _proximity(self, modes: list[str]) -> None:
+        """Two flying vehicles that come too close, and what that does to them."""
+        flying = [k for k, mode in enumerate(modes) if mode != OFF and self.vehicles.position[2, k] > 0.05]
+        p = self.vehicles.position[:, flying]
+        gap: NDArray[np.float64] = p[:, :, None] - p[:, None, :]
+        distance = np.sqrt((gap * gap).sum(axis=0))
+        near = set()
+        for i, j in np.argwhere(np.triu(distance < self.config.collision_m, 1)):
+            a, b, d = flying[i], flying[j], float(distance[i, j])
+            near.add((a, b))
+            if (a, b) not in self._close_pairs:
+                self._report(a, "collision", other=b + 1, distance=round(d, 3))
+            if d < self.config.crash_m:
+                for k in (a, b):
+                    self._report(k, "crash")
+                    self.firmware[k].supervisor.tumbled = True
+        self._close_pairs = near
+
+    def _report(self, index: int, name: str, **details: Any) -> None:
+        self.truth.event(self.time, index + 1, name, **details)
+
+    # -- links ------------------------------------------------------------------------------------------------------
+    def _serve(self, timeout: float) -> None:
+        for key, _ in self._selector.select(timeout):
+            if key.data < 0:
+                self._serve_control()
+                continue
+            sock = self._links[key.data].socket
+            while sock is not None:
+                try:
+                    datagram, host = sock.recvfrom(256)
+                except (BlockingIOError, ConnectionError):
+                    break
+                self._receive(key.data, datagram, host)
+
+    def _receive(self, index: int, datagram: bytes, host: tuple[str, int]) -> None:
+        link = self._links[index]
+        if link.frozen or (link.drop_up and self._loss.random() < link.drop_up):
+            return
+        link.host = host
+        reply = self.peers[index].receive(datagram, self.time)
+        if reply is not None:
+            self._send(link, reply)
+
+    def _send(self, link: _Link, datagram: bytes) -> None:
+        if link.socket is None or link.host is None or link.frozen:
+            return
+        if link.drop_down and self._loss.random() < link.drop_down:
+            return
+        # A host that has gone, or a full buffer: the packet is lost, as on the air.
+        with contextlib.suppress(OSError):
+            link.socket.sendto(datagram, link.host)
+
+    def _send_logs(self) -> None:
+        for peer, link in zip(self.peers, self._links, strict=True):
+            if peer.blocks and link.host is not None:
+                for datagram in peer.log_packets(self.tick, self.time):
+                    self._send(link, datagram)
+
+    # -- faults -----------------------------------------------------------------------------------------------------
+    def _serve_control(self) -> None:
+        if self._control is None:
+            return
+        try:
+            data, host = self._control.recvfrom(2048)
+        except (BlockingIOError, ConnectionError):
+            return
+        try:
+            request = json.loads(data)
+            if not isinstance(request, dict):
+                raise ConfigError("request", request, "a JSON object")
+            self.fault(request)
+            answer: dict[str, Any] = {"ok": True, "t": self.time}
+        except ConfigError as error:
+            answer = {"ok": False, "field": error.field, "value": error.value, "allowed": error.allowed}
+        except ValueError:
+            answer = {"ok": False, "field": "request", "value": data[:40].decode("ascii", "replace")}
+            answer["allowed"] = "a JSON object"
+        with contextlib.suppress(OSError):
+            self._control.sendto(json.dumps(answer, default=str).encode(), host)
+
+    def fault(self, request: dict[str, Any]) -> None:
+        """Let vehicles fail.
+
+        :param request: see `dtsa_bench.fake_crazyflie.control.check_fault`.
+        :raises ConfigError: it is not understood.
+        """
+        name, indices = check_fault(request, self.config.count)
+        for k in indices:
+            self._apply(name, k, request)
+            if request.get("seconds") is not None:
+                self._links[k].heal_at = self.time + request["seconds"]
+
+    def _apply(self, name: str, index: int, request: dict[str, Any]) -> None:
+        link, firmware = self._links[index], self.firmware[index]
+        numbers = {key: value for key, value in request.items() if key in ("rate", "direction", "voltage", "seconds")}
+        self._report(index, f"fault: {name}", **numbers)
+        if name == "drop":
+            rate, direction = request.get("rate", 1.0), request.get("direction", "both")
+            link.drop_up = rate if direction in ("up", "both") else link.drop_up
+            link.drop_down = rate if direction in ("down", "both") else link.drop_down
+        elif name == "freeze":
+            link.frozen = True
+        elif name == "close" and link.socket is not None:
+            self._selector.unregister(link.socket)
+            link.socket.close()
+            link.socket = None
+        elif name == "refuse_arming":
+            firmware.supervisor.refuse_arming = True
+        elif name == "tumble":
+            firmware.supervisor.tumbled = True
+        elif name == "battery":
+            motors = firmware.supervisor.motors_allowed and firmware.supervisor.flying
+            firmware.battery.force(request.get("voltage", 3.0), motors=motors)
+        elif name in ("heal", "reboot"):
+            self._heal(index)
+            if name == "reboot":
+                firmware.reset()
+                self.peers[index].reset()
+
+    def _heal(self, index: int) -> None:
+        link = self._links[index]
+        link.drop_up = link.drop_down = 0.0
+        link.frozen = False
+        link.heal_at = None
+        if link.socket is None:
+            link.socket = self._bind(self.config.base_port + index)
+            self._selector.register(link.socket, selectors.EVENT_READ, index)
+        self.firmware[index].supervisor.refuse_arming = False
+        self.firmware[index].supervisor.tumbled = False

@@ -1,0 +1,150 @@
+"""The firmware's supervisor: may the motors run, and what happens when things go wrong.
+
+States, timeouts and their order are those of the Crazyflie's firmware (supervisor.c, supervisor_state_machine.c).
+Times are arguments in seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+NOT_READY = "pre-flight checks not passed"
+CHECKED = "pre-flight checks passed"
+READY = "ready to fly"
+FLYING = "flying"
+LANDED = "landed"
+LEVEL_OUT = "level out"
+LOCKED = "locked"
+CRASHED = "crashed"
+
+MOTORS_ALLOWED = frozenset({READY, FLYING, LANDED, LEVEL_OUT})
+
+LEVEL_OUT_S = 0.5  # age of the setpoint at which a flying Crazyflie levels out
+SHUTDOWN_S = 2.0  # ... and at which it stops its motors
+FLYING_HYSTERESIS_S = 2.0  # low thrust for that long: not flying any more
+EMERGENCY_WATCHDOG_S = 1.0
+PREFLIGHT_TIMEOUT_S = 30.0  # armed, but not taken off
+LANDING_TIMEOUT_S = 3.0  # landed: disarmed after that long
+
+CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
+IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
+HL_ACTIVE, HL_FINISHED, HL_DISABLED = 256, 512, 1024
+
+
+class Supervisor:
+    """State machine of one Crazyflie.
+
+    :param report: called with the name of each event and details, for the record.
+    """
+
+    def __init__(self, report: Callable[..., None]) -> None:
+        self._report = report
+        self.state = CHECKED
+        self.armed = False
+        self.tumbled = False
+        self.refuse_arming = False
+        self.emergency = ""  # why an emergency stop is in force; latches until a reboot
+        self._watchdog: float | None = None  # time of the last watchdog packet
+        self._thrust: float | None = None  # time of the last thrust
+        self._since = 0.0  # time of the last change of state
+
+    @property
+    def motors_allowed(self) -> bool:
+        """True while setpoints reach the motors."""
+        return self.state in MOTORS_ALLOWED
+
+    @property
+    def flying(self) -> bool:
+        """What the firmware calls flying: thrust now or less than two seconds ago."""
+        return self.state in (FLYING, LEVEL_OUT)
+
+    def request_arming(self, arm: bool) -> bool:
+        """Arm or disarm; False when the firmware refuses."""
+        if arm != self.armed:
+            if arm and (self.state != CHECKED or self.refuse_arming):
+                self._report("arming refused", state=self.state)
+                return False
+            self.armed = arm
+            self._report("armed" if arm else "disarmed")
+        return True
+
+    def request_recovery(self) -> bool:
+        """Leave the crashed state once the Crazyflie stands upright."""
+        if self.state == CRASHED and not self.tumbled:
+            self._report("recovered")
+            self._enter(NOT_READY, self._since)
+        return self.state != CRASHED
+
+    def stop(self, reason: str) -> None:
+        """Emergency stop: latches until a reboot."""
+        if not self.emergency:
+            self.emergency = reason
+
+    def watchdog(self, t: float) -> None:
+        """A packet of the emergency stop watchdog came."""
+        self._watchdog = t
+
+    def update(self, t: float, *, setpoint_age: float, thrust: bool) -> None:
+        """One step.
+
+        :param t: s. :param setpoint_age: s since the last setpoint of any source.
+        :param thrust: the motors turn faster than idle.
+        """
+        if thrust:
+            self._thrust = t
+        if self._watchdog is not None and t >= self._watchdog + EMERGENCY_WATCHDOG_S:
+            self.stop("emergency watchdog")
+        in_air = self._thrust is not None and t - self._thrust < FLYING_HYSTERESIS_S
+        state = self._next(t, setpoint_age, in_air)
+        if state != self.state:
+            self._enter(state, t)
+
+    def _next(self, t: float, age: float, in_air: bool) -> str:
+        state = self.state
+        if self.emergency:
+            return LOCKED
+        if state in (LOCKED, CRASHED):
+            return state
+        if state == NOT_READY:
+            return state if self.tumbled else CHECKED
+        if state == CHECKED:
+            if self.tumbled:
+                return NOT_READY
+            return READY if self.armed else CHECKED
+        if state == READY:
+            if self.tumbled or not self.armed or t - self._since > PREFLIGHT_TIMEOUT_S:
+                return NOT_READY
+            return FLYING if in_air else READY
+        if state in (FLYING, LEVEL_OUT):
+            if self.tumbled or not self.armed or age > SHUTDOWN_S:
+                return CRASHED
+            if not in_air:
+                return LANDED
+            return LEVEL_OUT if age > LEVEL_OUT_S else FLYING
+        if self.tumbled or not self.armed or t - self._since > LANDING_TIMEOUT_S:  # landed
+            return NOT_READY
+        return FLYING if in_air else LANDED
+
+    def _enter(self, state: str, t: float) -> None:
+        before, self.state, self._since = self.state, state, t
+        details = {"reason": self.emergency} if state == LOCKED else {}
+        if state == CRASHED:
+            details["reason"] = "tumbled" if self.tumbled else "disarmed" if not self.armed else "setpoints ceased"
+        self._report("state", state=state, before=before, **details)
+        if state not in MOTORS_ALLOWED and self.armed:
+            self.armed = False
+            self._report("disarmed")
+
+    def info(self, *, planner_state: str, trajectory_finished: bool) -> int:
+        """The bit field `supervisor.info`."""
+        bits = IS_ARMED if self.armed else 0
+        bits |= CAN_BE_ARMED if self.state == CHECKED and not self.refuse_arming else 0
+        bits |= CAN_FLY if self.motors_allowed else 0
+        bits |= IS_FLYING if self.flying else 0
+        bits |= IS_TUMBLED if self.tumbled else 0
+        bits |= IS_LOCKED if self.state == LOCKED else 0
+        bits |= IS_CRASHED if self.state == CRASHED else 0
+        bits |= HL_ACTIVE if planner_state in ("flying", "landing") else 0
+        bits |= HL_FINISHED if trajectory_finished else 0
+        bits |= HL_DISABLED if planner_state == "disabled" else 0
+        return bits

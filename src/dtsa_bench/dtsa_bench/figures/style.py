@@ -1,0 +1,127 @@
+"""How all figures look, and how they are saved."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("agg")
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+INK, QUIET, GRID = "#1d2733", "#5b6774", "#dfe4ea"
+# Colours that stay apart for colour-blind readers and in grey print, in the order in which series get them.
+CYCLE = ("#c8553d", "#3d6fa8", "#2a9d77", "#e0a526", "#7a5ba6", "#6b7785", "#b0578d")
+# Schemes have the same colour in every figure.
+COLOURS = {
+    "TDMA, hold": "#c8553d", "DTSA, hold": "#e59a7f", "TDMA, linear": "#3d6fa8", "DTSA, linear": "#2a9d77",
+    "TDMA, intent": "#7fa8d6", "age, linear": "#e0a526", "oracle": "#6b7785", "lease": "#7a5ba6",
+    "tdma": "#3d6fa8", "dtsa": "#2a9d77", "age": "#e0a526", "aloha": "#b0578d",
+}  # fmt: skip
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+
+_SETTINGS = {
+    "font.family": "sans-serif", "font.sans-serif": ["DejaVu Sans"], "font.size": 9, "axes.titlesize": 10,
+    "axes.titleweight": "bold", "axes.titlelocation": "left", "axes.titlepad": 9, "axes.labelcolor": INK,
+    "axes.edgecolor": QUIET, "axes.linewidth": 0.8, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "axes.axisbelow": True, "grid.color": GRID, "grid.linewidth": 0.8, "text.color": INK,
+    "xtick.color": QUIET, "ytick.color": QUIET, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
+    "xtick.major.size": 3, "ytick.major.size": 3, "legend.frameon": False, "legend.fontsize": 9,
+    "figure.facecolor": "white", "savefig.facecolor": "white", "lines.linewidth": 1.8,
+    "lines.markersize": 4.5,
+    "svg.fonttype": "none", "svg.hashsalt": "dtsa", "figure.dpi": 100,
+}  # fmt: skip
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Settings that hold while figures are drawn and saved."""
+    with mpl.rc_context(_SETTINGS):
+        yield
+
+
+def colour(name: object, index: int) -> str:
+    """The colour of a series.
+
+    :param name: its name; schemes have a colour of their own.
+    :param index: its place among the series of the figure.
+    """
+    return COLOURS.get(str(name), CYCLE[index % len(CYCLE)])
+
+
+def colours(names: Sequence[object]) -> list[str]:
+    """Colours of the series of one figure, all different."""
+    taken = [COLOURS.get(str(name)) for name in names]
+    spare = iter([c for c in CYCLE if c not in taken] + list(CYCLE))
+    return [own if own is not None else next(spare) for own in taken]
+
+
+def panels(count: int, width: float = 3.3, height: float = 3.1, columns: int = 3) -> tuple[Figure, list[Axes]]:
+    """A figure with some panels side by side.
+
+    :param count: number of panels.
+    :param width: of a panel, inches.
+    :param height: of a panel, inches.
+    :param columns: largest number in a row.
+    """
+    across = min(count, columns)
+    down = -(-count // across)
+    figure = Figure(figsize=(width * across, height * down), layout="constrained")
+    grid = figure.subplots(down, across, squeeze=False)
+    axes = list(grid.flat)
+    for spare in axes[count:]:
+        spare.remove()
+    return figure, axes[:count]
+
+
+def legend_above(figure: Figure, handles: Sequence[Any], names: Sequence[object]) -> None:
+    """One legend for all panels, above them."""
+    if len(names) > 1:
+        figure.legend(
+            handles,
+            [str(name) for name in names],
+            loc="outside upper left",
+            ncols=min(len(names), 5),
+            columnspacing=1.4,
+            handlelength=1.4,
+        )
+
+
+def svg_text(figure: Figure) -> str:
+    """The figure as SVG that can stand inside HTML; equal figures give equal text."""
+    buffer = io.StringIO()
+    with style():
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def save(figure: Figure, directory: Path, name: str) -> str:
+    """Saves a figure as PNG (200 dpi) and SVG.
+
+    :param figure: the figure.
+    :param directory: where; made if needed.
+    :param name: file name without suffix.
+    :returns: the SVG's text, with ids that are its own so that several fit on one page.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    text = svg_text(figure)
+    (directory / f"{name}.svg").write_text('<?xml version="1.0" encoding="utf-8"?>\n' + text, encoding="utf-8")
+    with style():
+        figure.savefig(directory / f"{name}.png", dpi=200)
+    return unique_ids(text, name)
+
+
+def unique_ids(svg: str, prefix: str) -> str:
+    """The SVG with all its ids prefixed, so that several can stand on one page."""
+    prefix = re.sub(r"[^A-Za-z0-9_-]", "-", prefix)
+    svg = re.sub(r'\bid="', f'id="{prefix}-', svg)
+    svg = re.sub(r'href="#', f'href="#{prefix}-', svg)
+    return re.sub(r"url\(#", f"url(#{prefix}-", svg)

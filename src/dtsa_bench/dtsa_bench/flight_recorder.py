@@ -1,0 +1,187 @@
+"""Writes a flight into a bag: every message that went over the graph, and what follows from them, slot by slot."""
+
+from __future__ import annotations
+
+from array import array
+from pathlib import Path
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from dtsa_msgs.msg import Decision, Reception
+from rcl_interfaces.msg import ParameterType
+from rclpy.serialization import serialize_message
+
+from dtsa_agent.core import REASONS
+from dtsa_agent.ros import names
+from dtsa_agent.ros.wire import pack_received
+from dtsa_bench.bag.cdr import HEADER, SECOND, CdrBuilder, OdometryPacker
+from dtsa_bench.bag.writer import BagWriter
+from dtsa_bench.run_config import RunConfig
+from dtsa_channel_sim import Change
+from dtsa_channel_sim.answers import Answers
+from dtsa_channel_sim.verdict import Verdict
+
+
+def stamp(time_ns: int) -> Time:
+    """A time as a message."""
+    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
+    return Time(sec=seconds, nanosec=nanoseconds)
+
+
+class FlightRecorder:
+    """Writes a flight into a bag, slot after slot; see docs/recording.md for topics and times.
+
+    A slot counts as flown once all agents have told where it took them, in their answers to the next one. What a flight
+    that is cut short leaves half done does not get into its bag.
+
+    :param directory: the bag's directory.
+    :param run: the run.
+    """
+
+    def __init__(self, directory: Path, run: RunConfig) -> None:
+        self.run = run
+        agents = run.swarm.agents
+        self.bag = BagWriter(directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed)})
+        add = self.bag.add_topic
+        self._slot = add(f"{names.SWARM}/{names.SLOT}", "dtsa_msgs/msg/Slot")
+        self._transmission = add(f"{names.SWARM}/{names.TRANSMISSION}", "dtsa_msgs/msg/Transmission")
+        self._reception = add(f"{names.SWARM}/{names.RECEPTION}", "dtsa_msgs/msg/Reception")
+        self._decision = add(f"{names.SWARM}/{names.DECISION}", "dtsa_msgs/msg/Decision")
+        self._markers = add(f"{names.SWARM}/{names.MARKERS}", "visualization_msgs/msg/MarkerArray")
+        self._event = 0
+        spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
+        self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry", "sensor_data") for space in spaces]
+        self._packer = OdometryPacker([f"{space[1:]}/base_link" for space in spaces], names.FRAME)
+        self._messages: dict[int, list[tuple[bytes, int]]] = {}
+        self._answers: dict[int, list[tuple[bytes, bytes]]] = {}
+        self._reasons: dict[bytes, tuple[list[str], array[int]]] = {}
+        self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
+        self._pending_slot = -1
+        self._complete = -1  # last slot that all have answered
+        self.decision = self.reception = b""  # the last slot's, as CDR
+
+    def time_ns(self, slot: int) -> int:
+        """Simulated time at which a slot starts, ns."""
+        return names.slot_time_ns(slot, self.run.swarm.slot_ns)
+
+    def opened(self, slot: int, data: bytes, time_ns: int) -> None:
+        """Keeps a slot message for its turn."""
+        self._messages.setdefault(slot, []).append((data, time_ns))
+
+    def answer(self, slot: int, ids: bytes, data: bytes) -> None:
+        """Keeps a transmission message for its turn."""
+        self._answers.setdefault(slot, []).append((ids, data))
+
+    def complete(self, slot: int) -> None:
+        """All agents have answered a slot."""
+        self._complete = slot
+
+    def _write_messages(self, slot: int) -> None:
+        """Writes a slot's own message and all answers to it, in the order of their ids."""
+        at = self.time_ns(slot)
+        for data, time_ns in self._messages.pop(slot, []):
+            self.bag.write(self._slot, data, time_ns, time_ns)
+        for _, answer in sorted(self._answers.pop(slot, [])):
+            self.bag.write(self._transmission, answer, at, at)
+
+    def _write_pending(self) -> None:
+        """Writes all about the slot before the last one that was answered."""
+        if self._pending_slot < self._complete:
+            self._write_messages(self._pending_slot)
+            for channel, data, at in self._pending:
+                self.bag.write(channel, data, at, at)
+            self._pending = []
+
+    def write(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        """Takes in everything about a slot whose frames the air has carried.
+
+        :param slot: the slot.
+        :param answers: what the agents answered to it.
+        :param verdict: the channel's verdict on it.
+        """
+        self._write_pending()
+        begin, end = self.time_ns(slot), self.time_ns(slot + 1)
+        self.decision = self._decision_cdr(slot, begin, answers)
+        self.reception = self._reception_cdr(slot, end, verdict)
+        motion = self._packer.pack(begin, answers.position, answers.velocity)
+        self._pending_slot = slot
+        self._pending = [(self._decision, self.decision, begin)]
+        self._pending += [(channel, data, begin) for channel, data in zip(self._odometry, motion, strict=True)]
+        self._pending.append((self._reception, self.reception, end))
+
+    def _decision_cdr(self, slot: int, begin: int, answers: Answers) -> bytes:
+        key = answers.reason.tobytes()
+        known = self._reasons.get(key)
+        if known is None:
+            used = np.unique(answers.reason)
+            labels = [REASONS[code] if code < len(REASONS) else str(code) for code in used]
+            known = labels, array("B", np.searchsorted(used, answers.reason).astype(np.uint8).tobytes())
+            self._reasons[key] = known
+        message = Decision(
+            stamp=stamp(begin),
+            slot=slot,
+            agent=array("H", range(1, answers.agents + 1)),
+            chosen=array("H", answers.chosen.tobytes()),
+            reason_name=known[0],
+            reason_index=known[1],
+            reason=array("B", key),
+            digest=array("Q", answers.digest.tobytes()),
+            score=array("d", answers.score.tobytes()),
+        )
+        return bytes(serialize_message(message))
+
+    def _reception_cdr(self, slot: int, end: int, verdict: Verdict) -> bytes:
+        nothing = (0,) * len(verdict.senders)
+        received = pack_received(verdict.mask(self.run.swarm.agents)) if verdict.senders else b""
+        message = Reception(
+            stamp=stamp(end),
+            slot=slot,
+            outcome=verdict.outcome,
+            sender=array("H", verdict.senders),
+            received=array("B", received),
+            lost=array("H", verdict.lost or nothing),
+            collided=array("H", verdict.collided or nothing),
+        )
+        return bytes(serialize_message(message))
+
+    def show(self, slot: int, data: bytes) -> None:
+        """Takes in a picture of the swarm at the start of the slot that was written last."""
+        self._pending.append((self._markers, data, self.time_ns(slot)))
+
+    def channel_changed(self, change: Change) -> None:
+        """Writes a change of the channel's settings, made while it ran, as a ParameterEvent at its first slot."""
+        if not self._event:
+            self._event = self.bag.add_topic("/parameter_events", "rcl_interfaces/msg/ParameterEvent")
+        at = self.time_ns(change.slot)
+        self.bag.write(self._event, _parameter_event(at, f"{names.SWARM}/channel", change), at, at)
+
+    def close(self) -> None:
+        """Writes what is complete and finishes the bag."""
+        self._write_pending()
+        for slot in sorted({*self._messages, *self._answers}):
+            if slot <= self._complete:
+                self._write_messages(slot)
+        self.bag.close()
+
+
+def _parameter_event(time_ns: int, node: str, change: Change) -> bytes:
+    """A rcl_interfaces/ParameterEvent as CDR; rclpy would leave unused bytes at its end, which some readers refuse."""
+    values = [(name, value) for name, value in change.values if isinstance(value, (bool, int, float, str))]
+    message = CdrBuilder()
+    seconds, nanoseconds = divmod(time_ns, SECOND)
+    message.number("i", seconds)
+    message.number("I", nanoseconds)
+    message.text(node)
+    message.number("I", 0, len(values))  # new_parameters, changed_parameters
+    for name, value in values:
+        kind = next(
+            i for i, cls in enumerate((bool, int, float, str), ParameterType.PARAMETER_BOOL) if isinstance(value, cls)
+        )
+        message.text(name)
+        message.number("B", kind, value if isinstance(value, bool) else 0)
+        message.number("q", value if kind == ParameterType.PARAMETER_INTEGER else 0)
+        message.number("d", value if isinstance(value, float) else 0.0)
+        message.text(value if isinstance(value, str) else "")
+        message.number("I", 0, 0, 0, 0, 0)  # the five kinds of arrays
+    message.number("I", 0)  # deleted_parameters
+    return HEADER + bytes(message.data)

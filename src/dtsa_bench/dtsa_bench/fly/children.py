@@ -1,0 +1,108 @@
+"""The processes of a flight: started together, watched, ended together."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.ros.process import SUPERVISOR
+
+_LEAVE_S = 1.0  # to end by themselves once the run is over
+_TERM_S = 1.0  # to end after SIGTERM
+
+
+class NodeError(DtsaError):
+    """A node of the flight ended when it should not have."""
+
+
+@dataclass(slots=True)
+class Child:
+    """One process."""
+
+    name: str  # as the user knows it, e.g. "cf3"
+    agents: Sequence[int]  # ids of the agents in it
+    process: subprocess.Popen[bytes]
+    log: Path
+
+
+class Children:
+    """The processes that one supervisor started.
+
+    :param logs: directory for what they print.
+    :param environment: their environment variables, on top of this process's.
+    """
+
+    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
+        self._logs = logs
+        self._environment = {**os.environ, **environment, SUPERVISOR: str(os.getpid())}
+        self.all: list[Child] = []
+        self._told: list[Child] = []
+
+    def start(self, name: str, agents: Sequence[int], module: str, arguments: Sequence[str]) -> None:
+        """Starts `python -m module arguments` in a session of its own, so that Ctrl-C in the terminal reaches the
+        supervisor alone, which then ends all in good order.
+
+        :param name: what errors call it.
+        :param agents: ids of the agents in it.
+        """
+        log = self._logs / f"{name.replace(' ', '')}.log"
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                start_new_session=True,
+            )
+        self.all.append(Child(name, agents, process, log))
+
+    def ended(self) -> list[Child]:
+        """Processes that have ended since this was asked last."""
+        fresh = [child for child in self.all if child.process.poll() is not None and child not in self._told]
+        self._told += fresh
+        return fresh
+
+    def check(self) -> None:
+        """Looks whether all are alive.
+
+        :raises NodeError: naming those that are not, and why.
+        """
+        ended = [child for child in self.all if child.process.poll() is not None]
+        if ended:
+            raise NodeError("; ".join(describe_end(child) for child in ended))
+
+    def stop(self) -> list[str]:
+        """Waits until all have ended, and helps those that do not.
+
+        :returns: names of those that had to be helped.
+        """
+        helped: dict[str, None] = {}
+        for number, patience in ((None, _LEAVE_S), (signal.SIGTERM, _TERM_S), (signal.SIGKILL, 10.0)):
+            alive = [child for child in self.all if child.process.poll() is None]
+            if number is not None:
+                for child in alive:
+                    helped[child.name] = None
+                    child.process.send_signal(number)
+            deadline = time.monotonic() + patience
+            while time.monotonic() < deadline and any(child.process.poll() is None for child in alive):
+                time.sleep(0.01)
+        return list(helped)
+
+
+def describe_end(child: Child) -> str:
+    """Why a process ended, in one line."""
+    code = child.process.returncode
+    who = f"{child.name} (process {child.process.pid})"
+    if code < 0:
+        return f"{who} was killed by {signal.Signals(-code).name}"
+    lines = child.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    said = f": {lines[-1]}" if lines else ""
+    return f"{who} ended with code {code}{said}"

@@ -1,0 +1,396 @@
+"""A mission with Crazyflies: take-off, exchange of places in real time, landing; recorded like any other flight."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from builtin_interfaces.msg import Duration
+from dtsa_msgs.msg import Status
+from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff
+from geometry_msgs.msg import Point
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Empty as EmptyMessage
+from std_srvs.srv import Empty, Trigger
+
+from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.crazyflie.config import SwarmSettings
+from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.units import to_map
+from dtsa_agent.ros import names
+from dtsa_agent.ros.loop import Stop
+from dtsa_agent.ros.parameters import to_parameters
+from dtsa_bench.options import new_directory
+from dtsa_bench.recorded_channel import BAG, write_results
+from dtsa_bench.run_config import LOCKSTEP, RunConfig
+from dtsa_channel_sim.channel_node import declare_channel
+
+from .children import Child, Children, describe_end
+from .domain import ros_domain
+from .flight import ENVIRONMENT, Flight, FlightOptions, SupervisedRealtimeChannel
+from .progress import ProgressLine
+
+PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
+ARRIVED_M = 0.12  # m: at its start when this close
+CLIMB_MPS = 0.4
+SHIFT_MPS = 0.3
+BRIDGE_S = 60.0  # s, for the connections
+BRIDGE_END_S = 40.0  # s, to land by itself and close the links
+
+
+class MissionError(DtsaError):
+    """The mission cannot go on; everybody is landed."""
+
+
+def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of the swarm that a mission chooses unless the user does.
+
+    The paper's room: an ellipse of half axes 1.2 m and 2.0 m, ids in order, so that everyone finds its place.
+
+    :param settings: the swarm's YAML.
+    :param given: what the user has set, by name.
+    """
+    defaults = {"agents": len(settings.robots), "shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
+    return {name: value for name, value in defaults.items() if given.get(name) is None}
+
+
+def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
+    """The scenario, once it is sure that everybody stands where it begins.
+
+    :raises ConfigError: ids are missing, or a vehicle's place is not where the scenario wants it.
+    """
+    ids = [robot.id for robot in settings.robots]
+    if ids != list(range(1, config.agents + 1)):
+        raise ConfigError("robots", ids, f"the ids 1 to {config.agents}, one for each agent")
+    scenario = make_scenario(config)
+    origin = settings.station.room_origin_in_world
+    for robot, start in zip(settings.robots, scenario.start.T, strict=True):
+        x, y, _ = to_map(robot.initial_position, origin)
+        if np.hypot(x - start[0], y - start[1]) > PLACE_M:
+            raise ConfigError(
+                f"robots.{robot.name}.initial_position", list(robot.initial_position),
+                f"a place within {PLACE_M} m of ({start[0] + origin[0]:.2f}, {start[1] + origin[1]:.2f}), "
+                "where this scenario begins",
+            )  # fmt: skip
+    return scenario
+
+
+class MissionChannel(SupervisedRealtimeChannel):
+    """A supervised channel that watches over the bridge, too."""
+
+    bridge: Children | None = None
+
+    def idle(self) -> None:
+        """Called about ten times a second.
+
+        :raises NodeError: the bridge has ended.
+        """
+        if self.bridge is not None:
+            self.bridge.check()
+        super().idle()
+
+
+@dataclass(slots=True)
+class _Ended:
+    """True once the flight has to end: a signal, or a vehicle in trouble."""
+
+    stop: Stop
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.stop) or bool(self.reason)
+
+
+class Mission:
+    """What the ground station does: it calls the bridge's services, watches the vehicles, and is alive.
+
+    :param node: a node of its own.
+    :param settings: the swarm's YAML.
+    :param scenario: where everybody starts.
+    :param ended: is told why when something goes wrong.
+    :param say: prints a line.
+    """
+
+    def __init__(
+        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: _Ended, say: Callable[[str], None]
+    ) -> None:
+        self.node, self.settings, self.scenario, self.ended, self.say = node, settings, scenario, ended, say
+        self.status: dict[str, Status] = {}
+        self.place: dict[str, tuple[float, float, float]] = {}
+        self.exchanging = False
+        self.bridge_alive: Callable[[], None] = lambda: None
+        self._odometry: list[Any] = []
+        for robot in settings.robots:
+            node.create_subscription(Status, f"/{robot.name}/status", self._keep_status(robot.name), 10)
+            subscription = node.create_subscription(Odometry, f"/{robot.name}/odom", self._keep_place(robot.name), 1)
+            self._odometry.append(subscription)
+        self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
+        self._beating = threading.Event()
+        self._over = threading.Event()
+        self._clients: dict[str, Any] = {}
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._spinner = threading.Thread(target=self._executor.spin, name="mission", daemon=True)
+        self._pulse = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def _keep_status(self, name: str) -> Callable[[Status], None]:
+        def keep(message: Status) -> None:
+            self.status[name] = message
+            if self.exchanging and message.state != Status.STATE_FLYING and not self.ended.reason:
+                self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
+
+        return keep
+
+    def _keep_place(self, name: str) -> Callable[[Odometry], None]:
+        def keep(message: Odometry) -> None:
+            p = message.pose.pose.position
+            self.place[name] = p.x, p.y, p.z
+
+        return keep
+
+    def _beat(self) -> None:
+        while not self._over.wait(0.1):
+            if self._beating.is_set():
+                self._heartbeat.publish(EmptyMessage())
+
+    def start(self) -> None:
+        """Begin to listen."""
+        self._spinner.start()
+        self._pulse.start()
+
+    def close(self) -> None:
+        """End of all threads."""
+        self._over.set()
+        self._executor.shutdown()
+        self._spinner.join(2.0)
+        self._pulse.join(2.0)
+
+    def _client(self, kind: Any, name: str) -> Any:
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        return self._clients[name]
+
+    def call(self, kind: Any, name: str, timeout: float = 10.0, **fields: Any) -> Any:
+        """Call a service.
+
+        :raises MissionError: it does not answer or says no.
+        """
+        future = self._client(kind, name).call_async(kind.Request(**fields))
+        end = time.monotonic() + timeout
+        while not future.done():
+            self.bridge_alive()
+            if time.monotonic() > end:
+                raise MissionError(f"service {name} does not answer")
+            time.sleep(0.005)
+        response = future.result()
+        if not getattr(response, "success", True):
+            raise MissionError(f"{name}: {response.message}")
+        return response
+
+    def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
+        """Wait until something is so.
+
+        :raises MissionError: it takes too long, or the user interrupts.
+        """
+        end = time.monotonic() + timeout
+        while not condition():
+            self.bridge_alive()
+            if self.ended:
+                raise MissionError(self.ended.reason or "interrupted")
+            if time.monotonic() > end:
+                missing = [f"{n} {s.state_name} ({s.reason})" for n, s in self.status.items()]
+                raise MissionError(f"{what} took longer than {timeout:g} s: {', '.join(missing)}")
+            time.sleep(0.02)
+
+    def _all(self, *states: int) -> bool:
+        return len(self.status) == len(self.settings.robots) and all(s.state in states for s in self.status.values())
+
+    def take_off(self) -> None:
+        """Bridge up, arm, climb to the middle of the room, go to the start."""
+        emergency = self._client(Empty, "/all/emergency")
+        self.wait("the bridge's start", emergency.service_is_ready, BRIDGE_S)
+        self._beating.set()
+        self.wait("the connection", lambda: self._all(Status.STATE_READY), 10.0)
+        self.say("arming")
+        self.call(Arm, "/all/arm", arm=True)
+        self.wait("arming", lambda: self._all(Status.STATE_ARMED), 5.0)
+        height = self.settings.station.room_origin_in_world[2]
+        seconds = max(2.0, height / CLIMB_MPS)
+        self.say("take-off")
+        self.call(Takeoff, "/all/takeoff", height=height, duration=_duration(seconds))
+        time.sleep(seconds)
+        self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
+        self.wait("odometry", lambda: len(self.place) == len(self.settings.robots), 5.0)
+        for robot, start in zip(self.settings.robots, self.scenario.start.T.tolist(), strict=True):
+            seconds = 1.5 + float(np.linalg.norm(np.subtract(start, self.place[robot.name]))) / SHIFT_MPS
+            goal = Point(x=start[0], y=start[1], z=start[2])
+            self.call(GoTo, f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
+        self.wait("the way to the start", self._at_start, 20.0)
+        time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count
+        # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
+        self._executor.create_task(self._forget_odometry)
+        self.exchanging = True
+
+    def _forget_odometry(self) -> None:
+        while self._odometry:
+            self.node.destroy_subscription(self._odometry.pop())
+
+    def _at_start(self) -> bool:
+        away = [
+            np.linalg.norm(np.subtract(self.place[robot.name], start))
+            for robot, start in zip(self.settings.robots, self.scenario.start.T, strict=True)
+        ]
+        return max(away) < ARRIVED_M
+
+    def land(self, urgent: threading.Event) -> None:
+        """Land whoever is in the air and wait until all stand.
+
+        :param urgent: once set, all motors are stopped at once.
+        """
+        self.exchanging = False
+        flying = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)
+        if any(s.state in flying for s in self.status.values()):
+            self.say("landing")
+            height = self.settings.station.room_origin_in_world[2]
+            future = self._client(Land, "/all/land").call_async(
+                Land.Request(duration=_duration(max(2.0, height / CLIMB_MPS)))
+            )
+            end = time.monotonic() + self.settings.station.landing_timeout_s
+            while time.monotonic() < end and any(s.state in flying for s in self.status.values()):
+                if urgent.is_set():
+                    self.say("EMERGENCY STOP")
+                    self._client(Empty, "/all/emergency").call_async(Empty.Request())
+                    time.sleep(0.5)
+                    break
+                time.sleep(0.05)
+            future.cancel()
+        end_heartbeat = self._client(Trigger, "/all/end_heartbeat")
+        if end_heartbeat.service_is_ready():
+            future = end_heartbeat.call_async(Trigger.Request())
+            end = time.monotonic() + 2.0
+            while not future.done() and time.monotonic() < end:
+                time.sleep(0.01)
+        self._beating.clear()
+
+
+def _duration(seconds: float) -> Duration:
+    return Duration(sec=int(seconds), nanosec=int((seconds % 1.0) * 1e9))
+
+
+def fly_crazyflies(
+    run: RunConfig, settings: SwarmSettings, swarm_yaml: Path, out: str | Path, options: FlightOptions, stop: Stop
+) -> tuple[Flight, str]:
+    """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
+
+    :param run: what is flown; the number of agents is that of the robots.
+    :param settings: the swarm's YAML, read.
+    :param swarm_yaml: its path.
+    :param out: directory for the bag and the results.
+    :param options: domain, pictures.
+    :param stop: a flag that ends the mission early.
+    :returns: the results, and why the exchange was cut short (empty: it was not).
+    :raises ConfigError: before anything has been started.
+    :raises DtsaError: something failed before the exchange began, or a node died.
+    """
+    if run.mode == LOCKSTEP:
+        raise ConfigError("mode", run.mode, "realtime: vehicles do not wait for the agents")
+    require_cflib()
+    scenario = check_places(settings, run.swarm)
+    with ros_domain(options.domain) as domain:
+        directory = new_directory(out)
+        logs = directory / "log"
+        logs.mkdir()
+        for name, value in ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
+        environment = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs.resolve())}
+        os.environ["ROS_LOG_DIR"] = environment["ROS_LOG_DIR"]
+        context = Context()
+        progress = ProgressLine("fly")
+        bridge, agents = Children(logs, environment), Children(logs, environment)
+        bridge.start("bridge", [], "dtsa_agent.crazyflie.bridge_node",
+                     ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
+        ended = _Ended(stop)
+        mission: Mission | None = None
+        try:
+            rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            node = Node("mission", context=context, enable_rosout=False, start_parameter_services=False)
+            mission = Mission(node, settings, scenario, ended, progress.show)
+            mission.bridge_alive = bridge.check
+            mission.start()
+            mission.take_off()
+            _start_agents(agents, run, settings, directory)
+            flight = _exchange(context, run, directory, agents, bridge, progress, options, ended)
+            return flight, ended.reason
+        finally:
+            urgent = threading.Event()
+            old = signal.signal(signal.SIGINT, lambda *_: urgent.set())  # one more Ctrl-C is the emergency stop
+            try:
+                agents.stop()
+                if mission is not None:
+                    mission.land(urgent)
+                    mission.close()
+                _end_bridge(bridge.all[0])
+            finally:
+                signal.signal(signal.SIGINT, old)
+            progress.end()
+            context.try_shutdown()
+
+
+def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, directory: Path) -> None:
+    parameters = directory / "parameters.yaml"
+    content = {"/**": {"ros__parameters": to_parameters(run.swarm.to_dict(), SwarmConfig)}}
+    parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    rate = max(robot.command_rate_hz for robot in settings.robots)
+    ids = list(range(1, run.swarm.agents + 1))
+    agents.start("agents", ids, "dtsa_agent.crazyflie.agents_node",
+                 ["--ros-args", "--params-file", str(parameters), "-p", f"command_hz:={float(rate)}",
+                  "--disable-external-lib-logs", "--disable-rosout-logs"])  # fmt: skip
+
+
+def _exchange(context: Context, run: RunConfig, directory: Path, agents: Children, bridge: Children,
+              progress: ProgressLine, options: FlightOptions, ended: _Ended) -> Flight:  # fmt: skip
+    node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
+    try:
+        declare_channel(node, run.air)
+        channel = MissionChannel(node, run, directory, agents, progress, startup_s=options.startup_s, answer_s=2.0)
+        channel.bridge = bridge
+        try:
+            channel.run(ended)
+            channel.show()
+        finally:
+            channel.close()
+            progress.end()
+        summary = write_results(channel, directory, pictures=options.pictures and not ended)
+        summary |= {"backend": "cflib", "cut_short": ended.reason}
+        (directory / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        return Flight(summary, channel.scenario, np.array(channel.positions), directory / BAG)
+    finally:
+        node.destroy_node()
+
+
+def _end_bridge(child: Child) -> None:
+    """The bridge lands whoever may still fly, then closes its links: it gets the time for that."""
+    if child.process.poll() is None:
+        child.process.send_signal(signal.SIGINT)
+    try:
+        child.process.wait(BRIDGE_END_S)
+    except subprocess.TimeoutExpired:
+        child.process.kill()
+        child.process.wait()
+        raise MissionError(f"{describe_end(child)}: it did not end by itself") from None

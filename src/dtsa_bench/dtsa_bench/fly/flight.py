@@ -1,0 +1,250 @@
+"""One flight with real nodes: the channel and the recorder in this process, the agents in others."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from dtsa_agent.core import Scenario, SwarmConfig
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros import names
+from dtsa_agent.ros.loop import Stop
+from dtsa_agent.ros.parameters import to_parameters
+from dtsa_bench.metrics import FlightMetrics
+from dtsa_bench.options import new_directory
+from dtsa_bench.recorded_channel import BAG, RealtimeRecordedChannel, RecordedChannel, write_results
+from dtsa_bench.run_config import LOCKSTEP, RunConfig
+from dtsa_bench.simulate import may_share
+from dtsa_channel_sim import make_clocks
+from dtsa_channel_sim.answers import named
+from dtsa_channel_sim.channel_node import declare_channel
+from dtsa_channel_sim.realtime_channel import LOST_AFTER_S
+
+from .children import Children, describe_end
+from .domain import ros_domain
+from .progress import ProgressLine, flight_text
+
+ENVIRONMENT = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    # A node needs no more threads than its own: NumPy's would cost start-up time and memory.
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOptions:
+    """How a flight is carried out; none of it changes what happens in it."""
+
+    processes: int | None = None  # None: one an agent
+    domain: int | None = None  # None: any that is free
+    startup_s: float = 60.0
+    answer_s: float = 10.0
+    pictures: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """What is left of a flight."""
+
+    summary: dict[str, Any]  # as in summary.json
+    scenario: Scenario
+    positions: NDArray[np.float64]  # (T, 3, N) m, frame map, at the start of each slot
+    bag: Path
+
+
+class Supervision:
+    """What makes a recorded channel look after the agents' processes and show how far it is; mixed into its class."""
+
+    def __init__(
+        self, node: Node, run: RunConfig, directory: Path, children: Children, progress: ProgressLine, **more: Any
+    ) -> None:
+        super().__init__(node, run, directory, **more)  # type: ignore[call-arg]
+        self._children, self._progress = children, progress
+        self._start = time.monotonic()
+
+    def idle(self) -> None:
+        """Called about ten times a second."""
+        super().idle()  # type: ignore[misc]
+        self._look()
+        if not self._progress.due():
+            return
+        if not self.begin_s:  # type: ignore[attr-defined]
+            missing, agents = self.answers.missing, self.agents  # type: ignore[attr-defined]
+            waited = time.monotonic() - self._start
+            self._progress.show(f"starting, {waited:.0f} s, waiting for {missing} of {agents} agents")
+        else:
+            self.show()
+
+    def _look(self) -> None:
+        """Whether all processes are alive: in lockstep the flight cannot go on without one of them."""
+        self._children.check()
+
+    def show(self) -> None:
+        """Brings the progress line up to date."""
+        metrics: FlightMetrics = self.metrics  # type: ignore[attr-defined]
+        flown = metrics.slots * self.slot_ns / 1e9  # type: ignore[attr-defined]
+        closest, pair = metrics.closest()
+        text = flight_text(metrics.slots, flown, self.wall_time_s, closest, pair)  # type: ignore[attr-defined]
+        self._progress.show(text)
+
+
+class SupervisedChannel(Supervision, RecordedChannel):
+    """A lockstep flight under supervision."""
+
+
+class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
+    """A flight in real time under supervision: the others fly on when a process dies."""
+
+    def _look(self) -> None:
+        for child in self._children.ended():
+            if not self.begin_s:
+                self._children.check()
+            self._progress.say(f"{describe_end(child)}; the others fly on")
+            for agent in child.agents:
+                self.lose(agent)
+
+    def silent(self, agent: int) -> None:
+        super().silent(agent)
+        if all(agent not in child.agents for child in self._children.all if child.process.poll() is not None):
+            self._progress.say(f"{named([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")
+
+
+def split(agents: int, processes: int) -> list[list[int]]:
+    """Ids of the agents of each process, as evenly as possible."""
+    return [
+        list(range(agents * index // processes + 1, agents * (index + 1) // processes + 1))
+        for index in range(processes)
+    ]
+
+
+def check_options(run: RunConfig, options: FlightOptions) -> None:
+    """What can be known before anything is started.
+
+    :raises ConfigError: for options that do not fit the run.
+    """
+    agents = run.swarm.agents
+    if options.processes is not None and not 1 <= options.processes <= agents:
+        raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
+    if run.swarm.estimator == "oracle" and (options.processes or agents) > 1:
+        raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
+
+
+def fly(
+    run: RunConfig,
+    out: str | Path,
+    options: FlightOptions | None = None,
+    stop: Stop | None = None,
+    label: str = "fly",
+    started: Callable[[Children], None] | None = None,
+) -> Flight:
+    """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
+
+    :param run: what is flown.
+    :param out: directory for the bag and the results; empty, or not there yet.
+    :param options: how.
+    :param stop: a flag that ends the flight early.
+    :param label: what stands in front of the progress line.
+    :param started: is told the processes once they are started.
+    :returns: its results, which are also in ``out``.
+    :raises ConfigError: for options that are not usable; nothing has been started then.
+    :raises DtsaError: when a node dies, hangs or sends garbage; the message names it.
+    """
+    options = options or FlightOptions()
+    stop = stop if stop is not None else Stop()
+    check_options(run, options)
+    with ros_domain(options.domain) as domain:
+        directory = new_directory(out)
+        (directory / "log").mkdir()
+        for name, value in ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
+        environment = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str((directory / "log").resolve())}
+        os.environ["ROS_LOG_DIR"] = environment["ROS_LOG_DIR"]
+        context = Context()
+        children = Children(directory / "log", environment)
+        progress = ProgressLine(label)
+        # Started first: the interpreter of each process needs longer than all that follows here.
+        _start_agents(children, run, options, directory)
+        try:
+            rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            if started:
+                started(children)
+            return _fly(context, run, directory, children, progress, options, stop)
+        finally:
+            children.stop()
+            context.try_shutdown()
+
+
+def _fly(
+    context: Context,
+    run: RunConfig,
+    directory: Path,
+    children: Children,
+    progress: ProgressLine,
+    options: FlightOptions,
+    stop: Stop,
+) -> Flight:
+    node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
+    try:
+        declare_channel(node, run.air)
+        kind = SupervisedChannel if run.mode == LOCKSTEP else SupervisedRealtimeChannel
+        channel = kind(node, run, directory, children, progress, startup_s=options.startup_s, answer_s=options.answer_s)
+        try:
+            channel.run(stop)
+            channel.show()
+        finally:
+            channel.close()
+            progress.end()
+        children.stop()
+        summary = write_results(channel, directory, pictures=options.pictures and not stop)
+        return Flight(summary, channel.scenario, np.array(channel.positions), directory / BAG)
+    finally:
+        node.destroy_node()
+
+
+def _start_agents(children: Children, run: RunConfig, options: FlightOptions, directory: Path) -> None:
+    swarm = run.swarm
+    parameters = directory / "parameters.yaml"
+    values = {**to_parameters(swarm.to_dict(), SwarmConfig), "mode": run.mode}
+    content = {"/**": {"ros__parameters": values}}
+    parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    common = ["--ros-args", "--params-file", str(parameters), "--disable-external-lib-logs", "--disable-rosout-logs"]
+    if options.processes is None:
+        for agent in range(1, swarm.agents + 1):
+            place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_parameters(run, [agent])]
+            children.start(f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
+        return
+    shared = str(run.mode == LOCKSTEP and may_share(run)).lower()
+    for number, ids in enumerate(split(swarm.agents, options.processes), 1):
+        own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_view:={shared}"]
+        name = f"swarm_host_{number} with {named(ids)}"
+        children.start(name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_parameters(run, ids)])
+
+
+def _clock_parameters(run: RunConfig, ids: list[int]) -> list[str]:
+    """The clocks of some agents, and how long a frame takes, for real time."""
+    if run.mode == LOCKSTEP:
+        return []
+    clocks = [make_clocks(run.clocks, run.swarm.agents)[agent - 1] for agent in ids]
+    airtime, link = run.air.airtime, run.air.link_delay_ns
+    fixed = airtime.total_ns(0)
+    values = {
+        "clock_offset_ns": [clock.offset_ns for clock in clocks],
+        "clock_drift_ppb": [clock.drift_ppb for clock in clocks],
+        "clock_jitter_ns": float(run.clocks.jitter_ns),
+        "align": str(run.align).lower(),
+        "flight_time_ns": [fixed + link, airtime.total_ns(1) - fixed],
+    }
+    return [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]

@@ -1,0 +1,58 @@
+"""One line that shows how a flight goes."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TextIO
+
+_TERMINAL_S, _LOG_S = 0.2, 5.0
+
+
+class ProgressLine:
+    """Rewrites one line on a terminal; elsewhere prints a line every few seconds.
+
+    :param label: what stands in front.
+    :param stream: where to; default: standard error.
+    """
+
+    def __init__(self, label: str, stream: TextIO | None = None) -> None:
+        self._label = label
+        self._stream = stream or sys.stderr
+        self._terminal = self._stream.isatty()
+        self._next = 0.0
+        self._shown = False
+
+    def due(self) -> bool:
+        """Whether it is time for a new line."""
+        return time.monotonic() >= self._next
+
+    def show(self, text: str) -> None:
+        """Shows a text in place of the last one."""
+        self._next = time.monotonic() + (_TERMINAL_S if self._terminal else _LOG_S)
+        self._shown = True
+        if self._terminal:
+            self._stream.write(f"\r\x1b[K{self._label}: {text}")
+        else:
+            self._stream.write(f"{self._label}: {text}\n")
+        self._stream.flush()
+
+    def say(self, text: str) -> None:
+        """Prints a line that stays."""
+        self._stream.write(f"\r\x1b[K{self._label}: {text}\n" if self._terminal else f"{self._label}: {text}\n")
+        self._stream.flush()
+        self._next = 0.0
+
+    def end(self) -> None:
+        """Leaves the last line where it is."""
+        if self._terminal and self._shown:
+            self._stream.write("\n")
+            self._stream.flush()
+        self._shown = False
+
+
+def flight_text(slot: int, simulated_s: float, wall_s: float, closest_m: float, pair: tuple[int, int]) -> str:
+    """The line of a flight under way."""
+    factor = simulated_s / wall_s if wall_s > 0.0 else 0.0
+    near = f"closest cf{pair[0]} cf{pair[1]} {closest_m:.3f} m" if pair[0] else "closest: one agent alone"
+    return f"slot {slot}  simulated {simulated_s:.2f} s  wall {wall_s:.1f} s  real-time factor {factor:.2f}  {near}"

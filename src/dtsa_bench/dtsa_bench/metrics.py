@@ -1,0 +1,206 @@
+"""What a flight was worth: the one definition of all results, for `simulate`, `fly`, `sweep` and `verify`.
+
+Times are those of slot ends, counted from the start of slot 0. Distances and paths are true ones, at every control
+instant. Ages and estimate errors are taken at every slot's end after the boot round (from slot N on), over all pairs of
+an observer and a mover that the observer still has in A_p; an agent heard in the slot that just ended has age 0.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import Scenario, Swarm, _kernel
+from dtsa_agent.core.plugins import make_swarm
+from dtsa_agent.keys import with_key
+from dtsa_channel_sim.verdict import COLLISION, IDLE, SUCCESS
+
+from .run_config import RunConfig
+
+Array = NDArray[np.float64]
+
+_FAR_M = 1e5
+_CRASHED: int = _kernel.METRICS_CRASHED
+_ARRIVED: int = _kernel.METRICS_ARRIVED
+
+# Why a flight ended; an empty text while it goes on. STOPPED: the user, or an error, ended it early.
+COMPLETED, CRASHED, TIMED_OUT, STOPPED = "completed", "crashed", "timed out", "stopped"
+
+
+def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> Swarm:
+    """Tables that follow a flight from what the air carried, for whoever does not host all agents.
+
+    :param run: the run.
+    :param scenario: its scenario.
+    :param everyone: one table an agent, which any loss needs; otherwise one that stands for all.
+    """
+    observers = list(range(1, run.swarm.agents + 1)) if everyone else [0]
+    return with_key(make_swarm(run.swarm, scenario, local=[], observers=observers))
+
+
+class FlightMetrics:
+    """Follows one flight slot by slot, decides when it is over and sums up.
+
+    :param run: the run.
+    :param scenario: its scenario.
+    """
+
+    def __init__(self, run: RunConfig, scenario: Scenario) -> None:
+        swarm, limits = run.swarm, run.limits
+        self.run = run
+        self.scenario = scenario
+        self.end = ""  # COMPLETED, CRASHED, TIMED_OUT, or "" while the flight goes on
+        self.slots = 0
+        self.completion_slot = -1  # slots flown when all had arrived at the same time, -1: not yet
+        self.crash_slot = -1  # slots flown when the first two had crashed
+        self.collided_pair: tuple[int, int] | None = None
+        self.split_slot = -1  # first slot in which two agents' tables differed, -1: never
+        self._split = 0  # slots in which they did
+        self._torn = 0  # slots in which two agents took different agents for the sender
+        self._compared = 0
+        self.lost: set[int] = set()  # ids of agents that fell out of the flight
+        self._outcomes = [0, 0, 0]  # by IDLE, SUCCESS, COLLISION
+        start = np.ascontiguousarray(scenario.start, dtype=np.float64)
+        target = np.ascontiguousarray(scenario.target, dtype=np.float64)
+        moving = np.ascontiguousarray(scenario.moving, dtype=np.uint8)
+        self._kernel = _kernel.Metrics(start, target, moving, swarm.agents, limits.collision_m, swarm.r_min)
+        self._course = scenario.course(np.arange(swarm.agents, dtype=np.int32))
+        if self._course is not None:
+            self._course.advance(0, start)
+        self._last = start  # (3, N) m, positions at the end of the last slot
+        self._tail = math.ceil(limits.tail_s * 1e9 / swarm.slot_ns - 1e-6)
+        # First number of slots at which the flight is over whatever happens.
+        self._limit = max(1, math.ceil(limits.timeout_s * 1e9 / swarm.slot_ns - 1e-6))
+
+    def update(self, slot: int, track: Array, tables: Swarm | None, outcome: int) -> str:
+        """Takes in a slot that has just ended.
+
+        :param slot: its number; slots come one after the other from 0.
+        :param track: (S, 3, N) m, frame map: true positions at its control instants, the last at its end.
+        :param tables: what the agents (or :func:`metrics_tables`) know after ``end(slot)``; None: ages are left out.
+        :param outcome: the channel's verdict on it, IDLE, SUCCESS or COLLISION.
+        :returns: why the flight is over now, or "" if it goes on.
+        """
+        self.slots = done = slot + 1
+        self._outcomes[outcome] += 1
+        if self.lost:
+            track = track.copy()
+            for agent in self.lost:  # out of everybody's way, each by itself
+                track[:, :, agent - 1] = _FAR_M * agent
+        self._last = track[-1].copy()
+        state = self._kernel.update(done, track, None if tables is None else tables.kernel)
+        if self._course is not None:
+            self._course.advance(done, self._last)
+            if not self._course.final.all():
+                state &= ~_ARRIVED  # at its target by chance, with goals still to come
+        if state:
+            if state & _CRASHED and self.crash_slot < 0:
+                self.crash_slot = done
+                self.collided_pair = self._kernel.result()["pair"]
+                if self.run.limits.stop_on_crash:
+                    self.end = CRASHED
+                    return CRASHED
+            if state & _ARRIVED and self.completion_slot < 0:
+                self.completion_slot = done
+                self._limit = done + self._tail
+        if done >= self._limit:
+            self.end = TIMED_OUT if self.completion_slot < 0 else COMPLETED
+        return self.end
+
+    def lose(self, agent: int) -> None:
+        """An agent fell out of the flight: no distance to it, nor its way, counts any more.
+
+        :param agent: its id.
+        """
+        self.lost.add(agent)
+        self._kernel.drop(agent - 1)
+
+    def compare_views(self, slot: int, digests: NDArray[np.uint64], chosen: NDArray[np.uint16]) -> None:
+        """Takes in what all agents believe at the start of a slot, where that may differ.
+
+        :param slot: its number.
+        :param digests: (N,) digests of their tables, equal where tables are equal.
+        :param chosen: (N,) ids that they take for the slot's sender.
+        """
+        if self.lost:
+            here = [agent not in self.lost for agent in range(1, len(digests) + 1)]
+            digests, chosen = digests[here], chosen[here]
+        if not len(digests):
+            return
+        self._compared += 1
+        self._torn += bool((chosen != chosen[0]).any())
+        if (digests != digests[0]).any():
+            self._split += 1
+            if self.split_slot < 0:
+                self.split_slot = slot
+
+    def closest(self) -> tuple[float, tuple[int, int]]:
+        """Smallest distance so far, m, and the ids of the two agents."""
+        sums = self._kernel.result()
+        return math.sqrt(sums["min_distance2"]), sums["pair"]
+
+    def efficiencies(self) -> dict[int, float]:
+        """Distance from start to end over the path flown (1), by the id of each mover that has moved.
+
+        With several goals it is the length of the straight lines from goal to goal, and known of complete flights only.
+        """
+        path, plan = self._kernel.result()["path"], self.scenario.plan
+        if plan is not None and len(plan.goals) > 1:
+            if self.completion_slot < 0:
+                return {}
+            direct = plan.way
+        else:
+            direct = np.sqrt(((self._last - self.scenario.start) ** 2).sum(axis=0))
+        movers = np.flatnonzero(self.scenario.moving)
+        return {int(k) + 1: float(direct[k] / path[k]) for k in movers if path[k] > 0.0 and int(k) + 1 not in self.lost}
+
+    def summary(self, wall_time_s: float | None = None) -> dict[str, Any]:
+        """The results as plain values; what does not exist (no movers, not complete, ...) is None.
+
+        :param wall_time_s: wall-clock time that the flight took, s.
+        """
+        swarm, sums = self.run.swarm, self._kernel.result()
+        flown = self.slots * swarm.slot_ns / 1e9
+        pair = sums["pair"] if sums["pair"][0] else None
+        news = sums["age_count"]
+        efficiency = list(self.efficiencies().values())
+        return {
+            "agents": swarm.agents,
+            "moving": swarm.movers,
+            "policy": swarm.policy,
+            "estimator": swarm.estimator,
+            "avoider": swarm.avoider,
+            "slot_ms": swarm.slot_ms,
+            "loss": self.run.air.loss,
+            "seed": swarm.seed,
+            "end": self.end or STOPPED,
+            "completed": self.completion_slot >= 0,
+            "timed_out": self.end == TIMED_OUT,
+            "collided": self.crash_slot >= 0,
+            "collided_pair": list(self.collided_pair) if self.collided_pair else None,
+            "slots": {
+                "total": self.slots,
+                "success": self._outcomes[SUCCESS],
+                "collision": self._outcomes[COLLISION],
+                "idle": self._outcomes[IDLE],
+            },
+            "min_distance_m": math.sqrt(sums["min_distance2"]) if pair else None,
+            "min_distance_pair": list(pair) if pair else None,
+            "min_distance_time_s": sums["min_slot"] * swarm.slot_ns / 1e9 if pair else None,
+            "efficiency_mean": sum(efficiency) / len(efficiency) if efficiency else None,
+            "completion_time_s": self.completion_slot * swarm.slot_ns / 1e9 if self.completion_slot >= 0 else None,
+            "flight_time_s": flown,
+            "first_divergence_slot": self.split_slot if self.split_slot >= 0 else None,
+            "equal_views_share": 1.0 - self._split / self._compared if self._compared else 1.0,
+            "agreement_share": 1.0 - self._torn / self._compared if self._compared else 1.0,
+            "lost_agents": sorted(self.lost),
+            "age_mean_slots": sums["age_sum"] / news if news else None,
+            "age_max_slots": sums["age_max"] if news else None,
+            "estimate_error_mean_m": sums["error_sum"] / news if news else None,
+            "estimate_error_max_m": sums["error_max"] if news else None,
+            "wall_time_s": wall_time_s,
+            "realtime_factor": flown / wall_time_s if wall_time_s else None,
+        }

@@ -1,0 +1,104 @@
+"""An outside observer that reads every frame of policy ``lease`` and holds the agents to the protocol's rules.
+
+It knows what was sent, not what was heard, and shares no code with the agents: the order of a frame's lease bytes is
+written down here a second time, on purpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dtsa_agent.core import _kernel
+
+OPEN = 255
+
+
+@dataclass(slots=True)
+class Ledger:
+    """Who gave which turn to whom, and whether all kept to it.
+
+    :param agents: number of agents N.
+    :param anchor_every: M.
+    """
+
+    agents: int
+    anchor_every: int
+    issued: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # turn -> (issuer, lessee)
+    open_collisions: int = 0  # slots with two senders that had been given to all who wake
+    adopted_collisions: int = 0  # slots with two senders, given away by somebody other than their owner
+    plain_collisions: int = 0  # any other slot with two senders
+    open_slots: int = 0
+    adopted_slots: int = 0
+    leased_slots: int = 0
+    broken: list[str] = field(default_factory=list)  # rules that were broken, in words
+
+    def is_anchor(self, slot: int) -> bool:
+        """Whether a slot belongs to its owner whatever happens."""
+        return (slot // self.agents + slot % self.agents) % self.anchor_every == 0
+
+    def turns(self, slot: int, c_s: int, count: int) -> list[int]:
+        """The turns that the lease bytes of a frame speak of.
+
+        :param slot: slot of the frame.
+        :param c_s: its c_s.
+        :param count: number of lease bytes.
+        """
+        own = [slot + j * self.agents for j in range(1, self.anchor_every + 1)]
+        end = next((turn for turn in own if self.is_anchor(turn)), own[-1] + 1)
+        result: list[int] = []
+        for first in own:
+            ahead = [turn for turn in range(first - c_s, first) if not self.is_anchor(turn)]
+            result += [*ahead, first] if first < end else ahead
+        return result[:count]
+
+    def slot(self, slot: int, frames: dict[int, bytes]) -> None:
+        """Takes in one slot.
+
+        :param slot: its number; slots come in order.
+        :param frames: the frames of all senders, by id.
+        """
+        given = self.issued.pop(slot, [])
+        owner = slot % self.agents + 1
+        is_open = any(lessee == OPEN for _, lessee in given)
+        adopted = any(issuer != owner for issuer, _ in given)
+        self.open_slots += is_open
+        self.adopted_slots += adopted and not is_open
+        self.leased_slots += bool(given) and not is_open and not adopted
+        if len(frames) > 1:
+            self.open_collisions += is_open
+            self.adopted_collisions += adopted and not is_open
+            self.plain_collisions += not is_open and not adopted
+            if not is_open and not adopted:
+                self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}")
+        for sender, data in frames.items():
+            self._check_sender(slot, sender, owner, given)
+            self._read(slot, sender, data)
+
+    def _check_sender(self, slot: int, sender: int, owner: int, given: list[tuple[int, int]]) -> None:
+        lessees = {lessee for _, lessee in given}
+        if sender in lessees or OPEN in lessees:
+            return
+        if sender != owner:
+            self.broken.append(f"slot {slot}: agent {sender} sends in a turn of {owner} given to {sorted(lessees)}")
+        elif any(issuer == owner for issuer, _ in given):
+            self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(lessees)}")
+
+    def _read(self, slot: int, sender: int, data: bytes) -> None:
+        fields = _kernel.decode_extended(data)
+        if isinstance(fields, int):
+            self.broken.append(f"slot {slot}: agent {sender} sent a frame that is none ({fields})")
+            return
+        leases = fields["leases"]
+        if leases and slot % self.agents != sender - 1:
+            self.broken.append(f"slot {slot}: agent {sender} gives turns away in somebody else's turn")
+        for turn, lessee in zip(self.turns(slot, fields["c_s"], len(leases)), leases, strict=False):
+            if not lessee:
+                continue
+            owner = turn % self.agents + 1
+            if self.is_anchor(turn) or turn <= slot:
+                self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
+            entries = self.issued.setdefault(turn, [])
+            if sender == owner and any(i == owner and other != lessee for i, other in entries):
+                self.broken.append(f"slot {slot}: agent {sender} gives turn {turn} away a second time")
+            if (sender, lessee) not in entries:
+                entries.append((sender, lessee))

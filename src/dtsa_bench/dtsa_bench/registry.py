@@ -1,0 +1,34 @@
+"""Names of the commands. A module of its own: `tools/dtsa` reads it before anything is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+COMMANDS = {
+    "demo": "three flights of twelve quadcopters, recorded and compared, in a few minutes",
+    "fly": "one flight with real ROS 2 nodes, recorded to a bag",
+    "simulate": "one or many flights without ROS, as fast as the machine allows",
+    "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
+    "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
+    "replay": "play a bag back into the ROS graph",
+    "verify": "check a bag: was every decision what the protocol says?",
+    "recover": "make a readable bag of what a killed recorder left behind",
+    "report": "one web page about one or several recorded runs",
+    "export": "a bag's contents as CSV or Parquet",
+    "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
+    "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
+}
+
+
+def module_name(command: str) -> str:
+    """Name of the module of a command inside `dtsa_bench.commands`."""
+    return command.replace("-", "_")
+
+
+def available() -> Iterator[tuple[str, str]]:
+    """Commands that exist, in the order in which the help shows them, each with what it does."""
+    directory = Path(__file__).resolve().parent / "commands"
+    for command, text in COMMANDS.items():
+        if (directory / f"{module_name(command)}.py").is_file():
+            yield command, text

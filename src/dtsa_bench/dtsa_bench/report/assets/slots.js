@@ -1,0 +1,125 @@
+"use strict";
+/* The slot time line: the whole run above, some slots around the current time below. */
+const WINDOW = 120, LEFT = 52, RIGHT = 14;
+
+class SlotLine {
+  constructor(run, shared) {
+    const slots = run.slots;
+    this.run = run; this.shared = shared; this.first = slots.first; this.count = slots.count;
+    this.slot = new Uint32Array(bytes(slots.slot)); this.sender = new Uint16Array(bytes(slots.sender));
+    this.outcome = new Uint8Array(bytes(slots.outcome)); this.reason = new Uint8Array(bytes(slots.reason));
+    this.received = new Uint8Array(bytes(slots.received));
+    this.whole = el("canvas", {role: "img", "aria-label": "Who sent, over the whole run"});
+    this.part = el("canvas", {role: "img", "aria-label": "Who sent, slot by slot"});
+    this.node = el("div", {}, this.whole, this.part);
+    this.row = Math.max(2, Math.min(9, 300 / run.agents)); this.rowPart = Math.max(3.2, Math.min(15, 420 / run.agents));
+    onRedraw(this.node, width => { this.width = width; this.cache = null; this.draw(clock.time); });
+    clock.listen(time => this.width && this.draw(time));
+    shared.lines.push(this);
+    this.point(this.whole, () => [this.first, this.count]); this.point(this.part, () => [this.from, this.shown]);
+  }
+
+  color(index) {
+    if (this.outcome[index] === 2) return theme.color("collision");
+    return this.shared.reasons && this.reason[index] < 255 ? reasonColor(this.run.decisions.names[this.reason[index]]) : theme.color("success");
+  }
+
+  point(canvas, range) {
+    const slotAt = event => {
+      const box = canvas.getBoundingClientRect(), [first, count] = range();
+      const place = ((event.clientX - box.left) * this.width / box.width - LEFT) / (this.width - LEFT - RIGHT);
+      return place < 0 || place > 1 ? null : Math.min(first + count - 1, Math.floor(first + place * count));
+    };
+    canvas.addEventListener("pointermove", event => {
+      const slot = slotAt(event);
+      if (slot === null) { hideTip(); return; }
+      if (event.buttons & 1 && canvas === this.whole) clock.set((slot + 0.5) * this.run.slot_s);
+      showTip(event, this.describe(slot));
+    });
+    canvas.addEventListener("pointerdown", event => { const slot = slotAt(event); if (slot !== null) clock.set((slot + 0.5) * this.run.slot_s); });
+    canvas.addEventListener("pointerleave", hideTip);
+    canvas.style.cursor = "crosshair";
+  }
+
+  find(slot) { // index of the first frame in a slot or later
+    let low = 0, high = this.slot.length;
+    while (low < high) { const middle = (low + high) >> 1; if (this.slot[middle] < slot) low = middle + 1; else high = middle; }
+    return low;
+  }
+
+  describe(slot) {
+    const rows = [`slot ${whole(slot)}, ${num(slot * this.run.slot_s, 3, "s")}`];
+    for (let i = this.find(slot); i < this.slot.length && this.slot[i] === slot; i++) {
+      const why = this.reason[i] < 255 ? `, ${this.run.decisions.names[this.reason[i]]}` : "";
+      rows.push(`agent ${this.sender[i]}${why}: ${this.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.received[i] / 255, 0)}`);
+    }
+    if (rows.length === 1) rows.push("nobody sent");
+    return rows.join("\n");
+  }
+
+  draw(time) {
+    const current = Math.min(this.first + this.count - 1, Math.floor(time / this.run.slot_s + 1e-6));
+    this.shown = Math.min(this.count, WINDOW);
+    this.from = Math.max(this.first, Math.min(this.first + this.count - this.shown, current - Math.floor(this.shown / 2)));
+    this.drawWhole(current); this.drawPart(current);
+  }
+
+  drawWhole(current) {
+    const height = 26 + this.row * this.run.agents + 22;
+    if (!this.cache) {
+      this.cache = document.createElement("canvas");
+      const c = prepare(this.cache, this.width, height);
+      this.frame(c, this.first, this.count, this.row, height, "whole run");
+      this.context = prepare(this.whole, this.width, height);
+    }
+    const c = this.context, x = slot => LEFT + (this.width - LEFT - RIGHT) * (slot - this.first) / this.count;
+    c.clearRect(0, 0, this.width, height);
+    c.drawImage(this.cache, 0, 0, this.width, height);
+    c.fillStyle = theme.color("accent"); c.globalAlpha = 0.13; c.fillRect(x(this.from), 20, x(this.from + this.shown) - x(this.from), height - 40); c.globalAlpha = 1;
+    c.strokeStyle = theme.color("accent"); c.lineWidth = 1; c.strokeRect(x(this.from), 20, x(this.from + this.shown) - x(this.from), height - 40);
+    c.fillStyle = theme.color("ink"); c.fillRect(x(current + 0.5) - 0.5, 18, 1, height - 36);
+  }
+
+  drawPart(current) {
+    const height = 26 + this.rowPart * this.run.agents + 34, c = prepare(this.part, this.width, height);
+    this.frame(c, this.from, this.shown, this.rowPart, height, `slots ${whole(this.from)} to ${whole(this.from + this.shown - 1)}`, true);
+    const wide = (this.width - LEFT - RIGHT) / this.shown;
+    c.strokeStyle = theme.color("ink"); c.globalAlpha = 0.75; c.lineWidth = 1.2;
+    c.strokeRect(LEFT + (current - this.from) * wide, 19, wide, height - 52); c.globalAlpha = 1;
+  }
+
+  /* Frames of some slots: one row an agent, and a strip above that says what became of each slot. */
+  frame(c, first, count, row, height, title, axis) {
+    const inner = this.width - LEFT - RIGHT, wide = inner / count, top = 26, agents = this.run.agents;
+    c.font = `11.5px ${theme.color("sans")}`; c.fillStyle = theme.color("soft"); c.textBaseline = "alphabetic";
+    c.textAlign = "left"; c.fillText("agent", 2, 12); c.fillText(title, LEFT, 12);
+    c.fillStyle = theme.color("grid");
+    if (row >= 4.5) for (let agent = 0; agent < agents; agent += 2) c.fillRect(LEFT, top + agent * row, inner, row);
+    else c.fillRect(LEFT, top, inner, agents * row);
+    c.fillStyle = theme.color("idle"); c.fillRect(LEFT, 19, inner, 4);
+    const slim = Math.max(1, wide - (wide > 4 ? 1 : 0)), tall = Math.max(1.6, row - (row > 5 ? 1.2 : 0));
+    for (let pass = 0; pass < 2; pass++) { // collisions last: a single one must not vanish under its neighbours
+      for (let i = this.find(first); i < this.slot.length && this.slot[i] < first + count; i++) {
+        if ((this.outcome[i] === 2) !== (pass === 1)) continue;
+        const x = LEFT + (this.slot[i] - first) * wide;
+        c.fillStyle = this.color(i);
+        c.globalAlpha = this.outcome[i] === 2 ? 1 : 0.3 + 0.7 * this.received[i] / 255;
+        c.fillRect(x, top + (this.sender[i] - 1) * row, slim, tall);
+        c.globalAlpha = 1;
+        c.fillStyle = theme.color(this.outcome[i] === 2 ? "collision" : "success"); c.fillRect(x, 19, slim, 4);
+        if (this.received[i] < 255 && this.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("lost"); c.fillRect(x, top + (this.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.received[i] / 255), Math.min(3, tall / 3)); }
+      }
+    }
+    c.fillStyle = theme.color("soft"); c.textAlign = "right"; c.textBaseline = "middle";
+    const names = ticks(1, agents, Math.min(agents, agents * row / 15)).filter(value => value >= 1 && value === Math.round(value));
+    for (const name of names) c.fillText(name, LEFT - 8, top + (name - 0.5) * row);
+    const bottom = top + agents * row;
+    c.textAlign = "center"; c.textBaseline = "top";
+    const marks = ticks(first, first + count, this.width / 90).filter(value => value === Math.round(value) && value < first + count);
+    for (const mark of marks) {
+      const x = LEFT + (mark - first + (axis ? 0.5 : 0)) * wide;
+      c.fillStyle = theme.color("line"); c.fillRect(x, bottom, 1, 4); c.fillStyle = theme.color("soft"); c.fillText(whole(mark), x, bottom + 6);
+    }
+    if (axis) { c.textAlign = "right"; c.fillText("slot", this.width - RIGHT, bottom + 21); }
+  }
+}

@@ -1,0 +1,65 @@
+"""How old the agents' news of each other were, and how wrong their estimates, slot by slot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import Swarm
+from dtsa_bench.bag.run import RecordedRun
+from dtsa_bench.metrics import FlightMetrics
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """By slot and agent: means over all observers that still have that agent in A_p; NaN without any."""
+
+    slot: NDArray[np.int64]  # (M,)
+    age: NDArray[np.float64]  # slots, (M, N)
+    error: NDArray[np.float64]  # m, (M, N)
+
+
+def follow(run: RecordedRun, tables: Swarm, metrics: FlightMetrics, moving: NDArray[np.bool_]) -> News:
+    """Feed the recorded frames to tables like those of the agents, and the metrics with what they then know.
+
+    :param run: a run whose slots are complete from 0 on and that has odometry of all agents.
+    :param tables: tables only; one that hears everything, or one an agent.
+    :param metrics: updated slot by slot.
+    :param moving: (N,) who moves.
+    """
+    count, agents = len(run.slots), run.agents
+    age = np.full((count, agents), np.nan)
+    error = np.full((count, agents), np.nan)
+    starts = np.searchsorted(run.frames.slot, np.arange(count + 1))
+    # Control instants of a slot: after its start, up to its end.
+    edges = run.start_ns + np.arange(count + 1) * run.slot_ns
+    moments = np.searchsorted(run.motion.time_ns, edges, side="right")
+    shared = len(tables.observer) == 1 and tables.observer[0] < 0
+    own = np.zeros((len(tables.observer), agents), dtype=bool)
+    if not shared:
+        own[np.arange(len(own)), tables.observer] = True
+    for slot in range(count):
+        for index in range(starts[slot], starts[slot + 1]):
+            mask = None
+            if not shared:
+                mask = run.frames.received[index].astype(np.uint8)
+                mask[run.frames.sender[index] - 1] = 1  # who sends knows what it said
+            if run.frames.data[index]:
+                tables.hear(slot, run.frames.data[index], mask)
+        tables.end(slot)
+        last = max(1, moments[slot + 1])
+        track = np.ascontiguousarray(run.motion.position[min(moments[slot], last - 1) : last])
+        truth = track[-1]
+        metrics.update(slot, track, tables, int(run.outcome[slot]))
+        tables.estimate(slot + 1)
+        counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & moving & ~own
+        observers = counted.sum(axis=0)
+        some = observers > 0
+        news = np.where(counted, slot - tables.sent_slot, 0).sum(axis=0)
+        gap = tables.estimate_position - truth
+        wrong = np.where(counted, np.sqrt(np.einsum("vik,vik->vk", gap, gap)), 0).sum(axis=0)
+        age[slot, some] = news[some] / observers[some]
+        error[slot, some] = wrong[some] / observers[some]
+    return News(run.slots, age, error)

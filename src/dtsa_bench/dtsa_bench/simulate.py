@@ -1,0 +1,150 @@
+"""The Monte Carlo engine: one flight without ROS, over the very core that the nodes run.
+
+For the same :class:`RunConfig` it gives the same sender in every slot and the same positions as `fly`, bit
+for bit.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import Scenario, Swarm, make_scenario
+from dtsa_agent.core.plugins import make_swarm, shareable
+from dtsa_agent.keys import with_key
+from dtsa_channel_sim import Channel
+from dtsa_channel_sim.verdict import SUCCESS
+
+from .metrics import FlightMetrics
+from .run_config import RunConfig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Trace:
+    """What happened in every slot, for tests and figures; S control instants a slot, N agents."""
+
+    senders: list[tuple[int, ...]] = field(default_factory=list)  # ids
+    outcomes: list[int] = field(default_factory=list)
+    reasons: list[int] = field(default_factory=list)  # index into REASONS, of the first table
+    tracks: list[Array] = field(default_factory=list)  # (S, 3, N) m, frame map, true positions
+    estimates: list[Array] = field(default_factory=list)  # (3, N) m, of ``observer`` for the start of the next slot
+    heard: list[Array] = field(default_factory=list)  # (3, N) m, last received positions of ``observer``
+    heard_slot: list[NDArray[np.int64]] = field(default_factory=list)  # (N,) the slots they are from
+
+    def positions(self) -> Array:
+        """True positions at all control instants, (T, 3, N), m, frame map."""
+        return np.concatenate(self.tracks)
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """A simulated flight."""
+
+    run: RunConfig
+    scenario: Scenario
+    metrics: FlightMetrics
+    swarm: Swarm  # as it was at the end
+    trace: Trace | None
+    wall_time_s: float
+
+    def summary(self) -> dict[str, Any]:
+        """The results, with the keys of ``summary.json``."""
+        result = self.metrics.summary(self.wall_time_s)
+        result["malformed"], result["foreign"] = self.swarm.malformed, self.swarm.foreign
+        return result
+
+
+def may_share(run: RunConfig) -> bool:
+    """Whether one table may stand for all agents: nothing is ever lost, and all would decide the same.
+
+    :param run: the run.
+    """
+    air, swarm = run.air, run.swarm
+    lossless = not (
+        air.loss
+        or air.burst_length
+        or air.p_good
+        or air.jam
+        or air.partition
+        or air.range_m
+        or air.capture_db
+        or air.loss_matrix
+        or air.link_loss
+        or air.schedule
+    )
+    return lossless and shareable(swarm)
+
+
+def simulate(
+    run: RunConfig,
+    *,
+    shared_view: bool | None = None,
+    trace: bool = False,
+    observer: int = 1,
+    ages: bool = True,
+) -> Flight:
+    """Flies one run.
+
+    :param run: the run.
+    :param shared_view: one table for all agents; None: where :func:`may_share` allows it.
+    :param trace: keep what happened in every slot.
+    :param observer: id whose table the trace follows.
+    :param ages: measure ages and estimate errors; without them a run is a little faster.
+    """
+    begun = time.perf_counter()
+    scenario = make_scenario(run.swarm)
+    shared = may_share(run) if shared_view is None else shared_view
+    swarm = with_key(make_swarm(run.swarm, scenario, shared_view=shared))
+    metrics = FlightMetrics(run, scenario)
+    kept = Trace() if trace else None
+    _fly(swarm, Channel(run.air), metrics, kept, observer, ages)
+    return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
+
+
+def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int, ages: bool) -> None:
+    """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
+    advance, begin, fly, hear, end = swarm.scenario.advance, swarm.begin, swarm.fly, swarm.hear, swarm.end
+    frame, arbitrate, update = swarm.frame, channel.arbitrate, metrics.update
+    ids, track, position = swarm.ids, swarm.track, swarm.position
+    tables = swarm if ages else None
+    view = 0 if swarm.shared else observer - 1
+    compare = None if swarm.shared else metrics.compare_views  # one table cannot differ from itself
+    slot = 0
+    while True:
+        advance(slot, swarm)
+        heard = [(ids[index], frame(index)) for index in begin(slot)]
+        if compare is not None:
+            compare(slot, swarm.digest, swarm.chosen)
+        verdict = arbitrate(slot, [i for i, _ in heard], [len(data) for _, data in heard], position)
+        fly(slot)
+        received = verdict.received
+        if received is not None:
+            for row, (_, data) in enumerate(heard):
+                hear(slot, data, received[row])
+        elif verdict.outcome == SUCCESS:
+            for _, data in heard:
+                hear(slot, data)
+        end(slot)
+        over = update(slot, track, tables, verdict.outcome)
+        if kept is not None:
+            _keep(kept, swarm, slot, verdict.senders, verdict.outcome, view)
+        if over:
+            return
+        slot += 1
+
+
+def _keep(kept: Trace, swarm: Swarm, slot: int, senders: tuple[int, ...], outcome: int, view: int) -> None:
+    kept.senders.append(senders)
+    kept.outcomes.append(outcome)
+    kept.reasons.append(int(swarm.reason[view]))
+    kept.tracks.append(swarm.track.copy())
+    swarm.estimate(slot + 1)
+    kept.estimates.append(swarm.estimate_position[view].copy())
+    kept.heard.append(swarm.sent_position[view].copy())
+    kept.heard_slot.append(swarm.sent_slot[view].copy())

@@ -1,0 +1,114 @@
+"""Intervals for what a sweep measured:
+
+shares with Wilson, means with a seeded bootstrap. See docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEVEL = 0.95  # of every interval in reports, unless said otherwise
+RESAMPLES = 4000
+_SEED = 20_240_229  # the intervals of a report are the same whenever it is made again
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """k of n, with its Wilson interval."""
+
+    count: int
+    total: int
+    low: float  # share, 0 to 1
+    high: float
+
+    @property
+    def value(self) -> float:
+        """k / n; not a number without runs."""
+        return self.count / self.total if self.total else math.nan
+
+    def __str__(self) -> str:
+        return f"{self.count}/{self.total}"
+
+
+@dataclass(frozen=True, slots=True)
+class Mean:
+    """A mean with its bootstrap interval; the three are not a number without values."""
+
+    value: float
+    low: float
+    high: float
+    count: int  # values it is the mean of
+
+
+def wilson(count: int, total: int, level: float = LEVEL) -> Share:
+    """The share k / n with the interval of Wilson (1927), which stays honest at 0 of n and n of n.
+
+    :param count: k, how many runs did it.
+    :param total: n, how many runs there were.
+    :param level: probability that the interval holds the true share.
+    :raises ValueError: unless 0 <= k <= n and 0 < level < 1.
+    """
+    if not 0 <= count <= total:
+        raise ValueError(f"count: got {count}; allowed: 0 to {total}")
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level: got {level}; allowed: between 0 and 1")
+    if total == 0:
+        return Share(0, 0, 0.0, 1.0)
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    p, z2 = count / total, z * z
+    middle = (p + z2 / (2 * total)) / (1 + z2 / total)
+    half = z / (1 + z2 / total) * math.sqrt(p * (1 - p) / total + z2 / (4 * total * total))
+    # At the ends the formula gives exactly 0 or 1; rounding must not move them.
+    low = 0.0 if count == 0 else middle - half
+    high = 1.0 if count == total else middle + half
+    return Share(count, total, low, high)
+
+
+def bootstrap_mean(values: Iterable[float], level: float = LEVEL, resamples: int = RESAMPLES) -> Mean:
+    """The mean with a percentile bootstrap interval. The resampling is seeded: equal values, equal interval.
+
+    :param values: one value a run; those that are not finite are left out.
+    :param level: probability of the interval.
+    :param resamples: number of resamples.
+    """
+    data = _finite(values)
+    if not len(data):
+        return Mean(math.nan, math.nan, math.nan, 0)
+    mean = float(data.mean())
+    if len(data) == 1:
+        return Mean(mean, mean, mean, 1)
+    means = _resampled_means(data, resamples)
+    low, high = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
+    return Mean(mean, float(low), float(high), len(data))
+
+
+def paired_difference(first: Sequence[float], second: Sequence[float], level: float = LEVEL) -> Mean:
+    """Mean of ``second - first`` over pairs, with a bootstrap interval over the pairs.
+
+    Two schemes that flew the same seeds flew the same scenarios: their difference is known far better than
+    each mean.
+
+    :param first: values of one scheme, one a seed.
+    :param second: values of the other, in the same order; a pair counts where both are finite.
+    :param level: probability of the interval.
+    :raises ValueError: if the lengths differ.
+    """
+    if len(first) != len(second):
+        raise ValueError(f"pairs: got {len(first)} and {len(second)} values; allowed: as many of each")
+    return bootstrap_mean(np.asarray(second, dtype=float) - np.asarray(first, dtype=float), level)
+
+
+def _finite(values: Iterable[float]) -> NDArray[np.float64]:
+    data = np.asarray(list(values), dtype=np.float64)
+    return data[np.isfinite(data)]
+
+
+def _resampled_means(data: NDArray[np.float64], resamples: int) -> NDArray[np.float64]:
+    random = np.random.Generator(np.random.PCG64(_SEED))
+    return np.asarray(data[random.integers(0, len(data), (resamples, len(data)))].mean(axis=1))

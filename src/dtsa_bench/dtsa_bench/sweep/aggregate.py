@@ -1,0 +1,151 @@
+"""Rows of runs summed up: one group for each combination of the axes, with intervals."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ..statistics import Mean, Share, bootstrap_mean, wilson
+from .spec import Cell, Sweep
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A number that a flight has, and which flights count for it."""
+
+    name: str
+    label: str
+    unit: str
+    digits: int
+    complete_only: bool  # only flights that were completed without a crash, as in the paper
+    better: int = 0  # 1: more is better, -1: less is better
+
+
+MEASURES = {
+    measure.name: measure
+    for measure in (
+        Measure("min_distance_m", "minimum distance", "m", 3, True, 1),
+        Measure("efficiency_mean", "trajectory efficiency", "", 3, True, 1),
+        Measure("completion_time_s", "completion time", "s", 2, True, -1),
+        Measure("age_mean_slots", "age of news", "slots", 2, False, -1),
+        Measure("estimate_error_mean_m", "error of estimates", "m", 4, False, -1),
+        Measure("wasted_share", "slots without a frame", "", 3, False, -1),
+    )
+}
+CRASHED = "crashed"  # a share, not a mean; may stand where a measure's name stands in figures
+
+
+class Group:
+    """All runs of one cell.
+
+    :param cell: the cell.
+    :param rows: its rows.
+    """
+
+    def __init__(self, cell: Cell, rows: Sequence[Row]) -> None:
+        self.cell = cell
+        self.labels = cell.labels
+        self.rows = list(rows)
+        flown = [row for row in rows if row["status"] != "failed"]
+        self.flown = len(flown)
+        self.failed = len(rows) - len(flown)
+        self.timed_out = sum(row["status"] == "timed out" for row in flown)
+        self.crashed: Share = wilson(sum(bool(row["collided"]) for row in flown), len(flown))
+        self._means: dict[str, Mean] = {}
+
+    def left_out(self) -> dict[str, int]:
+        """Runs that do not count for means of complete flights, by reason."""
+        reasons: Counter[str] = Counter()
+        for row in self.rows:
+            if row["status"] == "failed":
+                reasons[f"failed ({row['reason']})"] += 1
+            elif row["collided"]:
+                reasons["crashed"] += 1
+            elif row["status"] != "completed":
+                reasons[row["status"]] += 1
+        return dict(reasons)
+
+    def values(self, measure: str) -> dict[int, float]:
+        """A measure by seed; runs that do not count are not a number."""
+        spec = MEASURES[measure]
+        return {row["seed"]: _value(row, spec) for row in self.rows}
+
+    def mean(self, measure: str) -> Mean:
+        """Mean of a measure over the runs that count, with a bootstrap interval."""
+        if measure not in self._means:
+            self._means[measure] = bootstrap_mean(self.values(measure).values())
+        return self._means[measure]
+
+
+def _value(row: Row, spec: Measure) -> float:
+    if row["status"] == "failed" or (spec.complete_only and (row["collided"] or row["status"] != "completed")):
+        return math.nan
+    if spec.name == "wasted_share":
+        return float(row["slots_total"] - row["slots_success"]) / row["slots_total"]
+    value = row.get(spec.name)
+    return math.nan if value is None else float(value)
+
+
+class Table:
+    """All groups of a sweep.
+
+    :param sweep: the sweep.
+    :param rows: its rows, see ``journal.collect``.
+    """
+
+    def __init__(self, sweep: Sweep, rows: Sequence[Row]) -> None:
+        self.sweep = sweep
+        by_cell: dict[int, list[Row]] = {index: [] for index in range(len(sweep.cells))}
+        for row in rows:
+            by_cell[row["cell"]].append(row)
+        self.groups = [Group(cell, by_cell[index]) for index, cell in enumerate(sweep.cells)]
+        self.runs = len(rows)
+
+    def levels(self, axis: str) -> list[Any]:
+        """The values of an axis, in the sweep's order."""
+        return list(dict.fromkeys(group.labels[axis] for group in self.groups))
+
+    def where(self, **labels: Any) -> list[Group]:
+        """Groups with these labels."""
+        return self.select(labels)
+
+    def select(self, labels: Mapping[str, Any], check: Callable[[Group], bool] = bool) -> list[Group]:
+        """Groups with these labels.
+
+        :param labels: axis -> value.
+        :param check: a further condition.
+        """
+        return [g for g in self.groups if all(g.labels.get(a) == v for a, v in labels.items()) and check(g)]
+
+    def left_out(self) -> dict[str, int]:
+        """Runs left out of the means of complete flights, by reason."""
+        total: Counter[str] = Counter()
+        for group in self.groups:
+            total.update(group.left_out())
+        return dict(total)
+
+    def plain(self) -> list[Row]:
+        """The groups as plain values, for results.json."""
+        return [_plain(group) for group in self.groups]
+
+
+def _plain(group: Group) -> Row:
+    crashed = group.crashed
+    means = {}
+    for name in MEASURES:
+        mean = group.mean(name)
+        if mean.count:
+            means[name] = {"mean": mean.value, "low": mean.low, "high": mean.high, "runs": mean.count}
+    return {
+        **group.labels,
+        "runs": len(group.rows),
+        "timed_out": group.timed_out,
+        "left_out": group.left_out(),
+        "crashed": {"count": crashed.count, "of": crashed.total, "low": crashed.low, "high": crashed.high},
+        **means,
+    }

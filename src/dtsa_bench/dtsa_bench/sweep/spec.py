@@ -1,0 +1,256 @@
+"""What a sweep flies:
+
+a base, axes that are combined with each other, and seeds. Read from YAML; see docs/bench.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dtsa_agent.core.config import SwarmConfig
+from dtsa_agent.core.errors import ConfigError
+from dtsa_channel_sim import ChannelConfig
+
+from ..run_config import RunConfig, RunLimits
+
+PRESETS = Path(__file__).resolve().parent.parent / "presets"
+FIGURE_KINDS = ("bars", "lines", "matrix", "trajectories", "estimate")
+#: Seeds of reports start here; those below are for tuning and tests.
+FIRST_SEED = 1001
+
+_SWARM = tuple(spec.name for spec in dataclasses.fields(SwarmConfig))
+_LIMITS = tuple(spec.name for spec in dataclasses.fields(RunLimits))
+_CHANNEL = tuple(
+    spec.name for spec in dataclasses.fields(ChannelConfig) if spec.name not in ("agents", "seed", "slot_ns")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One combination of the axes, flown with every seed."""
+
+    labels: dict[str, Any]  # axis -> value or name
+    settings: dict[str, Any]  # flat names -> values
+
+    def run(self, seed: int) -> RunConfig:
+        """The run with one seed.
+
+        :raises ConfigError: if the settings do not fit together.
+        """
+        return run_config({**self.settings, "seed": seed})
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """Cells, seeds, and what the report shows of them."""
+
+    name: str
+    title: str
+    text: str
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+    axes: tuple[str, ...]
+    figures: tuple[dict[str, Any], ...] = ()
+    source: dict[str, Any] = field(default_factory=dict)  # as it was read, with what the command line changed
+
+    def tasks(self) -> Iterator[Task]:
+        """All runs, cell by cell."""
+        for index, cell in enumerate(self.cells):
+            for seed in self.seeds:
+                settings = {**cell.settings, "seed": seed}
+                yield Task(key_of(settings), index, seed, settings)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One run of a sweep, small enough to be sent anywhere."""
+
+    key: str  # of the run's settings: equal settings, equal key
+    cell: int
+    seed: int
+    settings: dict[str, Any]
+
+    @property
+    def cost(self) -> float:
+        """A rough guess of the work in it, in arbitrary units."""
+        s = self.settings
+        agents = float(s.get("agents", 12))
+        slots = min(float(s.get("timeout_s", 60.0)), 3.0 + agents / 5) * 1000.0 / float(s.get("slot_ms", 10.0))
+        lossy = any(s.get(name) for name in ("loss", "burst_length", "range_m", "loss_matrix", "schedule"))
+        own = lossy or s.get("policy") in ("aloha", "lease")
+        tables = agents if own else 1.0
+        priority = 0.05 if s.get("policy", "dtsa") == "dtsa" else 0.002
+        return slots * (4.0 + 0.3 * agents + 0.006 * agents * agents + tables * priority * agents * (agents + 4) / 10)
+
+
+def key_of(settings: Mapping[str, Any]) -> str:
+    """A short digest of settings."""
+    text = json.dumps(settings, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+def run_config(settings: Mapping[str, Any]) -> RunConfig:
+    """A run from flat names: settings of the swarm, of the channel and of the limits side by side.
+
+    :param settings: values by name; ``seed`` is that of the swarm and of the channel.
+    :raises ConfigError: for names that do not exist and values that are not allowed.
+    """
+    parts: dict[str, dict[str, Any]] = {"swarm": {}, "channel": {}, "limits": {}}
+    for name, value in settings.items():
+        section = section_of(name)
+        if section is None:
+            raise ConfigError(name, value, "one of the settings " + ", ".join((*_SWARM, *_CHANNEL, *_LIMITS)))
+        parts[section][name] = value
+    swarm = SwarmConfig.from_dict(parts["swarm"])
+    channel = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed, **parts["channel"]}
+    return RunConfig(swarm, ChannelConfig.from_dict(channel), RunLimits(**parts["limits"]))
+
+
+def section_of(name: str) -> str | None:
+    """The section of a flat name: swarm, channel or limits; None if there is no such setting."""
+    for section, names in (("swarm", _SWARM), ("channel", _CHANNEL), ("limits", _LIMITS)):
+        if name in names:
+            return section
+    return None
+
+
+def preset_names() -> list[str]:
+    """Names of the sweeps that come with the package."""
+    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+
+
+def load_preset(name: str, **changes: Any) -> Sweep:
+    """A sweep that comes with the package.
+
+    :param name: one of :func:`preset_names`.
+    :param changes: as for :func:`make_sweep`.
+    :raises ConfigError: if there is none of that name.
+    """
+    if name not in preset_names():
+        raise ConfigError("preset", name, ", ".join(preset_names()))
+    return load_file(PRESETS / f"{name}.yaml", **changes)
+
+
+def load_file(path: str | Path, **changes: Any) -> Sweep:
+    """A sweep described in a YAML file.
+
+    :param path: the file.
+    :param changes: as for :func:`make_sweep`.
+    :raises ConfigError: if it cannot be read, or does not describe a sweep.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError("file", str(path), f"a readable YAML file ({error})") from error
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError("file", str(path), f"YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise ConfigError("file", str(path), "a mapping with axes, and base, seeds, title, text, figures as you like")
+    return make_sweep(content, Path(path).stem, **changes)
+
+
+def make_sweep(
+    content: Mapping[str, Any],
+    name: str,
+    *,
+    seeds: int | None = None,
+    first_seed: int | None = None,
+    base: Mapping[str, Any] | None = None,
+) -> Sweep:
+    """A sweep from the content of its YAML file. Every run is checked here, before anything flies.
+
+    :param content: what the file says.
+    :param name: of the sweep.
+    :param seeds: number of seeds, instead of the file's.
+    :param first_seed: first of them.
+    :param base: settings that win over the file's base.
+    :raises ConfigError: naming what is not usable.
+    """
+    known = ("title", "text", "seeds", "base", "axes", "figures")
+    for key in content:
+        if key not in known:
+            raise ConfigError(str(key), content[key], "one of " + ", ".join(known))
+    common = {**_mapping(content.get("base", {}), "base"), **(base or {})}
+    axes = _mapping(content.get("axes", {}), "axes")
+    levels = [_levels(axis, values) for axis, values in axes.items()]
+    chosen = _seeds(content.get("seeds", 30), seeds, first_seed)
+    cells = tuple(_cells(common, list(axes), levels))
+    for cell in cells:
+        cell.run(chosen[0])
+    figures = content.get("figures", [])
+    if not isinstance(figures, list):
+        raise ConfigError("figures", figures, "a list")
+    source = {**content, "base": common, "seeds": list(chosen)}
+    return Sweep(
+        name,
+        str(content.get("title", name)),
+        str(content.get("text", "")).strip(),
+        cells,
+        chosen,
+        tuple(axes),
+        tuple(_figure(entry, index, list(axes)) for index, entry in enumerate(figures)),
+        source,
+    )
+
+
+def _cells(
+    common: Mapping[str, Any], axes: Sequence[str], levels: Sequence[dict[str, dict[str, Any]]]
+) -> Iterator[Cell]:
+    for combination in itertools.product(*(level.items() for level in levels)):
+        settings: dict[str, Any] = dict(common)
+        for _, values in combination:
+            settings.update(values)
+        yield Cell({axis: label for axis, (label, _) in zip(axes, combination, strict=True)}, settings)
+
+
+def _levels(axis: str, values: object) -> dict[Any, dict[str, Any]]:
+    """Levels of an axis: a list of values of the setting it is named after, or names with settings each."""
+    if isinstance(values, Mapping) and values:
+        return {str(name): _mapping(settings, f"axes.{axis}.{name}") for name, settings in values.items()}
+    if isinstance(values, list) and values:
+        if section_of(axis) is None:
+            raise ConfigError(f"axes.{axis}", values, "names with settings, or an axis named after a setting")
+        return {value: {axis: value} for value in values}
+    raise ConfigError(f"axes.{axis}", values, "a list of values, or names with settings each")
+
+
+def _seeds(value: object, count: int | None, first: int | None) -> tuple[int, ...]:
+    listed = isinstance(value, list)
+    if listed and count is None and first is None:
+        # type: ignore[union-attr]
+        if not value or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in value):
+            raise ConfigError("seeds", value, "a number of seeds, or a list of whole numbers")
+        return tuple(value)  # type: ignore[arg-type]
+    number = count if count is not None else (len(value) if listed else value)  # type: ignore[arg-type]
+    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= 1_000_000:
+        raise ConfigError("seeds", number, "1 to 1000000")
+    start = FIRST_SEED if first is None else first
+    return tuple(range(start, start + number))
+
+
+def _figure(entry: object, index: int, axes: list[str]) -> dict[str, Any]:
+    figure = _mapping(entry, f"figures[{index}]")
+    if figure.get("kind") not in FIGURE_KINDS:
+        raise ConfigError(f"figures[{index}].kind", figure.get("kind"), ", ".join(FIGURE_KINDS))
+    for role in ("x", "series", "rows", "columns", "facets"):
+        if role in figure and figure[role] not in axes:
+            raise ConfigError(f"figures[{index}].{role}", figure[role], "one of the axes " + ", ".join(axes))
+    figure.setdefault("name", figure["kind"] if index == 0 else f"{figure['kind']}-{index + 1}")
+    return figure
+
+
+def _mapping(value: object, name: str) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ConfigError(name, value, "names with values")
+    return {str(key): item for key, item in value.items()}

@@ -1,0 +1,184 @@
+"""The picture of a flight: the paths from above, as the paper shows them (fig:12_exp_traj)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from dtsa_agent.core import Scenario
+from dtsa_bench.run_config import RunConfig
+
+Array = NDArray[np.float64]
+
+INK, MUTED, RULE, HOVER = "#1f2933", "#66727f", "#dfe4ea", "#aab4be"
+_LABELLED = 24  # agents that get their ids written
+_DPI = 160
+_FONT = {"font.family": "DejaVu Sans", "font.size": 9}
+
+
+def colours(scenario: Scenario) -> Array:
+    """A colour an agent, (N, 4), around the wheel by its place at the start: neighbours on the circle are alike."""
+    x, y = scenario.start[0] - scenario.start[0].mean(), scenario.start[1] - scenario.start[1].mean()
+    turn = (np.arctan2(y, x) / (2 * np.pi)) % 1.0
+    wheel = np.asarray(colormaps["hsv"](turn))
+    # Pure hues are too bright on white, and not equally so: darken by how light the eye sees them.
+    light = wheel[:, :3] @ np.array([0.2126, 0.7152, 0.0722])
+    wheel[:, :3] *= np.clip(0.42 / np.maximum(light, 0.05), 0.55, 0.92)[:, None]
+    return wheel
+
+
+def paint(axes: Axes, scenario: Scenario, positions: Array, crash: Sequence[int] | None = None) -> None:
+    """Paints one flight from above.
+
+    :param axes: where to.
+    :param scenario: starts, targets and movers.
+    :param positions: (T, 3, N) m, frame map.
+    :param crash: ids of two agents that collided at the end, if they did.
+    """
+    count = positions.shape[2]
+    thin = float(np.clip(30.0 / max(count, 1), 0.55, 1.9))
+    shade = colours(scenario)
+    extent = float(np.abs(scenario.start[:2]).max()) if count else 1.0
+    for k in np.flatnonzero(~scenario.moving):
+        axes.plot(*positions[-1, :2, k], "o", color=HOVER, markersize=5 + 2 * thin, markeredgecolor="white", zorder=2)
+    movers = np.flatnonzero(scenario.moving)
+    for k in movers:
+        path = positions[:, :2, k]
+        axes.plot(path[:, 0], path[:, 1], color="white", linewidth=thin + 1.4, solid_capstyle="round", zorder=3)
+        axes.plot(path[:, 0], path[:, 1], color=shade[k], linewidth=thin, solid_capstyle="round", zorder=3)
+    size = 3.2 + 2.2 * thin
+    for k in movers:
+        axes.plot(*scenario.start[:2, k], "o", mfc="white", mec=shade[k], mew=1.3, markersize=size, zorder=4)
+        axes.plot(*positions[-1, :2, k], "o", color=shade[k], mec="white", mew=0.7, markersize=size, zorder=5)
+    if count <= _LABELLED:
+        _write_ids(axes, scenario, extent)
+    if crash:
+        where = positions[-1][:2, [crash[0] - 1, crash[1] - 1]].mean(axis=1)
+        axes.plot(*where, "o", mfc="none", mec="#c81e1e", mew=1.8, markersize=22, zorder=7)
+        axes.annotate(
+            "crash",
+            where,
+            xytext=(15, 12),
+            textcoords="offset points",
+            color="#c81e1e",
+            fontsize=9,
+            fontweight="bold",
+            zorder=7,
+            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+        )
+
+
+def _write_ids(axes: Axes, scenario: Scenario, extent: float) -> None:
+    """Each agent's id, outside of its place at the start."""
+    for k in range(scenario.start.shape[1]):
+        x, y = scenario.start[:2, k]
+        length = max(float(np.hypot(x, y)), 1e-9)
+        out = 1.0 + 0.085 * extent / length
+        axes.text(x * out, y * out, str(k + 1), ha="center", va="center", fontsize=8, color=MUTED, zorder=6)
+
+
+def style(axes: Axes, title: str, subtitle: str, extent: float) -> None:
+    """Frame, scale and headings of one top view.
+
+    :param extent: m, half width of what is shown.
+    """
+    axes.set_aspect("equal")
+    axes.set_xlim(-extent, extent)
+    axes.set_ylim(-extent, extent)
+    axes.set_xlabel("x (m)", color=MUTED)
+    axes.set_ylabel("y (m)", color=MUTED)
+    axes.tick_params(colors=MUTED, length=3, labelsize=8)
+    axes.grid(color=RULE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    axes.text(0.0, 1.075, title, transform=axes.transAxes, fontsize=12, fontweight="bold", color=INK)
+    axes.text(0.0, 1.025, subtitle, transform=axes.transAxes, fontsize=8.5, color=MUTED)
+
+
+def subtitle(summary: dict[str, Any]) -> str:
+    """The results of a flight in one short line."""
+    parts = []
+    if summary["collided"]:
+        parts.append("crashed after {:.2f} s".format(summary["flight_time_s"]))
+    elif summary["completed"]:
+        parts.append("complete after {:.2f} s".format(summary["completion_time_s"]))
+    else:
+        parts.append("{} after {:.2f} s".format(summary["end"], summary["flight_time_s"]))
+    if summary["min_distance_m"] is not None:
+        parts.append("closest {:.3f} m".format(summary["min_distance_m"]))
+    if summary["efficiency_mean"] is not None:
+        parts.append("efficiency {:.3f}".format(summary["efficiency_mean"]))
+    return "   ·   ".join(parts)
+
+
+def heading(summary: dict[str, Any]) -> str:
+    """What flew, e.g. ``DTSA, linear``."""
+    policy = summary["policy"]
+    return f"{policy.upper() if policy in ('tdma', 'dtsa') else policy}, {summary['estimator']}"
+
+
+def view_extent(scenario: Scenario, positions: Sequence[Array]) -> float:
+    """Half width, m, of a square that shows all starts, ends and paths."""
+    reach = max(
+        [float(np.abs(scenario.start[:2]).max()), *(float(np.abs(p[:, :2]).max()) for p in positions if p.size)]
+    )
+    return 1.16 * max(reach, 0.5)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a picture."""
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=_DPI, facecolor="white")
+
+
+def draw_flight(path: Path, run: RunConfig, scenario: Scenario, positions: Array, summary: dict[str, Any]) -> None:
+    """Draws one flight into a PNG.
+
+    :param path: file to write.
+    :param run: the run.
+    :param scenario: its scenario.
+    :param positions: (T, 3, N) m, frame map.
+    :param summary: its results.
+    """
+    draw_flights(path, [(scenario, positions, summary)], "")
+
+
+def draw_flights(path: Path, flights: Sequence[tuple[Scenario, Array, dict[str, Any]]], title: str) -> None:
+    """Draws flights side by side, in one scale.
+
+    :param path: file to write.
+    :param flights: scenario, positions (T, 3, N) and summary of each.
+    :param title: above all of them; may be empty.
+    """
+    import matplotlib
+
+    count = len(flights)
+    with matplotlib.rc_context(_FONT):
+        figure = Figure(figsize=(4.9 * count + 0.6, 6.3 if title else 6.0))
+        extent = max(view_extent(scenario, [positions]) for scenario, positions, _ in flights)
+        bottom, top = 0.135, (0.80 if title else 0.87)
+        for index, (scenario, positions, summary) in enumerate(flights):
+            axes = figure.add_axes((0.13 / count + index / count, bottom, 0.84 / count, top - bottom))
+            paint(axes, scenario, positions, summary["collided_pair"] if summary["end"] == "crashed" else None)
+            style(axes, heading(summary), subtitle(summary), extent)
+            if index:
+                axes.set_ylabel("")
+        if title:
+            figure.text(0.13 / count, 0.945, title, fontsize=14, fontweight="bold", color=INK)
+        first = flights[0][2]
+        note = (
+            f"{first['agents']} agents, {first['moving']} moving, {first['slot_ms']:g} ms slots, "
+            f"loss {first['loss']:g}, avoider {first['avoider']}, seed {first['seed']}.\n"
+            "Seen from above: rings are starts, dots are ends."
+        )
+        figure.text(0.13 / count, 0.018, note, fontsize=8, color=MUTED, linespacing=1.5)
+        save(figure, path)

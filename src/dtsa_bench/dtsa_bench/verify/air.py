@@ -1,0 +1,204 @@
+"""All frames of a run on one time line, with what became of each: for runs that are checked but not flown again."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim.medium import OnAir
+from dtsa_channel_sim.realtime import RealtimeArbiter
+
+from .result import Difference, Mismatch
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class Sent:
+    """One frame."""
+
+    slot: int  # as its sender counts
+    on_air: OnAir
+    data: bytes
+    received: Mask | None = None  # (N,) by whom, as delivered
+    verdict: tuple[int, Mask, int, int] | None = None  # slot of its account, received, lost, collided
+    alone: bool = True  # nobody else was sending meanwhile
+
+    @property
+    def sender(self) -> int:
+        """Its id."""
+        return self.on_air.sender
+
+
+class Air:
+    """Frames as they were sent, delivered and judged.
+
+    :param config: the channel's settings.
+    :param own_clocks: whether frames start when their sender's clock says so; otherwise with their slot.
+    """
+
+    def __init__(self, config: ChannelConfig, own_clocks: bool) -> None:
+        self.config, self.own_clocks = config, own_clocks
+        self._sent: dict[tuple[int, int], Sent] = {}
+        self._unjudged: dict[int, deque[Sent]] = {}
+        self._positions: dict[int, NDArray[np.float64]] = {}
+        self.overlapping = 0  # pairs of frames
+
+    def send(self, slot: int, sender: int, start_ns: int, data: bytes) -> None:
+        """A frame goes out.
+
+        :param slot: as its sender counts.
+        :param start_ns: ns from the start of slot 0 by the channel's clock.
+        """
+        airtime = self.config.airtime
+        end_ns = start_ns + airtime.total_ns(len(data))
+        sent = Sent(slot, OnAir(sender, start_ns, start_ns + airtime.ramp_up_ns, end_ns), data)
+        self._sent[(slot, sender)] = sent
+        self._unjudged.setdefault(sender, deque()).append(sent)
+
+    def place(self, slot: int, position: NDArray[np.float64]) -> None:
+        """Where all are at a slot's start, (3, N) m; kept only where the channel asks for it."""
+        if self.config.range_m or self.config.capture_db:
+            self._positions[slot] = position.copy()
+
+    def deliver(self, slot: int, sender: int, data: bytes, received: Mask) -> Sent:
+        """A frame reaches some.
+
+        :raises Mismatch: nobody has sent it, it has been delivered already, or to its own sender.
+        """
+        sent = self._sent.get((slot, sender))
+        if sent is None:
+            why = "nobody hears what was not sent"
+            raise Mismatch(Difference("slot.sender", "an agent that sent", f"cf{sender}", why, slot))
+        for wrong, field_name, expected, recorded, why in (
+            (sent.data != data, "data", sent.data.hex(), data.hex(), "frames arrive as they were sent"),
+            (received[sender - 1], "received", "others only", f"cf{sender}", "nobody hears itself"),
+            (sent.received is not None, "sender", "one delivery", "two", "a frame arrives once"),
+        ):
+            if wrong:
+                raise Mismatch(Difference(f"slot.{field_name}", expected, recorded, why, slot, sender))
+        sent.received = received
+        return sent
+
+    def judged(self, slot: int, sender: int, received: Mask, lost: int, collided: int) -> None:
+        """The channel's verdict on a sender's next frame.
+
+        :raises Mismatch: there is no such frame.
+        """
+        waiting = self._unjudged.get(sender)
+        if not waiting:
+            why = "only what is sent is judged"
+            raise Mismatch(Difference("reception.sender", "agents that sent", f"cf{sender}", why, slot))
+        waiting.popleft().verdict = slot, received, lost, collided
+
+    def check_overlaps(self) -> dict[str, int]:
+        """Whether deliveries and verdicts agree, and nobody has heard two frames at one time, or while it sent.
+
+        :returns: how often what was found right.
+        :raises Mismatch: at the first frame for which that is not so.
+        """
+        by_start = sorted(self._sent.values(), key=lambda sent: sent.on_air.start_ns)
+        nobody = np.zeros(self.config.agents, dtype=np.bool_)
+        active: list[Sent] = []
+        for sent in by_start:
+            if sent.verdict is not None:
+                given = sent.received if sent.received is not None else nobody
+                if (given != sent.verdict[1]).any():
+                    raise Mismatch(Difference("reception.received", _ids(given), _ids(sent.verdict[1]),
+                                              "as delivered to the agents", sent.slot, sent.sender))  # fmt: skip
+            active = [other for other in active if other.on_air.end_ns > sent.on_air.start_ns]
+            for other in active:
+                self._pair(other, sent)
+                self._pair(sent, other)
+            active.append(sent)
+        return {"frames that nobody heard together with another": len(by_start)} if by_start else {}
+
+    def _pair(self, one: Sent, other: Sent) -> None:
+        """Two frames that meet in time."""
+        if one.on_air.deafens(other.on_air):
+            one.alone = other.alone = False
+        if one.on_air.overlaps(other.on_air):
+            self.overlapping += one.on_air < other.on_air
+            if one.received is not None and other.received is not None and (one.received & other.received).any():
+                both = f"both at {_ids(one.received & other.received)}"
+                why = f"it was on air together with a frame of cf{one.sender}"
+                expected = "one of two frames at most"
+                raise Mismatch(Difference("slot.received", expected, both, why, other.slot, other.sender))
+        if one.on_air.deafens(other.on_air) and other.received is not None and other.received[one.sender - 1]:
+            raise Mismatch(Difference("slot.received", f"without cf{one.sender}", _ids(other.received),
+                                      "who sends does not hear", other.slot, other.sender))  # fmt: skip
+
+    def check_verdicts(self, changes: list[tuple[int, dict[str, Any]]], only_alone: bool) -> int:
+        """Makes all verdicts again from the frames, their times and the channel's seed; after :meth:`check_overlaps`.
+
+        :param changes: first slot and values of each change of the channel's settings.
+        :param only_alone: leaves out frames that met another one.
+        :returns: how many are equal.
+        :raises Mismatch: at the first that is not.
+        """
+        channel = Channel(self.config)
+        for slot, values in changes:
+            channel.set(slot=slot, **values)
+        again = self._arbitrated(channel) if self.own_clocks else self._by_slots(channel)
+        equal = 0
+        for key, right in again.items():
+            sent = self._sent[key]
+            if sent.verdict is None or (only_alone and not sent.alone):
+                continue  # the recording ended before it was judged
+            expected, found = _shown(*right), _shown(*sent.verdict[1:])
+            for name, one, other in zip(("received", "lost", "collided"), expected, found, strict=True):
+                if one != other:
+                    why = "overlap on the time line, and the channel's draw from its seed"
+                    raise Mismatch(Difference(f"reception.{name}", one, other, why, sent.slot, sent.sender))
+            equal += 1
+        return equal
+
+    def _arbitrated(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
+        arbiter = RealtimeArbiter(channel)
+        for key, sent in self._sent.items():
+            arbiter.push(key, sent.sender, sent.on_air.start_ns, len(sent.data))
+        last = max((sent.on_air.end_ns for sent in self._sent.values()), default=0)
+        result = {}
+        for at in range(0, last + 2 * self.config.slot_ns, self.config.slot_ns):
+            for verdict in arbiter.settle(at):
+                result[verdict.frame_id] = verdict.received, verdict.lost, verdict.collided
+        return result  # type: ignore[return-value]
+
+    def _by_slots(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
+        slots: dict[int, list[Sent]] = {}
+        for sent in self._sent.values():
+            slots.setdefault(sent.slot, []).append(sent)
+        result = {}
+        for slot in sorted(slots):
+            frames = sorted(slots[slot], key=lambda sent: sent.sender)
+            senders = [sent.sender for sent in frames]
+            verdict = channel.arbitrate(slot, senders, [len(sent.data) for sent in frames], self._positions.get(slot))
+            mask, nothing = verdict.mask(self.config.agents), (0,) * len(frames)
+            for k, sender in enumerate(senders):
+                result[(slot, sender)] = mask[k], (verdict.lost or nothing)[k], (verdict.collided or nothing)[k]
+        return result
+
+    def safety(self) -> dict[str, Any]:
+        """What is worth knowing about the frames."""
+        judged = [sent.verdict for sent in self._sent.values() if sent.verdict is not None]
+        return {
+            "frames": len(self._sent),
+            "frames_not_judged": len(self._sent) - len(judged),
+            "overlapping_pairs": self.overlapping,
+            "frames_collided": sum(1 for verdict in judged if verdict[3]),
+        }
+
+
+def _shown(received: Mask, lost: int, collided: int) -> tuple[str, str, str]:
+    return _ids(received), str(lost), str(collided)
+
+
+def _ids(mask: Mask) -> str:
+    from dtsa_channel_sim.answers import named
+
+    return named((np.flatnonzero(mask) + 1).tolist())

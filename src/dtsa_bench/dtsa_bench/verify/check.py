@@ -1,0 +1,55 @@
+"""Verifies one bag, whatever kind of run it holds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.bag.errors import BagError, UnusableBag
+from dtsa_bench.bag.reader import Bag
+
+from .lockstep import LockstepCheck
+from .result import Difference, Mismatch, Result
+
+
+def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) -> Result:
+    """Checks a recorded run.
+
+    :param path: a bag directory, the directory of a flight with one in it, or an .mcap file.
+    :param progress: is called with the slot now and then.
+    :returns: what was checked, and the first difference if there is one.
+    :raises UnusableBag: if it cannot be read as a bag of this project at all.
+    """
+    begin = time.perf_counter()
+    with Bag(bag_directory(Path(path))) as bag:
+        mode = str(bag.config.get("mode", "lockstep"))
+        result = Result(str(path), mode)
+        try:
+            _check(bag, mode, result, progress)
+        except Mismatch as mismatch:
+            result.difference = mismatch.difference
+        except UnusableBag as error:
+            result.difference = Difference("the file", "a readable bag", "a damaged one", str(error))
+        except ConfigError as error:
+            result.difference = Difference("the recorded configuration", error.allowed, repr(error.value), error.field)
+        except BagError as error:
+            result.difference = Difference("a message", "valid CDR of its type", "other bytes", str(error))
+    result.wall_time_s = time.perf_counter() - begin
+    return result
+
+
+def _check(bag: Bag, mode: str, result: Result, progress: Callable[[int], None] | None) -> None:
+    if mode == "lockstep":
+        LockstepCheck(bag, result, progress).check()
+        return
+    from .realtime import RealtimeCheck
+
+    RealtimeCheck(bag, result).check()
+
+
+def bag_directory(path: Path) -> Path:
+    """The bag of a flight's directory, or the path itself."""
+    inner = path / "bag"
+    return inner if inner.is_dir() and not any(path.glob("*.mcap")) else path

@@ -1,0 +1,34 @@
+"""Build of dtsa_bench: commands, figures, launch files."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "dtsa_bench"
+ASSETS = ["html", "js", "css", "json", "yaml", "svg"]
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*"]),
+    package_data={NAME: ["py.typed", *(f"**/*.{suffix}" for suffix in ASSETS)]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *([(f"share/{NAME}/launch", sorted(glob("launch/*.py")))] if glob("launch/*.py") else []),
+        *([(f"share/{NAME}/config", sorted(glob("config/*.yaml")))] if glob("config/*.yaml") else []),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="DTSA maintainers",
+    maintainer_email="maintainers@dtsa.example",
+    description="Flights, experiments and their analysis: simulate, fly, record, replay, verify, report.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "dtsa = dtsa_bench.cli:main",
+            "recorded_channel = dtsa_bench.recorded_channel:main",
+            "fake_crazyflie = dtsa_bench.fake_crazyflie.cli:main",
+        ],
+    },
+)
