@@ -1,0 +1,273 @@
+"""Writes the layouts for Foxglove, Lichtblick and PlotJuggler.
+
+    python layouts/make.py [AGENTS]
+
+The layouts in this directory are those for 12 agents; for other swarms run this with their number.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+HERE = Path(__file__).resolve().parent
+AGENTS = 12
+COLOURS = ("#2f74b5", "#d9772b", "#3b9468", "#a4509a", "#b38f17", "#3a97a3", "#cf3f4c", "#7d78c6", "#7a9a3a", "#a3674a")
+PAIRS = 5  # PlotJuggler: distances from cf1 to so many others
+
+
+def colour(number: int) -> str:
+    """A colour for the n-th curve."""
+    return COLOURS[number % len(COLOURS)]
+
+
+# ---- Foxglove and Lichtblick ----
+
+
+def plot(title: str, paths: list[dict[str, Any]], label: str, **more: Any) -> dict[str, Any]:
+    """A Plot panel."""
+    return {
+        "paths": [{"enabled": True, "timestampMethod": "receiveTime", **path} for path in paths],
+        "minYValue": "",
+        "maxYValue": "",
+        "showLegend": True,
+        "legendDisplay": "floating",
+        "showPlotValuesInLegend": False,
+        "isSynced": True,
+        "xAxisVal": "timestamp",
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "yAxisLabel": label,
+        "sidebarDimension": 240,
+        "foxglovePanelTitle": title,
+        "lichtblickPanelTitle": title,
+        **more,
+    }
+
+
+def scene() -> dict[str, Any]:
+    """The 3D panel."""
+    grid = "c0a1f3f0-8c7c-4f0e-9a51-2f7f5d6e0001"
+    return {
+        "cameraState": {
+            "distance": 9,
+            "perspective": True,
+            "phi": 55,
+            "thetaOffset": 40,
+            "target": [0, 0, 0],
+            "targetOffset": [0, 0, 0],
+            "targetOrientation": [0, 0, 0, 1],
+            "fovy": 45,
+            "near": 0.05,
+            "far": 500,
+        },
+        "followMode": "follow-none",
+        "followTf": "map",
+        "scene": {"enableStats": False},
+        "transforms": {},
+        "topics": {"/swarm/markers": {"visible": True}},
+        "layers": {
+            grid: {
+                "visible": True,
+                "frameLocked": True,
+                "label": "Grid",
+                "instanceId": grid,
+                "layerId": "foxglove.Grid",
+                "frameId": "map",
+                "size": 8,
+                "divisions": 8,
+                "lineWidth": 1,
+                "color": "#8a96a555",
+                "position": [0, 0, -0.95],
+                "rotation": [0, 0, 0],
+                "order": 1,
+            }
+        },
+        "foxglovePanelTitle": "Flight",
+        "lichtblickPanelTitle": "Flight",
+    }
+
+
+def foxglove(agents: int = AGENTS) -> dict[str, Any]:
+    """The layout for Foxglove and Lichtblick.
+
+    :param agents: number of agents.
+    """
+    news = "/studio_script/swarm_news"
+    place = "pose.pose.position"
+    heights = [
+        {"value": f"/cf{k}/odom.{place}.z", "label": f"cf{k}", "color": colour(k - 1)} for k in range(1, agents + 1)
+    ]
+    ages = [
+        {"value": f"{news}.age_mean", "label": "mean", "color": COLOURS[0]},
+        {"value": f"{news}.age_max", "label": "oldest", "color": COLOURS[1]},
+    ]
+    distances = [
+        {"value": f"{news}.distance_min", "label": "closest pair", "color": COLOURS[0]},
+        {"value": "0.2", "label": "crash", "color": COLOURS[6]},
+    ]
+    senders = [{"value": "/swarm/reception.sender[:]", "label": "sender", "color": COLOURS[0], "showLine": False}]
+    outcome = {"value": "/swarm/reception.outcome", "label": "slots", "timestampMethod": "receiveTime"}
+    return {
+        "configById": {
+            "3D!swarm": scene(),
+            "StateTransitions!slots": {
+                "paths": [outcome],
+                "isSynced": True,
+                "foxglovePanelTitle": "Slots: idle, success, collision",
+                "lichtblickPanelTitle": "Slots: idle, success, collision",
+            },
+            "Plot!senders": plot("Who sends", senders, "agent"),
+            "Plot!ages": plot("Age of news", ages, "age (slots)"),
+            "Plot!distances": plot("Smallest distance", distances, "distance (m)"),
+            "Plot!heights": plot("Odometry: height", heights, "z (m)"),
+            "RawMessages!decision": {
+                "topicPath": "/swarm/decision",
+                "diffEnabled": False,
+                "diffMethod": "custom",
+                "diffTopicPath": "",
+                "showFullMessageForDiff": False,
+            },
+        },
+        "globalVariables": {},
+        "userNodes": {
+            "b6d0c0f2-4b7e-4d0c-8f6e-5b7f1c2d0001": {
+                "name": "swarm_news",
+                "sourceCode": (HERE / "swarm_news.ts").read_text(encoding="utf-8"),
+            }
+        },
+        "playbackConfig": {"speed": 1},
+        "layout": {
+            "direction": "row",
+            "splitPercentage": 52,
+            "first": {
+                "direction": "column",
+                "splitPercentage": 68,
+                "first": "3D!swarm",
+                "second": {
+                    "direction": "row",
+                    "splitPercentage": 50,
+                    "first": "Plot!heights",
+                    "second": "RawMessages!decision",
+                },
+            },
+            "second": {
+                "direction": "column",
+                "splitPercentage": 16,
+                "first": "StateTransitions!slots",
+                "second": {
+                    "direction": "column",
+                    "splitPercentage": 34,
+                    "first": "Plot!senders",
+                    "second": {
+                        "direction": "column",
+                        "splitPercentage": 50,
+                        "first": "Plot!distances",
+                        "second": "Plot!ages",
+                    },
+                },
+            },
+        },
+    }
+
+
+# ---- PlotJuggler ----
+
+DISTANCE = """return math.sqrt((value - v3)^2 + (v1 - v4)^2 + (v2 - v5)^2)"""
+AGE_GLOBAL = "last = nil"
+AGE = """if value == {agent} then last = time end
+if last == nil then return 0 end
+return time - last"""
+
+
+def plotjuggler(agents: int = AGENTS) -> str:
+    """The layout for PlotJuggler.
+
+    :param agents: number of agents.
+    """
+    root = ElementTree.Element("root")
+    tabs = ElementTree.SubElement(root, "tabbed_widget", name="Main Window", parent="main_window")
+    numbers = range(1, agents + 1)
+    _tab(
+        tabs,
+        "slots",
+        [
+            [("/swarm/reception/outcome", COLOURS[0])],
+            [("/swarm/reception/sender[0]", COLOURS[1])],
+            [(f"age of cf{k}", colour(k - 1)) for k in numbers],
+        ],
+        dots={1},
+    )
+    others = range(2, min(agents, PAIRS + 1) + 1)
+    _tab(
+        tabs,
+        "flight",
+        [
+            [(f"distance cf1 cf{k}", colour(k - 1)) for k in others],
+            *([(f"/cf{k}/odom/pose/pose/position/{axis}", colour(k - 1)) for k in numbers] for axis in "xyz"),
+        ],
+    )
+    ElementTree.SubElement(tabs, "currentTabIndex", index="0")
+    ElementTree.SubElement(root, "use_relative_time_offset", enabled="1")
+    equations = ElementTree.SubElement(root, "customMathEquations")
+    for k in others:
+        place = "odom/pose/pose/position"
+        more = [f"/cf1/{place}/y", f"/cf1/{place}/z", *(f"/cf{k}/{place}/{axis}" for axis in "xyz")]
+        _equation(equations, f"distance cf1 cf{k}", DISTANCE, f"/cf1/{place}/x", more)
+    for k in numbers:
+        source = "/swarm/reception/sender[0]"
+        _equation(equations, f"age of cf{k}", AGE.format(agent=k), source, [], AGE_GLOBAL)
+    ElementTree.indent(root, " ")
+    return "<?xml version='1.0' encoding='UTF-8'?>\n" + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _tab(
+    tabs: ElementTree.Element, name: str, plots: list[list[tuple[str, str]]], dots: set[int] | None = None
+) -> None:
+    tab = ElementTree.SubElement(tabs, "Tab", tab_name=name, containers="1")
+    share = ";".join([f"{1 / len(plots):.4f}"] * len(plots))
+    splitter = ElementTree.SubElement(
+        ElementTree.SubElement(tab, "Container"), "DockSplitter", orientation="-", count=str(len(plots)), sizes=share
+    )
+    for number, curves in enumerate(plots):
+        area = ElementTree.SubElement(splitter, "DockArea", name="...")
+        style = "Dots" if number in (dots or ()) else "Lines"
+        panel = ElementTree.SubElement(area, "plot", mode="TimeSeries", style=style, flip_x="false", flip_y="false")
+        ElementTree.SubElement(panel, "limitY")
+        for curve, ink in curves:
+            ElementTree.SubElement(panel, "curve", name=curve, color=ink)
+
+
+def _equation(
+    parent: ElementTree.Element, name: str, function: str, source: str, more: list[str], start: str = ""
+) -> None:
+    snippet = ElementTree.SubElement(parent, "snippet", name=name)
+    ElementTree.SubElement(snippet, "global").text = start
+    ElementTree.SubElement(snippet, "function").text = function
+    ElementTree.SubElement(snippet, "linked_source").text = source
+    if more:
+        sources = ElementTree.SubElement(snippet, "additional_sources")
+        for number, entry in enumerate(more, 1):
+            ElementTree.SubElement(sources, f"v{number}").text = entry
+
+
+def main(words: list[str]) -> int:
+    """Write both layouts beside this script."""
+    if len(words) > 1 or (words and not (words[0].isdigit() and 1 <= int(words[0]) <= 1000)):
+        print(f"make.py: AGENTS: got {' '.join(words)!r}; allowed: one number from 1 to 1000", file=sys.stderr)
+        return 2
+    agents = int(words[0]) if words else AGENTS
+    for name, text in (
+        ("foxglove_swarm.json", json.dumps(foxglove(agents), indent=2) + "\n"),
+        ("plotjuggler_swarm.xml", plotjuggler(agents)),
+    ):
+        (HERE / name).write_text(text, encoding="utf-8")
+        print(HERE / name)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

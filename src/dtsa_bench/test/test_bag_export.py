@@ -1,0 +1,143 @@
+"""Exported tables against the bag they come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet
+import pytest
+from flight_helpers import flight_bag
+
+from dtsa_agent.core import decode_frame
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.bag import export as module
+from dtsa_bench.bag.errors import BagError, UnusableBag
+from dtsa_bench.bag.export import COLUMNS, export
+from dtsa_bench.bag.reader import Bag
+from dtsa_bench.bag.run import load_run
+from dtsa_bench.bag.writer import BagWriter
+
+SLOTS, AGENTS = 120, 6
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lossy flight whose frames collide: ALOHA."""
+    directory = tmp_path_factory.mktemp("bags") / "flight"
+    flight_bag(directory, slots=SLOTS, loss=0.2, agents=AGENTS, policy="aloha", seed=3)
+    return directory
+
+
+def read(directory: Path, kind: str) -> dict[str, pd.DataFrame]:
+    """All tables of an export."""
+    how = {"parquet": pd.read_parquet, "csv": pd.read_csv}[kind]
+    return {path.stem: how(path) for path in directory.glob(f"*.{kind}")}
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv"])
+def test_tables_have_the_documented_columns_and_the_bag_s_values(flight: Path, tmp_path: Path, kind: str) -> None:
+    written = export(flight, tmp_path / "tables", kind)
+    tables = read(tmp_path / "tables", kind)
+    assert {one.path.stem: one.rows for one in written} == {name: len(table) for name, table in tables.items()}
+    assert {name: list(table.columns) for name, table in tables.items()} == {
+        name: [column for column, _, _ in columns] for name, columns in COLUMNS.items()
+    }
+    text = (tmp_path / "tables" / "columns.md").read_text(encoding="utf-8")
+    for columns in COLUMNS.values():
+        for name, _, meaning in columns:
+            assert f"`{name}`" in text
+            assert meaning in text
+    with Bag(flight) as bag:
+        receptions = [typed for _, typed in bag.typed(["/swarm/reception"])]
+        decisions = [typed for _, typed in bag.typed(["/swarm/decision"])]
+        transmissions = [typed for _, typed in bag.typed(["/swarm/transmission"])]
+    outcomes = ["idle", "success", "collision"]
+    assert tables["slots"]["slot"].tolist() == list(range(SLOTS))
+    assert tables["slots"]["outcome"].tolist() == [outcomes[one.outcome] for one in receptions]
+    assert tables["slots"]["senders"].tolist() == [len(one.sender) for one in receptions]
+    assert np.allclose(tables["slots"]["time_s"], np.arange(SLOTS) * 0.01)
+    frames = tables["frames"]
+    assert frames["sender"].tolist() == [int(k) for one in receptions for k in one.sender]
+    assert frames["lost"].tolist() == [int(k) for one in receptions for k in one.lost]
+    for row in frames.itertuples():
+        data = bytes.fromhex(row.data)
+        heard = np.unpackbits(receptions[row.slot].received, bitorder="little")[:8].sum()
+        frame = decode_frame(data)
+        assert (frame.sender, frame.slot, len(data)) == (row.sender, row.slot, row.length)
+        assert (row.position_x_m, row.position_y_m, row.position_z_m) == pytest.approx(frame.position, abs=1e-9)
+        assert frame.c_r == row.c_r
+        if len(receptions[row.slot].sender) == 1:
+            assert row.received == heard
+            assert row.received + row.lost == AGENTS - 1
+    assert tables["decisions"]["chosen"].tolist() == [int(k) for one in decisions for k in one.chosen]
+    names = [one.reason_name[k] for one in decisions for k in one.reason_index]
+    assert tables["decisions"]["reason"].tolist() == names
+    assert tables["decisions"]["digest"].astype("uint64").tolist() == [int(k) for one in decisions for k in one.digest]
+    states = tables["states"]
+    first = states[states["agent"] == 3].reset_index(drop=True)
+    for slot in (1, 50, SLOTS - 1):
+        track = transmissions[slot].track.reshape(-1, 3, AGENTS)[-1, :, 2]
+        row = first[np.isclose(first["time_s"], slot * 0.01)].iloc[0]
+        assert [row["position_x_m"], row["position_y_m"], row["position_z_m"]] == pytest.approx(track, abs=1e-9)
+
+
+def test_units_are_in_the_parquet_files(flight: Path, tmp_path: Path) -> None:
+    export(flight, tmp_path / "tables", tables=["states"])
+    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["columns.md", "states.parquet"]
+    schema = pyarrow.parquet.read_schema(tmp_path / "tables" / "states.parquet")
+    assert schema.field("velocity_x_mps").metadata[b"unit"] == b"m/s"
+
+
+def test_tables_larger_than_a_batch_are_whole(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(flight, tmp_path / "one")
+    monkeypatch.setattr(module, "ROWS", 50)
+    export(flight, tmp_path / "many")
+    for name, table in read(tmp_path / "one", "parquet").items():
+        assert table.equals(read(tmp_path / "many", "parquet")[name]), name
+
+
+def test_motion_falls_back_to_odometry(flight: Path, tmp_path: Path) -> None:
+    with (
+        Bag(flight) as bag,
+        BagWriter(tmp_path / "bag", bag.config) as writer,
+    ):
+        names = [name for name in bag.topics if name != "/swarm/transmission"]
+        channels = {}
+        for name in names:
+            topic = bag.topics[name]
+            definition = module_definition(topic)
+            channels[name] = writer.add_topic(name, topic.type, list(topic.profiles), definition)
+        for message in bag.messages(names):
+            writer.write(channels[message.topic], message.data, message.log_time_ns, message.publish_time_ns)
+    with Bag(flight) as bag:
+        with_tracks = load_run(bag).motion
+    with Bag(tmp_path / "bag") as bag:
+        run = load_run(bag)
+    assert not any(run.frames.data)
+    common, a, b = np.intersect1d(run.motion.time_ns, with_tracks.time_ns, return_indices=True)
+    assert len(common) > SLOTS - 3
+    assert np.array_equal(run.motion.position[a], with_tracks.position[b])
+
+
+def module_definition(topic: object) -> object:
+    """A topic's definition, to write it again."""
+    from dtsa_bench.bag.schema import Definition
+
+    return Definition(topic.type, topic.definition, topic.type_hash)  # type: ignore[attr-defined]
+
+
+def test_bad_input_is_refused(flight: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="parquet or csv"):
+        export(flight, tmp_path / "a", "xlsx")
+    with pytest.raises(ConfigError, match="slots, frames, decisions, states"):
+        export(flight, tmp_path / "a", tables=["slot"])
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="empty or does not exist"):
+        export(flight, tmp_path)
+    with pytest.raises(UnusableBag):
+        export(tmp_path / "nothing", tmp_path / "a")
+    with pytest.raises((BagError, ConfigError)):
+        export(flight, tmp_path / "file" / "below")
+    assert not (tmp_path / "a").exists()

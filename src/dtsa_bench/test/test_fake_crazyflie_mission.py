@@ -1,0 +1,143 @@
+"""Missions: the agents' nodes, the bridge, the real cflib and simulated Crazyflies, from take-off to landing."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("cflib")
+pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs.srv")
+
+from bridge_helpers import FakeFleet, fake_fleet, settings, wait_for
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_bench.fake_crazyflie.truth import read_truth
+
+pytestmark = [pytest.mark.slow, pytest.mark.ros]
+COUNT = 4
+FLY = [sys.executable, "-m", "dtsa_bench", "fly", "--backend", "cflib", "--no-picture", "--slot-ms", "20"]
+
+
+def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
+    """The swarm's YAML, everybody on its place of the ellipse."""
+    data: dict[str, Any] = settings(fleet, {"safety": safety})
+    for k, robot in enumerate(data["robots"].values()):
+        angle = 2 * math.pi * k / COUNT
+        robot["initial_position"] = [round(1.2 * math.cos(angle), 3), round(2.0 * math.sin(angle), 3), 0.0]
+    path = folder / "swarm.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def test_take_off_exchange_landing(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, COUNT) as fleet:
+        config, out = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45), tmp_path / "out"
+        command = [*FLY, "--config", str(config), "--out", str(out), "--policy", "lease"]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert result.returncode == 0, result.stderr
+        summary = json.loads((out / "summary.json").read_text())
+        assert (summary["end"], summary["backend"], summary["cut_short"]) == ("completed", "cflib", "")
+        assert 1.0 < summary["completion_time_s"] < 30.0
+        assert (out / "bag" / "metadata.yaml").is_file()
+        times, track, events = read_truth(fleet.truth)
+        assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
+        # Who stood opposite each other have changed places, and everybody stands on the floor.
+        assert track[-1, 2] == pytest.approx([0.0] * COUNT)
+        goal = track[0][:2, [2, 3, 0, 1]]
+        assert np.linalg.norm(track[-1][:2] - goal, axis=0).max() < 0.5
+        for k in range(1, COUNT + 1):
+            assert [e["state"] for e in fleet.events(k, "state")][:3] == ["ready to fly", "flying", "landed"]
+        # What the bag's metrics say about the closest approach is what truly happened, within the sensors' noise.
+        begin = max(
+            next(e["t"] for e in events if e["cf"] == k and e["event"] == "streaming") for k in range(1, COUNT + 1)
+        )
+        end = min(e["t"] for e in events if e["event"] == "land")
+        during = track[(times >= begin) & (times <= end)]
+        gap = np.linalg.norm(during[:, :, :, None] - during[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
+        assert summary["min_distance_m"] == pytest.approx(gap.min(), abs=0.05)
+
+
+def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, COUNT) as fleet:
+        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out"), "--tail-s", "60"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            end = time.monotonic() + 60
+            while len(fleet.events(name="streaming")) < COUNT and time.monotonic() < end:
+                time.sleep(0.1)
+            time.sleep(1.0)
+            fleet.fault("freeze", 2)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.wait()
+        assert process.returncode == 1
+        assert "cut short: cf2 is lost" in errors
+        for k in (1, 3, 4):
+            assert [e["state"] for e in fleet.events(k, "state")][:3] == ["ready to fly", "flying", "landed"]
+        assert fleet.state_event(2, "level out")
+        assert not [e for e in fleet.events() if e["event"] in ("collision", "crash") and e["cf"] != 2]
+
+
+def fly(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*FLY, *arguments], capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_bad_input_starts_nothing(tmp_path: Path) -> None:
+    out = str(tmp_path / "out")
+    robots = {f"cf{k}": {"uri": f"udp://127.0.0.1:{9000 + k}"} for k in range(1, 5)}
+    config = tmp_path / "swarm.yaml"
+    config.write_text(yaml.safe_dump({"robots": robots}))
+    for arguments, words in (
+        (["--out", out], "--config FILE"),
+        (["--out", out, "--config", str(config)], "within 0.25 m of (1."),
+        (["--out", out, "--config", str(config), "--agents", "3", "--moving", "2"], "the ids 1 to 3"),
+    ):
+        result = fly(*arguments)
+        assert result.returncode == 2
+        assert words in result.stderr
+        assert len(result.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="pip install cflib"):
+        require_cflib()
+
+
+def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2) as fleet:
+        data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
+        data["robots"]["cf1"]["initial_position"] = [1.2, 0.0, 0.0]
+        data["robots"]["cf2"]["initial_position"] = [-1.2, 0.0, 0.0]
+        config = tmp_path / "swarm.yaml"
+        config.write_text(yaml.safe_dump(data))
+        command = [*FLY, "--config", str(config), "--out", str(tmp_path / "out"), "--tail-s", "60"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            wait_for(lambda: len(fleet.events(name="streaming")) == 2, 60)
+            process.send_signal(signal.SIGINT)
+            wait_for(lambda: len(fleet.events(name="land")) == 2, 20)
+            assert not any(e["state"] == "locked" for e in fleet.events(name="state"))
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.wait()
+        assert process.returncode == 130
+        for k in (1, 2):
+            assert fleet.state_event(k, "locked")["reason"] == "emergency stop"

@@ -1,0 +1,474 @@
+"""Flights of real nodes from the command line: what they record, how they end, and who is named when a node fails."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from node_helpers import end_of, ros_graph
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.ros.wire import split_frames
+from dtsa_bench.bag.reader import Bag
+from dtsa_bench.fly.domain import ros_domain
+from dtsa_bench.run_config import RunConfig, RunLimits
+from dtsa_bench.simulate import simulate
+from dtsa_bench.verify import verify_bag
+from dtsa_channel_sim import ChannelConfig, ClockConfig, make_clocks
+
+pytestmark = pytest.mark.ros
+
+PATIENCE_S = 60.0
+# Long enough to be interrupted, whatever the machine.
+ENDLESS = ("--agents", "3", "--moving", "2", "--tail-s", "3600", "--no-picture")
+
+
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "dtsa_bench", "fly", *words]
+
+
+def fly(out: Path, *words: str) -> dict[str, Any]:
+    """A whole flight; its summary."""
+    done = subprocess.run(
+        command("--out", str(out), *words), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads((out / "summary.json").read_text())
+
+
+def frames(out: Path) -> list[tuple[int, int, bytes]]:
+    """(slot, sender, frame) of all frames that the nodes of a flight sent, in order."""
+    sent = []
+    with Bag(out / "bag") as bag:
+        for _, message in bag.typed(["/swarm/transmission"]):
+            pieces = split_frames(message.data, message.length)
+            sent += [(int(message.slot), int(a), f) for a, f in zip(message.agent, pieces, strict=True) if f]
+    return sorted(sent)
+
+
+def children(supervisor: int) -> list[int]:
+    """Processes that a flight has started and that are still there, whoever their parent is by now."""
+    mark = f"DTSA_SUPERVISOR={supervisor}".encode()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                if (
+                    mark in (entry / "environ").read_bytes().split(b"\0")
+                    and b") Z " not in (entry / "stat").read_bytes()
+                ):
+                    found.append(int(entry.name))
+    return found
+
+
+def until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.02)
+
+
+@contextmanager
+def flying(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+    """A flight that has begun, in the state in which the test leaves it."""
+    process = subprocess.Popen(
+        command("--out", str(out), *words), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    )
+    bag = out / "bag" / "bag_0.mcap"
+    try:
+        until(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 20_000))
+        yield process
+    finally:
+        left = children(process.pid)
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def pid_of(supervisor: int, agent: int) -> int:
+    """Process of one agent."""
+    name = f"__ns:=/cf{agent}".encode()
+    return next(pid for pid in children(supervisor) if name in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
+
+
+def readable(out: Path) -> int:
+    """Slots in a bag that is finished and says nothing but what the protocol gives."""
+    assert (out / "bag" / "metadata.yaml").is_file()
+    result = verify_bag(out / "bag")
+    assert result.ok, result.difference
+    return result.slots
+
+
+@pytest.mark.parametrize(("loss", "splits"), [("0", ["per-agent", "1"]), ("0.25", ["per-agent", "2"])])
+def test_same_seed_same_flight_whatever_the_processes(tmp_path: Path, loss: str, splits: list[str]) -> None:
+    words = ("--agents", "4", "--loss", loss, "--seed", "7", "--tail-s", "0.2", "--no-picture")
+    summaries = [fly(tmp_path / split, *words, "--processes", split) for split in splits]
+    first, second = (frames(tmp_path / split) for split in splits)
+    assert first == second
+    assert len(first) > 100
+    for summary in summaries:
+        del summary["wall_time_s"], summary["realtime_factor"]
+    assert summaries[0] == summaries[1]
+    swarm = SwarmConfig(agents=4, seed=7)
+    air = ChannelConfig(agents=4, slot_ns=swarm.slot_ns, seed=7, loss=float(loss))
+    simulated = simulate(RunConfig(swarm, air, RunLimits(tail_s=0.2))).summary()
+    for key in ("slots", "min_distance_m", "completion_time_s", "efficiency_mean", "age_max_slots"):
+        assert simulated[key] == summaries[0][key], key
+
+
+@pytest.mark.parametrize("policy", ["tdma", "dtsa", "age"])
+def test_nodes_agree_on_the_sender_and_never_send_together(tmp_path: Path, policy: str) -> None:
+    words = ("--agents", "12", "--policy", policy, "--processes", "3", "--timeout-s", "3", "--no-picture")
+    summary = fly(tmp_path / "out", *words)
+    assert summary["slots"]["collision"] == 0
+    with Bag(tmp_path / "out" / "bag") as bag:
+        decisions = [message for _, message in bag.typed(["/swarm/decision"])]
+        receptions = [message for _, message in bag.typed(["/swarm/reception"])]
+    assert len(decisions) == len(receptions) == summary["slots"]["total"]
+    assert all(len(np.unique(message.chosen)) == 1 for message in decisions)
+    assert all(len(message.sender) <= 1 for message in receptions)
+    assert sum(len(message.sender) for message in receptions) == summary["slots"]["success"]
+    readable(tmp_path / "out")
+
+
+def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+
+    out = tmp_path / "out"
+    summary = fly(out, "--agents", "5", "--moving", "4", "--tail-s", "0.1")
+    wanted = {
+        "agents",
+        "moving",
+        "policy",
+        "estimator",
+        "avoider",
+        "slot_ms",
+        "loss",
+        "seed",
+        "slots",
+        "collided",
+        "min_distance_m",
+        "efficiency_mean",
+        "completion_time_s",
+        "age_mean_slots",
+        "age_max_slots",
+        "estimate_error_mean_m",
+        "wall_time_s",
+        "realtime_factor",
+    }
+    assert wanted <= summary.keys()
+    assert summary["end"] == "completed"
+    total = summary["slots"]["total"]
+    with AnyReader([out / "bag"]) as reader:
+        counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+        stamps = [time_ns for _, time_ns, _ in reader.messages()]
+        last = [
+            reader.deserialize(data, c.msgtype) for c, _, data in reader.messages() if c.topic == "/swarm/transmission"
+        ][-5:]
+    assert counts == {
+        "/swarm/slot": total + 1,
+        "/swarm/transmission": 5 * (total + 1),
+        "/swarm/reception": total,
+        "/swarm/decision": total,
+        "/swarm/markers": -(-total // 10),
+        **{f"/cf{k}/odom": total for k in range(1, 6)},
+    }
+    assert stamps[0] == 1_000_000_000
+    assert stamps[-1] == 1_000_000_000 + total * 10_000_000
+    target = {int(message.agent[0]): message for message in last}
+    assert sorted(target) == [1, 2, 3, 4, 5]
+    assert (out / "trajectories.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert (out / "trajectories.png").stat().st_size > 20_000
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_flight_leaves_no_process_and_a_readable_bag(tmp_path: Path, number: int) -> None:
+    with flying(tmp_path / "out", *ENDLESS) as process:
+        assert len(children(process.pid)) == 3
+        process.send_signal(number)
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 130
+        assert "interrupted" in said
+        assert children(process.pid) == []
+        assert readable(tmp_path / "out") > 10
+        assert json.loads((tmp_path / "out" / "summary.json").read_text())["end"] == "stopped"
+
+
+@pytest.mark.parametrize("started", [1, 3])
+def test_a_signal_during_the_start_leaves_no_process(tmp_path: Path, started: int) -> None:
+    process = subprocess.Popen(command("--out", str(tmp_path / "out"), *ENDLESS), stderr=subprocess.PIPE, text=True)
+    until(lambda: len(children(process.pid)) >= started)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert "Traceback" not in said
+    assert children(process.pid) == []
+
+
+def test_a_killed_agent_is_named_and_everything_ends(tmp_path: Path) -> None:
+    with flying(tmp_path / "out", *ENDLESS) as process:
+        victim = pid_of(process.pid, 2)
+        os.kill(victim, signal.SIGKILL)
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 1
+        assert said.splitlines()[-1] == f"dtsa: error: cf2 (process {victim}) was killed by SIGKILL"
+        assert children(process.pid) == []
+        assert readable(tmp_path / "out") > 10
+
+
+def test_a_hung_agent_is_named_and_everything_ends(tmp_path: Path) -> None:
+    with flying(tmp_path / "out", *ENDLESS, "--answer-s", "1") as process:
+        os.kill(pid_of(process.pid, 3), signal.SIGSTOP)
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 1
+        assert re.search(r"cf3 did not answer slot \d+ within 1 s: dead or hung\?$", said.strip())
+        assert children(process.pid) == []
+        assert readable(tmp_path / "out") > 10
+
+
+def test_in_real_time_agents_keep_their_own_clocks(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = (
+        "--agents",
+        "4",
+        "--policy",
+        "tdma",
+        "--mode",
+        "realtime",
+        "--clock-offset-ns",
+        "300000",
+        "--tail-s",
+        "0.1",
+        "--clock-drift-ppm",
+        "50",
+        "--clock-jitter-ns",
+        "20000",
+        "--no-picture",
+        "--processes",
+        "2",
+    )
+    summary = fly(out, *words)
+    assert summary["mode"] == "realtime"
+    assert summary["end"] == "completed"
+    assert summary["lost_agents"] == []
+    assert summary["slots"]["success"] > summary["slots"]["total"] // 2
+    assert summary["realtime_factor"] == pytest.approx(1.0, abs=0.2)
+    with Bag(out / "bag") as bag:
+        sent = [message for _, message in bag.typed(["/swarm/transmission"])]
+    first = {
+        int(agent): int(offset)
+        for message in sent[:2]
+        for agent, offset in zip(message.agent, message.offset_ns, strict=True)
+    }
+    assert len(set(first.values())) == 4  # four clocks, none like another
+    readable(out)
+
+
+def test_in_real_time_the_others_fly_on_when_one_is_killed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = (
+        "--agents",
+        "5",
+        "--moving",
+        "4",
+        "--policy",
+        "lease",
+        "--mode",
+        "realtime",
+        "--tail-s",
+        "0.2",
+        "--no-picture",
+    )
+    with flying(out, *words) as process:
+        victim = pid_of(process.pid, 3)
+        os.kill(victim, signal.SIGKILL)
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, said
+        assert f"cf3 (process {victim}) was killed by SIGKILL; the others fly on" in said
+        assert children(process.pid) == []
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["lost_agents"] == [3]
+    assert summary["end"] == "completed"
+    assert summary["collided"] is False
+    with Bag(out / "bag") as bag:
+        assert bag.topic("/swarm/decision").count == summary["slots"]["total"]
+        silent = [message.slot for _, message in bag.typed(["/swarm/transmission"]) if message.agent[0] == 3]
+        others = [message.slot for _, message in bag.typed(["/swarm/transmission"]) if message.agent[0] != 3]
+    assert max(silent) + 100 < max(others)  # it flew, and long after it the others did
+
+
+def test_slots_of_a_clock_start_when_that_clock_says_so() -> None:
+    from dtsa_agent.ros.realtime import slot_starts
+
+    config = ClockConfig(offset_ns=2_000_000, drift_ppm=50.0, seed=3)
+    clocks = make_clocks(config, 6)
+    offset = np.array([clock.offset_ns for clock in clocks])
+    drift = np.array([clock.drift_ppb for clock in clocks])
+    for slot in (0, 1, 777, 60_000):
+        local = slot * 10_000_000
+        expected = [clock.to_channel(local) - local for clock in clocks]
+        assert slot_starts(local, offset, drift).tolist() == expected
+
+
+def test_agents_do_not_outlive_a_killed_flight(tmp_path: Path) -> None:
+    with flying(tmp_path / "out", *ENDLESS) as process:
+        assert len(children(process.pid)) == 3
+        process.kill()
+        process.wait()
+        until(lambda: not children(process.pid))
+    recovered = subprocess.run(
+        [sys.executable, "-m", "dtsa_bench", "recover", str(tmp_path / "out" / "bag")],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert recovered.returncode == 0, recovered.stderr
+
+
+NOISE = """
+import sys, rclpy
+from dtsa_msgs.msg import Slot, Transmission
+from rclpy.serialization import serialize_message
+rclpy.init()
+node = rclpy.create_node("noise")
+publisher = node.create_publisher(Transmission, "/swarm/transmission", 10)
+message = Transmission(agent=[2], length=[0], steps=1, track=[0.0] * 3, velocity=[0.0] * 3, command=[0.0] * 3,
+                       chosen=[0], reason=[0], digest=[0], score=[0.0])
+def answer(slot):
+    message.slot = slot.slot
+    data = bytes(serialize_message(message))
+    if slot.slot >= 5:
+        kind = sys.argv[1]
+        if kind == "bytes":
+            data = bytes([0, 1, 0, 0]) + bytes([255]) * 40
+        else:
+            message.track = [float("nan")] * 3 if kind == "nan" else [0.0] * 4
+            data = bytes(serialize_message(message))
+    publisher.publish(data)
+node.create_subscription(Slot, "/swarm/slot", answer, 10)
+rclpy.spin(node)
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("bytes", "channel: error: cf2 sent garbage in slot 5: a message of 44 bytes that is no Transmission"),
+        ("nan", "channel: error: cf2 sent an unusable answer: positions, velocities or goals that are no"),
+        ("shape", "channel: error: cf2 sent an unusable answer: 4 numbers in track for 1 agents"),
+    ],
+)
+def test_a_node_that_sends_garbage_is_named_and_the_others_end(tmp_path: Path, kind: str, said: str) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = graph.start("dtsa_channel_sim.channel_node", "-p", "agents:=2")
+        agent = graph.start("dtsa_agent.ros.agent_node", "-p", "id:=1", "-p", "agents:=2")
+        noise = subprocess.Popen([sys.executable, "-c", NOISE, kind], env=graph.environment, stderr=subprocess.DEVNULL)
+        try:
+            code, error = end_of(channel)
+            assert code == 1
+            assert error.splitlines()[-1].startswith(said)  # the middleware may have said something before
+            assert end_of(agent) == (0, "")
+        finally:
+            noise.kill()
+            noise.wait()
+
+
+def test_the_channel_changes_in_flight_and_the_bag_still_verifies(tmp_path: Path) -> None:
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    out = tmp_path / "out"
+    with ros_graph(tmp_path) as graph:
+        parameters = ["agents:=4", "seed:=3", "tail_s:=3600.0", f"out:={out}"]
+        channel = graph.start("dtsa_bench.recorded_channel", *[w for p in parameters for w in ("-p", p)])
+        host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=4", "-p", "seed:=3", "-p", "shared_view:=true")
+        bag = out / "bag" / "bag_0.mcap"
+        graph.until(lambda: bag.exists() and bag.stat().st_size > 20_000)
+        change = graph.node.create_client(SetParameters, "/swarm/channel/set_parameters")
+        graph.until(change.service_is_ready)
+        for values, good in (({"loss": 0.5}, True), ({"loss": 1.5}, False), ({"partition": "1-2 | 3-4"}, True)):
+            request = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+            done = change.call_async(SetParameters.Request(parameters=request))
+            graph.until(done.done)
+            assert done.result().results[0].successful is good
+            size = bag.stat().st_size
+            graph.until(lambda size=size: bag.stat().st_size > size + 10_000)
+        assert end_of(channel, signal.SIGINT)[0] == 0
+        assert end_of(host) == (0, "")
+    readable(out)
+    with Bag(out / "bag") as recorded:
+        events = [message for _, message in recorded.typed(["/parameter_events"])]
+        lost = [int(np.sum(message.lost)) for _, message in recorded.typed(["/swarm/reception"])]
+        divided = [len(np.unique(message.digest)) for _, message in recorded.typed(["/swarm/decision"])]
+    assert [event.changed_parameters[0].name for event in events] == ["loss", "partition"]
+    assert lost[0] == 0
+    assert max(lost) > 0
+    assert divided[0] == 1
+    assert max(divided) > 1  # what was one table for all became one an agent
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--policy", "fifo"], "policy: got 'fifo'; allowed: tdma, dtsa"),
+        (["--agents", "0"], "agents: got 0; allowed: 1 to 1024"),
+        (["--agents", "4", "--moving", "6"], "moving: got 6; allowed: 0 to 4, the number of agents"),
+        (["--moving", "3"], "moving: got 3; allowed: an even number: agents exchange places in pairs"),
+        (["--slot-ms", "-5"], "slot_ms: got -5.0; allowed: 0.5 to 1000 ms"),
+        (["--loss", "1.2"], "loss: got 1.2; allowed: a number from 0 to 1"),
+        (["--processes", "13"], "processes: got '13'; allowed: per-agent, or a whole number, 1 to 12"),
+        (["--domain", "233"], "domain: got '233'; allowed: a whole number, 0 to 232"),
+        (["--mode", "turbo"], "mode: got 'turbo'; allowed: lockstep, realtime"),
+        (["--estimator", "oracle"], "estimator: got 'oracle'; allowed: hold, linear or intent"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    from dtsa_bench.cli import main
+
+    assert main(["fly", "--out", str(tmp_path / "out"), *words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"dtsa: error: {said}")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_directory_or_a_domain_in_use_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dtsa_bench.cli import main
+
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    assert main(["fly", "--out", str(tmp_path / "full")]) == 2
+    assert capsys.readouterr().err.startswith("dtsa: error: out: got")
+    with ros_domain() as taken:
+        assert main(["fly", "--out", str(tmp_path / "out"), "--domain", str(taken)]) == 2
+        assert "in use" in capsys.readouterr().err
+        with ros_domain() as other:
+            assert other != taken
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+        somebody.bind(("", 7400 + 250 * taken + 10))
+        assert main(["fly", "--out", str(tmp_path / "out"), "--domain", str(taken)]) == 2
+        assert "in use" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

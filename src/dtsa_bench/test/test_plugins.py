@@ -1,0 +1,153 @@
+"""Policies, estimators and avoiders from a package of the user's, found by entry point."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dtsa_agent.core import REASONS, Agent, ConfigError, LocalProtocolError, SwarmConfig, plugins
+from dtsa_bench.simulate import simulate
+from dtsa_bench.sweep import spec, work
+
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "dtsa_plugins"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The example package, installed by pip into a directory of its own."""
+    source, target = tmp_path_factory.mktemp("source") / "example", tmp_path_factory.mktemp("target")
+    shutil.copytree(EXAMPLE, source)
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run([*command, "--target", str(target), str(source)], check=True, capture_output=True)
+    sys.path.append(str(target))
+    importlib.invalidate_caches()
+    yield target
+    sys.path.remove(str(target))
+    sys.modules.pop("dtsa_plugins", None)
+
+
+def flight(**settings: Any) -> Any:
+    return simulate(spec.run_config({"agents": 6, "seed": 5, "timeout_s": 1.5, **settings}), trace=True)
+
+
+def test_a_policy_of_ones_own_decides_who_sends() -> None:
+    result = flight(policy="least-known")
+    assert {REASONS[code] for code in result.trace.reasons} == {"plugin"}
+    senders = result.trace.senders
+    assert senders[:6] == [(i,) for i in range(1, 7)]
+    assert all(len(ids) == 1 for ids in senders)
+    assert [ids[0] for ids in senders[10::10]] == [slot // 10 % 6 + 1 for slot in range(10, len(senders), 10)]
+
+
+def test_an_estimator_of_ones_own_feeds_avoider_and_metrics() -> None:
+    linear, damped = (flight(estimator=name, policy="tdma") for name in ("linear", "damped"))
+    quick = flight(estimator="damped", policy="tdma", options={"damped.rest_s": 0.05})
+    assert len({f.trace.positions().tobytes() for f in (linear, damped, quick)}) == 3
+    # Whoever is believed to stop at once is believed to be too far back.
+    errors = [f.summary()["estimate_error_mean_m"] for f in (linear, damped, quick)]
+    assert errors[0] < errors[1] < errors[2]
+    swarm = quick.swarm
+    age = (quick.metrics.slots - swarm.sent_slot[0]) * 0.01
+    expected = swarm.sent_position[0] + swarm.sent_velocity[0] * age * (1 + 1 / (1 + age / 0.05)) / 2
+    np.testing.assert_allclose(quick.trace.estimates[-1], expected, atol=1e-12)
+
+
+def test_an_avoider_of_ones_own_flies() -> None:
+    result = flight(avoider="give-way", timeout_s=20.0)
+    assert result.summary()["end"] == "completed"
+    assert plugins.avoider_model("give-way").vehicle.tau == 0.1
+    speed = np.linalg.norm(np.diff(result.trace.positions(), axis=0), axis=1) / 0.01
+    assert 0.9 < speed.max() <= 1.0 + 1e-9
+    straight = flight(
+        avoider="none", timeout_s=20.0, options={"v_max": 1.0, "tau": 0.1, "spacing": 0.55, "min_radius": 1.8}
+    )
+    assert straight.summary()["end"] == "crashed"
+
+
+def test_all_three_together_are_the_same_flight_every_time_and_with_single_agents() -> None:
+    settings = {"policy": "least-known", "estimator": "damped", "avoider": "give-way", "timeout_s": 0.6}
+    together = flight(**settings)
+    config = SwarmConfig(agents=6, seed=5, **{k: v for k, v in settings.items() if k != "timeout_s"})
+    agents = [Agent(i, config) for i in range(1, 7)]
+    for slot in range(60):
+        frames = {agent.id: agent.on_slot(slot) for agent in agents}
+        sent = {i: data for i, data in frames.items() if data}
+        assert tuple(sent) == together.trace.senders[slot]
+        for agent in agents:
+            agent.swarm.fly(slot)
+            for i, data in sent.items():
+                assert agent.id == i or agent.on_frame(data, slot)
+        positions = np.concatenate([agent.swarm.position for agent in agents], axis=1)
+        assert np.array_equal(positions, together.trace.tracks[slot][-1])
+
+
+@pytest.mark.ros
+def test_nodes_find_plugins_too_and_agree_with_the_simulator(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy")
+    from dtsa_bench.fly.flight import FlightOptions, fly
+
+    # Its processes inherit the way to the package.
+    before = os.environ.get("PYTHONPATH", "")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(installed), before])))
+    settings = {"agents": 4, "policy": "least-known", "estimator": "damped", "avoider": "give-way", "loss": 0.1}
+    run = spec.run_config({**settings, "seed": 5, "timeout_s": 0.8})
+    real = fly(run, tmp_path / "flight", FlightOptions(processes=2, pictures=False))
+    ours = simulate(run, trace=True)
+    assert ours.trace is not None
+    ends = np.stack([track[-1] for track in ours.trace.tracks])
+    assert len(real.positions) >= 80
+    assert np.array_equal(real.positions[1:80], ends[:79])
+
+
+def test_sweeps_take_plugins_by_name_and_their_failures_are_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = spec.load_file(EXAMPLE / "sweep.yaml", seeds=1)
+    assert {cell.labels["policy"] for cell in sweep.cells} == {"tdma", "dtsa", "least-known"}
+    tasks = [task for task in sweep.tasks() if task.settings["policy"] == "least-known"]
+    rows = [work.fly_one(task) for task in tasks]
+    assert len(rows) == 4
+    assert {row["status"] for row in rows} <= {"completed", "crashed"}
+    assert all(row["summary"]["policy"] == "least-known" for row in rows)
+
+    import dtsa_plugins
+
+    monkeypatch.setattr(dtsa_plugins.LeastKnown, "choose", lambda self, view, slot: 1 // 0)
+    row = work.fly_one(tasks[0])
+    assert row["status"] == "failed"
+    assert "ZeroDivisionError" in row["reason"]
+    monkeypatch.setattr(dtsa_plugins.LeastKnown, "choose", lambda self, view, slot: 99)
+    with pytest.raises(LocalProtocolError, match="99"):
+        simulate(spec.run_config({**tasks[0].settings, "agents": 6, "moving": 6}))
+
+
+def test_what_does_not_exist_or_does_not_import_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind, near in (("policy", "least-known"), ("estimator", "damped"), ("avoider", "give-way")):
+        with pytest.raises(ConfigError, match=f"^{kind}: got 'nothing'.*{near}"):
+            SwarmConfig(**{kind: "nothing"})
+    broken = importlib.metadata.EntryPoint("broken", "no_such_module:Thing", "dtsa.policies")
+    monkeypatch.setattr(plugins, "available", lambda kind: {"broken": broken})
+    with pytest.raises(ConfigError, match="no_such_module"):
+        SwarmConfig(policy="broken")
+
+
+def test_what_a_plugin_sees_it_cannot_change() -> None:
+    swarm = plugins.make_swarm(SwarmConfig(agents=3, moving=2, policy="least-known"))
+    view = plugins.View(swarm, 0)
+    for name in ("sent_position", "in_ap", "last_turn", "own_position", "goal"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(view, name)[...] = 0
+
+
+def test_built_in_names_never_make_a_plugin_swarm() -> None:
+    assert type(plugins.make_swarm(SwarmConfig())).__name__ == "Swarm"
+    assert type(plugins.make_swarm(SwarmConfig(policy="least-known"))).__name__ == "PluginSwarm"

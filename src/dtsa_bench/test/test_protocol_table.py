@@ -1,0 +1,88 @@
+"""The protocol's table: its rows, its verdicts, its files."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dtsa_bench.protocol_bench.cases import PROTOCOLS, cases, run_case
+from dtsa_bench.protocol_bench.table import as_text, run_table, summarise
+
+
+def case(name: str):  # type: ignore[no-untyped-def]
+    return next(row for row in cases() if row.name == name)
+
+
+def test_names_are_unique() -> None:
+    names = [row.name for row in cases()]
+    assert len(set(names)) == len(names)
+
+
+def test_all_moving_without_loss_is_exactly_tdma() -> None:
+    row = case("12/12 moving, no loss")
+    ages = {name: run_case(row, name, 1, 2000).age for name in PROTOCOLS if name != "dtsa"}
+    assert ages == dict.fromkeys(ages, 5.5)
+    assert run_case(row, "dtsa", 1, 2000).age > 5.5
+
+
+@pytest.mark.parametrize(
+    ("name", "ceiling"),
+    [
+        ("12/6 moving, no loss", 0.64),
+        ("12/6 moving, 30 %", 0.64),
+        ("12/2 moving, no loss", 0.2),
+        ("12/2 moving, 10 %", 0.2),
+        ("12/12 moving, 10 %", 0.9),
+        ("70/35 moving, 10 %", 0.64),
+        ("12/6, hoverers final, from the first slot on", 0.999),
+        ("70 stop and go, pauses of 3000, no loss", 0.8),
+        ("70 stop and go, pauses of 1000, no loss", 1.02),
+        ("70 stop and go, pauses of 300, 10 %", 1.02),
+    ],
+)
+def test_lease_is_younger_than_tdma(name: str, ceiling: float) -> None:
+    row = case(name)
+    slots = 8000 if "stop" in name else 4000
+    lease, tdma = (run_case(row, protocol, 7, slots) for protocol in ("lease", "tdma"))
+    assert lease.age < ceiling * tdma.age
+    assert lease.broken == 0
+    assert lease.collisions == lease.open_collisions + lease.adopted_collisions
+    assert lease.collisions <= 0.001 * lease.slots
+
+
+def test_plain_dtsa_falls_apart_with_the_first_losses() -> None:
+    row = case("12/6 moving, 10 %")
+    dtsa, tdma, lease = (run_case(row, protocol, 3, 4000) for protocol in ("dtsa", "tdma", "lease"))
+    assert dtsa.collisions > 100
+    assert dtsa.age > tdma.age > lease.age
+
+
+def test_files_and_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_table(tmp_path, seeds=2, slots=4000, jobs=1, only="12, 12 moving, no") == 0
+    printed = capsys.readouterr().out
+    assert (tmp_path / "protocol.md").read_text() in printed + "\n"
+    (row,) = json.loads((tmp_path / "protocol.json").read_text())
+    assert row["case"] == "join of 1 of 12, 12 moving, no loss"
+    assert row["ok"]
+    assert 0 <= row["lease"]["first frame"]["max"] <= 84
+    with (tmp_path / "protocol.csv").open() as file:
+        runs = list(csv.DictReader(file))
+    assert [(r["protocol"], r["seed"]) for r in runs] == [
+        (p, s) for p in ("lease S=0", "lease") for s in ("1001", "1002")
+    ]
+
+
+def test_a_broken_rule_or_an_old_age_is_a_no() -> None:
+    row = case("12/6 moving, no loss")
+    good = {(row.name, name): [run_case(row, name, 1, 1500)] for name in PROTOCOLS}
+    assert summarise([row], good)[0]["ok"]
+    for column, change in (("lease", {"broken": 1}), ("lease", {"age": 9.0}), ("lease S=0", {"collisions": 1}),
+                           ("lease", {"collisions": 2})):  # fmt: skip
+        bad = {**good, (row.name, column): [replace(good[row.name, column][0], **change)]}
+        table = summarise([row], bad)
+        assert not table[0]["ok"], change
+        assert "| NO |" in as_text(table)
