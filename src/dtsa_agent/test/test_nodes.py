@@ -85,6 +85,19 @@ def test_a_node_that_missed_slots_says_so_and_ends(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
+def test_a_node_ends_when_its_channel_has_gone(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-p", "id:=1", "-p", "agents:=2")
+        channel.ask(0)
+        channel.ask(1)
+        assert agent.poll() is None
+        graph.node.destroy_publisher(channel.publisher)
+        said = "agent: error: the channel has gone after slot 1 without ending the run\n"
+        assert end_of(agent) == (1, said)
+
+
+@pytest.mark.ros
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number: int) -> None:
     with ros_graph(tmp_path) as graph:

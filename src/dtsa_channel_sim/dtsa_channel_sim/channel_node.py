@@ -149,8 +149,10 @@ def _body(stop: Stop, supervised: bool) -> None:
         medium = Channel(ChannelConfig.from_dict(values))
         channel = PlainChannel(node, medium, steps, slots, startup_s=startup_s, answer_s=answer_s)
         follow_parameters(node, medium)
-        channel.run(stop)
-        channel.close()
+        try:
+            channel.run(stop)
+        finally:
+            channel.close()
     finally:
         node.destroy_node()
 

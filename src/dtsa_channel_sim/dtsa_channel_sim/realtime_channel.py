@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import time
-from array import array
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from dtsa_msgs.msg import Slot, Transmission
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
-from rosgraph_msgs.msg import Clock
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros import names
-from dtsa_agent.ros.loop import Loop
-from dtsa_agent.ros.wire import pack_received
 
 from .airtime import LONGEST_FRAME
 from .answers import Answers, named
 from .channel import Channel
 from .realtime import FrameVerdict, RealtimeArbiter
+from .ros_channel import RosChannel, put_frames, slot_stamp
 from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 _NS = 1_000_000_000
@@ -34,38 +30,24 @@ _PATIENCE = 10  # slots that a slot is kept open for agents that have not report
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 
 
-class RealtimeChannel:
+class RealtimeChannel(RosChannel):
     """Medium of a swarm whose agents have clocks of their own.
 
-    The hooks are those of :class:`~dtsa_channel_sim.lockstep.LockstepChannel`; slots are the channel's own. An
-    agent that falls silent is missed, but nobody waits for it.
+    Slots are the channel's own. An agent that falls silent is missed, but nobody waits for it.
 
     :param node: the ROS node.
     :param channel: the medium.
     :param steps: control instants in a slot.
-    :param swarm_namespace: namespace of the swarm's topics.
-    :param startup_s: s of wall time that all agents have to report.
     :param answer_s: not used: nobody waits.
+    :param more: as for :class:`RosChannel`.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        channel: Channel,
-        steps: int,
-        swarm_namespace: str = names.SWARM,
-        startup_s: float = 60.0,
-        answer_s: float = 0.0,
-    ) -> None:
-        self.node, self.channel = node, channel
-        self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
-        self.slot = -1  # last slot that is settled
-        self.answers = Answers(self.agents, steps)
-        self.unusable = 0  # messages that could not be read
+    def __init__(self, node: Node, channel: Channel, steps: int, answer_s: float = 0.0, **more: Any) -> None:
+        super().__init__(node, channel, steps, waiting=names.REALTIME_WAITING, **more)
         self.missed = 0  # reports of agents that came too late to count
         self.lost: set[int] = set()  # ids of agents that have fallen silent for good
         self.arbiter = RealtimeArbiter(channel)
-        self._steps, self._startup_s = steps, startup_s
+        self._steps = steps
         self._zero = 0
         self._book: dict[int, Answers] = {}
         self._frames: dict[tuple[int, int], bytes] = {}
@@ -76,36 +58,11 @@ class RealtimeChannel:
         self._stride_ns = round(_STRIDE * self.slot_ns)
         self._grace_ns = round(_GRACE * self.slot_ns)
         self._close_ns = self._grace_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
-        qos = names.lockstep_qos(names.REALTIME_WAITING)
-        self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", qos)
-        self._clock = node.create_publisher(Clock, "/clock", 10)
-        self._clock_watched = False
-        reports = names.lockstep_qos(names.REALTIME_WAITING * self.agents)
-        self.loop = Loop(node, Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", reports, raw=True)
 
-    # Hooks, see LockstepChannel.
-
-    def published(self, slot: int, data: bytes, time_ns: int) -> None:
-        """Frames have been delivered."""
-
-    def received(self, slot: int, ids: bytes, data: bytes) -> None:
-        """A usable report has come in."""
+    # Two more hooks.
 
     def reported(self, message: Transmission) -> None:
-        """The same, decoded; late ones too."""
-
-    def answered(self, slot: int, answers: Answers) -> bool:
-        """All agents that still live have reported for a slot. Whether the run goes on."""
-        return True
-
-    def judged(self, slot: int, frames: dict[int, bytes], verdict: Verdict) -> None:
-        """The air has carried a slot's frames."""
-
-    def recorded(self, slot: int, answers: Answers, verdict: Verdict) -> None:
-        """A slot is over."""
-
-    def idle(self) -> None:
-        """Called about ten times a second."""
+        """A usable report has come in, here decoded; late ones too."""
 
     def silent(self, agent: int) -> None:
         """An agent has fallen silent for good."""
@@ -121,8 +78,7 @@ class RealtimeChannel:
             if self._prepare(stop):
                 self._fly(stop)
         finally:
-            if self.node.context.ok():
-                self._publisher.publish(Slot(slot=max(0, self.slot + 1), phase=Slot.END))
+            self._publish_end()
 
     def lose(self, agent: int) -> None:
         """Takes note that an agent is gone."""
@@ -147,14 +103,12 @@ class RealtimeChannel:
                 message = self._decoded(data)
                 if message is not None:
                     self.answers.add(message)
-            if self.loop.housekeeping():
-                self.idle()
+            self._housekeeping()
             if now - begin > self._startup_s:
                 missing = named(self.answers.silent)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
         self._zero = time.monotonic_ns() + _LEAD_NS
-        seconds, nanoseconds = divmod(self._zero, _NS)
-        self._publisher.publish(Slot(phase=Slot.START, stamp=Time(sec=seconds, nanosec=nanoseconds)))
+        self._publisher.publish(Slot(phase=Slot.START, stamp=slot_stamp(self._zero)))
         self._heard_ns[:] = 0
         return True
 
@@ -175,9 +129,7 @@ class RealtimeChannel:
             while self._due(now):
                 if not self._close_slot():
                     return
-            if self.loop.housekeeping():
-                self._clock_watched = self._clock.get_subscription_count() > 0
-                self.idle()
+            self._housekeeping()
 
     def _decoded(self, data: bytes) -> Any:
         try:
@@ -236,20 +188,12 @@ class RealtimeChannel:
         if not verdict.received.any():
             return
         frame = self._frames[(slot, sender)]
-        seconds, nanoseconds = divmod(names.TIME_ZERO_NS + max(0, verdict.arrival_ns), _NS)
-        message = Slot(
-            stamp=Time(sec=seconds, nanosec=nanoseconds),
-            slot=slot,
-            phase=Slot.RUN,
-            heard_slot=slot,
-            sender=array("H", [sender]),
-            length=array("B", [len(frame)]),
-            data=array("B", frame),
-            received=array("B", pack_received(verdict.received[None])),
-        )
+        time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
+        message = Slot(stamp=slot_stamp(time_ns), slot=slot, phase=Slot.RUN, heard_slot=slot)
+        put_frames(message, [sender], [frame], verdict.received[None])
         data = bytes(serialize_message(message))
         self._publisher.publish(data)
-        self.published(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, verdict.arrival_ns))
+        self.published(max(slot, self.slot + 1), data, time_ns)
 
     def _due(self, now: int) -> bool:
         """Whether the next slot can be closed: its frames are settled, all agents have reported for the one after."""
@@ -270,9 +214,7 @@ class RealtimeChannel:
         self.answers = book
         frames, verdict = self._verdict(slot)
         self.judged(slot, frames, verdict)
-        if self._clock_watched:
-            seconds, nanoseconds = divmod(names.slot_time_ns(slot, self.slot_ns), _NS)
-            self._clock.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+        self._tell_time(slot_stamp(names.slot_time_ns(slot, self.slot_ns)))
         self.recorded(slot, book, verdict)
         self.slot = slot
         self._lag_ns = int(np.median(self._offset_ns[[k for k in range(self.agents) if k + 1 not in self.lost] or [0]]))
@@ -308,11 +250,3 @@ class RealtimeChannel:
             tuple(verdict.lost for verdict in settled),
             tuple(verdict.collided for verdict in settled),
         )
-
-    def close(self) -> None:
-        """Waits for the last message to leave and gives the handles back."""
-        from rclpy.duration import Duration
-
-        if self.node.context.ok():
-            self._publisher.wait_for_all_acked(Duration(seconds=1.0))
-        self.loop.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from array import array
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +24,8 @@ from dtsa_agent.keys import with_key
 from . import names
 from .loop import Loop, Stop
 from .wire import split_frames, unpack_received
+
+_GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
 
 
 class SwarmNode:
@@ -61,6 +64,7 @@ class SwarmNode:
         self._message = Transmission()
         self._message.agent = array("H", self.swarm.ids)
         self._message.steps = config.steps
+        self._channel_seen = 0.0  # time.monotonic()
         self._odometry: list[tuple[int, Publisher]] = []
         self._watched: list[tuple[int, Publisher]] = []
         qos = names.lockstep_qos(waiting)
@@ -78,7 +82,15 @@ class SwarmNode:
             self._odometry.append((index, publisher))
 
     def idle(self) -> None:
-        """Looks around; called about ten times a second."""
+        """Looks around; called about ten times a second.
+
+        :raises LocalProtocolError: when the channel has gone without ending the run.
+        """
+        now = time.monotonic()
+        if self.slot < 0 or self.loop.subscription.get_publisher_count():
+            self._channel_seen = now
+        elif now - self._channel_seen > _GONE_S:
+            raise LocalProtocolError(f"the channel has gone after slot {self.slot} without ending the run")
         self._watched = [entry for entry in self._odometry if entry[1].get_subscription_count()]
 
     def run(self, stop: Stop) -> None:
