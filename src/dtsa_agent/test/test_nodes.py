@@ -20,7 +20,6 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros import names
-from dtsa_agent.ros.swarm_node import separate_tables
 from dtsa_agent.ros.wire import pack_received, split_frames, unpack_received
 from dtsa_agent.settings import format_values, parse_values, settings_of
 
@@ -191,7 +190,7 @@ def test_agents_that_shared_a_table_go_on_alone_as_if_they_never_had(policy: str
         shared.fly(slot)
         lossy = slot >= 97
         if slot == 97:
-            shared = separate_tables(shared, slot)
+            shared = shared.with_own_tables(slot)
         for index in senders:
             mask = (random.random(6) < 0.6).astype(np.uint8) if lossy else np.ones(6, dtype=np.uint8)
             mask[index] = 0

@@ -258,6 +258,30 @@ def test_a_recovered_bag_verifies_up_to_where_it_was_cut(flight: Path, tmp_path:
     assert 0.5 * whole.slots < result.slots < whole.slots
 
 
+@pytest.mark.parametrize("sealed", [False, True])
+def test_a_wrong_frame_is_shown_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sealed: bool) -> None:
+    if sealed:
+        monkeypatch.setenv("DTSA_AUTH_KEY", "5a" * 16)
+    shape = ("--agents", "4", "--moving", "2", "--policy", "lease", "--processes", "1", "--timeout-s", "0.5")
+    flight = fly(tmp_path / "flight", *shape, *(["--auth"] if sealed else []))
+
+    def edit(messages: list[Message]) -> list[Message]:
+        with Bag(flight / "bag") as bag:
+            for i, message in enumerate(messages[len(messages) // 2 :], len(messages) // 2):
+                if message.topic == "/swarm/transmission" and (data := bag.decode(message).data).size:
+                    at = message.data.index(data.tobytes()) + 8  # the sender's position
+                    messages[i] = altered(message, at, 0)
+                    return messages
+        raise AssertionError("nobody sent")
+
+    difference = result_of(flight, tmp_path, edit).difference
+    assert difference is not None
+    for text in (difference.expected, difference.recorded):
+        assert "no frame" not in text
+        assert "news of cf" in text
+        assert ("sealed" in text) == sealed
+
+
 def test_what_is_no_bag_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"nonsense")
     for path in (tmp_path / "x.mcap", tmp_path / "nothing"):

@@ -54,10 +54,10 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 def decode_frame(data: bytes) -> Frame:
-    """The fields of a frame.
+    """The fields of a frame that all profiles have.
 
     :param data: the bytes heard.
-    :raises RemoteProtocolError: if they are no frame of profile ``paper``.
+    :raises RemoteProtocolError: if they are no frame: sealed ones are opened first.
     """
     fields = _kernel.decode(data)
     if isinstance(fields, int):

@@ -91,7 +91,9 @@ class Swarm:
         self._make_tables(len(self.observer), agents)
         self._make_agents(count, config.steps)
         self.course = self.scenario.course(self.local)
-        self.kernel = _kernel.Swarm(self._parameters(count), self._arrays())
+        parameters = self._parameters(count)
+        self._state = self._arrays()
+        self.kernel = _kernel.Swarm(parameters, self._state)
         self.authenticator: Authenticator | None = None
         self.begin = self.kernel.begin
         self.decide = self.kernel.decide
@@ -238,6 +240,24 @@ class Swarm:
         :raises ValueError: with a shared table.
         """
         self.kernel.restart(local_index)
+
+    def with_own_tables(self, slot: int) -> Swarm:
+        """The same agents in the same state, each with a table of its own: for the first frame that not all have heard.
+
+        :param slot: the slot that is under way: after ``fly(slot)``, before ``end(slot)``.
+        :returns: what takes the place of this swarm, which must not be used any more.
+        """
+        swarm = Swarm(self.config, self.scenario, local=self.ids)
+        if self.authenticator:
+            swarm.authenticate(self.authenticator)
+        # Lists the senders of the open slot; the state that they sent is copied over what this encodes.
+        swarm.sends[:] = self.sends
+        swarm.emit(slot)
+        for name, values in self._state.items():
+            if name != "observer":
+                swarm._state[name][...] = values  # the one table becomes everybody's
+        swarm.course = self.course
+        return swarm
 
     def leave(self, local_index: int) -> None:
         """A local agent leaves: with policy ``lease`` it says so in its next own turn and is switched off then.

@@ -159,7 +159,7 @@ class SwarmNode:
 
     def _unshare(self, slot: int) -> Swarm:
         """From the first frame on that not all have heard every agent keeps a table of its own."""
-        self.swarm = separate_tables(self.swarm, slot)
+        self.swarm = self.swarm.with_own_tables(slot)
         return self.swarm
 
     def _answer(self, slot: int, stamp: Time, senders: Sequence[int]) -> None:
@@ -196,53 +196,6 @@ class SwarmNode:
             place.x, place.y, place.z = self.swarm.position[:, index].tolist()
             speed.x, speed.y, speed.z = self.swarm.velocity[:, index].tolist()
             publisher.publish(message)
-
-
-def separate_tables(shared: Swarm, slot: int) -> Swarm:
-    """The same agents in the same state, each with a table of its own.
-
-    :param shared: agents that share a table, between ``fly(slot)`` and ``end(slot)``.
-    :param slot: the slot that is not closed yet.
-    """
-    swarm = Swarm(shared.config, shared.scenario, local=shared.ids)
-    if shared.authenticator:
-        swarm.authenticate(shared.authenticator)
-    # Lists the senders of the open slot; the state that they sent is copied over what this encodes.
-    swarm.sends[:] = shared.sends
-    swarm.emit(slot)
-    for name in (
-        "position",
-        "velocity",
-        "command",
-        "goal",
-        "known_goal",
-        "track",
-        "active",
-        "final",
-        "present",
-        "chosen",
-        "reason",
-        "digest",
-        "score",
-        "frame_length",
-        "frames",
-    ):
-        getattr(swarm, name)[...] = getattr(shared, name)
-    swarm.course = shared.course
-    for name in (
-        "sent_position",
-        "sent_velocity",
-        "sent_intent",
-        "sent_slot",
-        "last_turn",
-        "in_ap",
-        "estimate_position",
-        "estimate_velocity",
-        "_entry_hash",
-        "_view_hash",
-    ):
-        getattr(swarm, name)[...] = getattr(shared, name)[:1]
-    return swarm
 
 
 def parse_ids(value: Any, agents: int) -> list[int]:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core import REASONS, RemoteProtocolError, decode_frame
+from dtsa_agent.core.authentication import TAG_LENGTH
+from dtsa_agent.core.frame_extended import EXTENDED_LENGTH, ExtendedFrame, decode_extended
 from dtsa_bench.bag.errors import BagError
 from dtsa_bench.bag.reader import Bag, Message
 
@@ -142,9 +144,26 @@ def _in_frames(what: str, a: np.ndarray, b: np.ndarray, message: Any, slot: int,
 
 
 def _frame(data: bytes) -> str:
-    try:
-        frame = decode_frame(data)
-    except RemoteProtocolError as error:
-        return f"{data.hex()} (no frame: {error})"
-    place = ", ".join(f"{x:.3f}" for x in frame.position)
-    return f"{data.hex()} (cf{frame.sender}, slot {frame.slot}, c_r {frame.c_r}, at {place} m)"
+    """A frame in words, sealed or not."""
+    why = ""
+    for length, seal in ((len(data), ""), (len(data) - TAG_LENGTH, ", sealed")):
+        try:
+            frame = decode_frame(data[:length])
+            more = _more(decode_extended(data[:length])) if length == EXTENDED_LENGTH else ""
+        except RemoteProtocolError as error:
+            why = why or str(error)
+            continue
+        place = ", ".join(f"{x:.3f}" for x in frame.position)
+        return f"{data.hex()} (cf{frame.sender}, slot {frame.slot}, c_r {frame.c_r}, at {place} m{more}{seal})"
+    return f"{data.hex()} (no frame: {why})"
+
+
+def _more(frame: ExtendedFrame) -> str:
+    """What an extended frame says beyond its sender's state."""
+    words = [f"c_s {frame.c_s}"] if frame.c_s else []
+    words += ["leaving"] if frame.leaving else []
+    words += ["on probation"] if frame.probation else []
+    words += [f"news of cf{item.agent}, {item.age} slots old" for item in frame.gossip]
+    words += [f"leases {frame.leases.hex(' ')}"] if any(frame.leases) else []
+    words += [f"relays {', '.join(f'+{ahead}: {lessee}' for ahead, lessee in frame.relay)}"] if frame.relay else []
+    return "".join(f", {word}" for word in words)
