@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from dtsa_bench.benchmark import baselines, parts
+from dtsa_bench.benchmark import baselines, crazyflie, parts
 from dtsa_bench.cli import main
 
 
@@ -54,9 +56,53 @@ def test_targets_are_met_or_not() -> None:
         {"what": "whole slot", "agents": 200, "policy": "dtsa", "core_us": 300.0, "pyrvo_ten_us": 200.0},
         {"what": "whole slot", "agents": 70, "policy": "age", "core_us": 5.0},
     ]
-    assert [target["met"] for target in parts.targets(rows)] == [False, True]
+    bridge = {"what": "crazyflie bridge", "crazyflies": 12, "commands_hz": 47.0, "logs_hz": 50.0, "connect_s": 1.0}
+    bridge |= {"close_s": 3.5, "latency_p99_ms": 9.0, "bridge_cpu_percent": 61.0}
+    rows += [bridge, {"what": "crazyflie bridge", "left_out": "no cflib"}]
+    met = [target["met"] for target in parts.targets(rows)]
+    assert met == [False, True, False, True, True, False, True, False]
 
 
 def test_unknown_parts_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["benchmark", "--parts", "kernels,moon"]) == 2
     assert "moon" in capsys.readouterr().err
+
+
+def test_without_cflib_the_bridge_is_left_out(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "cflib" else True)
+    assert main(["benchmark", "--parts", "crazyflie", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    (row,) = content["crazyflie"]
+    assert row["left_out"] == "cflib is not installed: tools/dtsa setup --extra cflib"
+    assert content["targets"] == []
+
+
+def test_rate_and_latency_of_commands() -> None:
+    published = 100.0 + 0.02 * np.arange(50) + np.array([[0.0], [0.001]])  # 50 Hz for one second, to two
+    rows = [(k, i, published[k, i] + 0.002) for k in range(2) for i in range(50)]
+    rows[7] = (0, 7, published[0, 7] + 0.050)
+    others = [(0, -3, 99.9), (1, 50, 101.1)]  # before and after the measurement
+    row = crazyflie.commands(published, np.array(rows + others), 2)
+    assert row["commands_hz"] == pytest.approx(50.0)
+    assert row["latency_median_ms"] == pytest.approx(2.0, abs=1e-3)
+    assert 2.0 < row["latency_p99_ms"] < 50.0
+    half = crazyflie.commands(published, np.array(rows[::2]), 2)
+    assert half["commands_hz"] == pytest.approx(25.0)
+    nobody = crazyflie.commands(published, np.empty((0, 3)), 2)
+    assert nobody["commands_hz"] == 0.0
+    assert not nobody["latency_p99_ms"] <= 10.0  # not a number: not met
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_the_bridge_is_measured_in_flight() -> None:
+    pytest.importorskip("cflib")
+    pytest.importorskip("dtsa_msgs.srv")
+    row = crazyflie.measure(2, 1.0, {"link_age_s": 3.0, "command_age_s": 0.45})
+    assert row["crazyflies"] == 2
+    for name in ("connect_s", "close_s", "commands_hz", "logs_hz", "bridge_cpu_percent", "fleet_cpu_percent"):
+        assert row[name] > 0.0, name
+    assert 0.0 < row["latency_median_ms"] <= row["latency_p99_ms"]
+    assert row["commands_hz"] < 60.0

@@ -142,7 +142,7 @@ class BridgeNode(Node):
         began = time.monotonic()
         missing = self.bridge.connect()
         total = len(self.bridge.vehicles)
-        self.say("info", f"{total - len(missing)} of {total} connected in {time.monotonic() - began:.1f} s")
+        self.say("info", f"{total - len(missing)} of {total} connected in {time.monotonic() - began:.2f} s")
         if missing:
             self.say("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:

@@ -1,6 +1,6 @@
 """What is measured:
 
-kernels, whole slots, whole flights, nodes in lockstep, and the growth with the number of agents.
+kernels, whole slots, whole flights, nodes in lockstep, the growth with the number of agents, the Crazyflie bridge.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from dtsa_agent.core.frame import PROFILE_PAPER
 
 from ..simulate import simulate
 from ..sweep.spec import run_config
+from . import crazyflie as bridge
 from .baselines import NotHere, baseline
+from .crazyflie import crazyflie as crazyflie
 
 Row = dict[str, Any]
 SIZES = (18, 70, 200)
@@ -228,8 +230,10 @@ def targets(rows: list[Row]) -> list[Row]:
                 continue
             what = f"whole slot of {row['agents']}, {row['policy']}, against pyrvo's avoidance alone [us]"
             found.append(_target(what, row["core_us"], row["pyrvo_ten_us"]))
+        elif row["what"] == bridge.WHAT and "left_out" not in row:
+            found += [_target(*target) for target in bridge.targets(row)]
     return found
 
 
-def _target(what: str, value: float, limit: float) -> Row:
-    return {"target": what, "value": value, "limit": limit, "met": value <= limit}
+def _target(what: str, value: float, limit: float, least: bool = False) -> Row:
+    return {"target": what, "value": value, "limit": limit, "met": value >= limit if least else value <= limit}

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 DESCRIPTION = """\
-Measures kernels, whole slots, whole flights and nodes in lockstep, and beside them, in the same run, the same
-scenario in plain NumPy, pyrvo's ORCA step and RotorPy's multirotor. Times depend on the machine and on what
-else runs on it; the
-ratios much less."""
-PARTS = ("kernels", "avoidance", "slots", "flights", "cost", "nodes")
+Measures kernels, whole slots, whole flights, nodes in lockstep and the Crazyflie bridge (with cflib), and beside
+them, in the same run, the same scenario in plain NumPy, pyrvo's ORCA step and RotorPy's multirotor. Times depend
+on the machine and on what else runs on it; the ratios much less."""
+PARTS = ("kernels", "avoidance", "slots", "flights", "cost", "nodes", "crazyflie")
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

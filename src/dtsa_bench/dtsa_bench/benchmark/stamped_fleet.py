@@ -1,0 +1,74 @@
+"""Simulated Crazyflies that note when each streamed velocity command arrives: the far end of the bridge's benchmark.
+
+    python -m dtsa_bench.benchmark.stamped_fleet COUNT BASE_PORT FILE
+
+The times are the kernel's, so they do not depend on what the simulation is busy with.
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import struct
+import sys
+from typing import Any
+
+import numpy as np
+
+from dtsa_agent.ros.process import follow_supervisor
+from dtsa_bench.fake_crazyflie import crtp
+from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig
+
+READY = "the simulated Crazyflies are there"
+# A command's number travels in its velocity along x: far below anything that moves a vehicle.
+STEP_MPS = 1e-6
+_VELOCITY = 8  # type byte of a velocity along the world's axes
+_SO_TIMESTAMPNS = 35  # Linux; the module `socket` has no name for it before Python 3.14
+
+
+class _Stamped(socket.socket):
+    """A UDP socket that notes commands with the time of their arrival (s, system clock)."""
+
+    arrivals: list[tuple[int, int, float]]
+    index: int
+
+    def recvfrom(self, size: int, flags: int = 0) -> tuple[bytes, Any]:  # type: ignore[override]
+        data, extra, _, address = self.recvmsg(size, 64, flags)
+        packet = crtp.unpack(data)
+        if packet is not None and packet[:2] == (crtp.GENERIC_COMMANDER, 0) and packet[2][:1] == bytes((_VELOCITY,)):
+            number = round(struct.unpack_from("<f", packet[2], 1)[0] / STEP_MPS)
+            for level, kind, value in extra:
+                if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
+                    seconds, nanoseconds = struct.unpack("@ll", value)
+                    self.arrivals.append((self.index, number, seconds + 1e-9 * nanoseconds))
+        return data, address
+
+
+class StampedFleet(Fleet):
+    """A fleet whose sockets note arrivals: rows of vehicle (from 0), number of the command, time (s)."""
+
+    def _bind(self, port: int) -> socket.socket:
+        if not hasattr(self, "arrivals"):
+            self.arrivals: list[tuple[int, int, float]] = []
+        plain = super()._bind(port)
+        plain.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        stamped = _Stamped(fileno=plain.detach())
+        stamped.arrivals, stamped.index = self.arrivals, port - self.config.base_port
+        return stamped
+
+
+def main() -> int:
+    """Flies until SIGINT or SIGTERM, then writes the arrivals (NumPy, shape (n, 3))."""
+    count, base_port, path = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+    follow_supervisor()
+    fleet = StampedFleet(FleetConfig(count=count, base_port=base_port))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: fleet.stop())
+    print(READY, flush=True)
+    fleet.run()
+    np.save(path, np.array(fleet.arrivals, dtype=float).reshape(-1, 3))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
