@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,13 @@ import pytest
 pytest.importorskip("cflib")
 
 from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings, wait_for
+from metronome import ATTEMPTS, STILL_S, Metronome, flown_again_when_still
 
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_bench.fake_crazyflie.truth import read_truth
 
 pytestmark = pytest.mark.slow
-SLACK_S = 0.4  # what a loaded machine may add to a reaction
+SLACK_S = 0.4  # what a busy machine may add to a reaction, besides the time for which it stands still
 
 
 @dataclass
@@ -33,14 +33,16 @@ class FaultFlight:
     monotonic: float  # when the faults came, this process's clock
     fleet_time: float  # ... and the fleet's
     states: dict[int, State]  # seven seconds later
+    others: list[str]  # what the supervisors of those without a fault went through, up to the ground
+    slack_s: float
 
     def reacted(self, pattern: str) -> float:
         return self.flight.logged(pattern, self.monotonic) - self.monotonic
 
 
-@pytest.fixture(scope="module")
-def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultFlight]:
-    with fake_fleet(tmp_path_factory.mktemp("faults"), 8) as fleet, flight(settings(fleet)) as pilot:
+def fly_with_faults(folder: Path) -> tuple[FaultFlight, float]:
+    """The flight, and for how long the machine stood still in it, s."""
+    with fake_fleet(folder, 8) as fleet, flight(settings(fleet)) as pilot, Metronome() as metronome:
         assert pilot.bridge.connect() == []
         pilot.take_off()
         time.sleep(0.5)
@@ -53,14 +55,24 @@ def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultFlig
         pilot.velocity["cf6"] = (-1.0, 0.0, 0.0)
         time.sleep(7)
         states = {k: pilot.state(k) for k in range(1, 9)}
-        result = FaultFlight(fleet, pilot, began, t, states)
         pilot.bridge.land_all("test over")
         pilot.bridge.wait_landed(lambda: False)
-        yield result
+        others = [event["state"] for cf in (7, 8) for event in fleet.events(cf, "state")]
+    slack = SLACK_S + metronome.late_s
+    return FaultFlight(fleet, pilot, began, t, states, others, slack), metronome.late_s
+
+
+@pytest.fixture(scope="module")
+def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> FaultFlight:
+    for _ in range(ATTEMPTS):
+        result, still_s = fly_with_faults(tmp_path_factory.mktemp("faults"))
+        if still_s < STILL_S:
+            break
+    return result
 
 
 def test_frozen_link_is_lost_within_half_a_second(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf1: flying -> lost") < 0.5 + SLACK_S
+    assert fault_flight.reacted("cf1: flying -> lost") < 0.5 + fault_flight.slack_s
     assert fault_flight.states[1] is State.LOST
     # The Crazyflie by itself: level after 0.5 s without setpoints, motors off 1 s after the last watchdog packet.
     level = fault_flight.fleet.state_event(1, "level out")
@@ -69,24 +81,24 @@ def test_frozen_link_is_lost_within_half_a_second(fault_flight: FaultFlight) -> 
 
 
 def test_closed_socket_is_lost(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf2: flying -> lost") < 0.5 + SLACK_S
+    assert fault_flight.reacted("cf2: flying -> lost") < 0.5 + fault_flight.slack_s
     assert fault_flight.states[2] is State.LOST
 
 
 def test_tumbled_vehicle_is_an_emergency(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted(r"cf3: flying -> emergency \(tumbled") < SLACK_S
+    assert fault_flight.reacted(r"cf3: flying -> emergency \(tumbled") < fault_flight.slack_s
     assert not any(e["event"] == "streaming" and e["t"] > fault_flight.fleet_time for e in fault_flight.fleet.events(3))
 
 
 def test_empty_battery_lands(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf4: battery: .* critical .*: land") < 1.0 + SLACK_S
+    assert fault_flight.reacted("cf4: battery: .* critical .*: land") < 1.0 + fault_flight.slack_s
     assert fault_flight.fleet.events(4, "land")
     assert fault_flight.states[4] in (State.READY, State.ARMED)
 
 
 def test_commands_that_cease_hold_then_land(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf5: commands: .*: hold") < 0.25 + SLACK_S
-    assert 2.5 < fault_flight.reacted("cf5: commands: .*: land") < 3.0 + SLACK_S
+    assert fault_flight.reacted("cf5: commands: .*: hold") < 0.25 + fault_flight.slack_s
+    assert 2.5 < fault_flight.reacted("cf5: commands: .*: land") < 3.0 + fault_flight.slack_s
     names = [e["event"] for e in fault_flight.fleet.events(5) if e["t"] > fault_flight.fleet_time]
     assert names[:3] == ["stream ended", "go_to", "land"]
     assert "level out" not in [e.get("state") for e in fault_flight.fleet.events(5)]  # the firmware never had to help
@@ -111,11 +123,12 @@ def test_nobody_else_is_harmed(fault_flight: FaultFlight) -> None:
         moved = np.linalg.norm(track[during][:, :, k] - track[during][0, :, k], axis=1)
         assert moved.max() < 0.1
     assert not [e for e in events if e["event"] in ("collision", "crash")]
-    assert [e["state"] for cf in (7, 8) for e in fault_flight.fleet.events(cf, "state")] == 2 * [
+    assert fault_flight.others == 2 * [
         "ready to fly", "flying", "landed", *(["pre-flight checks not passed", "pre-flight checks passed"])
     ]  # fmt: skip
 
 
+@flown_again_when_still
 def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> None:
     with (
         fake_fleet(tmp_path, 3, "--layout", "line", "--half-axes", "1.2", "0.6") as fleet,
@@ -195,6 +208,7 @@ with flight(data) as pilot:
 """
 
 
+@flown_again_when_still
 def test_killed_bridge_leaves_it_to_the_firmware(tmp_path: Path) -> None:
     """One bridge with and one without the emergency watchdog, both killed."""
     import json
