@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -20,21 +19,8 @@ from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.config import parse_swarm
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_bench.fake_crazyflie import send_fault
+from dtsa_bench.fake_crazyflie.ports import free_base_port
 from dtsa_bench.fake_crazyflie.truth import read_truth
-
-
-def free_ports(count: int) -> int:
-    """First of `count` + 1 UDP ports in a row that are free; the one before it is free, too."""
-    for base in range(20100, 60000, count + 7):
-        with contextlib.ExitStack() as stack:
-            try:
-                for port in range(base - 1, base + count):
-                    sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                    sock.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return base
-    raise RuntimeError("no free ports")
 
 
 @dataclass
@@ -66,7 +52,7 @@ class FakeFleet:
 @contextlib.contextmanager
 def fake_fleet(folder: Path, count: int, *options: str) -> Iterator[FakeFleet]:
     """Simulated Crazyflies in a process of their own."""
-    base = free_ports(count)
+    base = free_base_port(count)
     truth = folder / f"truth-{base}.jsonl"
     command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--count", str(count), "--base-port", str(base)]
     command += ["--truth", str(truth), "--quiet", *options]
@@ -120,8 +106,8 @@ class Flight:
         ready = [n for n in names if self.bridge.vehicles[n].state == State.READY]
         self.bridge.each(ready, lambda v: v.arm(True))
         wait_for(lambda: all(self.bridge.vehicles[n].state == State.ARMED for n in ready))
-        assert self.bridge.each(ready, lambda v: v.takeoff(0.95, 1.5)) == (True, "")
-        time.sleep(1.8)
+        assert self.bridge.each(ready, lambda v: v.takeoff(0.95, 2.0)) == (True, "")
+        time.sleep(2.3)
         self.velocity = dict.fromkeys(ready, (0.0, 0.0, 0.0))
         threading.Thread(target=self.pilot, daemon=True).start()
 

@@ -115,7 +115,7 @@ def up(graph: Graph) -> None:
             assert f"{prefix}/{service}" in names
     assert graph.call(Arm, "/all/arm", arm=True).success
     wait_for(lambda: all(graph.state(k) == "armed" for k in (1, 2, 3)))
-    assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=1, nanosec=500_000_000)).success
+    assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=2)).success
     wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2]) < 0.1 for k in (1, 2, 3)))
 
 
@@ -150,8 +150,14 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(swarm: tuple[FakeFleet, subpro
     diagnostics = {s.hardware_id: s for s in graph.last["/diagnostics"].status}
     assert {"cf1", "cf2", "cf3"} == set(diagnostics)
     assert "battery [V]" in {v.key for v in diagnostics["cf1"].values}
+    # A go_to that no Crazyflie can keep is refused; a landing is not, it takes longer.
+    answer = graph.call(GoTo, "/cf3/go_to", relative=True, goal=Point(y=0.5), duration=Duration(nanosec=100_000_000))
+    assert not answer.success
+    assert "cf3: duration 0.10 s is too short for 0.50 m" in answer.message
     # The stream ends: the bridge holds. Landing one by service, the others by Ctrl-C.
-    assert graph.call(Land, "/cf3/land", height=0.0, duration=Duration(sec=3)).success
+    answer = graph.call(Land, "/cf3/land", height=0.0, duration=Duration(nanosec=200_000_000))
+    assert answer.success
+    assert "cf3: landing takes" in answer.message
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=25)
     assert process.returncode == 0, output

@@ -227,7 +227,10 @@ class BridgeNode(Node):
 
     def _land(self, names: list[str], request: Any, response: Any) -> Any:
         duration = _seconds(request.duration)
-        return self._each(names, lambda v: v.land("service", request.height, duration), response)
+        notes: list[str] = []
+        self._each(names, lambda v: v.land("service", request.height, duration, notes.append), response)
+        response.message = "; ".join(filter(None, (response.message, *notes)))
+        return response
 
     def _go_to(self, names: list[str], request: Any, response: Any) -> Any:
         goal, duration = request.goal, _seconds(request.duration)

@@ -80,7 +80,10 @@ class StationSettings:
     room_origin_in_world: Vector = (0.0, 0.0, 0.95)  # m: where the Crazyflies' world sees the origin of `map`
     force_budget: bool = False  # fly even if the radios cannot carry it
     toc_cache: str = ""  # folder of the variables' tables; empty: ~/.cache/dtsa/crazyflie
-    land_speed_mps: float = option(0.4, "speed of a landing", unit="m/s", minimum=0.05, maximum=2)
+    land_speed_mps: float = option(0.4, "mean speed of a landing", unit="m/s", minimum=0.05, maximum=2)
+    max_speed_mps: float = option(
+        1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
+    )
     landing_timeout_s: float = option(20.0, "longest wait for all to land", unit="s", minimum=1, maximum=300)
     safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.link import Link
+from dtsa_agent.crazyflie.paths import shortest_s, too_short
 from dtsa_agent.crazyflie.safety import Watched
 from dtsa_agent.crazyflie.state_machine import State, StateMachine
 from dtsa_agent.crazyflie.units import Setpoint, VehicleState, to_map, velocity_world, yaw_of
@@ -25,6 +26,7 @@ HOLD_S = 0.5  # s, duration of the path to the place that is held
 MIN_LAND_S = 1.0
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
 BLIND_REPEATS = 3
+BLIND_LAND_S = 2.0
 QUALITY_WINDOW_S = 1.0
 WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
 ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
@@ -188,6 +190,11 @@ class Vehicle:
                 return f"{self.name} is {self.state.name.lower()}, not armed"
             if self.last is not None and self.last.battery < self.robot.battery_critical_v:
                 return f"{self.name}: battery {self.last.battery:.2f} V"
+            if not math.isfinite(height):
+                return f"{self.name}: height {height} m is not finite"
+            z = 0.0 if self.last is None else max(self.last.position[2], 0.0)
+            if problem := too_short(duration, height - z, self.station.max_speed_mps):
+                return f"{self.name}: {problem}"
             self._deaf = False
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
@@ -199,6 +206,9 @@ class Vehicle:
         with self.lock:
             if self.state != State.FLYING or self._deaf:
                 return f"{self.name} is {self.state.name.lower()}" + (f" ({self.action})" if self._deaf else "")
+            here = (0.0, 0.0, 0.0) if relative or self.last is None else self.last.position
+            if problem := too_short(duration, math.dist(place, here), self.station.max_speed_mps):
+                return f"{self.name}: {problem}"
             self.action = "go_to"
             x, y, z = place
             self._high_level(lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative), duration)
@@ -244,12 +254,19 @@ class Vehicle:
             self._streaming = True
             self.link.mailbox.put_setpoint(velocity_world((0.0, 0.0, 0.0), 0.0, now))
 
-    def land(self, reason: str, height: float = 0.0, duration: float = 0.0) -> str:
+    def land(
+        self, reason: str, height: float = 0.0, duration: float = 0.0, note: Callable[[str], None] | None = None
+    ) -> str:
         """Sink and stop the motors; why not, or an empty text.
 
-        :param height: m above the floor. :param duration: s; 0: at the station's landing speed.
+        A landing is never refused for its numbers: one that would be too fast takes longer.
+
+        :param height: m above the floor.
+        :param duration: s; 0: at the station's landing speed.
+        :param note: is told when it takes longer than that.
         """
         with self.lock:
+            height = height if math.isfinite(height) else 0.0
             if self.state not in (State.ARMED, State.FLYING, State.LANDING, State.LOST):
                 return f"{self.name} is {self.state.name.lower()}"
             self._deaf = True
@@ -259,14 +276,31 @@ class Vehicle:
             # A blind landing must end a stream that the firmware may still follow.
             self._streaming = self._streaming or self.state == State.LOST
             self.machine.land(f"land: {reason}")
+            seconds, limit = self._landing_s(height, duration), self.station.max_speed_mps
+            if 0.0 < duration < seconds:
+                longer = (
+                    f"{self.name}: landing takes {seconds:.2f} s: {too_short(duration, self._height() - height, limit)}"
+                )
+                self._log("warn", longer)
+                if note is not None:
+                    note(longer)
 
             def sink() -> None:
-                z = self.last.position[2] if self.last is not None else 1.0
-                seconds = duration or max(MIN_LAND_S, (z - height) / self.station.land_speed_mps)
+                seconds = self._landing_s(height, duration)
                 self._high_level(lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
 
             self._brake_then(sink)
             return ""
+
+    def _height(self) -> float:
+        """Last known height above the floor, m."""
+        return self.last.position[2] if self.last is not None else 1.0
+
+    def _landing_s(self, height: float, duration: float) -> float:
+        """Duration (s) of a landing to a height (m) that was wanted to take `duration` (s; 0: as the station says)."""
+        way = abs(self._height() - height)
+        wanted = duration if duration > 0.0 else max(MIN_LAND_S, way / self.station.land_speed_mps)
+        return max(wanted, shortest_s(way, self.station.max_speed_mps))
 
     def stop(self, reason: str) -> None:
         """Emergency stop: motors off for good."""
@@ -315,7 +349,8 @@ class Vehicle:
             if self._blind and now >= self._blind[0]:
                 self._blind.pop(0)
                 self._streaming = True
-                self._high_level(lambda cf: cf.high_level_commander.land(0.0, 2.0, yaw=None), math.inf)
+                seconds = self._landing_s(0.0, BLIND_LAND_S)
+                self._high_level(lambda cf: cf.high_level_commander.land(0.0, seconds, yaw=None), math.inf)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
             self.guarded |= watchdog and self.state in WATCHED_OVER
             if self.guarded and self.state not in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import socket
 from contextlib import ExitStack
 
@@ -9,21 +10,30 @@ from dtsa_agent.core.errors import ConfigError
 
 FIRST = 19850  # where cflib's scan looks, too
 LAST = 32000  # below Linux's ephemeral ports
+_RANDOM = random.SystemRandom()
 
 
-def free_base_port(count: int, first: int = FIRST) -> int:
-    """Base port of a fleet: it, the `count` - 1 after it, and the control port before it are free.
+def free_base_port(count: int, first: int | None = None) -> int:
+    """Base port of a fleet: it, the `count` - 1 after it, and the control port before it are free now.
 
     :param count: vehicles.
-    :param first: the lowest base port that will do.
+    :param first: the lowest base port that will do; None: any, so that two who look at the same time seldom agree.
     :raises ConfigError: there are not so many free ports in a row.
     """
-    for base in range(first, LAST - count, count + 1):
-        with ExitStack() as stack:
-            try:
-                for port in range(base - 1, base + count):
-                    stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)).bind(("127.0.0.1", port))
-            except OSError:
-                continue
+    low = FIRST if first is None else first
+    bases = range(low, LAST - count, count + 1)
+    offset = _RANDOM.randrange(len(bases)) if first is None else 0
+    for base in (*bases[offset:], *bases[:offset]):
+        if _free(base - 1, base + count):
             return base
-    raise ConfigError("port", first, f"{count + 1} free UDP ports in a row between {first - 1} and {LAST}")
+    raise ConfigError("port", low, f"{count + 1} free UDP ports in a row between {low - 1} and {LAST}")
+
+
+def _free(begin: int, end: int) -> bool:
+    with ExitStack() as stack:
+        try:
+            for port in range(begin, end):
+                stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)).bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True

@@ -32,6 +32,7 @@ from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.paths import shortest_s
 from dtsa_agent.crazyflie.units import to_map
 from dtsa_agent.ros import names
 from dtsa_agent.ros.loop import Stop
@@ -231,14 +232,16 @@ class Mission:
         self.call(Arm, "/all/arm", arm=True)
         self.wait("arming", lambda: self._all(Status.STATE_ARMED), 5.0)
         height = self.settings.station.room_origin_in_world[2]
-        seconds = max(2.0, height / CLIMB_MPS)
+        limit = self.settings.station.max_speed_mps
+        seconds = max(2.0, height / CLIMB_MPS, shortest_s(height, limit))
         self.say("take-off")
         self.call(Takeoff, "/all/takeoff", height=height, duration=_duration(seconds))
         time.sleep(seconds)
         self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
         self.wait("odometry", lambda: len(self.place) == len(self.settings.robots), 5.0)
         for robot, start in zip(self.settings.robots, self.scenario.start.T.tolist(), strict=True):
-            seconds = 1.5 + float(np.linalg.norm(np.subtract(start, self.place[robot.name]))) / SHIFT_MPS
+            way = float(np.linalg.norm(np.subtract(start, self.place[robot.name])))
+            seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))
             goal = Point(x=start[0], y=start[1], z=start[2])
             self.call(GoTo, f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
         self.wait("the way to the start", self._at_start, 20.0)
