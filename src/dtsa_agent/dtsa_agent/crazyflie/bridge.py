@@ -65,18 +65,20 @@ class Bridge:
         self._guard.start()
 
     # -- connection -------------------------------------------------------------------------------------------------
-    def connect(self, names: Iterable[str] | None = None) -> list[str]:
+    def connect(self, names: Iterable[str] | None = None, stop: Callable[[], bool] = lambda: False) -> list[str]:
         """Connect in parallel and wait; one that is missing does not keep the others.
 
         :param names: whom; None: all.
-        :return: names of those that could not be connected.
+        :param stop: asked ten times a second; True ends the wait.
+        :return: names of those that are not connected.
         """
         vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
         waiting = threading.Semaphore(0)
         for vehicle in vehicles:
             vehicle.connect(waiting.release)
         for _ in vehicles:
-            waiting.acquire()
+            while not (waiting.acquire(timeout=0.1) or stop()):
+                pass
         return [v.name for v in vehicles if v.state in (State.DISCONNECTED, State.CONNECTING)]
 
     @property

@@ -137,10 +137,15 @@ class BridgeNode(Node):
             logger.info(line)
 
     # -- connection -------------------------------------------------------------------------------------------------
-    def start(self) -> str:
-        """Connect all, then offer topics and services; why the swarm cannot fly, or an empty text."""
+    def start(self, stop: Callable[[], bool] = lambda: False) -> str:
+        """Connect all, then offer topics and services; why the swarm cannot fly, or an empty text.
+
+        :param stop: asked ten times a second; True ends the wait for the connections.
+        """
         began = time.monotonic()
-        missing = self.bridge.connect()
+        missing = self.bridge.connect(stop=stop)
+        if stop():
+            return "interrupted while connecting"
         total = len(self.bridge.vehicles)
         self.say("info", f"{total - len(missing)} of {total} connected in {time.monotonic() - began:.2f} s")
         if missing:
@@ -353,13 +358,14 @@ def diagnostic(s: Snapshot) -> DiagnosticStatus:
 
 
 class _Interrupts:
-    """The first Ctrl-C (or SIGTERM) lands all, the second is the emergency stop."""
+    """The first Ctrl-C (or SIGTERM, or a terminal that is closed) lands all, the second is the emergency stop."""
 
     def __init__(self) -> None:
         self.count = 0
         self.event = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup wants it to go on
+                signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: object) -> None:
         self.count += 1
@@ -371,7 +377,7 @@ def run_node(node: BridgeNode) -> int:
     interrupts = _Interrupts()
     # Several threads a Crazyflie share one interpreter; a command that waits for its turn shall not wait 5 ms.
     sys.setswitchinterval(SWITCH_S)
-    problem = node.start()
+    problem = node.start(interrupts.event.is_set)
     if problem:
         node.say("error", problem)
         node.bridge.close()

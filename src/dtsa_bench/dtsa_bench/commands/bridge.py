@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import subprocess
 import sys
@@ -13,7 +14,6 @@ from pathlib import Path
 DESCRIPTION = """\
 The bridge to the Crazyflies of a swarm.yaml: topics /cfN/..., services /cfN/... and /all/..., as in Crazyswarm2.
 The first Ctrl-C lands all, the second stops all motors."""
-SIM_BASE_PORT = 19850
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -74,20 +74,31 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     import yaml
 
     from dtsa_agent.crazyflie.config import load_swarm
+    from dtsa_agent.ros.process import SUPERVISOR
+    from dtsa_bench.fake_crazyflie.ports import FIRST, free_base_port
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))
-    for index, robot in enumerate(load_swarm(config).robots):
-        data["robots"][robot.name]["uri"] = f"udp://127.0.0.1:{SIM_BASE_PORT + index}"
+    robots = load_swarm(config).robots
+    base = free_base_port(len(robots), FIRST)
+    for index, robot in enumerate(robots):
+        data["robots"][robot.name]["uri"] = f"udp://127.0.0.1:{base + index}"
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dtsa-bridge-")))
     path = folder / config.name
     path.write_text(yaml.safe_dump(data), encoding="utf-8")
     command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--config", str(path), "--quiet"]
-    # A process group of its own: Ctrl-C is for the bridge, which still has to land them.
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    # A session of its own: Ctrl-C is for the bridge, which still has to land them. They end when this process does.
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {SUPERVISOR: str(os.getpid())},
+    )
     stack.callback(_end, process)
     assert process.stdout is not None
     for line in process.stdout:  # the addresses, then one line that says that they are there
         if "Ctrl-C" in line:
+            print(line.partition("; Ctrl-C")[0], flush=True)
             return path
     raise SystemExit(process.wait())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import time
@@ -119,6 +120,10 @@ def run(args: argparse.Namespace) -> int:
     if args.fault is not None:
         request_fault(args)
         return 0
+    if "DTSA_SUPERVISOR" in os.environ:  # the bridge started this fleet for itself, and has rclpy
+        from dtsa_agent.ros.process import follow_supervisor
+
+        follow_supervisor()
     fleet = Fleet(fleet_config(args))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: fleet.stop())

@@ -1,0 +1,181 @@
+"""`dtsa bridge --backend sim`: simulated Crazyflies, the bridge, a flight, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("cflib")
+pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs.srv")
+
+from builtin_interfaces.msg import Duration
+from dtsa_msgs.msg import Status
+from dtsa_msgs.srv import Arm, Land, Takeoff
+from node_helpers import Graph, ros_graph
+from std_srvs.srv import Empty
+
+pytestmark = [pytest.mark.slow, pytest.mark.ros]
+NAMES = ("cf1", "cf2")
+PATIENT = {"link_age_s": 3.0, "command_age_s": 0.45}  # not what is tested here
+
+
+class Bridge:
+    """The command's process, and what it prints."""
+
+    def __init__(self, environment: dict[str, str], config: Path, *options: str) -> None:
+        command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), *options]
+        self.process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        self.lines.extend(iter(self.process.stdout.readline, ""))
+
+    def text(self) -> str:
+        return "".join(self.lines)
+
+    def end(self, patience: float = 60.0) -> int:
+        code = self.process.wait(patience)
+        self._reader.join(10)
+        return code
+
+    def children(self) -> list[int]:
+        """Ids of the processes that it has started."""
+        tasks = Path(f"/proc/{self.process.pid}/task")
+        return [int(child) for task in tasks.iterdir() for child in (task / "children").read_text().split()]
+
+
+@contextmanager
+def bridge(environment: dict[str, str], config: Path, *options: str) -> Iterator[Bridge]:
+    started = Bridge(environment, config, *options)
+    try:
+        yield started
+    finally:
+        started.process.kill()
+        started.process.wait()
+        started._reader.join(10)
+        assert started.process.stdout is not None
+        started.process.stdout.close()
+
+
+def swarm_yaml(folder: Path, uri: str) -> Path:
+    robots = {name: {"uri": uri.format(k), "initial_position": [0.5 * k, 0.3, 0.0]} for k, name in enumerate(NAMES)}
+    station = {"toc_cache": str(folder / "cache"), "safety": PATIENT, "min_connected": 2}
+    path = folder / "swarm.yaml"
+    path.write_text(yaml.safe_dump({"robots": robots, "station": station}))
+    return path
+
+
+def gone(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def wait_for(condition: Callable[[], object], limit: float = 60.0) -> None:
+    end = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+class Station:
+    """Calls services and knows the states."""
+
+    def __init__(self, graph: Graph, started: Bridge) -> None:
+        self.graph, self.bridge = graph, started
+        self.states: dict[str, str] = {}
+        for name in NAMES:
+            keep = self._keep(name)
+            graph.node.create_subscription(Status, f"/{name}/status", keep, 10)
+
+    def _keep(self, name: str) -> Callable[[Status], None]:
+        return lambda message: self.states.__setitem__(name, message.state_name)
+
+    def until(self, condition: Callable[[], object]) -> None:
+        self.graph.until(lambda: condition() or self.bridge.process.poll() is not None)
+        assert self.bridge.process.poll() is None, self.bridge.text()
+
+    def all(self, state: str) -> None:
+        self.until(lambda: [self.states.get(name) for name in NAMES] == [state] * len(NAMES))
+
+    def call(self, kind: Any, name: str, **fields: Any) -> None:
+        client = self.graph.node.create_client(kind, name)
+        self.until(client.service_is_ready)
+        future = client.call_async(kind.Request(**fields))
+        self.until(future.done)
+        assert getattr(future.result(), "success", True), future.result()
+
+
+def test_take_off_landing_and_ctrl_c(tmp_path: Path) -> None:
+    config = swarm_yaml(tmp_path, "radio://0/80/2M/E7E7E7E70{}")
+    with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--backend", "sim") as started:
+        station = Station(graph, started)
+        station.until(graph.node.create_client(Empty, "/all/emergency").service_is_ready)
+        assert re.search(r"2 simulated Crazyflies, protocol \d+; faults: UDP port \d+\n", started.text())
+        (fleet,) = started.children()
+        station.all("ready")
+        station.call(Arm, "/all/arm", arm=True)
+        station.all("armed")
+        station.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
+        station.all("flying")
+        station.call(Land, "/all/land", duration=Duration(sec=2))
+        station.all("ready")
+        started.process.send_signal(signal.SIGINT)
+        assert started.end() == 0, started.text()
+        assert gone(fleet)
+        assert "Traceback" not in started.text()
+
+
+def test_the_terminal_is_closed_in_flight(tmp_path: Path) -> None:
+    config = swarm_yaml(tmp_path, "udp://192.0.2.1:{}9")
+    with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--backend", "sim") as started:
+        station = Station(graph, started)
+        station.all("ready")
+        (fleet,) = started.children()
+        station.call(Arm, "/all/arm", arm=True)
+        station.all("armed")
+        station.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
+        station.all("flying")
+        started.process.send_signal(signal.SIGHUP)
+        assert started.end() == 0, started.text()
+        assert "landing cf1, cf2" in started.text()
+        assert gone(fleet)
+
+
+def test_killed_it_takes_the_simulated_ones_along(tmp_path: Path) -> None:
+    config = swarm_yaml(tmp_path, "usb://{}")
+    with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--backend", "sim") as started:
+        wait_for(lambda: "simulated Crazyflies" in started.text())
+        (fleet,) = started.children()
+        started.process.kill()
+        wait_for(lambda: gone(fleet))
+
+
+def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:
+    config = swarm_yaml(tmp_path, "udp://127.0.0.1:{}9")
+    content = yaml.safe_load(config.read_text()) | {"all": {"connect_timeout_s": 300, "connect_attempts": 100}}
+    config.write_text(json.dumps(content))
+    with ros_graph(tmp_path) as graph, bridge(graph.environment, config) as started:
+        wait_for(lambda: "cf2: disconnected -> connecting" in started.text())
+        started.process.send_signal(signal.SIGINT)
+        assert started.end() == 1
+        assert "interrupted while connecting" in started.text()
