@@ -213,6 +213,13 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
     assert "Traceback" not in result.stderr
 
 
+def test_a_bad_command_line_ends_with_exit_code_2() -> None:
+    result = run_bridge("config=/nowhere/swarm.yaml")
+    assert result.returncode == 2
+    assert "config=/nowhere/swarm.yaml" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
 def test_too_few_connected_ends_the_bridge(tmp_path: Path) -> None:
     config = tmp_path / "swarm.yaml"
     robots = {"cf1": {"uri": "udp://127.0.0.1:9"}}

@@ -145,7 +145,7 @@ def test_take_off_landing_and_ctrl_c(tmp_path: Path) -> None:
         assert "Traceback" not in started.text()
 
 
-def test_the_terminal_is_closed_in_flight(tmp_path: Path) -> None:
+def test_a_closed_terminal_lands_all_and_sigterm_is_no_second_ctrl_c(tmp_path: Path) -> None:
     config = swarm_yaml(tmp_path, "udp://192.0.2.1:{}9")
     with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--backend", "sim") as started:
         station = Station(graph, started)
@@ -156,8 +156,10 @@ def test_the_terminal_is_closed_in_flight(tmp_path: Path) -> None:
         station.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
         station.all("flying")
         started.process.send_signal(signal.SIGHUP)
+        wait_for(lambda: "landing cf1, cf2" in started.text())
+        started.process.send_signal(signal.SIGTERM)  # as `ros2 launch` does after five seconds
         assert started.end() == 0, started.text()
-        assert "landing cf1, cf2" in started.text()
+        assert "EMERGENCY" not in started.text()
         assert gone(fleet)
 
 

@@ -1,57 +1,38 @@
 """The bridge as a ROS node: `ros2 run dtsa_agent crazyflie_bridge --ros-args -p config:=swarm.yaml`.
 
-Topics and services have the names that Crazyswarm2's users know. The node is a thin shell: everything that decides is
-in `bridge`, `vehicle` and `safety`.
+Topics and services have the names that Crazyswarm2's users know. The node is a thin shell: its start and end are here,
+what comes in and goes out is in `bridge_inputs` and `bridge_outputs`; everything that decides is in `bridge`, `vehicle`
+and `safety`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import rclpy
-from builtin_interfaces.msg import Duration as DurationMsg
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from dtsa_msgs.msg import FullState, Hover, Position, Status, VelocityWorld
-from dtsa_msgs.srv import Arm, GoTo, Land, NotifySetpointsStop, Takeoff
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Empty as EmptyMsg
-from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.bridge import Bridge
+from dtsa_agent.crazyflie.bridge_inputs import Inputs
+from dtsa_agent.crazyflie.bridge_outputs import Outputs
 from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
-from dtsa_agent.crazyflie.state_machine import State
-from dtsa_agent.crazyflie.units import VehicleState, to_map, to_world
-from dtsa_agent.crazyflie.vehicle import Snapshot, Vehicle
 from dtsa_agent.ros.process import follow_supervisor
 
 STATUS_HZ = 5.0
 SWITCH_S = 0.0005
-MAX_CLOCK_S = 0.1
-LATEST_ONLY = QoSProfile(depth=1)
-FRAME = "map"
-
-
-def _seconds(duration: DurationMsg) -> float:
-    return duration.sec + duration.nanosec * 1e-9
 
 
 def safety_parameters(node: Node, given: SafetySettings) -> SafetySettings:
@@ -96,19 +77,7 @@ class BridgeNode(Node):
         safety = safety_parameters(self, settings.station.safety)
         station = dataclasses.replace(settings.station, safety=safety)
         self.settings = SwarmSettings(settings.robots, station)
-        self.origin = station.room_origin_in_world
-        self._odom: dict[str, Any] = {}
-        self._pose: dict[str, Any] = {}
-        self._status: dict[str, Any] = {}
-        self._odom_message: dict[str, Odometry] = {}
-        self._last_state: dict[str, State] = {}
-        for robot in self.settings.robots:
-            name = robot.name
-            self._odom[name] = self.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
-            self._pose[name] = self.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
-            self._status[name] = self.create_publisher(Status, f"{name}/status", QoSProfile(depth=10))
-        self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
-        self._wanted: dict[str, tuple[bool, bool]] = {}
+        self.outputs = Outputs(self, self.settings)
         self._commands = Node(
             "crazyflie_bridge_commands",
             namespace=self.get_namespace(),
@@ -118,7 +87,7 @@ class BridgeNode(Node):
             use_global_arguments=False,
         )
         self.pump = CommandPump(self._commands)
-        self.bridge = Bridge(self.settings, self.say, self._publish_state)
+        self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
 
     def close(self) -> None:
         """End of what this node added to itself."""
@@ -152,213 +121,17 @@ class BridgeNode(Node):
             self.say("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:
             return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
-        self._create_interfaces()
-        self.create_timer(1.0 / STATUS_HZ, self._publish_status)
-        self.create_timer(1.0, self._publish_diagnostics)
+        Inputs(self, self.bridge, self.pump).offer()
+        self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.snapshots()))
+        self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.snapshots()))
         return ""
-
-    def _create_interfaces(self) -> None:
-        for vehicle in self.bridge.vehicles.values():
-            name = vehicle.name
-            for kind, topic, callback in (
-                (FullState, "cmd_full_state", self._full_state),
-                (Position, "cmd_position", self._position),
-                (VelocityWorld, "cmd_velocity_world", self._velocity_world),
-                (Hover, "cmd_hover", self._hover),
-            ):
-                self.pump.subscribe(kind, f"{name}/{topic}", partial(self._command, vehicle, callback), LATEST_ONLY)
-            self._create_services(name, [name])
-            self.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
-        self.pump.start()
-        self.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self.bridge.heartbeat(), LATEST_ONLY)
-        self.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
-        # all/emergency is created last: whoever waits for it knows that everything else is there.
-        self._create_services("all", list(self.bridge.vehicles))
-
-    def _create_services(self, prefix: str, names: list[str]) -> None:
-        self.create_service(Takeoff, f"{prefix}/takeoff", partial(self._takeoff, names))
-        self.create_service(Land, f"{prefix}/land", partial(self._land, names))
-        self.create_service(GoTo, f"{prefix}/go_to", partial(self._go_to, names))
-        self.create_service(Arm, f"{prefix}/arm", partial(self._arm, names))
-        self.create_service(NotifySetpointsStop, f"{prefix}/notify_setpoints_stop", partial(self._notify, names))
-        self.create_service(Empty, f"{prefix}/emergency", partial(self._emergency, names))
-
-    # -- commands ---------------------------------------------------------------------------------------------------
-    def _command(
-        self, vehicle: Vehicle, convert: Callable[[Any, float], units.Setpoint], message: Any, info: Any
-    ) -> None:
-        # The command is as old as its publication; a sender's clock that is wrong makes it at most a tenth older.
-        age = (time.time_ns() - info["source_timestamp"]) * 1e-9
-        try:
-            setpoint = convert(message, time.monotonic() - min(max(age, 0.0), MAX_CLOCK_S))
-        except ValueError as error:
-            self.get_logger().warning(f"{vehicle.name}: {error}", throttle_duration_sec=1.0)
-            return
-        if not vehicle.command(setpoint):
-            self.get_logger().warning(
-                f"{vehicle.name}: commands are not accepted while {vehicle.state.name.lower()} ({vehicle.action})",
-                throttle_duration_sec=5.0,
-            )
-
-    def _world(self, frame: str, x: float, y: float, z: float) -> units.Vector:
-        return (x, y, z) if frame == "world" else to_world((x, y, z), self.origin)
-
-    def _full_state(self, m: FullState, stamp: float) -> units.Setpoint:
-        p, q, v, w, a = m.pose.position, m.pose.orientation, m.twist.linear, m.twist.angular, m.acc
-        place = self._world(m.header.frame_id, p.x, p.y, p.z)
-        return units.full_state(place, (v.x, v.y, v.z), (a.x, a.y, a.z), (q.x, q.y, q.z, q.w), (w.x, w.y, w.z), stamp)
-
-    def _position(self, m: Position, stamp: float) -> units.Setpoint:
-        return units.position(self._world(m.header.frame_id, m.x, m.y, m.z), m.yaw, stamp)
-
-    def _velocity_world(self, m: VelocityWorld, stamp: float) -> units.Setpoint:
-        return units.velocity_world((m.vel.x, m.vel.y, m.vel.z), m.yaw_rate, stamp)
-
-    def _hover(self, m: Hover, stamp: float) -> units.Setpoint:
-        return units.hover(m.vx, m.vy, m.yaw_rate, m.z_distance, stamp)
-
-    # -- services ---------------------------------------------------------------------------------------------------
-    def _each(self, names: list[str], order: Callable[[Vehicle], str | None], response: Any) -> Any:
-        response.success, response.message = self.bridge.each(names, order)
-        return response
-
-    def _takeoff(self, names: list[str], request: Any, response: Any) -> Any:
-        problem = self.bridge.enough()
-        if problem:
-            self.say("error", f"no take-off: {problem}")
-            response.success, response.message = False, problem
-            return response
-        return self._each(names, lambda v: v.takeoff(request.height, _seconds(request.duration)), response)
-
-    def _land(self, names: list[str], request: Any, response: Any) -> Any:
-        duration = _seconds(request.duration)
-        notes: list[str] = []
-        self._each(names, lambda v: v.land("service", request.height, duration, notes.append), response)
-        response.message = "; ".join(filter(None, (response.message, *notes)))
-        return response
-
-    def _go_to(self, names: list[str], request: Any, response: Any) -> Any:
-        goal, duration = request.goal, _seconds(request.duration)
-        place = (goal.x, goal.y, goal.z)
-        if not all(math.isfinite(v) for v in (*place, request.yaw)):
-            response.success, response.message = False, "the goal is not finite"
-            return response
-        if not request.relative:
-            place = to_world(place, self.origin)
-        return self._each(names, lambda v: v.go_to(place, request.yaw, duration, request.relative), response)
-
-    def _arm(self, names: list[str], request: Any, response: Any) -> Any:
-        return self._each(names, lambda v: v.arm(request.arm), response)
-
-    def _notify(self, names: list[str], request: Any, response: Any) -> Any:
-        return self._each(names, lambda v: v.notify_setpoints_stop(request.remain_valid_millisecs), response)
-
-    def _emergency(self, names: list[str], request: Any, response: Any) -> Any:
-        for name in names:
-            self.bridge.vehicles[name].stop("service emergency")
-        self.say("error", f"EMERGENCY STOP of {', '.join(names)}: service")
-        return response
-
-    def _reconnect(self, name: str, request: Any, response: Any) -> Any:
-        problem = self.bridge.reconnect(name)
-        response.success, response.message = not problem, problem or "connecting"
-        return response
-
-    def _end_heartbeat(self, request: Any, response: Any) -> Any:
-        self.bridge.end_heartbeat()
-        response.success = True
-        return response
-
-    # -- what goes out ----------------------------------------------------------------------------------------------
-    def _publish_state(self, vehicle: Vehicle, state: VehicleState) -> None:
-        """Odometry and pose of one log packet, in the link's thread; only what somebody listens to."""
-        name = vehicle.name
-        odom, pose = self._wanted.get(name, (False, False))
-        if not (odom or pose):
-            return
-        stamp = self.get_clock().now().to_msg()
-        x, y, z = to_map(state.position, self.origin)
-        qx, qy, qz, qw = state.orientation
-        message = self._odom_message.get(name)
-        if message is None:
-            message = self._odom_message[name] = Odometry(child_frame_id=f"{name}/base_link")
-            message.header.frame_id = FRAME
-        message.header.stamp = stamp
-        p, q = message.pose.pose.position, message.pose.pose.orientation
-        p.x, p.y, p.z = x, y, z
-        q.x, q.y, q.z, q.w = qx, qy, qz, qw
-        if odom:
-            v = message.twist.twist.linear  # REP-103: the twist of an odometry is in the child's frame
-            v.x, v.y, v.z = units.rotate_inverse(state.orientation, state.velocity)
-            self._odom[name].publish(message)
-        if pose:
-            self._pose[name].publish(PoseStamped(header=message.header, pose=message.pose.pose))
-
-    def _publish_status(self) -> None:
-        stamp = self.get_clock().now().to_msg()
-        for s in self.bridge.snapshots():
-            self._wanted[s.name] = (
-                self._odom[s.name].get_subscription_count() > 0,
-                self._pose[s.name].get_subscription_count() > 0,
-            )
-            self._status[s.name].publish(status_message(s, stamp))
-
-    def _publish_diagnostics(self) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [diagnostic(s) for s in self.bridge.snapshots()]
-        self.diagnostics.publish(message)
-
-
-def status_message(s: Snapshot, stamp: Any) -> Status:
-    """A vehicle's status on the wire."""
-    message = Status(
-        supervisor_info=s.vehicle.info & 0xFFFF if s.vehicle else 0,
-        battery_voltage=s.vehicle.battery if s.vehicle else 0.0,
-        rssi=s.rssi,
-        num_tx_unicast=s.sent,
-        num_rx_unicast=s.received,
-        state=int(s.state),
-        state_name=s.state.name.lower(),
-        link_quality=s.link_quality,
-        log_age=s.log_age if math.isfinite(s.log_age) else -1.0,
-        command_age=s.command_age if math.isfinite(s.command_age) else -1.0,
-        latency_ms=s.latency_p99 * 1000,
-        reason=s.reason,
-    )
-    message.header.stamp = stamp
-    message.header.frame_id = FRAME
-    return message
-
-
-def diagnostic(s: Snapshot) -> DiagnosticStatus:
-    """A vehicle's line in /diagnostics."""
-    level = DiagnosticStatus.OK
-    if s.state in (State.EMERGENCY, State.LOST):
-        level = DiagnosticStatus.ERROR
-    elif s.state in (State.DISCONNECTED, State.CONNECTING) or s.reason.startswith(("battery", "hold", "land:")):
-        level = DiagnosticStatus.WARN
-    values = {
-        "battery [V]": f"{s.vehicle.battery:.2f}" if s.vehicle else "unknown",
-        "link quality": f"{s.link_quality:.2f}",
-        "log age [s]": f"{s.log_age:.2f}",
-        "last command age [s]": f"{s.command_age:.2f}",
-        "commands [Hz]": f"{s.command_hz:.0f}",
-        "command latency, 99th percentile [ms]": f"{s.latency_p99 * 1000:.1f}",
-        "commands refused": str(s.refused),
-        "reason": s.reason,
-    }
-    return DiagnosticStatus(
-        level=level,
-        name=f"crazyflie_bridge: {s.name}",
-        message=s.state.name.lower(),
-        hardware_id=s.name,
-        values=[KeyValue(key=key, value=value) for key, value in values.items()],
-    )
 
 
 class _Interrupts:
-    """The first Ctrl-C (or SIGTERM, or a terminal that is closed) lands all, the second is the emergency stop."""
+    """The first Ctrl-C (or SIGTERM, or a terminal that is closed) lands all; one more Ctrl-C is the emergency stop.
+
+    Only that: who starts processes, like `ros2 launch`, sends SIGTERM to those that take long to end.
+    """
 
     def __init__(self) -> None:
         self.count = 0
@@ -368,7 +141,8 @@ class _Interrupts:
                 signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: object) -> None:
-        self.count += 1
+        if number == signal.SIGINT or not self.count:
+            self.count += 1
         self.event.set()
 
 
@@ -415,7 +189,11 @@ def main(args: Sequence[str] | None = None) -> int:
     """Entry point of the executable `crazyflie_bridge`."""
     argv = list(sys.argv if args is None else args)
     follow_supervisor()
-    rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy's errors for a wrong command line have no common base
+        print(f"crazyflie_bridge: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 2
     node = None
     try:
         node = BridgeNode()

@@ -1,0 +1,155 @@
+"""What comes in over the graph: streamed commands, services, the ground station's heartbeat."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from builtin_interfaces.msg import Duration as DurationMsg
+from dtsa_msgs.msg import FullState, Hover, Position, VelocityWorld
+from dtsa_msgs.srv import Arm, GoTo, Land, NotifySetpointsStop, Takeoff
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Empty as EmptyMsg
+from std_srvs.srv import Empty, Trigger
+
+from dtsa_agent.crazyflie import units
+from dtsa_agent.crazyflie.bridge import Bridge
+from dtsa_agent.crazyflie.pump import CommandPump
+from dtsa_agent.crazyflie.units import to_world
+from dtsa_agent.crazyflie.vehicle import Vehicle
+
+MAX_CLOCK_S = 0.1
+LATEST_ONLY = QoSProfile(depth=1)
+
+
+def _seconds(duration: DurationMsg) -> float:
+    return duration.sec + duration.nanosec * 1e-9
+
+
+class Inputs:
+    """Topics and services of all vehicles.
+
+    :param node: offers the services.
+    :param bridge: the swarm.
+    :param pump: takes the streamed commands; not started yet.
+    """
+
+    def __init__(self, node: Node, bridge: Bridge, pump: CommandPump) -> None:
+        self._node, self._bridge, self._pump = node, bridge, pump
+        self._origin = bridge.settings.station.room_origin_in_world
+
+    def offer(self) -> None:
+        """Create everything; `/all/emergency` is last: whoever waits for it knows that everything else is there."""
+        for vehicle in self._bridge.vehicles.values():
+            name = vehicle.name
+            for kind, topic, callback in (
+                (FullState, "cmd_full_state", self._full_state),
+                (Position, "cmd_position", self._position),
+                (VelocityWorld, "cmd_velocity_world", self._velocity_world),
+                (Hover, "cmd_hover", self._hover),
+            ):
+                self._pump.subscribe(kind, f"{name}/{topic}", partial(self._command, vehicle, callback), LATEST_ONLY)
+            self._create_services(name, [name])
+            self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
+        self._pump.start()
+        self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.heartbeat(), LATEST_ONLY)
+        self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
+        self._create_services("all", list(self._bridge.vehicles))
+
+    def _create_services(self, prefix: str, names: list[str]) -> None:
+        self._node.create_service(Takeoff, f"{prefix}/takeoff", partial(self._takeoff, names))
+        self._node.create_service(Land, f"{prefix}/land", partial(self._land, names))
+        self._node.create_service(GoTo, f"{prefix}/go_to", partial(self._go_to, names))
+        self._node.create_service(Arm, f"{prefix}/arm", partial(self._arm, names))
+        self._node.create_service(NotifySetpointsStop, f"{prefix}/notify_setpoints_stop", partial(self._notify, names))
+        self._node.create_service(Empty, f"{prefix}/emergency", partial(self._emergency, names))
+
+    # -- commands ---------------------------------------------------------------------------------------------------
+    def _command(
+        self, vehicle: Vehicle, convert: Callable[[Any, float], units.Setpoint], message: Any, info: Any
+    ) -> None:
+        # The command is as old as its publication; a sender's clock that is wrong makes it at most a tenth older.
+        age = (time.time_ns() - info["source_timestamp"]) * 1e-9
+        try:
+            setpoint = convert(message, time.monotonic() - min(max(age, 0.0), MAX_CLOCK_S))
+        except ValueError as error:
+            self._node.get_logger().warning(f"{vehicle.name}: {error}", throttle_duration_sec=1.0)
+            return
+        if not vehicle.command(setpoint):
+            self._node.get_logger().warning(
+                f"{vehicle.name}: commands are not accepted while {vehicle.state.name.lower()} ({vehicle.action})",
+                throttle_duration_sec=5.0,
+            )
+
+    def _world(self, frame: str, x: float, y: float, z: float) -> units.Vector:
+        return (x, y, z) if frame == "world" else to_world((x, y, z), self._origin)
+
+    def _full_state(self, m: FullState, stamp: float) -> units.Setpoint:
+        p, q, v, w, a = m.pose.position, m.pose.orientation, m.twist.linear, m.twist.angular, m.acc
+        place = self._world(m.header.frame_id, p.x, p.y, p.z)
+        return units.full_state(place, (v.x, v.y, v.z), (a.x, a.y, a.z), (q.x, q.y, q.z, q.w), (w.x, w.y, w.z), stamp)
+
+    def _position(self, m: Position, stamp: float) -> units.Setpoint:
+        return units.position(self._world(m.header.frame_id, m.x, m.y, m.z), m.yaw, stamp)
+
+    def _velocity_world(self, m: VelocityWorld, stamp: float) -> units.Setpoint:
+        return units.velocity_world((m.vel.x, m.vel.y, m.vel.z), m.yaw_rate, stamp)
+
+    def _hover(self, m: Hover, stamp: float) -> units.Setpoint:
+        return units.hover(m.vx, m.vy, m.yaw_rate, m.z_distance, stamp)
+
+    # -- services ---------------------------------------------------------------------------------------------------
+    def _each(self, names: list[str], order: Callable[[Vehicle], str | None], response: Any) -> Any:
+        response.success, response.message = self._bridge.each(names, order)
+        return response
+
+    def _takeoff(self, names: list[str], request: Any, response: Any) -> Any:
+        problem = self._bridge.enough()
+        if problem:
+            self._node.get_logger().error(f"no take-off: {problem}")
+            response.success, response.message = False, problem
+            return response
+        return self._each(names, lambda v: v.takeoff(request.height, _seconds(request.duration)), response)
+
+    def _land(self, names: list[str], request: Any, response: Any) -> Any:
+        duration = _seconds(request.duration)
+        notes: list[str] = []
+        self._each(names, lambda v: v.land("service", request.height, duration, notes.append), response)
+        response.message = "; ".join(filter(None, (response.message, *notes)))
+        return response
+
+    def _go_to(self, names: list[str], request: Any, response: Any) -> Any:
+        goal, duration = request.goal, _seconds(request.duration)
+        place = (goal.x, goal.y, goal.z)
+        if not all(math.isfinite(v) for v in (*place, request.yaw)):
+            response.success, response.message = False, "the goal is not finite"
+            return response
+        if not request.relative:
+            place = to_world(place, self._origin)
+        return self._each(names, lambda v: v.go_to(place, request.yaw, duration, request.relative), response)
+
+    def _arm(self, names: list[str], request: Any, response: Any) -> Any:
+        return self._each(names, lambda v: v.arm(request.arm), response)
+
+    def _notify(self, names: list[str], request: Any, response: Any) -> Any:
+        return self._each(names, lambda v: v.notify_setpoints_stop(request.remain_valid_millisecs), response)
+
+    def _emergency(self, names: list[str], request: Any, response: Any) -> Any:
+        for name in names:
+            self._bridge.vehicles[name].stop("service emergency")
+        self._node.get_logger().error(f"EMERGENCY STOP of {', '.join(names)}: service")
+        return response
+
+    def _reconnect(self, name: str, request: Any, response: Any) -> Any:
+        problem = self._bridge.reconnect(name)
+        response.success, response.message = not problem, problem or "connecting"
+        return response
+
+    def _end_heartbeat(self, request: Any, response: Any) -> Any:
+        self._bridge.end_heartbeat()
+        response.success = True
+        return response

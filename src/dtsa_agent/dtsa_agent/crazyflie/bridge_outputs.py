@@ -1,0 +1,133 @@
+"""What goes out over the graph: odometry, pose, status and diagnostics."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from dtsa_msgs.msg import Status
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from dtsa_agent.crazyflie import units
+from dtsa_agent.crazyflie.config import SwarmSettings
+from dtsa_agent.crazyflie.state_machine import State
+from dtsa_agent.crazyflie.units import VehicleState, to_map
+from dtsa_agent.crazyflie.vehicle import Snapshot, Vehicle
+
+LATEST_ONLY = QoSProfile(depth=1)
+FRAME = "map"
+
+
+class Outputs:
+    """Publishers of all vehicles.
+
+    :param node: publishes.
+    :param settings: the swarm's.
+    """
+
+    def __init__(self, node: Node, settings: SwarmSettings) -> None:
+        self._clock = node.get_clock()
+        self._origin = settings.station.room_origin_in_world
+        self._odom: dict[str, Any] = {}
+        self._pose: dict[str, Any] = {}
+        self._status: dict[str, Any] = {}
+        self._odom_message: dict[str, Odometry] = {}
+        self._wanted: dict[str, tuple[bool, bool]] = {}  # odometry, pose: does somebody listen?
+        for robot in settings.robots:
+            name = robot.name
+            self._odom[name] = node.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
+            self._pose[name] = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
+            self._status[name] = node.create_publisher(Status, f"{name}/status", QoSProfile(depth=10))
+        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+
+    def publish_state(self, vehicle: Vehicle, state: VehicleState) -> None:
+        """Odometry and pose of one log packet, in the link's thread; only what somebody listens to."""
+        name = vehicle.name
+        odom, pose = self._wanted.get(name, (False, False))
+        if not (odom or pose):
+            return
+        stamp = self._clock.now().to_msg()
+        x, y, z = to_map(state.position, self._origin)
+        qx, qy, qz, qw = state.orientation
+        message = self._odom_message.get(name)
+        if message is None:
+            message = self._odom_message[name] = Odometry(child_frame_id=f"{name}/base_link")
+            message.header.frame_id = FRAME
+        message.header.stamp = stamp
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        p.x, p.y, p.z = x, y, z
+        q.x, q.y, q.z, q.w = qx, qy, qz, qw
+        if odom:
+            v = message.twist.twist.linear  # REP-103: the twist of an odometry is in the child's frame
+            v.x, v.y, v.z = units.rotate_inverse(state.orientation, state.velocity)
+            self._odom[name].publish(message)
+        if pose:
+            self._pose[name].publish(PoseStamped(header=message.header, pose=message.pose.pose))
+
+    def publish_status(self, snapshots: list[Snapshot]) -> None:
+        """Status of all; also looks who listens to odometry and pose."""
+        stamp = self._clock.now().to_msg()
+        for s in snapshots:
+            self._wanted[s.name] = (
+                self._odom[s.name].get_subscription_count() > 0,
+                self._pose[s.name].get_subscription_count() > 0,
+            )
+            self._status[s.name].publish(status_message(s, stamp))
+
+    def publish_diagnostics(self, snapshots: list[Snapshot]) -> None:
+        """Diagnostics of all."""
+        message = DiagnosticArray()
+        message.header.stamp = self._clock.now().to_msg()
+        message.status = [diagnostic(s) for s in snapshots]
+        self._diagnostics.publish(message)
+
+
+def status_message(s: Snapshot, stamp: Any) -> Status:
+    """A vehicle's status on the wire."""
+    message = Status(
+        supervisor_info=s.vehicle.info & 0xFFFF if s.vehicle else 0,
+        battery_voltage=s.vehicle.battery if s.vehicle else 0.0,
+        rssi=s.rssi,
+        num_tx_unicast=s.sent,
+        num_rx_unicast=s.received,
+        state=int(s.state),
+        state_name=s.state.name.lower(),
+        link_quality=s.link_quality,
+        log_age=s.log_age if math.isfinite(s.log_age) else -1.0,
+        command_age=s.command_age if math.isfinite(s.command_age) else -1.0,
+        latency_ms=s.latency_p99 * 1000,
+        reason=s.reason,
+    )
+    message.header.stamp = stamp
+    message.header.frame_id = FRAME
+    return message
+
+
+def diagnostic(s: Snapshot) -> DiagnosticStatus:
+    """A vehicle's line in /diagnostics."""
+    level = DiagnosticStatus.OK
+    if s.state in (State.EMERGENCY, State.LOST):
+        level = DiagnosticStatus.ERROR
+    elif s.state in (State.DISCONNECTED, State.CONNECTING) or s.reason.startswith(("battery", "hold", "land:")):
+        level = DiagnosticStatus.WARN
+    values = {
+        "battery [V]": f"{s.vehicle.battery:.2f}" if s.vehicle else "unknown",
+        "link quality": f"{s.link_quality:.2f}",
+        "log age [s]": f"{s.log_age:.2f}",
+        "last command age [s]": f"{s.command_age:.2f}",
+        "commands [Hz]": f"{s.command_hz:.0f}",
+        "command latency, 99th percentile [ms]": f"{s.latency_p99 * 1000:.1f}",
+        "commands refused": str(s.refused),
+        "reason": s.reason,
+    }
+    return DiagnosticStatus(
+        level=level,
+        name=f"crazyflie_bridge: {s.name}",
+        message=s.state.name.lower(),
+        hardware_id=s.name,
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )
