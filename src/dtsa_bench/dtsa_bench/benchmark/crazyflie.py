@@ -96,10 +96,11 @@ def measure(count: int, measure_s: float, safety: Mapping[str, float] | None = N
             far.all[0].process.send_signal(signal.SIGINT)
             far.all[0].process.wait(PATIENCE_S)
             connected = re.search(rf"{count} of {count} connected in ([\d.]+) s", bridge.log.read_text())
+            assert connected is not None  # else it would not have offered its services: min_connected
             return {
                 "what": WHAT,
                 "crazyflies": count,
-                "connect_s": float(connected[1]) if connected else float("nan"),
+                "connect_s": float(connected[1]),
                 "close_s": close_s,
                 **commands(published, np.load(arrivals) - (0, pilot.first, 0), count),
                 "logs_hz": min(logs),
@@ -117,13 +118,16 @@ def commands(published: NDArray[np.float64], arrivals: NDArray[np.float64], coun
 
     :param published: time of each command by Crazyflie and number less the first one's, s, shape (count, n).
     :param arrivals: Crazyflie (from 0), number of the command less the first one's, time (s); shape (m, 3).
+    :raises BenchmarkError: none arrived.
     """
     number = published.shape[1]
     arrivals = arrivals[(arrivals[:, 1] >= 0) & (arrivals[:, 1] < number)]
+    if not len(arrivals):
+        raise BenchmarkError("no command has arrived")
     who, which = arrivals[:, 0].astype(int), arrivals[:, 1].astype(int)
     latency = 1e3 * (arrivals[:, 2] - published[who, which])
     lasted = (published[:, -1] - published[:, 0]).mean() * number / (number - 1)
-    median, p99 = np.percentile(latency, (50, 99)) if latency.size else (np.nan, np.nan)
+    median, p99 = np.percentile(latency, (50, 99))
     return {
         "commands_hz": float(np.bincount(who, minlength=count).min() / lasted),
         "latency_median_ms": float(median),
