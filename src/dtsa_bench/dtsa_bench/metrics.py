@@ -62,6 +62,7 @@ class FlightMetrics:
         self._torn = 0  # slots in which two agents took different agents for the sender
         self._compared = 0
         self.lost: set[int] = set()  # ids of agents that fell out of the flight
+        self._torn_ways: set[int] = set()  # ids of those of whose way a part is not known
         self._outcomes = [0, 0, 0]  # by IDLE, SUCCESS, COLLISION
         start = np.ascontiguousarray(scenario.start, dtype=np.float64)
         target = np.ascontiguousarray(scenario.target, dtype=np.float64)
@@ -94,8 +95,10 @@ class FlightMetrics:
         state = self._kernel.update(done, track, None if tables is None else tables.kernel)
         if self._course is not None:
             self._course.advance(done, self._last)
-            if not self._course.final.all():
+            if not all(self._course.final[k] for k in range(len(self._course.final)) if k + 1 not in self.lost):
                 state &= ~_ARRIVED  # at its target by chance, with goals still to come
+        if state & _ARRIVED and not self._returned_arrived():
+            state &= ~_ARRIVED
         if state:
             if state & _CRASHED and self.crash_slot < 0:
                 self.crash_slot = done
@@ -116,7 +119,23 @@ class FlightMetrics:
         :param agent: its id.
         """
         self.lost.add(agent)
+        self._torn_ways.add(agent)
         self._kernel.drop(agent - 1)
+
+    def regain(self, agent: int) -> None:
+        """An agent that fell out takes part again: distances to it count, and it has to arrive.
+
+        Its way stays unknown, and news of it stay out of the ages.
+
+        :param agent: its id.
+        """
+        self.lost.discard(agent)
+
+    def _returned_arrived(self) -> bool:
+        """Whether all movers that fell out and came back are at their targets, too."""
+        back = [agent - 1 for agent in self._torn_ways - self.lost if self.scenario.moving[agent - 1]]
+        away = self._last[:, back] - self.scenario.target[:, back]
+        return bool((np.sqrt((away * away).sum(axis=0)) <= self.run.swarm.r_min).all())
 
     def compare_views(self, slot: int, digests: NDArray[np.uint64], chosen: NDArray[np.uint16]) -> None:
         """Takes in what all agents believe at the start of a slot, where that may differ.
@@ -155,7 +174,11 @@ class FlightMetrics:
         else:
             direct = np.sqrt(((self._last - self.scenario.start) ** 2).sum(axis=0))
         movers = np.flatnonzero(self.scenario.moving)
-        return {int(k) + 1: float(direct[k] / path[k]) for k in movers if path[k] > 0.0 and int(k) + 1 not in self.lost}
+        return {
+            int(k) + 1: float(direct[k] / path[k])
+            for k in movers
+            if path[k] > 0.0 and int(k) + 1 not in self._torn_ways
+        }
 
     def summary(self, wall_time_s: float | None = None) -> dict[str, Any]:
         """The results as plain values; what does not exist (no movers, not complete, ...) is None.

@@ -178,9 +178,17 @@ class RealtimeRecordedChannel(RecordedFlight, RealtimeChannel):
     def silent(self, agent: int) -> None:
         self.metrics.lose(agent)
 
+    def back(self, agents: list[int]) -> None:
+        for agent in agents:
+            self.metrics.regain(agent)
+
     def summary(self) -> dict[str, Any]:
         """The flight's results."""
-        counts = {"late_frames": self.arbiter.late, "missed_reports": self.missed}
+        counts = {
+            "late_frames": self.arbiter.late,
+            "missed_reports": self.missed,
+            "returned_agents": sorted(self.returned),
+        }
         return {**super().summary(), "mode": "realtime", **counts, **self.clocks.summary()}
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from dtsa_msgs.msg import Slot, Transmission
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -23,11 +24,13 @@ from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 _NS = 1_000_000_000
 _TICK_NS = 500_000
 _REPEAT_S = 0.1
+_TELL_S = 1.0  # the start is told again so often, for processes that come later
 _LEAD_NS = 300_000_000  # from the start message to slot 0
 _GRACE = 0.35  # of a slot: a frame reaches the channel at most this late, or it is late
 _STRIDE = 0.25  # of a slot: time moves on by this much at most before messages are looked for again
 _PATIENCE = 10  # slots that a slot is kept open for agents that have not reported yet
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
+_AFTERLIFE = 10  # slots: a report for a later one was made after its agent had been given up
 
 
 class RealtimeChannel(RosChannel):
@@ -45,10 +48,13 @@ class RealtimeChannel(RosChannel):
     def __init__(self, node: Node, channel: Channel, steps: int, answer_s: float = 0.0, **more: Any) -> None:
         super().__init__(node, channel, steps, waiting=names.REALTIME_WAITING, **more)
         self.missed = 0  # reports of agents that came too late to count
-        self.lost: set[int] = set()  # ids of agents that have fallen silent for good
+        self.lost: set[int] = set()  # ids of agents that have fallen silent
+        self.returned: set[int] = set()  # ids of those that were, and report again
         self.arbiter = RealtimeArbiter(channel)
         self._steps = steps
         self._zero = 0
+        self._told = 0.0  # time.monotonic() of the last start message
+        self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
         self._book: dict[int, Answers] = {}
         self._frames: dict[tuple[int, int], bytes] = {}
         self._settled: dict[int, list[FrameVerdict]] = {}
@@ -59,13 +65,16 @@ class RealtimeChannel(RosChannel):
         self._grace_ns = round(_GRACE * self.slot_ns)
         self._close_ns = self._grace_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
 
-    # Two more hooks.
+    # Three more hooks.
 
     def reported(self, message: Transmission) -> None:
         """A usable report has come in, here decoded; late ones too."""
 
     def silent(self, agent: int) -> None:
-        """An agent has fallen silent for good."""
+        """An agent has fallen silent."""
+
+    def back(self, agents: list[int]) -> None:
+        """Agents that had fallen silent report again."""
 
     # The run.
 
@@ -84,7 +93,23 @@ class RealtimeChannel(RosChannel):
         """Takes note that an agent is gone."""
         if agent not in self.lost:
             self.lost.add(agent)
+            self.returned.discard(agent)
+            self._given_up[agent] = (time.monotonic_ns() - self._zero) // self.slot_ns
             self.silent(agent)
+
+    def last_place(self, agent: int) -> NDArray[np.float64]:
+        """Where an agent has reported to be last, (3,) m."""
+        reported = [slot for slot, book in self._book.items() if book.answered[agent - 1]]
+        book = self._book[max(reported)] if reported else self.answers
+        return book.position[:, agent - 1]
+
+    def _welcome(self, slot: int, book: Answers) -> None:
+        """Takes agents back that were lost and have reported for a slot."""
+        again = [a for a in sorted(self.lost) if book.answered[a - 1] and slot > self._given_up[a] + _AFTERLIFE]
+        if again:
+            self.lost.difference_update(again)
+            self.returned.update(again)
+            self.back(again)
 
     def _prepare(self, stop: Any) -> bool:
         """Waits until all agents have reported, and tells them when slot 0 starts."""
@@ -108,9 +133,13 @@ class RealtimeChannel(RosChannel):
                 missing = named(self.answers.silent)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
         self._zero = time.monotonic_ns() + _LEAD_NS
-        self._publisher.publish(Slot(phase=Slot.START, stamp=slot_stamp(self._zero)))
+        self._tell_start()
         self._heard_ns[:] = 0
         return True
+
+    def _tell_start(self) -> None:
+        self._told = time.monotonic()
+        self._publisher.publish(Slot(phase=Slot.START, stamp=slot_stamp(self._zero)))
 
     def _fly(self, stop: Any) -> None:
         tick = now = 0
@@ -129,6 +158,8 @@ class RealtimeChannel(RosChannel):
             while self._due(now):
                 if not self._close_slot():
                     return
+            if time.monotonic() - self._told > _TELL_S:
+                self._tell_start()
             self._housekeeping()
 
     def _decoded(self, data: bytes) -> Any:
@@ -225,6 +256,8 @@ class RealtimeChannel(RosChannel):
     def _completed(self, slot: int) -> Answers:
         """A slot's reports, those that are missing taken from the slot before."""
         book = self._entry(slot)
+        if self.lost:
+            self._welcome(slot, book)
         book.carry(self.answers)
         # Compared with the others: if nobody is heard, it may be this process that got no time.
         newest = int(self._heard_ns.max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -86,6 +87,10 @@ def _realtime(node: Node, ids: Sequence[int], config: SwarmConfig, swarm: str) -
         2,
         "from the order to send until a receiver has the frame: for any frame, and more for each of its bytes (ns)",
     )
+    text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
+    places = list(_declare(node, "resume_at", [0.0], text, ParameterType.PARAMETER_DOUBLE_ARRAY))
+    if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):
+        raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
     return RealtimeNode(
         node,
         config,
@@ -97,6 +102,7 @@ def _realtime(node: Node, ids: Sequence[int], config: SwarmConfig, swarm: str) -
         jitter_ns=jitter,
         align=align,
         flight_time_ns=(fixed, per_byte),
+        resume_at=places if len(places) > 1 else (),
     )
 
 

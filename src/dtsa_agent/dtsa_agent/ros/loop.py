@@ -34,7 +34,8 @@ class Stop:
     """
 
     def __init__(self) -> None:
-        self.signal = 0
+        self.signal = 0  # the first one; 0: none yet
+        self.count = 0  # how many have come
         self._old: dict[int, Any] = {}
 
     def __enter__(self) -> Stop:
@@ -51,6 +52,7 @@ class Stop:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.signal = self.signal or number
+        self.count += 1
 
 
 class _OwnHands(CallbackGroup):

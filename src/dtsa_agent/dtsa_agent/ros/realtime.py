@@ -11,16 +11,22 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from dtsa_msgs.msg import Slot
 from numpy.typing import NDArray
+from rclpy.duration import Duration
 
 from dtsa_agent.core.alignment import ClockAligner
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
+from dtsa_agent.core.swarm import PRESENT_LEAVING
 
 from . import names
+from .joining import Listeners, Newcomers
 from .loop import Stop
 from .swarm_node import SwarmNode
+from .wire import split_frames, unpack_received
 
 _PPB = 1_000_000_000
 _PATIENCE_NS = 50_000_000
+_DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
+_DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
 _LEAD = 0.25  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time
 
 
@@ -45,6 +51,10 @@ class RealtimeNode(SwarmNode):
     of them is due; a frame carries the time at which its agent starts to send it: its slot's start, or later if it was
     not ready by then.
 
+    A process that was there at the channel's call begins with slot 0. One that comes later is told where the time line
+    lies, too, because the stamps of messages are on it; but its agents take the time of their slots from the first
+    frame that each hears, and know nothing: :mod:`dtsa_agent.ros.joining`.
+
     :param args: as for :class:`SwarmNode`.
     :param offset_ns: (L,) ns, offset of each agent's clock: positive clocks are early.
     :param drift_ppb: (L,) parts per billion by which each runs fast.
@@ -52,6 +62,8 @@ class RealtimeNode(SwarmNode):
     :param align: whether agents move their slots towards what they hear.
     :param flight_time_ns: ns from the order to send a frame until the receivers' flight processors have it: for any
         frame, and for each of its bytes.
+    :param resume_at: m, x, y, z of each agent in turn: where its vehicle hovers when it comes into a flight under way;
+        none: at its start in the scenario.
     """
 
     def __init__(
@@ -62,6 +74,7 @@ class RealtimeNode(SwarmNode):
         jitter_ns: float = 0.0,
         align: bool = True,
         flight_time_ns: tuple[int, int] = (0, 0),
+        resume_at: Sequence[float] = (),
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, waiting=names.REALTIME_WAITING, **kwargs)
@@ -76,6 +89,18 @@ class RealtimeNode(SwarmNode):
         self._jitter_ns = jitter_ns
         self._random = [generator(self.config.seed, STREAM_CLOCKS, agent) for agent in self.swarm.ids]
         self._fixed_ns, self._per_byte_ns = flight_time_ns
+        self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3).T
+        self._called = False  # was there when the channel asked who is
+        self._listeners: Listeners | None = None
+        self._timeless: NDArray[np.bool_] = np.zeros(
+            count, dtype=np.bool_
+        )  # came late, and takes its time from the next frame
+        self._newcomers = Newcomers(count)
+        self._first = 0  # slot with which this process began, or began anew
+        # Whoever stood still for so long does not wait until the others think it dead, and knows too little.
+        self._too_long_ns = max(500, 3 * self.config.anchor_every * self.config.agents) * self.slot_ns
+        self._leaves_by: int | None = None  # slot: leaving; ends then at the latest
+        self._signals = 0
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
         self._early: list[Slot] = []  # frames of a slot that is still to come here
 
@@ -86,25 +111,87 @@ class RealtimeNode(SwarmNode):
         """
         return slot_starts(slot * self.slot_ns, self._offset, self._drift) + self._shift
 
+    def local_ns(self, time_ns: int) -> NDArray[np.int64]:
+        """What each agent's clock shows, ns.
+
+        :param time_ns: ns on the channel's time line.
+        """
+        return np.asarray(time_ns + time_ns * self._drift // _PPB + self._offset)
+
     def run(self, stop: Stop) -> None:
-        """Flies until the run is over or a signal comes."""
-        while not stop:
+        """Flies until the run is over or a signal comes; with policy ``lease`` agents say farewell first.
+
+        :raises ConfigError: in a flight under way that agents of this policy cannot come into.
+        """
+        while not self._ended(stop):
             if not self._zero:
                 message = self.loop.wait()
                 if message is not None and not self._prepare(message):
                     return
-            elif not self._step():
+            elif not (self._listen() if self._listeners else self._step()):
                 return
             if self.loop.housekeeping():
                 self.idle()
 
+    def _ended(self, stop: Stop) -> bool:
+        """Whether to end now because of a signal: the second one, or when all agents here have left after the first."""
+        if not stop:
+            return False
+        swarm = self.swarm
+        if self._leaves_by is None:
+            if self.config.policy != "lease" or self.slot < self._first:
+                return True
+            self._signals = stop.count
+            self._leaves_by = self.slot + (self.config.anchor_every + 1) * self.config.agents
+            for index in range(len(swarm.ids)):
+                swarm.leave(index)
+        if stop.count == self._signals and self.slot <= self._leaves_by and (swarm.present == PRESENT_LEAVING).any():
+            return not self.loop.subscription.get_publisher_count()
+        self._publisher.wait_for_all_acked(_DELIVERY)
+        return True
+
     def _prepare(self, message: Slot) -> bool:
         """Answers the channel's call, or takes the start time; False when the run is over."""
         if message.phase == Slot.PREPARE:
+            self._called = True
             self._answer(0, message.stamp, ())
         elif message.phase == Slot.START:
             self._zero = message.stamp.sec * _PPB + message.stamp.nanosec
+            if not self._called:
+                now = self.local_ns(time.monotonic_ns() - self._zero)
+                self._listeners = Listeners(self.config, self.swarm.ids, now.tolist())
+                self._timeless[:] = True
+                if self._resume_at.size:
+                    self.swarm.position[:] = self._resume_at
+                    self.swarm.track[:] = self._resume_at
         return message.phase != Slot.END
+
+    def _listen(self) -> bool:
+        """Waits for frames that say what time it is; False when the run is over."""
+        assert self._listeners is not None
+        message = self.loop.wait(_PATIENCE_NS)
+        if message is not None and message.phase == Slot.END:
+            return False
+        if message is not None and message.phase == Slot.RUN:
+            self._overhear(message)
+        now = time.monotonic_ns() - self._zero
+        if self._listeners.ready(self.local_ns(now).tolist()):
+            self._listeners = None
+            self._begin_anew(now)
+        return True
+
+    def _begin_anew(self, now: int) -> None:
+        """From the next slot on all agents here take part, knowing nothing.
+
+        :param now: ns on the channel's time line.
+        """
+        ahead = now + self._lead_ns
+        following = (ahead - int(self.starts(ahead // self.slot_ns).min())) // self.slot_ns + 1
+        self._first, self.slot = following, following - 1
+        for index in range(len(self.swarm.ids)):
+            self._newcomers.add(self.swarm, index, following)
+        for aligner in self._aligners:
+            aligner.reset()
 
     def _step(self) -> bool:
         """Waits for the next slot or message; False when the run is over."""
@@ -116,7 +203,10 @@ class RealtimeNode(SwarmNode):
         while (message := self.loop.take()) is not None:
             if not self._take(message):
                 return False
-        self._open(self.slot + 1)
+        if -remaining > self._too_long_ns and self.config.policy == "lease":
+            self._begin_anew(time.monotonic_ns() - self._zero)
+        else:
+            self._open(self.slot + 1)
         return True
 
     def _take(self, message: Slot) -> bool:
@@ -130,22 +220,60 @@ class RealtimeNode(SwarmNode):
         return True
 
     def _take_frames(self, message: Slot) -> None:
+        if message.heard_slot < self._first - 1:
+            return  # from before it began
         # In the slot in which it was sent, even if this process, or the channel's, has been kept waiting since.
         masks = self._hear(message, message.heard_slot)
-        if not self._aligners or masks is None:
+        if masks is None or not (self._aligners or self._timeless.any()):
             return
-        arrival = message.stamp.sec * _PPB + message.stamp.nanosec - names.TIME_ZERO_NS
-        expected = message.heard_slot * self.slot_ns + self._fixed_ns + self._per_byte_ns * message.length[0]
-        late = arrival - expected - self.starts(message.heard_slot)
+        late = self._lateness(message)
         for index in np.flatnonzero(masks[0]):
-            self._shift[index] += self._aligners[index].hear(int(late[index]))
+            if self._timeless[index]:
+                self._take_time(index, late)
+                if abs(late[index]) >= self.slot_ns // 2:
+                    self._newcomers.add(self.swarm, index, self.slot + 1)
+            elif self._aligners:
+                aligner = self._aligners[index]
+                self._shift[index] += aligner.hear(int(late[index]))
+                # The frame that a newcomer took its time from may have left late.
+                self._timeless[index] = not self._called and aligner.ignored_in_a_row >= _DOUBTS
+
+    def _overhear(self, message: Slot) -> None:
+        """Takes in a frame of which only the time counts."""
+        assert self._listeners is not None
+        heard = unpack_received(memoryview(message.received), len(message.sender), self.config.agents)
+        (frame,) = split_frames(memoryview(message.data), message.length)
+        key = self.swarm.authenticator
+        if key is not None and key.open(frame, message.heard_slot) is None:
+            return
+        late, began = self._lateness(message), self.local_ns(self._began_ns(message))
+        for index in np.flatnonzero(heard[0, self.swarm.local]):
+            if self._listeners.hear(index, message.heard_slot, int(began[index])):
+                self._take_time(index, late)
+
+    def _take_time(self, index: np.intp, late: NDArray[np.int64]) -> None:
+        self._shift[index] += late[index]
+        self._timeless[index] = False
+        if self._aligners:
+            self._aligners[index].reset()
+
+    def _began_ns(self, message: Slot) -> int:
+        """When the transmission of a frame began, by its arrival and length: ns on the channel's time line."""
+        arrival = int(message.stamp.sec) * _PPB + int(message.stamp.nanosec) - names.TIME_ZERO_NS
+        return arrival - self._fixed_ns - self._per_byte_ns * int(message.length[0])
+
+    def _lateness(self, message: Slot) -> NDArray[np.int64]:
+        """How much later than each agent expects a frame has begun, ns."""
+        slot = int(message.heard_slot)
+        return np.asarray(self._began_ns(message) - slot * self.slot_ns - self.starts(slot))
 
     def _open(self, slot: int) -> None:
         """Closes the last slot and opens the next: decide, send, fly."""
         swarm = self.swarm
-        if slot:
+        if slot > self._first:
             swarm.end(slot - 1)
         swarm.scenario.advance(slot, swarm)
+        self._newcomers.hold(swarm, slot)
         senders = swarm.begin(slot)
         starts = self.starts(slot)
         now = time.monotonic_ns() - self._zero - slot * self.slot_ns

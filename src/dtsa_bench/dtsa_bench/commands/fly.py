@@ -45,6 +45,13 @@ def add_parser(subparsers: Any) -> None:
         default=10.0,
         help="wall time in which every node must answer a slot, s [10]",
     )
+    parser.add_argument(
+        "--respawn",
+        metavar="S",
+        type=float,
+        default=None,
+        help="real time: a process that died is started again after S seconds, and its agents come back [off]",
+    )
     parser.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
     add_mode_options(parser)
     add_run_options(parser)
@@ -76,7 +83,9 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.ros.loop import Stop
     from dtsa_bench.fly.flight import FlightOptions, fly
 
-    options = FlightOptions(processes=processes, domain=domain, answer_s=args.answer_s, pictures=args.picture)
+    options = FlightOptions(
+        processes=processes, domain=domain, answer_s=args.answer_s, pictures=args.picture, respawn_s=args.respawn
+    )
     with Stop() as stop:
         flight = fly(config, directory, options, stop)
     print(describe(flight.summary))

@@ -30,6 +30,8 @@ class Child:
     agents: Sequence[int]  # ids of the agents in it
     process: subprocess.Popen[bytes]
     log: Path
+    module: str
+    arguments: Sequence[str]
 
 
 class Children:
@@ -53,7 +55,7 @@ class Children:
         :param agents: ids of the agents in it.
         """
         log = self._logs / f"{name.replace(' ', '')}.log"
-        with log.open("wb") as output:
+        with log.open("ab") as output:
             process = subprocess.Popen(
                 [sys.executable, "-m", module, *arguments],
                 stdin=subprocess.DEVNULL,
@@ -62,7 +64,17 @@ class Children:
                 env=self._environment,
                 start_new_session=True,
             )
-        self.all.append(Child(name, agents, process, log))
+        self.all.append(Child(name, agents, process, log, module, arguments))
+
+    def again(self, child: Child, more: Sequence[str] = ()) -> None:
+        """Starts a process that has ended another time; the new one takes its place.
+
+        :param child: the process.
+        :param more: arguments on top of those it had.
+        """
+        self.all.remove(child)
+        self.start(child.name, child.agents, child.module, [*child.arguments, *more])
+        self.all[-1].arguments = child.arguments
 
     def ended(self) -> list[Child]:
         """Processes that have ended since this was asked last."""

@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros import names
+from dtsa_agent.ros.joining import check_joinable
 from dtsa_agent.ros.loop import Stop
 from dtsa_agent.ros.parameters import to_parameters
 from dtsa_bench.metrics import FlightMetrics
@@ -32,7 +33,7 @@ from dtsa_channel_sim.answers import named
 from dtsa_channel_sim.channel_node import declare_channel
 from dtsa_channel_sim.realtime_channel import LOST_AFTER_S
 
-from .children import Children, describe_end
+from .children import Child, Children, describe_end
 from .domain import ros_domain
 from .progress import ProgressLine, flight_text
 
@@ -52,6 +53,7 @@ class FlightOptions:
     domain: int | None = None  # None: any that is free
     startup_s: float = 60.0
     answer_s: float = 10.0
+    respawn_s: float | None = None  # real time: a process that died is started again after so long; None: it is not
     pictures: bool = True
 
 
@@ -108,15 +110,35 @@ class SupervisedChannel(Supervision, RecordedChannel):
 
 
 class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
-    """A flight in real time under supervision: the others fly on when a process dies."""
+    """A flight in real time under supervision: the others fly on when a process dies, and it may be started again."""
+
+    def __init__(self, *args: Any, respawn_s: float | None = None, **more: Any) -> None:
+        super().__init__(*args, **more)
+        self._respawn_s = respawn_s
+        self._dead: list[tuple[float, Child]] = []  # time.monotonic() at which each is started again
 
     def _look(self) -> None:
         for child in self._children.ended():
             if not self.begin_s:
                 self._children.check()
-            self._progress.say(f"{describe_end(child)}; the others fly on")
+            left = not child.process.returncode
+            self._progress.say(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
             for agent in child.agents:
                 self.lose(agent)
+            if self._respawn_s is not None and not left:
+                self._dead.append((time.monotonic() + self._respawn_s, child))
+        while self._dead and time.monotonic() >= self._dead[0][0]:
+            self._start_again(self._dead.pop(0)[1])
+
+    def _start_again(self, child: Child) -> None:
+        """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
+        text = ", ".join(f"{value:.6f}" for agent in child.agents for value in self.last_place(agent))
+        self._children.again(child, ["-p", f"resume_at:=[{text}]"])
+        self._progress.say(f"{child.name} is started again")
+
+    def back(self, agents: list[int]) -> None:
+        super().back(agents)
+        self._progress.say(f"{named(agents)} {'takes' if len(agents) == 1 else 'take'} part again")
 
     def silent(self, agent: int) -> None:
         super().silent(agent)
@@ -142,6 +164,12 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
     if run.swarm.estimator == "oracle" and (options.processes or agents) > 1:
         raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
+    if options.respawn_s is not None:
+        if run.mode == LOCKSTEP:
+            raise ConfigError("respawn", options.respawn_s, "only with --mode realtime: in lockstep all wait for all")
+        if not 0.0 <= options.respawn_s <= 3600.0:
+            raise ConfigError("respawn", options.respawn_s, "0 to 3600 s")
+        check_joinable(run.swarm.policy)
 
 
 def fly(
@@ -201,8 +229,13 @@ def _fly(
     node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
     try:
         declare_channel(node, run.air)
-        kind = SupervisedChannel if run.mode == LOCKSTEP else SupervisedRealtimeChannel
-        channel = kind(node, run, directory, children, progress, startup_s=options.startup_s, answer_s=options.answer_s)
+        limits = {"startup_s": options.startup_s, "answer_s": options.answer_s}
+        channel: SupervisedChannel | SupervisedRealtimeChannel
+        if run.mode == LOCKSTEP:
+            channel = SupervisedChannel(node, run, directory, children, progress, **limits)
+        else:
+            again = options.respawn_s
+            channel = SupervisedRealtimeChannel(node, run, directory, children, progress, respawn_s=again, **limits)
         try:
             channel.run(stop)
             channel.show()
