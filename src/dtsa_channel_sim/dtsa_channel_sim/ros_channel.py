@@ -37,7 +37,7 @@ class RosChannel:
     :param startup_s: s of wall time that all agents have to answer for the first time.
     """
 
-    end_s = 4.0  # wall time that the nodes have to hear of the end
+    farewell_s = 4.0  # wall time that the nodes have to hear of the end
 
     def __init__(
         self,
@@ -121,7 +121,7 @@ class RosChannel:
 
     def close(self) -> None:
         """Waits until all nodes know that the run is over, or have left, and gives the handles back."""
-        deadline = time.monotonic() + self.end_s
+        deadline = time.monotonic() + self.farewell_s
         while self.node.context.ok() and time.monotonic() < deadline:
             # The middleware asks for acknowledgements, and repeats what was lost, every 3 s only: so say it again.
             if self._publisher.wait_for_all_acked(Duration(seconds=_REPEAT_S)):

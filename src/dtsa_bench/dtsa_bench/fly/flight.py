@@ -70,7 +70,7 @@ class Flight:
 class Supervision:
     """What makes a recorded channel look after the agents' processes and show how far it is; mixed into its class."""
 
-    end_s = 1.0  # the supervisor ends those that have not heard
+    farewell_s = 1.0  # the supervisor ends those that have not heard
 
     def __init__(
         self, node: Node, run: RunConfig, directory: Path, children: Children, progress: ProgressLine, **more: Any
