@@ -19,7 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dtsa_bench.fly.domain import ros_domain
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 class Graph:

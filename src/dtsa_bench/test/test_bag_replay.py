@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from bag_helpers import SECOND, SyntheticRun, synthetic_bag
+from metronome import flown_again_when_overloaded
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.bag import replay, schema
@@ -233,6 +234,7 @@ def filled(data: bytes) -> str:
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun) -> None:
     need_ros()
     environment = ros_environment()

@@ -21,6 +21,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
 from bridge_helpers import FakeFleet, fake_fleet, settings, wait_for
+from metronome import flown_again_when_overloaded
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.link import require_cflib
@@ -42,6 +43,7 @@ def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
     return path
 
 
+@flown_again_when_overloaded
 def test_take_off_exchange_landing(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT) as fleet:
         config, out = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45), tmp_path / "out"
@@ -70,6 +72,7 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
         assert summary["min_distance_m"] == pytest.approx(gap.min(), abs=0.05)
 
 
+@flown_again_when_overloaded
 def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT) as fleet:
         command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out"), "--tail-s", "60"]
@@ -119,6 +122,7 @@ def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyP
         require_cflib()
 
 
+@flown_again_when_overloaded
 def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2) as fleet:
         data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from metronome import flown_again_when_overloaded
 
 from dtsa_agent.core.alignment import ClockAligner
 from dtsa_bench.bag.reader import Bag, Message
@@ -59,6 +60,7 @@ def drifts(seconds: float) -> list[float]:
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_with_alignment_slots_stay_together_and_without_frames_collide(aligned: Path, tmp_path: Path) -> None:
     apart = fly(tmp_path / "apart", *TIGHT, "--no-align")
     together = json.loads((aligned / "summary.json").read_text())
@@ -76,6 +78,7 @@ def test_with_alignment_slots_stay_together_and_without_frames_collide(aligned: 
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
     """All that agents report is recorded, and a frame that one of them had not taken in would show in its view."""
     out, agents = tmp_path / "flight", 70
@@ -113,6 +116,7 @@ def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_an_agent_that_hangs_is_named_and_the_others_fly_on(tmp_path: Path) -> None:
     out = tmp_path / "flight"
     words = ("--agents", "3", "--policy", "lease", "--processes", "3", "--mode", "realtime", "--tail-s", "0.5")

@@ -1,0 +1,102 @@
+"""`dtsa fly` as a process, and the processes that it starts."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.ros.wire import split_frames
+from dtsa_bench.bag.reader import Bag
+from dtsa_bench.verify import verify_bag
+
+PATIENCE_S = 120.0
+# Long enough to be interrupted, whatever the machine.
+ENDLESS = ("--agents", "3", "--moving", "2", "--tail-s", "3600", "--no-picture")
+
+
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "dtsa_bench", "fly", *words]
+
+
+def fly(out: Path, *words: str) -> dict[str, Any]:
+    """A whole flight; its summary."""
+    done = subprocess.run(
+        command("--out", str(out), *words), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads((out / "summary.json").read_text())
+
+
+def frames(out: Path) -> list[tuple[int, int, bytes]]:
+    """(slot, sender, frame) of all frames that the nodes of a flight sent, in order."""
+    sent = []
+    with Bag(out / "bag") as bag:
+        for _, message in bag.typed(["/swarm/transmission"]):
+            pieces = split_frames(message.data, message.length)
+            sent += [(int(message.slot), int(a), f) for a, f in zip(message.agent, pieces, strict=True) if f]
+    return sorted(sent)
+
+
+def children(supervisor: int) -> list[int]:
+    """Processes that a flight has started and that are still there, whoever their parent is by now."""
+    mark = f"DTSA_SUPERVISOR={supervisor}".encode()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                if (
+                    mark in (entry / "environ").read_bytes().split(b"\0")
+                    and b") Z " not in (entry / "stat").read_bytes()
+                ):
+                    found.append(int(entry.name))
+    return found
+
+
+def until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.02)
+
+
+@contextmanager
+def flying(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+    """A flight that has begun, in the state in which the test leaves it."""
+    process = subprocess.Popen(
+        command("--out", str(out), *words), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    )
+    bag = out / "bag" / "bag_0.mcap"
+    try:
+        until(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 20_000))
+        yield process
+    finally:
+        left = children(process.pid)
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def pid_of(supervisor: int, agent: int) -> int:
+    """Process of one agent."""
+    name = f"__ns:=/cf{agent}".encode()
+    return next(pid for pid in children(supervisor) if name in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
+
+
+def readable(out: Path) -> int:
+    """Slots in a bag that is finished and says nothing but what the protocol gives."""
+    assert (out / "bag" / "metadata.yaml").is_file()
+    result = verify_bag(out / "bag")
+    assert result.ok, result.difference
+    return result.slots
