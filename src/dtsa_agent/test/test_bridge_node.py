@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,12 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from dtsa_msgs.msg import Position, Status, VelocityWorld  # noqa: E402
 from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff  # noqa: E402
 from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
+from metronome import flown_again_when_overloaded  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Empty, Trigger  # noqa: E402
+
+from dtsa_bench.fly.domain import ros_domain  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 COUNT = 3
@@ -85,10 +88,9 @@ class Graph:
         self.context.try_shutdown()
 
 
-@pytest.fixture
+@contextmanager
 def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
-    domain = random.randrange(10, 100)
-    with fake_fleet(tmp_path, COUNT) as fleet:
+    with ros_domain() as domain, fake_fleet(tmp_path, COUNT) as fleet:
         config = tmp_path / "swarm.yaml"
         config.write_text(yaml.safe_dump(settings(fleet, PATIENT)))
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -119,79 +121,84 @@ def up(graph: Graph) -> None:
     wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2]) < 0.1 for k in (1, 2, 3)))
 
 
-def test_a_flight_over_the_graph_and_ctrl_c_lands(swarm: tuple[FakeFleet, subprocess.Popen[str], Graph]) -> None:
-    fleet, process, graph = swarm
-    up(graph)
-    odometry = graph.last["/cf1/odom"]
-    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "cf1/base_link")
-    assert graph.last["/cf1/pose"].header.frame_id == "map"
-    x = graph.place(1)[0]
-    # go_to in the frame map; commands are not taken before it has been flown.
-    goal = Point(x=x - 0.3, y=0.2, z=0.1)
-    assert graph.call(GoTo, "/cf1/go_to", goal=goal, duration=Duration(sec=1)).success
-    wait_for(lambda: graph.place(1) == pytest.approx((x - 0.3, 0.2, 0.1), abs=0.05))
-    # Streamed commands, with yaw: cf2 by velocity, cf1 by position.
-    y = graph.place(2)[1]
-    for _ in range(50):
-        message = VelocityWorld(yaw_rate=1.0)
-        message.vel.y = -0.4
-        graph.velocity[2].publish(message)
-        place = Position(x=x - 0.3, y=0.0, z=0.0, yaw=1.0)
-        graph.position.publish(place)
-        time.sleep(0.02)
-    assert graph.place(2)[1] < y - 0.2
-    turned = graph.last["/cf2/odom"].pose.pose.orientation
-    assert turned.z > 0.2  # counter-clockwise
-    assert graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.0), abs=0.15)
-    status = graph.last["/cf2/status"]
-    assert status.supervisor_info & Status.SUPERVISOR_INFO_IS_FLYING
-    assert 3.0 < status.battery_voltage < 4.2
-    assert not graph.call(Trigger, "/cf2/reconnect").success
-    diagnostics = {s.hardware_id: s for s in graph.last["/diagnostics"].status}
-    assert {"cf1", "cf2", "cf3"} == set(diagnostics)
-    assert "battery [V]" in {v.key for v in diagnostics["cf1"].values}
-    # A go_to that no Crazyflie can keep is refused; a landing is not, it takes longer.
-    answer = graph.call(GoTo, "/cf3/go_to", relative=True, goal=Point(y=0.5), duration=Duration(nanosec=100_000_000))
-    assert not answer.success
-    assert "cf3: duration 0.10 s is too short for 0.50 m" in answer.message
-    # The stream ends: the bridge holds. Landing one by service, the others by Ctrl-C.
-    answer = graph.call(Land, "/cf3/land", height=0.0, duration=Duration(nanosec=200_000_000))
-    assert answer.success
-    assert "cf3: landing takes" in answer.message
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=25)
-    assert process.returncode == 0, output
-    assert "landing" in output
-    for k in (1, 2, 3):
-        assert fleet.events(k, "land")
-        assert [e["state"] for e in fleet.events(k, "state")][2] == "landed"
-    assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
+@flown_again_when_overloaded
+def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
+    with swarm(tmp_path) as (fleet, process, graph):
+        up(graph)
+        odometry = graph.last["/cf1/odom"]
+        assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "cf1/base_link")
+        assert graph.last["/cf1/pose"].header.frame_id == "map"
+        x = graph.place(1)[0]
+        # go_to in the frame map; commands are not taken before it has been flown.
+        goal = Point(x=x - 0.3, y=0.2, z=0.1)
+        assert graph.call(GoTo, "/cf1/go_to", goal=goal, duration=Duration(sec=1)).success
+        wait_for(lambda: graph.place(1) == pytest.approx((x - 0.3, 0.2, 0.1), abs=0.05))
+        # Streamed commands, with yaw: cf2 by velocity, cf1 by position.
+        y = graph.place(2)[1]
+        for _ in range(50):
+            message = VelocityWorld(yaw_rate=1.0)
+            message.vel.y = -0.4
+            graph.velocity[2].publish(message)
+            place = Position(x=x - 0.3, y=0.0, z=0.0, yaw=1.0)
+            graph.position.publish(place)
+            time.sleep(0.02)
+        assert graph.place(2)[1] < y - 0.2
+        turned = graph.last["/cf2/odom"].pose.pose.orientation
+        assert turned.z > 0.2  # counter-clockwise
+        assert graph.place(1) == pytest.approx((x - 0.3, 0.0, 0.0), abs=0.15)
+        status = graph.last["/cf2/status"]
+        assert status.supervisor_info & Status.SUPERVISOR_INFO_IS_FLYING
+        assert 3.0 < status.battery_voltage < 4.2
+        assert not graph.call(Trigger, "/cf2/reconnect").success
+        diagnostics = {s.hardware_id: s for s in graph.last["/diagnostics"].status}
+        assert {"cf1", "cf2", "cf3"} == set(diagnostics)
+        assert "battery [V]" in {v.key for v in diagnostics["cf1"].values}
+        # A go_to that no Crazyflie can keep is refused; a landing is not, it takes longer.
+        answer = graph.call(
+            GoTo, "/cf3/go_to", relative=True, goal=Point(y=0.5), duration=Duration(nanosec=100_000_000)
+        )
+        assert not answer.success
+        assert "cf3: duration 0.10 s is too short for 0.50 m" in answer.message
+        # The stream ends: the bridge holds. Landing one by service, the others by Ctrl-C.
+        answer = graph.call(Land, "/cf3/land", height=0.0, duration=Duration(nanosec=200_000_000))
+        assert answer.success
+        assert "cf3: landing takes" in answer.message
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 0, output
+        assert "landing" in output
+        for k in (1, 2, 3):
+            assert fleet.events(k, "land")
+            assert [e["state"] for e in fleet.events(k, "state")][2] == "landed"
+        assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
 
 
-def test_second_ctrl_c_is_the_emergency_stop(swarm: tuple[FakeFleet, subprocess.Popen[str], Graph]) -> None:
-    fleet, process, graph = swarm
-    up(graph)
-    process.send_signal(signal.SIGINT)
-    wait_for(lambda: len(fleet.events(name="land")) == COUNT)
-    assert not any(e["state"] == "locked" for e in fleet.events(name="state"))
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=25)
-    assert process.returncode == 1
-    assert "EMERGENCY STOP of all: second Ctrl-C" in output
-    for k in (1, 2, 3):
-        assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
+@flown_again_when_overloaded
+def test_second_ctrl_c_is_the_emergency_stop(tmp_path: Path) -> None:
+    with swarm(tmp_path) as (fleet, process, graph):
+        up(graph)
+        process.send_signal(signal.SIGINT)
+        wait_for(lambda: len(fleet.events(name="land")) == COUNT)
+        assert not any(e["state"] == "locked" for e in fleet.events(name="state"))
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 1
+        assert "EMERGENCY STOP of all: second Ctrl-C" in output
+        for k in (1, 2, 3):
+            assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
 
 
-def test_emergency_service(swarm: tuple[FakeFleet, subprocess.Popen[str], Graph]) -> None:
-    fleet, _, graph = swarm
-    up(graph)
-    graph.call(Empty, "/cf1/emergency")
-    wait_for(lambda: graph.state(1) == "emergency")
-    assert graph.state(2) == "flying"
-    graph.call(Empty, "/all/emergency")
-    wait_for(lambda: graph.state(2) == graph.state(3) == "emergency")
-    for k in (1, 2, 3):
-        assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
+@flown_again_when_overloaded
+def test_emergency_service(tmp_path: Path) -> None:
+    with swarm(tmp_path) as (fleet, _, graph):
+        up(graph)
+        graph.call(Empty, "/cf1/emergency")
+        wait_for(lambda: graph.state(1) == "emergency")
+        assert graph.state(2) == "flying"
+        graph.call(Empty, "/all/emergency")
+        wait_for(lambda: graph.state(2) == graph.state(3) == "emergency")
+        for k in (1, 2, 3):
+            assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
 
 
 def run_bridge(*arguments: str) -> subprocess.CompletedProcess[str]:
