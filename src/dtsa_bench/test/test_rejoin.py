@@ -248,7 +248,58 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
     assert "policy: got 'dtsa'; allowed: tdma, aloha, lease, to come into a flight that is under way" in said
 
 
+@pytest.mark.ros
+def test_an_agent_may_come_late(tmp_path: Path) -> None:
+    with flying(tmp_path / "flight", *ROOMY, *LEASE, "--late", "cf3=0.5") as flight:
+        flight.until(lambda: "cf3 takes part\n" in flight.said)
+        flight.fly_on(300)
+        summary = flight.land()
+    assert "has not been heard of" not in flight.said
+    assert (summary["lost_agents"], summary["returned_agents"]) == ([], [3])
+    assert flight.safety["frames_collided"] == 0
+    found = reports(flight.out, 3)
+    assert found[0].slot > 50
+    scenario = make_scenario(SwarmConfig(agents=4, moving=4, scenario="waypoints", axis_x_m=6.0, stops=50))
+    assert found[0].place == pytest.approx(scenario.start[:, 2])
+    assert first_turn(found, 3).reason == "anchor"
+    assert sum(report.heard > 0 for report in found) > 5
+
+
 # Without nodes.
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--respawn", "1"], "respawn: got 1.0; allowed: only with --mode realtime"),
+        (["--respawn", "-1", "--mode", "realtime", "--policy", "tdma"], "respawn: got -1.0; allowed: 0 to 3600 s"),
+        (
+            ["--respawn", "1", "--mode", "realtime", "--policy", "dtsa"],
+            "policy: got 'dtsa'; allowed: tdma, aloha, lease",
+        ),
+        (["--late", "cf2"], "late: got 'cf2'; allowed: cfK=S,..."),
+        (["--late", "cf2=1"], "late: got {2: 1.0}; allowed: only with --mode realtime"),
+        (["--late", "cf13=1", "--mode", "realtime", "--policy", "tdma"], "late: got {13: 1.0}; allowed: some, not all"),
+        (
+            ["--late", "cf2=1", "--mode", "realtime", "--policy", "lease", "--processes", "2"],
+            "late: got {2: 1.0}; allowed: only with --processes per-agent",
+        ),
+        (
+            ["--respawn", "1", "--backend", "cflib", "--config", "x"],
+            "respawn: got 1.0; allowed: only with --backend sim",
+        ),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    from dtsa_bench.cli import main
+
+    assert main(["fly", "--out", str(tmp_path / "out"), *words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"dtsa: error: {said}")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_who_is_back_counts_again() -> None:

@@ -89,6 +89,16 @@ class RealtimeChannel(RosChannel):
         finally:
             self._publish_end()
 
+    def expect_later(self, agent: int, place: NDArray[np.float64]) -> None:
+        """An agent will not be there at the start.
+
+        :param agent: its id.
+        :param place: (3,) m, where its vehicle waits.
+        """
+        self.lose(agent)
+        self._given_up[agent] = -_AFTERLIFE
+        self.answers.track[:, :, agent - 1] = place
+
     def lose(self, agent: int) -> None:
         """Takes note that an agent is gone."""
         if agent not in self.lost:
@@ -116,7 +126,7 @@ class RealtimeChannel(RosChannel):
         begin = time.monotonic()
         repeat = 0.0
         self.answers.open()
-        while self.answers.missing:
+        while set(self.answers.silent) - self.lost:
             if stop:
                 return False
             now = time.monotonic()
@@ -130,7 +140,7 @@ class RealtimeChannel(RosChannel):
                     self.answers.add(message)
             self._housekeeping()
             if now - begin > self._startup_s:
-                missing = named(self.answers.silent)
+                missing = named(set(self.answers.silent) - self.lost)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
         self._zero = time.monotonic_ns() + _LEAD_NS
         self._tell_start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,12 @@ def add_parser(subparsers: Any) -> None:
         default=None,
         help="real time: a process that died is started again after S seconds, and its agents come back [off]",
     )
+    parser.add_argument(
+        "--late",
+        metavar="cfK=S,...",
+        default=None,
+        help="real time: agents whose processes are started S seconds after slot 0 only [none]",
+    )
     parser.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
     add_mode_options(parser)
     add_run_options(parser)
@@ -84,7 +91,12 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_bench.fly.flight import FlightOptions, fly
 
     options = FlightOptions(
-        processes=processes, domain=domain, answer_s=args.answer_s, pictures=args.picture, respawn_s=args.respawn
+        processes=processes,
+        domain=domain,
+        answer_s=args.answer_s,
+        pictures=args.picture,
+        respawn_s=args.respawn,
+        late_s=late_agents(args.late),
     )
     with Stop() as stop:
         flight = fly(config, directory, options, stop)
@@ -98,6 +110,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def late_agents(text: str | None) -> dict[int, float]:
+    """Seconds by agent, from ``cf5=3,cf6=4.5``.
+
+    :raises ConfigError: if the text is none of that kind.
+    """
+    late = {}
+    for part in (text or "").split(",") if text is not None else ():
+        found = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
+        if not found:
+            from dtsa_agent.core.errors import ConfigError
+
+            raise ConfigError("late", text, "cfK=S,...: agents, and seconds after slot 0")
+        late[int(found[1])] = float(found[2])
+    return late
+
+
 def run_crazyflies(args: argparse.Namespace) -> int:
     """A mission with Crazyflies.
 
@@ -106,6 +134,9 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     from dtsa_agent.core.errors import ConfigError
     from dtsa_agent.crazyflie.config import load_swarm
 
+    for name in ("respawn", "late"):
+        if getattr(args, name) is not None:
+            raise ConfigError(name, getattr(args, name), "only with --backend sim")
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     path = Path(args.config)

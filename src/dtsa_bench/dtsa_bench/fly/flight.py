@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ class FlightOptions:
     startup_s: float = 60.0
     answer_s: float = 10.0
     respawn_s: float | None = None  # real time: a process that died is started again after so long; None: it is not
+    late_s: Mapping[int, float] = field(default_factory=dict)  # real time: agents that start so long after slot 0
     pictures: bool = True
 
 
@@ -109,13 +111,26 @@ class SupervisedChannel(Supervision, RecordedChannel):
     """A lockstep flight under supervision."""
 
 
+@dataclass(frozen=True, slots=True)
+class LateStart:
+    """An agent whose process is started while the flight is under way."""
+
+    after_s: float  # s after slot 0
+    agent: int
+    start: Callable[[], None]
+
+
 class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
     """A flight in real time under supervision: the others fly on when a process dies, and it may be started again."""
 
-    def __init__(self, *args: Any, respawn_s: float | None = None, **more: Any) -> None:
+    def __init__(self, *args: Any, respawn_s: float | None = None, late: Sequence[LateStart] = (), **more: Any) -> None:
         super().__init__(*args, **more)
         self._respawn_s = respawn_s
+        self._late = sorted(late, key=lambda start: start.after_s)
         self._dead: list[tuple[float, Child]] = []  # time.monotonic() at which each is started again
+        self._new = {start.agent for start in late}  # those that have never taken part
+        for start in late:
+            self.expect_later(start.agent, self.scenario.start[:, start.agent - 1])
 
     def _look(self) -> None:
         for child in self._children.ended():
@@ -129,6 +144,10 @@ class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
                 self._dead.append((time.monotonic() + self._respawn_s, child))
         while self._dead and time.monotonic() >= self._dead[0][0]:
             self._start_again(self._dead.pop(0)[1])
+        while self._late and self.begin_s and time.monotonic() - self.begin_s >= self._late[0].after_s:
+            start = self._late.pop(0)
+            start.start()
+            self._progress.say(f"{named([start.agent])} is started")
 
     def _start_again(self, child: Child) -> None:
         """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
@@ -138,11 +157,14 @@ class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
 
     def back(self, agents: list[int]) -> None:
         super().back(agents)
-        self._progress.say(f"{named(agents)} {'takes' if len(agents) == 1 else 'take'} part again")
+        again = "" if self._new.issuperset(agents) else " again"
+        self._new.difference_update(agents)
+        self._progress.say(f"{named(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
 
     def silent(self, agent: int) -> None:
         super().silent(agent)
-        if all(agent not in child.agents for child in self._children.all if child.process.poll() is not None):
+        known = {agent for child in self._children.all if child.process.poll() is not None for agent in child.agents}
+        if agent not in known | {start.agent for start in self._late}:
             self._progress.say(f"{named([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")
 
 
@@ -164,12 +186,18 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
     if run.swarm.estimator == "oracle" and (options.processes or agents) > 1:
         raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
-    if options.respawn_s is not None:
-        if run.mode == LOCKSTEP:
-            raise ConfigError("respawn", options.respawn_s, "only with --mode realtime: in lockstep all wait for all")
-        if not 0.0 <= options.respawn_s <= 3600.0:
-            raise ConfigError("respawn", options.respawn_s, "0 to 3600 s")
-        check_joinable(run.swarm.policy)
+    late = dict(options.late_s)
+    for name, value in (("respawn", options.respawn_s), ("late", late or None)):
+        if value is not None and run.mode == LOCKSTEP:
+            raise ConfigError(name, value, "only with --mode realtime: in lockstep all wait for all")
+        if value is not None:
+            check_joinable(run.swarm.policy)
+    if options.respawn_s is not None and not 0.0 <= options.respawn_s <= 3600.0:
+        raise ConfigError("respawn", options.respawn_s, "0 to 3600 s")
+    if late and (not set(late) < set(range(1, agents + 1)) or not all(0.0 <= s <= 86400.0 for s in late.values())):
+        raise ConfigError("late", late, f"some, not all, of the agents 1 to {agents}, and 0 to 86400 s")
+    if late and options.processes is not None:
+        raise ConfigError("late", late, "only with --processes per-agent")
 
 
 def fly(
@@ -206,12 +234,12 @@ def fly(
         children = Children(directory / "log", environment)
         progress = ProgressLine(label)
         # Started first: the interpreter of each process needs longer than all that follows here.
-        _start_agents(children, run, options, directory)
+        late = _start_agents(children, run, options, directory)
         try:
             rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
             if started:
                 started(children)
-            return _fly(context, run, directory, children, progress, options, stop)
+            return _fly(context, run, directory, children, progress, options, stop, late)
         finally:
             children.stop()
             context.try_shutdown()
@@ -225,6 +253,7 @@ def _fly(
     progress: ProgressLine,
     options: FlightOptions,
     stop: Stop,
+    late: Sequence[LateStart],
 ) -> Flight:
     node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
     try:
@@ -235,7 +264,9 @@ def _fly(
             channel = SupervisedChannel(node, run, directory, children, progress, **limits)
         else:
             again = options.respawn_s
-            channel = SupervisedRealtimeChannel(node, run, directory, children, progress, respawn_s=again, **limits)
+            channel = SupervisedRealtimeChannel(
+                node, run, directory, children, progress, respawn_s=again, late=late, **limits
+            )
         try:
             channel.run(stop)
             channel.show()
@@ -249,23 +280,30 @@ def _fly(
         node.destroy_node()
 
 
-def _start_agents(children: Children, run: RunConfig, options: FlightOptions, directory: Path) -> None:
+def _start_agents(children: Children, run: RunConfig, options: FlightOptions, directory: Path) -> list[LateStart]:
+    """Starts the agents' processes, but for those that come late."""
     swarm = run.swarm
     parameters = directory / "parameters.yaml"
     values = {**to_parameters(swarm.to_dict(), SwarmConfig), "mode": run.mode}
     content = {"/**": {"ros__parameters": values}}
     parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     common = ["--ros-args", "--params-file", str(parameters), "--disable-external-lib-logs", "--disable-rosout-logs"]
+    late: list[LateStart] = []
     if options.processes is None:
         for agent in range(1, swarm.agents + 1):
             place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_parameters(run, [agent])]
-            children.start(f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
-        return
+            start = partial(children.start, f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
+            if agent in options.late_s:
+                late.append(LateStart(options.late_s[agent], agent, start))
+            else:
+                start()
+        return late
     shared = str(run.mode == LOCKSTEP and may_share(run)).lower()
     for number, ids in enumerate(split(swarm.agents, options.processes), 1):
         own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_view:={shared}"]
         name = f"swarm_host_{number} with {named(ids)}"
         children.start(name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_parameters(run, ids)])
+    return late
 
 
 def _clock_parameters(run: RunConfig, ids: list[int]) -> list[str]:
