@@ -1,10 +1,16 @@
-"""Settings of all tests: property tests have no deadline for one example, and look at the same ones in each CI run."""
+"""Settings of all tests: property tests do not depend on the machine's speed, and look at the same ones in each CI run."""
 
 from __future__ import annotations
 
 import os
 
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-settings.register_profile("dtsa", deadline=None, derandomize=bool(os.environ.get("CI")), print_blob=True)
+settings.register_profile(
+    "dtsa",
+    deadline=None,
+    derandomize=bool(os.environ.get("CI")),
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow],  # says something about the machine only
+)
 settings.load_profile("dtsa")
