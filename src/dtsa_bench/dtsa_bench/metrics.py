@@ -62,6 +62,7 @@ class FlightMetrics:
         self._torn = 0  # slots in which two agents took different agents for the sender
         self._compared = 0
         self.lost: set[int] = set()  # ids of agents that fell out of the flight
+        self.awaited: set[int] = set()  # ids of those of them that will come back: the flight is not complete without
         self._torn_ways: set[int] = set()  # ids of those of whose way a part is not known
         self._outcomes = [0, 0, 0]  # by IDLE, SUCCESS, COLLISION
         start = np.ascontiguousarray(scenario.start, dtype=np.float64)
@@ -97,7 +98,7 @@ class FlightMetrics:
             self._course.advance(done, self._last)
             if not all(self._course.final[k] for k in range(len(self._course.final)) if k + 1 not in self.lost):
                 state &= ~_ARRIVED  # at its target by chance, with goals still to come
-        if state & _ARRIVED and not self._returned_arrived():
+        if state & _ARRIVED and self.lost | self._torn_ways and not self._others_arrived():
             state &= ~_ARRIVED
         if state:
             if state & _CRASHED and self.crash_slot < 0:
@@ -130,10 +131,14 @@ class FlightMetrics:
         :param agent: its id.
         """
         self.lost.discard(agent)
+        self.awaited.discard(agent)
 
-    def _returned_arrived(self) -> bool:
-        """Whether all movers that fell out and came back are at their targets, too."""
-        back = [agent - 1 for agent in self._torn_ways - self.lost if self.scenario.moving[agent - 1]]
+    def _others_arrived(self) -> bool:
+        """Whether movers are left, and those that came back are at their targets, too, and no more will come."""
+        movers = {int(k) + 1 for k in np.flatnonzero(self.scenario.moving)}
+        if movers & self.awaited or (movers and movers <= self.lost):
+            return False
+        back = [agent - 1 for agent in (self._torn_ways - self.lost) & movers]
         away = self._last[:, back] - self.scenario.target[:, back]
         return bool((np.sqrt((away * away).sum(axis=0)) <= self.run.swarm.r_min).all())
 

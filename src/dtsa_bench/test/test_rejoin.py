@@ -265,6 +265,35 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
     assert sum(report.heard > 0 for report in found) > 5
 
 
+@pytest.mark.ros
+def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) -> None:
+    few = (
+        "--agents",
+        "2",
+        "--moving",
+        "2",
+        "--mode",
+        "realtime",
+        "--policy",
+        "lease",
+        "--processes",
+        "1",
+        "--no-picture",
+    )
+    with flying(tmp_path / "over", *few) as flight:
+        os.kill(flight.pid("__node:=swarm_host_1"), signal.SIGKILL)
+        assert flight.process.wait(PATIENCE_S) == 1
+        assert "nobody is left: swarm_host_1 with cf1 .. cf2" in flight.said
+    with flying(tmp_path / "again", *few, "--respawn", "0") as flight:
+        os.kill(flight.pid("__node:=swarm_host_1"), signal.SIGKILL)
+        assert flight.process.wait(PATIENCE_S) == 0, flight.said
+    assert "cf1 .. cf2 take part again" in flight.said
+    summary = json.loads((flight.out / "summary.json").read_text())
+    assert (summary["end"], summary["returned_agents"]) == ("completed", [1, 2])
+    result = verify_bag(flight.out)
+    assert result.ok, result.difference
+
+
 # Without nodes.
 
 
@@ -322,10 +351,14 @@ def test_who_is_back_counts_again() -> None:
     metrics.regain(2)
     away = there.copy()
     away[:, 1] += 5.0
+    metrics.lose(3)
+    metrics.awaited.add(3)
+    assert fly(there) == ""  # one is still to come
+    metrics.regain(3)
     assert fly(away) == ""  # all others have arrived
     assert fly(there) == COMPLETED
     assert metrics.summary()["lost_agents"] == []
-    assert set(metrics.efficiencies()) == {1, 3, 4}  # of its way a part is not known
+    assert set(metrics.efficiencies()) == {1, 4}  # of its way a part is not known
     metrics.lose(2)
     assert fly(elsewhere) == COMPLETED
     assert metrics.crash_slot < 0

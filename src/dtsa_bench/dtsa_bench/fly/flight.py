@@ -34,7 +34,7 @@ from dtsa_channel_sim.answers import named
 from dtsa_channel_sim.channel_node import declare_channel
 from dtsa_channel_sim.realtime_channel import LOST_AFTER_S
 
-from .children import Child, Children, describe_end
+from .children import Child, Children, NodeError, describe_end
 from .domain import ros_domain
 from .progress import ProgressLine, flight_text
 
@@ -130,6 +130,7 @@ class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
         self._dead: list[tuple[float, Child]] = []  # time.monotonic() at which each is started again
         self._new = {start.agent for start in late}  # those that have never taken part
         for start in late:
+            self.metrics.awaited.add(start.agent)
             self.expect_later(start.agent, self.scenario.start[:, start.agent - 1])
 
     def _look(self) -> None:
@@ -142,6 +143,9 @@ class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
                 self.lose(agent)
             if self._respawn_s is not None and not left:
                 self._dead.append((time.monotonic() + self._respawn_s, child))
+                self.metrics.awaited.update(child.agents)
+            if len(self.lost) == self.agents and not self._dead and not self._late:
+                raise NodeError(f"nobody is left: {describe_end(child)}")
         while self._dead and time.monotonic() >= self._dead[0][0]:
             self._start_again(self._dead.pop(0)[1])
         while self._late and self.begin_s and time.monotonic() - self.begin_s >= self._late[0].after_s:
