@@ -78,6 +78,30 @@ def test_with_alignment_slots_stay_together_and_without_frames_collide(aligned: 
 
 
 @pytest.mark.ros
+def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path: Path) -> None:
+    words = (
+        "--agents",
+        "3",
+        "--moving",
+        "2",
+        "--policy",
+        "tdma",
+        "--processes",
+        "1",
+        "--mode",
+        "realtime",
+        "--no-align",
+    )
+    fly(tmp_path / "fast", *words, "--clock-offset-ns", "4000000", "--timeout-s", "1")
+    with Bag(tmp_path / "fast" / "bag") as bag:
+        times = {(m.topic, int(v.slot)): m.log_time_ns for m, v in bag.typed(["/swarm/transmission", "/swarm/slot"])}
+    early = [slot for topic, slot in times if times.get(("/swarm/slot", slot), 2**63) < times[topic, slot]]
+    assert early
+    result = verify_bag(tmp_path / "fast")
+    assert result.ok, result.difference
+
+
+@pytest.mark.ros
 @flown_again_when_overloaded
 def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
     """All that agents report is recorded, and a frame that one of them had not taken in would show in its view."""

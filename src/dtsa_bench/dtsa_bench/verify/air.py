@@ -61,6 +61,10 @@ class Air:
         self._sent[(slot, sender)] = sent
         self._unjudged.setdefault(sender, deque()).append(sent)
 
+    def knows(self, slot: int, sender: int) -> bool:
+        """Whether a frame has gone out."""
+        return (slot, sender) in self._sent
+
     def place(self, slot: int, position: NDArray[np.float64]) -> None:
         """Where all are at a slot's start, (3, N) m; kept only where the channel asks for it."""
         if self.config.range_m or self.config.capture_db:
@@ -160,11 +164,13 @@ class Air:
 
     def _arbitrated(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
         arbiter = RealtimeArbiter(channel)
-        for key, sent in self._sent.items():
-            arbiter.push(key, sent.sender, sent.on_air.start_ns, len(sent.data))
+        waiting = deque(sorted(self._sent.items(), key=lambda item: item[1].on_air.start_ns))
         last = max((sent.on_air.end_ns for sent in self._sent.values()), default=0)
         result = {}
         for at in range(0, last + 2 * self.config.slot_ns, self.config.slot_ns):
+            while waiting and waiting[0][1].on_air.start_ns < at:
+                key, sent = waiting.popleft()
+                arbiter.push(key, sent.sender, sent.on_air.start_ns, len(sent.data))
             for verdict in arbiter.settle(at):
                 result[verdict.frame_id] = verdict.received, verdict.lost, verdict.collided
         return result  # type: ignore[return-value]
