@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from metronome import flown_again_when_overloaded
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame_extended import decode_extended
@@ -160,6 +161,7 @@ def first_turn(found: list[Report], agent: int) -> Report:
         ("__ns:=/cf2", [2], ("--policy", "tdma", "--frame", "extended")),
     ],
 )
+@flown_again_when_overloaded
 def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
     tmp_path: Path, argument: str, agents: list[int], words: tuple[str, ...]
 ) -> None:
@@ -187,6 +189,7 @@ def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, *LEASE) as flight:
         asleep = flight.pid("__ns:=/cf2")
@@ -206,6 +209,7 @@ def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_sigterm_lets_an_agent_say_farewell_and_a_second_one_does_not_wait(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, "--policy", "lease", "--respawn", "0") as flight:
         os.kill(flight.pid("__ns:=/cf2"), signal.SIGTERM)
@@ -249,6 +253,7 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_an_agent_may_come_late(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, *LEASE, "--late", "cf3=0.5") as flight:
         flight.until(lambda: "cf3 takes part\n" in flight.said)
@@ -266,6 +271,7 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) -> None:
     few = (
         "--agents",

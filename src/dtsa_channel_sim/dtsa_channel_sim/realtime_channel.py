@@ -30,6 +30,7 @@ _GRACE = 0.35  # of a slot: a frame reaches the channel at most this late, or it
 _STRIDE = 0.25  # of a slot: time moves on by this much at most before messages are looked for again
 _PATIENCE = 10  # slots that a slot is kept open for agents that have not reported yet
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
+_AHEAD = 100  # slots: a report from farther in the future is none
 _AFTERLIFE = 10  # slots: a report for a later one was made after its agent had been given up
 
 
@@ -189,8 +190,8 @@ class RealtimeChannel(RosChannel):
         message = self._decoded(data)
         if message is None:
             return
-        slot = message.slot
-        if slot > self.slot + 100:
+        slot, now = message.slot, time.monotonic_ns() - self._zero
+        if slot > now // self.slot_ns + _AHEAD:
             self.missed += len(message.agent)
             return
         if slot > self.slot:
@@ -207,7 +208,6 @@ class RealtimeChannel(RosChannel):
             return
         self.received(slot, message.agent.tobytes(), data)
         self.reported(message)
-        now = time.monotonic_ns() - self._zero
         for agent, offset, length in zip(message.agent, message.offset_ns, message.length, strict=True):
             self._heard_ns[agent - 1] = now
             self._offset_ns[agent - 1] = offset

@@ -26,6 +26,7 @@ from .wire import split_frames, unpack_received
 _PPB = 1_000_000_000
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
+_C_S, _FAREWELL = 2, 255  # byte of an extended frame, and its value in the last one of an agent that leaves
 _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
 _LEAD = 0.25  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time
 
@@ -100,6 +101,7 @@ class RealtimeNode(SwarmNode):
         # Whoever stood still for so long does not wait until the others think it dead, and knows too little.
         self._too_long_ns = max(500, 3 * self.config.anchor_every * self.config.agents) * self.slot_ns
         self._leaves_by: int | None = None  # slot: leaving; ends then at the latest
+        self._gone: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)  # who has said farewell, on the air
         self._signals = 0
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
         self._early: list[Slot] = []  # frames of a slot that is still to come here
@@ -272,6 +274,8 @@ class RealtimeNode(SwarmNode):
         swarm = self.swarm
         if slot > self._first:
             swarm.end(slot - 1)
+        if self._leaves_by is not None:
+            swarm.present[~self._gone] = PRESENT_LEAVING
         swarm.scenario.advance(slot, swarm)
         self._newcomers.hold(swarm, slot)
         senders = swarm.begin(slot)
@@ -286,6 +290,8 @@ class RealtimeNode(SwarmNode):
                 swarm.frame_length[index] = 0
                 offsets[index] = starts[index]
                 self.unsent += 1
+            elif swarm.present[index] == PRESENT_LEAVING and swarm.frames[index, _C_S] == _FAREWELL:
+                self._gone[index] = True
         self._message.offset_ns = array("q", offsets.tobytes())
         seconds, nanoseconds = divmod(names.slot_time_ns(slot, self.slot_ns), _PPB)
         self.slot = slot
