@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -319,3 +321,27 @@ def test_a_rule_speaks_again_after_it_had_ceased() -> None:
     monitor = SafetyMonitor(SafetySettings())
     ages = [0.3, 0.4, 0.02, 0.3]
     assert [len(monitor.check(t, [vehicle(command_age=a)], None)) for t, a in enumerate(ages)] == [1, 0, 0, 1]
+
+
+# -- real-time priority -----------------------------------------------------------------------------------------------
+PRIORITY = """
+import os, threading
+from dtsa_agent.crazyflie.priority import give_way, stay_on_one_processor, take_priority
+over = threading.Event()
+threading.Thread(target=over.wait).start()
+why = take_priority(7)
+policies = {os.sched_getscheduler(int(task)) for task in os.listdir("/proc/self/task")}
+assert why or policies == {os.SCHED_RR}, policies
+stay_on_one_processor()
+assert {len(os.sched_getaffinity(int(task))) for task in os.listdir("/proc/self/task")} == {1}
+give_way()
+assert os.sched_getscheduler(0) == os.SCHED_OTHER
+over.set()
+print(why)
+"""
+
+
+def test_real_time_priority_is_taken_by_all_threads_or_refused_with_a_word() -> None:
+    result = subprocess.run([sys.executable, "-c", PRIORITY], capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout in ("\n", "Operation not permitted; see ulimit -r\n")

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from dtsa_msgs.msg import Slot, VelocityWorld
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_agent.crazyflie.units import rotate
 from dtsa_agent.ros import names
 from dtsa_agent.ros.hosting import declare_swarm
@@ -131,6 +132,9 @@ def _body(stop: Stop, supervised: bool) -> None:
         span = FloatingPointRange(from_value=1.0, to_value=100.0, step=0.0)
         rate = ParameterDescriptor(description="rate of the commands (Hz)", read_only=True, floating_point_range=[span])
         command_hz = float(node.declare_parameter("command_hz", 50.0, rate).value)
+        levels = IntegerRange(from_value=0, to_value=90, step=1)
+        level = ParameterDescriptor(description="real-time priority", read_only=True, integer_range=[levels])
+        take_priority(int(node.declare_parameter("priority", 0, level).value))
         ids = parse_ids(ids, config.agents)
         zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
         agents = ExternalVehicles(

@@ -27,6 +27,7 @@ from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.bridge_inputs import Inputs
 from dtsa_agent.crazyflie.bridge_outputs import Outputs
 from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
+from dtsa_agent.crazyflie.priority import stay_on_one_processor, take_priority
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.ros.process import follow_supervisor
@@ -151,6 +152,11 @@ def run_node(node: BridgeNode) -> int:
     interrupts = _Interrupts()
     # Several threads a Crazyflie share one interpreter; a command that waits for its turn shall not wait 5 ms.
     sys.setswitchinterval(SWITCH_S)
+    level = node.settings.station.priority
+    if level and (problem := take_priority(level)):
+        node.say("warn", f"no real-time priority ({problem}): keep this station free of other work")
+    elif level:
+        stay_on_one_processor()
     problem = node.start(interrupts.event.is_set)
     if problem:
         node.say("error", problem)

@@ -85,6 +85,9 @@ class StationSettings:
         1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
     )
     landing_timeout_s: float = option(20.0, "longest wait for all to land", unit="s", minimum=1, maximum=300)
+    priority: int = option(
+        20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
+    )
     safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
 
     def __post_init__(self) -> None:

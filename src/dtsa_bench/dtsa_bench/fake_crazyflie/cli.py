@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import FAULTS, send_fault
 from dtsa_bench.fake_crazyflie.fleet import MAX_COUNT, Fleet, FleetConfig
@@ -36,6 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="orca", help="flight model whose vehicle they are (%(default)s)")
     parser.add_argument("--no-noise", action="store_true", help="perfect sensors")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="record of what really happened (JSON lines)")
+    parser.add_argument(
+        "--priority", type=int, default=30, help="real-time priority, 0 to 90: the world waits for nobody (%(default)s)"
+    )
     parser.add_argument("--quiet", action="store_true", help="no status line")
     faults = parser.add_argument_group("faults", "sent to a fleet that is already running, instead of starting one")
     faults.add_argument("--fault", choices=FAULTS, help="; ".join(f"{k}: {v}" for k, v in FAULTS.items()))
@@ -124,7 +128,10 @@ def run(args: argparse.Namespace) -> int:
         from dtsa_agent.ros.process import follow_supervisor
 
         follow_supervisor()
+    if not 0 <= args.priority <= 90:
+        raise ConfigError("priority", args.priority, "0 to 90")
     fleet = Fleet(fleet_config(args))
+    take_priority(args.priority)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: fleet.stop())
     for uri in fleet.config.uris:

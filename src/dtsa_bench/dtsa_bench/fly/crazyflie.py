@@ -33,6 +33,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.paths import shortest_s
+from dtsa_agent.crazyflie.priority import give_way, take_priority
 from dtsa_agent.crazyflie.units import to_map
 from dtsa_agent.ros import names
 from dtsa_agent.ros.loop import Stop
@@ -336,6 +337,7 @@ def fly_crazyflies(
             mission = Mission(node, settings, scenario, ended, progress.show)
             mission.bridge_alive = bridge.check
             mission.start()
+            take_priority(settings.station.priority)
             mission.take_off()
             _start_agents(agents, run, settings, directory)
             flight = _exchange(context, run, directory, agents, bridge, progress, options, ended)
@@ -363,6 +365,7 @@ def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, dir
     ids = list(range(1, run.swarm.agents + 1))
     agents.start("agents", ids, "dtsa_agent.crazyflie.agents_node",
                  ["--ros-args", "--params-file", str(parameters), "-p", f"command_hz:={float(rate)}",
+                  "-p", f"priority:={settings.station.priority}",
                   "--disable-external-lib-logs", "--disable-rosout-logs"])  # fmt: skip
 
 
@@ -379,6 +382,7 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         finally:
             channel.close()
             progress.end()
+        give_way()  # the bridge does not: it has to land them
         summary = write_results(channel, directory, pictures=options.pictures and not ended)
         summary |= {"backend": "cflib", "cut_short": ended.reason}
         (directory / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
