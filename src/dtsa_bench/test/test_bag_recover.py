@@ -11,6 +11,7 @@ from bag_helpers import SyntheticRun, synthetic_bag
 from mcap.reader import make_reader
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.bag import container
 from dtsa_bench.bag.errors import UnusableBag
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.recover import recover
@@ -103,6 +104,24 @@ def test_100_flipped_bits_lose_at_most_one_chunk_and_bring_nothing_wrong(run: Sy
         assert set(found) <= known, place
         assert len(rows) - most <= len(found) <= len(rows), place
         assert len(found) == len(rows) or said, place
+
+
+def test_a_flipped_bit_in_what_a_record_is_brings_nothing_wrong(run: SyntheticRun, tmp_path: Path) -> None:
+    whole, rows = run.writer.path.read_bytes(), rows_of(run.writer.path)
+    known, most = set(rows), max(count for _, _, count in chunks_of(run.writer.path))
+    places, position = [], len(container.MAGIC)
+    while position < len(whole) - len(container.MAGIC):
+        places.append(position)
+        position += container.PREFIX.size + container.PREFIX.unpack_from(whole, position)[1]
+    path = tmp_path / "flipped.mcap"
+    for place in [*places[:16], *places[-12:]]:
+        for bit in range(8):
+            data = bytearray(whole)
+            data[place] ^= 1 << bit
+            path.write_bytes(data)
+            found, _ = recovered(path, tmp_path / "new")
+            assert set(found) <= known, (place, bit)
+            assert len(rows) - most <= len(found) <= len(rows), (place, bit)
 
 
 def test_a_hole_in_the_middle_is_stepped_over(run: SyntheticRun, tmp_path: Path) -> None:

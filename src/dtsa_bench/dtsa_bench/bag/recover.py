@@ -83,6 +83,7 @@ class _Salvage:
     def entries(self) -> Iterator[container.Entry]:
         """All readable messages in the order of the file; collects schemas, channels and notes on the way."""
         self.notes.clear()
+        chunked = bool(self.chunk_offsets)
         position = len(container.MAGIC)
         if self._data[:position] != container.MAGIC:
             self.notes.append("the start mark is missing")
@@ -98,9 +99,15 @@ class _Salvage:
                 continue
             opcode = self._data[position]
             if opcode == container.CHUNK:
+                chunked = True
                 yield from self._chunk(position, end)
             elif opcode == container.MESSAGE:
-                yield from container.messages(self._data[position:end], position)
+                if not chunked or self._keep_damaged:
+                    yield from container.messages(self._data[position:end], position)
+                else:  # it has no checksum: as likely an index whose first byte has changed
+                    self.notes.append(
+                        f"{end - position} bytes at {position} look like a message between chunks; left out"
+                    )
             elif opcode <= container.CHANNEL or opcode == container.METADATA:
                 self._define(opcode, self._data[position + container.PREFIX.size : end])
             position = end
