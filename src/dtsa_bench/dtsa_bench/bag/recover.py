@@ -93,7 +93,7 @@ class _Salvage:
             if end is None:
                 yield from self._cut_off(position)
                 found = self._next_chunk(position + 1)
-                if found < self._size:
+                if found < self._size or self.closed:  # else it is the end that is missing
                     self.notes.append(f"{found - position} bytes at {position} make no sense")
                 position = found
                 continue
@@ -249,6 +249,9 @@ def recover(
         if identifier in salvage.channels:
             topic = salvage.channels[identifier].topic
             result.expected[topic] = result.expected.get(topic, 0) + count
+    had = sum(salvage.expected.values())
+    if had > result.count:
+        result.damaged.append(f"{had - result.count} of the {had} messages that the file had are lost")
     return result
 
 
