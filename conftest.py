@@ -1,4 +1,4 @@
-"""Settings of all tests: property tests do not depend on the machine's speed, and look at the same ones in each CI run."""
+"""Settings of all tests: properties do not depend on the machine's speed, and CI looks at the same examples each time."""
 
 from __future__ import annotations
 
