@@ -1,4 +1,4 @@
-"""Settings of all tests: properties do not depend on the machine's speed, and CI looks at the same examples each time."""
+"""Settings of all tests: no property depends on the machine's speed, and CI looks at the same examples each time."""
 
 from __future__ import annotations
 
