@@ -12,7 +12,7 @@ from .errors import ConfigError
 
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
-AVOIDERS = ("orca", "potential", "jerky", "bvc", "bvc-firmware", "none")
+AVOIDERS = ("orca", "crazyflie", "potential", "jerky", "bvc", "bvc-firmware", "none")
 SELECTIONS = ("candidates", "pairwise")
 FRAMES = ("auto", "paper", "extended")
 SHAPES = ("circle", "ellipse", "ellipsoid")

@@ -167,6 +167,8 @@ class FlightModel:
 
 
 _ORCA = AvoiderParams(v_max=1.5, radius=0.336, horizon=1.0, softness=30.0, bias=0.2)
+# Vehicles that know themselves to a few centimetres only, and cannot wait for each other.
+_CRAZYFLIE = dataclasses.replace(_ORCA, radius=0.40)
 _POTENTIAL = AvoiderParams(v_max=1.0, influence=1.31, strength=0.33, core=0.1, tangential=0.3)
 _JERKY = AvoiderParams(v_max=1.0, influence=0.43, strength=0.541, core=0.2, tangential=0.3)
 _BVC = AvoiderParams(v_max=1.5, radius=0.163, horizon=1.0, sidestep=0.25)
@@ -177,6 +179,7 @@ FLIGHT_MODELS: Mapping[str, FlightModel] = MappingProxyType(
         model.name: model
         for model in (
             FlightModel("orca", "orca", _ORCA, VehicleParams(0.25, 2.0), 0.9, 2.2),
+            FlightModel("crazyflie", "orca", _CRAZYFLIE, VehicleParams(0.25, 2.0), 0.9, 2.2),
             FlightModel("potential", "potential", _POTENTIAL, VehicleParams(0.1, 2.0), 0.55, 1.8),
             FlightModel("jerky", "potential", _JERKY, VehicleParams(0.05, 15.0), 0.55, 1.8),
             FlightModel("bvc", "bvc", _BVC, VehicleParams(0.25, 2.0), 0.9, 2.2),
