@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import ConfigError, range_text
 
 _KINDS = {"int": "int", "float": "float", "bool": "bool", "str": "text"}
 _WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false"}
@@ -58,12 +58,9 @@ class Setting:
         raise ConfigError(self.name, text, allowed + self._range())
 
     def _range(self) -> str:
-        low, high = self.minimum, self.maximum
-        if low is None and high is None:
+        if self.minimum is None and self.maximum is None:
             return ""
-        if high is None:
-            return f", {low:g} or more"
-        return f", {high:g} or less" if low is None else f", {low:g} to {high:g}"
+        return ", " + range_text(self.minimum, self.maximum)
 
 
 def settings_of(cls: type) -> tuple[Setting, ...]:

@@ -33,7 +33,7 @@ def test_all_but_one_of_an_odd_swarm_move_by_default() -> None:
         ("selection", "first", "candidates, pairwise"),
         ("slot_ms", -10, "0.5 to 1000 ms"),
         ("slot_ms", math.nan, "0.5 to 1000 ms"),
-        ("seed", -1, "0 to"),
+        ("seed", -1, "0 to 9223372036854775807"),
         ("epsilon", 1.5, "0 to 1"),
         ("r_min", 0.0, "0.001 to 100 m"),
         ("options", {"v_mx": 1.0}, "v_max"),
@@ -46,6 +46,12 @@ def test_errors_name_field_value_and_what_is_allowed(field: str, value: object, 
     assert field in text or "v_mx" in text
     assert allowed in text
     assert "\n" not in text
+
+
+def test_an_error_does_not_repeat_a_whole_file() -> None:
+    error = ConfigError("config", "x" * 100_000, "a mapping")
+    assert len(str(error)) < 200
+    assert str(error).endswith(" ...; allowed: a mapping")
 
 
 def test_round_trip_through_plain_values() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dtsa_bench import cli
 from dtsa_bench.sweep import spec
 from dtsa_bench.sweep.aggregate import Table
 from dtsa_bench.sweep.claims import FAILS, HOLDS, OPEN, PARTLY, claims_of, clean_up_to
@@ -151,3 +152,12 @@ def test_every_preset_ends_in_a_report_that_needs_no_network(name: str, tmp_path
     for kind in ("png", "svg"):
         assert len(list((tmp_path / "figures").glob(f"*.{kind}"))) == len(sweep.figures)
     assert f"{3 * len(sweep.cells)} of {3 * len(sweep.cells)} flights" in page
+
+
+@pytest.mark.parametrize("names", ["paper-12,nope", "protocol,paper-12"])
+def test_presets_that_cannot_be_swept_are_refused_before_anything_is_flown(
+    names: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["sweep", "--preset", names, "--out", str(tmp_path)]) == 2
+    assert "paper-12, paper-18" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

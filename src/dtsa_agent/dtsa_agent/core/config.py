@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from .errors import ConfigError
+from .errors import ConfigError, range_text
 
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
@@ -70,21 +70,12 @@ def check_fields(config: Any) -> None:
             continue
         if low is None and high is None:
             continue
-        bounds = _bounds(low, high, meta.get("unit", ""))
+        bounds = range_text(low, high, meta.get("unit", ""))
         whole = str(spec.type).startswith("int")
         if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
             raise ConfigError(spec.name, value, ("a whole number, " if whole else "a number, ") + bounds)
         if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
             raise ConfigError(spec.name, value, bounds)
-
-
-def _bounds(low: float | None, high: float | None, unit: str) -> str:
-    tail = f" {unit}" if unit and unit != "1" else ""
-    if high is None:
-        return f"{low:g} or more{tail}"
-    if low is None:
-        return f"{high:g} or less{tail}"
-    return f"{low:g} to {high:g}{tail}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ConfigError
+from .errors import ConfigError, range_text
 
 Array = NDArray[np.float64]
 
@@ -35,8 +35,7 @@ def _check(params: Any) -> None:
     """
     for spec in dataclasses.fields(params):
         value, meta = getattr(params, spec.name), spec.metadata
-        unit = f" {meta['unit']}" if meta["unit"] != "1" else ""
-        allowed = f"{meta['minimum']:g} to {meta['maximum']:g}{unit}"
+        allowed = range_text(meta["minimum"], meta["maximum"], meta["unit"])
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ConfigError(spec.name, value, "a number, " + allowed)
         if not math.isfinite(value) or not meta["minimum"] <= value <= meta["maximum"]:

@@ -9,7 +9,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import ConfigError, range_text
 from dtsa_agent.settings import Setting, format_values, settings_of
 
 _UNBOUNDED = 2.0**62
@@ -95,7 +95,7 @@ def allowed_text(setting: Setting) -> str:
     words = {"int": "a whole number", "float": "a number", "bool": "true or false", "values": "name=number, ..."}
     text = words.get(setting.kind, "a text")
     if setting.minimum is not None and setting.maximum is not None:
-        text += f", {setting.minimum:g} to {setting.maximum:g}"
+        text += ", " + range_text(setting.minimum, setting.maximum)
     return f"{text} {setting.unit}".rstrip()
 
 

@@ -92,6 +92,7 @@ def _protocol(args: argparse.Namespace) -> int:
 
 
 def _sweeps(args: argparse.Namespace) -> list[Sweep]:
+    from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.options import whole_number
     from dtsa_bench.sweep import spec
 
@@ -102,7 +103,11 @@ def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     }
     if args.file:
         return [spec.load_file(args.file, **changes)]
-    return [spec.load_preset(name.strip(), **changes) for name in args.preset.split(",")]
+    names = [name.strip() for name in args.preset.split(",")]
+    for name in names:
+        if name not in spec.preset_names():
+            raise ConfigError("preset", name, ", ".join(spec.preset_names()) + f"; {PROTOCOL}, but alone")
+    return [spec.load_preset(name, **changes) for name in names]
 
 
 def _base(words: list[str]) -> dict[str, object]:
