@@ -60,7 +60,7 @@ class SwarmNode:
         self.config = config
         self.swarm = with_key(make_swarm(config, scenario, local=sorted(ids), shared_view=shared_view))
         self.slot = -1  # the slot that has been answered
-        self._goal = np.full_like(self.swarm.goal, np.nan)
+        self._goal = b""  # as last told
         self._message = Transmission()
         self._message.agent = array("H", self.swarm.ids)
         self._message.steps = config.steps
@@ -178,11 +178,9 @@ class SwarmNode:
         message.track = array("d", swarm.track.tobytes())
         message.velocity = array("d", swarm.velocity.tobytes())
         message.command = array("d", swarm.command.tobytes())
-        if np.array_equal(self._goal, swarm.goal):
-            message.goal = array("d")
-        else:
-            self._goal[:] = swarm.goal
-            message.goal = array("d", swarm.goal.tobytes())
+        goal = swarm.goal.tobytes()
+        message.goal = array("d", goal if goal != self._goal else b"")
+        self._goal = goal
         self._publisher.publish(message)
 
     def _publish_odometry(self, stamp: Time) -> None:
