@@ -35,7 +35,9 @@ print(*{name.lower().replace("_", "-").replace(".", "-") for name in names})
 def clean_environment() -> dict[str, str]:
     """Environment for pip and the build: nothing of another Python or ROS installation leaks in."""
     dropped = {"PYTHONPATH", "PYTHONHOME", "PIP_USER", "PIP_TARGET", "PIP_PREFIX", "__PYVENV_LAUNCHER__"}
-    return {key: value for key, value in os.environ.items() if key not in dropped}
+    kept = {key: value for key, value in os.environ.items() if key not in dropped}
+    # Packages without a wheel are built apart, with tools of their own: pip before 23.1 wants those of the environment.
+    return kept | {"PIP_USE_PEP517": "1"}
 
 
 def venv_key() -> str:
