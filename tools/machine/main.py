@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from machine import layout, prepare, workspace
@@ -120,23 +121,30 @@ def run_shell(arguments: list[str]) -> int:
     if arguments:
         return start("bash", arguments)
     start_file = layout.STATE / "bashrc"
+    unless = "command -v ros2 >/dev/null || " if layout.has_ros_installation() else ""
     layout.write(
         start_file,
         "[ -f ~/.bashrc ] && . ~/.bashrc\n"
         f"export PATH='{workspace.environment()['PATH']}'\n"
         f". '{layout.INSTALL}/local_setup.bash'\n"
         f"dtsa() {{ '{layout.ROOT}/tools/dtsa' \"$@\"; }}\n"
-        f"command -v ros2 >/dev/null || ros2() {{ '{layout.ROOT}/tools/dtsa' ros2 \"$@\"; }}\n"
+        f"{unless}ros2() {{ '{layout.ROOT}/tools/dtsa' ros2 \"$@\"; }}\n"
         'PS1="(dtsa) ${PS1-}"\n',
     )
     return start("bash", ["--rcfile", str(start_file), "-i"])
+
+
+def has_ros2(environment: Mapping[str, str]) -> bool:
+    """Whether the real `ros2` is there. Beside the wheels, one in the path is of another distribution, and would not
+    find its parts."""
+    return layout.has_ros_installation() and shutil.which("ros2", path=environment["PATH"]) is not None
 
 
 def run_ros2(arguments: list[str]) -> int:
     """`tools/dtsa ros2 ...`: the real command where it exists."""
     prepare.prepare(set())
     environment = workspace.environment()
-    if shutil.which("ros2", path=environment["PATH"]):
+    if has_ros2(environment):
         return start("ros2", arguments)
     from machine import ros2
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from machine import checks, cmake_paths, layout, prepare, progress, ros2, wheels, workspace
+from machine import checks, cmake_paths, layout, main, prepare, progress, ros2, wheels, workspace
 
 DTSA = layout.ROOT / "tools" / "dtsa"
 
@@ -96,7 +96,10 @@ def test_missing_products_need_a_build(checkout: Path) -> None:
     assert workspace.changed_packages() == ["dtsa_agent", "dtsa_channel_sim", "dtsa_bench"]
 
 
-def test_sets_of_requirements_are_remembered(checkout: Path) -> None:
+def test_sets_of_requirements_are_remembered(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    assert wheels.missing_sets({"cflib"}) == ["runtime", "cflib"]
+    monkeypatch.delenv("ROS_DISTRO")
     assert wheels.missing_sets({"cflib"}) == ["ros", "runtime", "cflib"]
     for name in ("ros", "runtime", "cflib"):
         layout.write(layout.VENV_STAMPS / name, wheels.set_key(name))
@@ -319,6 +322,17 @@ def test_stand_in_says_what_is_wrong(words: list[str], message: str, prefix: dic
         ros2.main(words, prefix)
     assert str(raised.value).startswith(message)
     assert raised.value.code == 2
+
+
+@pytest.mark.parametrize("distribution", ["", "humble", "jazzy"])
+def test_stand_in_makes_way_for_the_command_of_jazzy_only(
+    distribution: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DISTRO", distribution)
+    assert not main.has_ros2({"PATH": str(tmp_path)})
+    (tmp_path / "ros2").write_text("#!/bin/sh\n")
+    (tmp_path / "ros2").chmod(0o755)
+    assert main.has_ros2({"PATH": str(tmp_path)}) == (distribution == "jazzy")
 
 
 def test_stand_in_agrees_with_the_ament_index() -> None:
