@@ -14,9 +14,11 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.bag import metadata
 from dtsa_bench.bag.columns import Table
 from dtsa_bench.bag.errors import BagError, UnusableBag
 from dtsa_bench.bag.reader import Bag, Message, find_file
+from dtsa_bench.bag.recover import recover
 from dtsa_bench.bag.writer import BagWriter
 
 RECEPTION = "dtsa_msgs/msg/Reception"
@@ -250,6 +252,35 @@ def test_a_ros_bag_of_somebody_else_can_be_read_but_has_no_configuration(tmp_pat
         assert not bag.is_ours
         with pytest.raises(UnusableBag, match="no configuration"):
             _ = bag.config
+
+
+def test_bags_that_rosbag2_has_packed_are_named_as_such(tmp_path: Path) -> None:
+    """As its options `--compression-mode file` and `message` leave them."""
+    whole = tmp_path / "whole" / "whole_0.mcap.zstd"
+    whole.parent.mkdir()
+    whole.write_bytes(b"\x28\xb5\x2f\xfd")
+    single = tmp_path / "single.mcap"
+    with single.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        record = "version: 9\ncompression_format: zstd\ncompression_mode: MESSAGE\ncustom_data: ~\n"
+        writer.add_metadata("rosbag2", {"serialized_metadata": record})
+        channel = writer.register_channel("/x", "cdr", writer.register_schema("std_msgs/msg/Empty", "ros2msg", b""))
+        writer.add_message(channel, SECOND, b"\x28\xb5\x2f\xfd", SECOND)
+        writer.finish()
+    for path in (whole.parent, whole, single):
+        with pytest.raises(UnusableBag, match=r"compressed .*; `ros2 bag convert`"):
+            Bag(path)
+        with pytest.raises(UnusableBag, match=r"compressed .*; `ros2 bag convert`"):
+            recover(path, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_texts_of_the_recorder_stay_texts_without_quotes() -> None:
+    text = 'version: 9\ncustom_data:\n  version: 1.10\n  seed: 007\n  yes: no\n  empty: ""\n'
+    loaded = metadata.load(text)
+    assert loaded["version"] == 9
+    assert metadata.custom_data(loaded) == {"version": "1.10", "seed": "007", "yes": "no", "empty": ""}
 
 
 def test_metadata_yaml_is_not_needed(run: SyntheticRun, tmp_path: Path) -> None:

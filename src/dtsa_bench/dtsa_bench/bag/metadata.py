@@ -84,6 +84,10 @@ def build(
     }
 
 
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_TextLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # every value as it is written
+
+
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
     """Writes every value out: rosbag2's YAML reader must not meet anchors."""
 
@@ -99,16 +103,27 @@ def dump(content: Mapping[str, Any]) -> str:
 def load(text: str) -> dict[str, Any]:
     """A metadata map from its YAML text; empty if the text is none."""
     try:
-        loaded = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        loaded = yaml.load(text, Loader=_Loader)
+        if not isinstance(loaded, dict):
+            return {}
+        custom = loaded.get("custom_data")
+        if isinstance(custom, dict) and not all(isinstance(entry, str) for pair in custom.items() for entry in pair):
+            # rosbag2 writes these texts without quotes: 1.10 and 007 stay what they are, not 1.1 and 7.
+            loaded["custom_data"] = yaml.load(text, Loader=_TextLoader)["custom_data"]
     except yaml.YAMLError:
         return {}
-    return loaded if isinstance(loaded, dict) else {}
+    return loaded
 
 
 def custom_data(content: Mapping[str, Any]) -> dict[str, str]:
     """The recorder's own texts in a metadata map."""
     custom = content.get("custom_data")
     return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+
+
+def has_packed_messages(content: Mapping[str, Any]) -> bool:
+    """Whether a bag's metadata says that rosbag2 compressed each message by itself."""
+    return str(content.get("compression_mode", "")).lower() == "message"
 
 
 def write(directory: Path, content: Mapping[str, Any]) -> Path:

@@ -26,6 +26,10 @@ from dtsa_bench.bag import columns as tables
 from dtsa_bench.bag import container, metadata, qos
 from dtsa_bench.bag.errors import BagError, UnusableBag
 
+SQLITE = "an sqlite3 bag; `ros2 bag convert` makes an mcap bag of it"
+PACKED = "its file is compressed as a whole; `ros2 bag convert` makes a plain bag of it"
+PACKED_MESSAGES = "its messages are compressed one by one; `ros2 bag convert` makes a plain bag of it"
+
 
 class Message(NamedTuple):
     """One recorded message."""
@@ -88,7 +92,10 @@ class Bag:
         if summary.statistics.message_count and not summary.chunk_indexes:
             raise self._damaged("its messages are not in indexed chunks")
         self._read_topics(summary)
-        self.custom_data = self._read_custom_data()  # the recorder's own texts; empty in a foreign bag
+        record = self._read_record()
+        if metadata.has_packed_messages(record):
+            raise UnusableBag(self.given, PACKED_MESSAGES)
+        self.custom_data = metadata.custom_data(record)  # the recorder's own texts; empty in a foreign bag
         statistics = summary.statistics
         self.message_count: int = statistics.message_count
         self.start_ns: int = statistics.message_start_time
@@ -123,13 +130,13 @@ class Bag:
             )
             self._channels[identifier] = (channel.topic, schema.name)
 
-    def _read_custom_data(self) -> dict[str, str]:
-        """Texts that the recorder stored beside the messages; a foreign or damaged record gives none."""
-        found: dict[str, str] = {}
+    def _read_record(self) -> dict[str, Any]:
+        """What the recorder stored beside the messages; empty where there is nothing, or it is damaged."""
+        found: dict[str, Any] = {}
         with suppress(McapError, struct.error, ValueError, KeyError, OSError, StopIteration, MemoryError):
             for record in self._reader.iter_metadata():
                 if record.name == metadata.RECORD_NAME:
-                    found = metadata.custom_data(metadata.load(record.metadata.get(metadata.RECORD_KEY, "")))
+                    found = metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))
         return found
 
     @property
@@ -304,7 +311,9 @@ def find_file(path: Path) -> Path:
         raise UnusableBag(path, "there is no such file or directory")
     if not path.is_dir():
         if path.suffix == ".db3":
-            raise UnusableBag(path, "an sqlite3 bag; `ros2 bag convert` makes an mcap bag of it")
+            raise UnusableBag(path, SQLITE)
+        if path.suffix == ".zstd":
+            raise UnusableBag(path, PACKED)
         return path
     found = sorted(path.glob("*.mcap"))
     if len(found) == 1:
@@ -314,7 +323,9 @@ def find_file(path: Path) -> Path:
             path, f"holds {len(found)} .mcap files: name one of them, or join them with `ros2 bag convert`"
         )
     if any(path.glob("*.db3")):
-        raise UnusableBag(path, "an sqlite3 bag; `ros2 bag convert` makes an mcap bag of it")
+        raise UnusableBag(path, SQLITE)
+    if any(path.glob("*.mcap.zstd")):
+        raise UnusableBag(path, PACKED)
     below = sorted(entry.parent.name for entry in path.glob("*/*.mcap"))
     hint = f"; did you mean one of {', '.join(below[:5])} in it?" if below else ""
     raise UnusableBag(path, f"the directory holds no .mcap file{hint}")

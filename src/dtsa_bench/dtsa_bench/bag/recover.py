@@ -24,7 +24,7 @@ from mcap.records import Channel, Metadata, Schema
 from dtsa_bench.bag import container, metadata, qos
 from dtsa_bench.bag.digest import KEY
 from dtsa_bench.bag.errors import UnusableBag
-from dtsa_bench.bag.reader import find_file
+from dtsa_bench.bag.reader import PACKED_MESSAGES, find_file
 from dtsa_bench.bag.schema import Definition
 from dtsa_bench.bag.writer import BagWriter
 
@@ -63,6 +63,7 @@ class _Salvage:
         self.channels: dict[int, Channel] = {}
         self.custom_data: dict[str, str] = {}
         self.ros_distro = ""
+        self.packed = False  # each message is compressed by itself
         self.expected: dict[int, int] = {}
         self.chunk_offsets: list[int] = []
         self.closed = False
@@ -178,6 +179,7 @@ class _Salvage:
                     found = metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))
                     self.custom_data = metadata.custom_data(found) or self.custom_data
                     self.ros_distro = str(found.get("ros_distro", self.ros_distro))
+                    self.packed |= metadata.has_packed_messages(found)
             elif opcode in (container.SCHEMA, container.CHANNEL):
                 kind: Any = Schema if opcode == container.SCHEMA else Channel
                 known: dict[int, Any] = self.schemas if opcode == container.SCHEMA else self.channels
@@ -238,6 +240,8 @@ def recover(
     salvage = _Salvage(data, keep_damaged)
     # The first pass finds all channels: their first definition may be lost, and a later one good.
     readable = sum(1 for entry in salvage.entries() if entry.channel in salvage.channels)
+    if salvage.packed:
+        raise UnusableBag(path, PACKED_MESSAGES)
     if not readable:
         raise UnusableBag(path, "no message in it can be read: there is nothing to save")
     result = Recovery(source, target, closed=salvage.closed)
