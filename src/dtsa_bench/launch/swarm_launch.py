@@ -14,6 +14,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.settings import settings_of
 from dtsa_bench.options import FROM_SWARM
 from dtsa_bench.run_config import RunLimits
@@ -75,6 +76,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
             for agent in range(1, config.agents + 1)
         ]
         return nodes
+    if not processes.isdecimal() or not 1 <= int(processes) <= config.agents:
+        raise ConfigError("processes", processes, f"per-agent, or 1 to {config.agents}, the number of agents")
     count = int(processes)
     bounds = [config.agents * index // count for index in range(count + 1)]
     nodes += [
@@ -103,6 +106,12 @@ def generate_launch_description() -> LaunchDescription:
     arguments += [
         DeclareLaunchArgument(
             "processes", default_value="per-agent", description="per-agent, or a number of processes"
+        ),
+        DeclareLaunchArgument(
+            "mode",
+            default_value="lockstep",
+            choices=["lockstep"],
+            description="lockstep; for flights in real time: tools/dtsa fly --mode realtime",
         ),
         DeclareLaunchArgument("out", default_value="flight", description="new directory for the bag and the results"),
         DeclareLaunchArgument("channel_file", default_value="", description="YAML file with settings of the channel"),

@@ -1,0 +1,77 @@
+"""The launch file in a full installation of Jazzy: a flight by `ros2 launch`."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from dtsa_bench.bag.reader import Bag
+
+pytest.importorskip("launch_ros", reason="no `ros2 launch` on this machine: it comes with an installation of ROS 2")
+pytest.importorskip("dtsa_msgs", reason="the workspace is not built")
+pytestmark = pytest.mark.skipif(shutil.which("ros2") is None, reason="no `ros2` on this machine")
+
+
+def launch(tmp_path: Path, *words: str) -> str:
+    """Output of `ros2 launch dtsa_bench swarm_launch.py ...`."""
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(os.getpid() % 90 + 10),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(tmp_path / "log"),
+    }
+    result = subprocess.run(
+        ["ros2", "launch", "dtsa_bench", "swarm_launch.py", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
+        env=environment,
+        check=False,
+    )
+    return result.stdout
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("processes", ["per-agent", "2"])
+def test_a_launched_flight_is_recorded_and_ends(processes: str, tmp_path: Path) -> None:
+    out = tmp_path / "flight"
+    text = launch(
+        tmp_path, "agents:=4", "policy:=lease", "timeout_s:=1", f"processes:={processes}", "partition:=1-2 | 3-4",
+        f"out:={out}",
+    )  # fmt: skip
+    assert "has died" not in text, text
+    assert text.count("has finished cleanly") == 1 + (4 if processes == "per-agent" else int(processes))
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["end"] == "timed out"
+    with Bag(out / "bag") as bag:
+        assert bag.config["channel"]["partition"] == "1-2 | 3-4"
+        assert bag.topics["/cf4/odom"].count == 100
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("policy:=nonsense", "policy: got 'nonsense'; allowed: tdma"),
+        ("processes:=nonsense", "processes: got 'nonsense'; allowed: per-agent, or 1 to 4"),
+        ("processes:=5", "processes: got '5'; allowed: per-agent, or 1 to 4"),
+        ("mode:=realtime", "mode"),
+    ],
+)
+def test_wrong_arguments_are_named_before_anything_starts(word: str, message: str, tmp_path: Path) -> None:
+    text = launch(tmp_path, "agents:=4", word, f"out:={tmp_path / 'flight'}")
+    assert message in text
+    assert "Traceback" not in text
+    assert "process started" not in text
+    assert not (tmp_path / "flight").exists()
+
+
+def test_all_settings_are_arguments(tmp_path: Path) -> None:
+    text = launch(tmp_path, "--show-args")
+    for name in ("agents", "policy", "loss", "partition", "timeout_s", "processes", "mode", "out", "channel_file"):
+        assert f"'{name}':" in text
