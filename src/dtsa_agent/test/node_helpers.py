@@ -10,8 +10,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import rclpy
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -47,6 +49,21 @@ class Graph:
             assert time.monotonic() < deadline, "nothing happened"
             act()
             self.executor.spin_once(timeout_sec=0.05)
+
+    def ask(self, client: Client, request: Any) -> Any:
+        """Answer of a service. Asked again every few seconds: a server that has not found its client yet drops answers,
+        and on a busy machine that takes a while."""
+        answers = [client.call_async(request)]
+        next_time = time.monotonic() + 5
+
+        def again() -> None:
+            nonlocal next_time
+            if time.monotonic() > next_time:
+                next_time = time.monotonic() + 5
+                answers.append(client.call_async(request))
+
+        self.until(lambda: any(answer.done() for answer in answers), again)
+        return next(answer.result() for answer in answers if answer.done())
 
 
 @contextmanager

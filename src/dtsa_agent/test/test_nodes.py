@@ -105,10 +105,9 @@ def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number
         get = graph.node.create_client(GetParameters, "/cf3/agent/get_parameters")
         graph.until(lambda: describe.service_is_ready() and get.service_is_ready())
         fields = [setting for setting in settings_of(SwarmConfig) if setting.kind != "structure"]
-        asked = describe.call_async(DescribeParameters.Request(names=[setting.name for setting in fields]))
-        values = get.call_async(GetParameters.Request(names=["slot_ms", "id"]))
-        graph.until(lambda: asked.done() and values.done())
-        for setting, found in zip(fields, asked.result().descriptors, strict=True):
+        described = graph.ask(describe, DescribeParameters.Request(names=[setting.name for setting in fields]))
+        values = graph.ask(get, GetParameters.Request(names=["slot_ms", "id"]))
+        for setting, found in zip(fields, described.descriptors, strict=True):
             assert setting.help in found.description
             assert found.read_only
             if setting.kind == "int":
@@ -117,7 +116,7 @@ def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number
                 assert found.floating_point_range[0].from_value == setting.minimum
             if setting.choices:
                 assert ", ".join(setting.choices) in found.additional_constraints
-        assert values.result().values[1].integer_value == 3
+        assert values.values[1].integer_value == 3
         assert end_of(agent, number) == (0, "")
 
 
