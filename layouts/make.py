@@ -17,6 +17,8 @@ HERE = Path(__file__).resolve().parent
 AGENTS = 12
 COLOURS = ("#2f74b5", "#d9772b", "#3b9468", "#a4509a", "#b38f17", "#3a97a3", "#cf3f4c", "#7d78c6", "#7a9a3a", "#a3674a")
 PAIRS = 5  # PlotJuggler: distances from cf1 to so many others
+LEGEND = 145  # pixels, width of Foxglove's legends
+SCRIPTS = ("swarm_ages", "swarm_distances", "swarm_odometry")  # one a panel: a second one may miss part of an output
 
 
 def colour(number: int) -> str:
@@ -28,32 +30,34 @@ def colour(number: int) -> str:
 
 
 def plot(title: str, paths: list[dict[str, Any]], label: str, **more: Any) -> dict[str, Any]:
-    """A Plot panel."""
+    """A Plot panel.
+
+    :param more: further settings. An axis without ``minYValue`` or ``maxYValue`` finds its own; an empty text means 0.
+    """
     return {
         "paths": [{"enabled": True, "timestampMethod": "receiveTime", **path} for path in paths],
-        "minYValue": "",
-        "maxYValue": "",
         "showLegend": True,
-        "legendDisplay": "floating",
+        "legendDisplay": "left",
         "showPlotValuesInLegend": False,
         "isSynced": True,
         "xAxisVal": "timestamp",
         "showXAxisLabels": True,
         "showYAxisLabels": True,
         "yAxisLabel": label,
-        "sidebarDimension": 240,
+        "sidebarDimension": LEGEND,
         "foxglovePanelTitle": title,
         "lichtblickPanelTitle": title,
         **more,
     }
 
 
-def scene() -> dict[str, Any]:
-    """The 3D panel."""
+def scene(agents: int) -> dict[str, Any]:
+    """The 3D panel, seen from so far that the whole swarm is in it."""
+    size = max(8, 2 * round(0.2 * agents))
     grid = "c0a1f3f0-8c7c-4f0e-9a51-2f7f5d6e0001"
     return {
         "cameraState": {
-            "distance": 9,
+            "distance": max(9, round(0.45 * agents, 1)),
             "perspective": True,
             "phi": 55,
             "thetaOffset": 40,
@@ -66,9 +70,9 @@ def scene() -> dict[str, Any]:
         },
         "followMode": "follow-none",
         "followTf": "map",
-        "scene": {"enableStats": False},
+        "scene": {"enableStats": False, "transforms": {"showLabel": False, "axisScale": 0.5}},
         "transforms": {},
-        "topics": {"/swarm/markers": {"visible": True}},
+        "topics": {"/swarm/markers": {"visible": True}, "/studio_script/swarm_odometry": {"visible": True}},
         "layers": {
             grid: {
                 "visible": True,
@@ -77,8 +81,8 @@ def scene() -> dict[str, Any]:
                 "instanceId": grid,
                 "layerId": "foxglove.Grid",
                 "frameId": "map",
-                "size": 8,
-                "divisions": 8,
+                "size": size,
+                "divisions": size,
                 "lineWidth": 1,
                 "color": "#8a96a555",
                 "position": [0, 0, -0.95],
@@ -86,9 +90,16 @@ def scene() -> dict[str, Any]:
                 "order": 1,
             }
         },
-        "foxglovePanelTitle": "Flight",
-        "lichtblickPanelTitle": "Flight",
+        "foxglovePanelTitle": "Flight, with velocities",
+        "lichtblickPanelTitle": "Flight, with velocities",
     }
+
+
+def user_script(name: str, agents: int) -> str:
+    """A script of the layout, with the odometry of all agents instead of the first one's."""
+    source = (HERE / f"{name}.ts").read_text(encoding="utf-8")
+    topics = ", ".join(f'"/cf{k}/odom"' for k in range(1, agents + 1))
+    return source.replace('inputs = ["/cf1/odom"]', f"inputs = [{topics}]")
 
 
 def foxglove(agents: int = AGENTS) -> dict[str, Any]:
@@ -96,34 +107,36 @@ def foxglove(agents: int = AGENTS) -> dict[str, Any]:
 
     :param agents: number of agents.
     """
-    news = "/studio_script/swarm_news"
+    ages_of, distances_of = "/studio_script/swarm_ages", "/studio_script/swarm_distances"
     place = "pose.pose.position"
     heights = [
         {"value": f"/cf{k}/odom.{place}.z", "label": f"cf{k}", "color": colour(k - 1)} for k in range(1, agents + 1)
     ]
     ages = [
-        {"value": f"{news}.age_mean", "label": "mean", "color": COLOURS[0]},
-        {"value": f"{news}.age_max", "label": "oldest", "color": COLOURS[1]},
+        {"value": f"{ages_of}.age_mean", "label": "mean", "color": COLOURS[0]},
+        {"value": f"{ages_of}.age_max", "label": "oldest", "color": COLOURS[1]},
     ]
     distances = [
-        {"value": f"{news}.distance_min", "label": "closest pair", "color": COLOURS[0]},
+        {"value": f"{distances_of}.distance_min", "label": "closest pair", "color": COLOURS[0]},
         {"value": "0.2", "label": "crash", "color": COLOURS[6]},
     ]
-    senders = [{"value": "/swarm/reception.sender[:]", "label": "sender", "color": COLOURS[0], "showLine": False}]
+    dots = {"showLine": False, "lineSize": 2}
+    senders = [{"value": "/swarm/reception.sender[:]", "label": "sender", "color": COLOURS[0], **dots}]
     outcome = {"value": "/swarm/reception.outcome", "label": "slots", "timestampMethod": "receiveTime"}
+    slots = "Slots: 0 idle, 1 success, 2 collision"
     return {
         "configById": {
-            "3D!swarm": scene(),
+            "3D!swarm": scene(agents),
             "StateTransitions!slots": {
                 "paths": [outcome],
                 "isSynced": True,
-                "foxglovePanelTitle": "Slots: idle, success, collision",
-                "lichtblickPanelTitle": "Slots: idle, success, collision",
+                "foxglovePanelTitle": slots,
+                "lichtblickPanelTitle": slots,
             },
-            "Plot!senders": plot("Who sends", senders, "agent"),
-            "Plot!ages": plot("Age of news", ages, "age (slots)"),
-            "Plot!distances": plot("Smallest distance", distances, "distance (m)"),
-            "Plot!heights": plot("Odometry: height", heights, "z (m)"),
+            "Plot!senders": plot("Who sends", senders, "agent", minYValue=0),
+            "Plot!ages": plot("Age of news", ages, "age (slots)", minYValue=0),
+            "Plot!distances": plot("Smallest distance", distances, "distance (m)", minYValue=0),
+            "Plot!heights": plot("Odometry: height", heights, "z (m)", sidebarDimension=90),
             "RawMessages!decision": {
                 "topicPath": "/swarm/decision",
                 "diffEnabled": False,
@@ -134,10 +147,8 @@ def foxglove(agents: int = AGENTS) -> dict[str, Any]:
         },
         "globalVariables": {},
         "userNodes": {
-            "b6d0c0f2-4b7e-4d0c-8f6e-5b7f1c2d0001": {
-                "name": "swarm_news",
-                "sourceCode": (HERE / "swarm_news.ts").read_text(encoding="utf-8"),
-            }
+            f"b6d0c0f2-4b7e-4d0c-8f6e-5b7f1c2d{number:04}": {"name": name, "sourceCode": user_script(name, agents)}
+            for number, name in enumerate(SCRIPTS, 1)
         },
         "playbackConfig": {"speed": 1},
         "layout": {

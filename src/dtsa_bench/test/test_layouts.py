@@ -69,27 +69,48 @@ def test_files_are_what_the_script_writes(make: ModuleType) -> None:
 def test_every_foxglove_panel_is_shown_and_every_path_exists(make: ModuleType) -> None:
     layout = make.foxglove()
     assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
-    (script,) = layout["userNodes"].values()
-    produced = re.search(r'export const output = "([^"]+)"', script["sourceCode"])
-    assert produced is not None
-    fields = re.findall(r"^  (\w+): [\w\[\]]+;", script["sourceCode"], re.M)
-    inputs = re.search(r"export const inputs = (\[[^\]]+\])", script["sourceCode"])
-    assert inputs is not None
-    assert set(json.loads(inputs[1])) <= TYPES.keys()
+    fields: dict[str, set[str]] = {}  # that the scripts make, by topic
+    for script in layout["userNodes"].values():
+        source = script["sourceCode"]
+        produced = re.search(r'^export const output = "([^"]+)"', source, re.M)
+        inputs = re.search(r"^export const inputs = (\[[^\]]+\])", source, re.M)
+        assert produced is not None
+        assert inputs is not None
+        assert set(json.loads(inputs[1])) <= TYPES.keys()
+        assert "return undefined" not in source
+        assert produced[1] not in fields
+        fields[produced[1]] = set(re.findall(r"^  (\w+): [\w\[\]]+;", source, re.M))
+    shown = set()
     checked = 0
     for config in layout["configById"].values():
         for topic in config.get("topics", {}):
-            assert topic in TYPES
+            assert topic in TYPES or topic in fields
+            shown.add(topic)
         for path in [entry["value"] for entry in config.get("paths", [])] + [config.get("topicPath", "0")]:
             if re.fullmatch(r"[\d.]+", path):
                 continue  # a line at a value
             topic, _, field = path.partition(".")
-            if topic == produced[1]:
-                assert field in fields
+            if topic in fields:
+                assert field in fields[topic]
             else:
                 assert not field or has_field(topic, field), path
+            shown.add(topic)
             checked += 1
     assert checked > 12
+    assert fields.keys() <= shown
+
+
+def test_no_limit_of_an_axis_is_text(make: ModuleType) -> None:
+    for config in make.foxglove()["configById"].values():
+        for limit in ("minXValue", "maxXValue", "minYValue", "maxYValue"):
+            assert isinstance(config.get(limit, 0), (int, float)), limit  # Lichtblick takes "" for 0
+
+
+def test_arrows_of_all_agents(make: ModuleType) -> None:
+    for agents in (1, 3, 12):
+        assert [f'"/cf{k}/odom"' in make.user_script("swarm_odometry", agents) for k in range(1, 14)] == [
+            k <= agents for k in range(1, 14)
+        ]
 
 
 def test_the_check_of_fields_can_fail() -> None:
