@@ -14,7 +14,9 @@ from node_helpers import Graph, end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
 
+from builtin_interfaces.msg import Time
 from dtsa_msgs.msg import Slot, Transmission
+from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
@@ -71,6 +73,24 @@ def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> Non
         assert channel.answers[-1] == second  # asked again: the same answer, nothing has moved
         channel.publisher.publish(Slot(slot=2, phase=Slot.END))
         assert end_of(agent) == (0, "")
+
+
+@pytest.mark.ros
+def test_odometry_is_sent_to_who_listens_reliably_like_rviz(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        heard: list[Odometry] = []
+        graph.node.create_subscription(Odometry, "/cf2/odom", heard.append, 5)
+        graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3", "-p", "moving:=2", "-p", "seed:=5")
+        answers: list[Transmission] = []
+        while not heard:
+            answers.append(channel.ask(len(answers), stamp=Time(sec=len(answers))))
+        first = heard[0]
+        slot = first.header.stamp.sec
+        assert (first.header.frame_id, first.child_frame_id) == ("map", "cf2/base_link")
+        place, speed = first.pose.pose.position, first.twist.twist.linear
+        assert [place.x, place.y, place.z] == list(answers[slot].track)
+        assert [speed.x, speed.y, speed.z] == list(answers[slot].velocity)
 
 
 @pytest.mark.ros

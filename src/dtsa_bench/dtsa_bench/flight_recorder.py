@@ -50,7 +50,7 @@ class FlightRecorder:
         self._markers = add(f"{names.SWARM}/{names.MARKERS}", "visualization_msgs/msg/MarkerArray")
         self._event = 0
         spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
-        self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry", "sensor_data") for space in spaces]
+        self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
         self._packer = OdometryPacker([f"{space[1:]}/base_link" for space in spaces], names.FRAME)
         self._messages: dict[int, list[tuple[bytes, int]]] = {}
         self._answers: dict[int, list[tuple[bytes, bytes]]] = {}

@@ -14,7 +14,6 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import qos_profile_sensor_data
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
@@ -25,6 +24,7 @@ from . import names
 from .loop import Loop, Stop
 from .wire import split_frames, unpack_received
 
+_ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
 _GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
 
 
@@ -78,7 +78,7 @@ class SwarmNode:
         """
         for index, space in enumerate(namespaces or map(names.agent_namespace, self.swarm.ids)):
             topic = f"{space.rstrip('/')}/{names.ODOMETRY}"
-            publisher = self.node.create_publisher(Odometry, topic, qos_profile_sensor_data)
+            publisher = self.node.create_publisher(Odometry, topic, _ODOMETRY_DEPTH)
             self._odometry.append((index, publisher))
 
     def idle(self) -> None:
