@@ -147,7 +147,18 @@ class Mission:
         self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
         self._beating = threading.Event()
         self._over = threading.Event()
-        self._clients: dict[str, Any] = {}
+        # Made long before they are used: a server drops the answer to a client that it has not discovered yet.
+        self._clients = {
+            name: node.create_client(kind, name)
+            for kind, name in (
+                (Arm, "/all/arm"),
+                (Takeoff, "/all/takeoff"),
+                (Land, "/all/land"),
+                (Empty, "/all/emergency"),
+                (Trigger, "/all/end_heartbeat"),
+                *((GoTo, f"/{robot.name}/go_to") for robot in settings.robots),
+            )
+        }
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._spinner = threading.Thread(target=self._executor.spin, name="mission", daemon=True)
@@ -185,17 +196,12 @@ class Mission:
         self._spinner.join(2.0)
         self._pulse.join(2.0)
 
-    def _client(self, kind: Any, name: str) -> Any:
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(kind, name)
-        return self._clients[name]
-
     def call(self, kind: Any, name: str, timeout: float = 10.0, **fields: Any) -> Any:
         """Call a service.
 
         :raises MissionError: it does not answer or says no.
         """
-        future = self._client(kind, name).call_async(kind.Request(**fields))
+        future = self._clients[name].call_async(kind.Request(**fields))
         end = time.monotonic() + timeout
         while not future.done():
             self.bridge_alive()
@@ -227,7 +233,7 @@ class Mission:
 
     def take_off(self) -> None:
         """Bridge up, arm, climb to the middle of the room, go to the start."""
-        emergency = self._client(Empty, "/all/emergency")
+        emergency = self._clients["/all/emergency"]
         self.wait("the bridge's start", emergency.service_is_ready, BRIDGE_S)
         self._beating.set()
         self.wait("the connection", lambda: self._all(Status.STATE_READY), 10.0)
@@ -274,19 +280,19 @@ class Mission:
         if any(s.state in flying for s in self.status.values()):
             self.say("landing")
             height = self.settings.station.room_origin_in_world[2]
-            future = self._client(Land, "/all/land").call_async(
+            future = self._clients["/all/land"].call_async(
                 Land.Request(duration=_duration(max(2.0, height / CLIMB_MPS)))
             )
             end = time.monotonic() + self.settings.station.landing_timeout_s
             while time.monotonic() < end and any(s.state in flying for s in self.status.values()):
                 if urgent.is_set():
                     self.say("EMERGENCY STOP")
-                    self._client(Empty, "/all/emergency").call_async(Empty.Request())
+                    self._clients["/all/emergency"].call_async(Empty.Request())
                     time.sleep(0.5)
                     break
                 time.sleep(0.05)
             future.cancel()
-        end_heartbeat = self._client(Trigger, "/all/end_heartbeat")
+        end_heartbeat = self._clients["/all/end_heartbeat"]
         if end_heartbeat.service_is_ready():
             future = end_heartbeat.call_async(Trigger.Request())
             end = time.monotonic() + 2.0
