@@ -123,7 +123,7 @@ def foxglove(agents: int = AGENTS) -> dict[str, Any]:
     dots = {"showLine": False, "lineSize": 2}
     senders = [{"value": "/swarm/reception.sender[:]", "label": "sender", "color": COLOURS[0], **dots}]
     outcome = {"value": "/swarm/reception.outcome", "label": "slots", "timestampMethod": "receiveTime"}
-    slots = "Slots: 0 idle, 1 success, 2 collision"
+    slots = "Slots"
     return {
         "configById": {
             "3D!swarm": scene(agents),
