@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,11 @@ def test_the_shortest_duration_keeps_the_speed_of_the_firmwares_path() -> None:
 
     for distance, limit in ((1.0, 1.2), (0.3, 0.5), (1.9, 1.0)):
         seconds = shortest_s(distance, limit)
-        path = septic(0.0, 0.0, distance, seconds)
+        path = septic(0.0, 0.0, 0.0, distance, seconds)
         speed = [evaluate(path, t)[1] for t in np.linspace(0.0, seconds, 201)]
         assert max(speed) == pytest.approx(limit, rel=1e-6)
         assert shortest_s(-distance, limit) == seconds
-    assert shortest_s(0.0, 1.0) > 0.0  # the firmware divides by it
+    assert shortest_s(0.0, 1.0) > 0.0
     assert pytest.approx(2.1875) == PEAK
 
 
@@ -71,3 +72,54 @@ def test_in_flight(tmp_path: Path) -> None:
         assert not [e for e in fleet.events() if e["event"] in ("hard landing", "crash")]
         landing = fleet.events(1, "land")[0]["t"]
         assert fleet.state_event(1, "landed")["t"] - landing > 1.5
+
+
+@pytest.mark.slow
+def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None:
+    pytest.importorskip("cflib")
+    from bridge_helpers import fake_fleet, flight, settings, wait_for
+
+    from dtsa_agent.crazyflie.state_machine import State
+    from dtsa_agent.crazyflie.units import velocity_world
+
+    with fake_fleet(tmp_path, 1) as fleet:
+        with flight(settings(fleet, {"safety": {"link_age_s": 3.0, "geofence": False}})) as pilot:
+            assert pilot.bridge.connect() == []
+            cf = pilot.bridge.vehicles["cf1"]
+
+            def stream() -> None:
+                for _ in range(10):
+                    assert cf.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic()))
+                    time.sleep(0.05)
+
+            def reaches(height: float) -> None:
+                wait_for(lambda: cf.last is not None and abs(cf.last.position[2] - height) < 0.05)
+
+            cf.arm(True)
+            wait_for(lambda: cf.state is State.ARMED)
+            assert cf.takeoff(1.0, 2.0) == ""
+            reaches(1.0)
+            wait_for(lambda: cf.state is State.FLYING)
+            time.sleep(1.0)  # the take-off is flown to its end
+            stream()
+            assert cf.notify_setpoints_stop(0) == ""
+            wait_for(lambda: fleet.events(name="stream ended"))
+            stream()
+            assert cf.takeoff(1.3, 1.5) == ""
+            reaches(1.3)
+            assert cf.land("test", 0.0, 3.0) == ""
+            reaches(1.1)
+            assert cf.takeoff(1.3, 1.5) == ""
+            reaches(1.3)
+            assert cf.state is State.FLYING
+            assert cf.land("test") == ""
+            wait_for(lambda: cf.state is State.READY)
+        names = [e["event"] for e in fleet.events(1)]
+        assert names.count("takeoff") == 1
+        assert names.count("go_to") >= 3
+        states = [e["state"] for e in fleet.events(1, "state")]
+        assert states[:3] == ["ready to fly", "flying", "landed"]
+        # A stream ends when there is something else to fly. Here both packets come at once, over the air they do not.
+        ended = [k for k, name in enumerate(names) if name == "stream ended"]
+        assert len(ended) >= 2
+        assert {names[k - 1] for k in ended} <= {"go_to", "land"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import socket
 import struct
 import subprocess
@@ -14,56 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from craft import Craft
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.fake_crazyflie import Fleet, FleetConfig, cli, crtp, layout, planner, toc
-from dtsa_bench.fake_crazyflie.battery import Battery
-from dtsa_bench.fake_crazyflie.estimate import Estimate, attitude, compress, quaternion
-from dtsa_bench.fake_crazyflie.firmware import FLY, LEVEL, OFF, Firmware, yaw_of
-from dtsa_bench.fake_crazyflie.peer import Peer
+from dtsa_bench.fake_crazyflie import Fleet, FleetConfig, cli, crtp, layout, toc
 from dtsa_bench.fake_crazyflie.truth import read_truth
-
-finite = st.floats(-5, 5)
-
-
-class Craft:
-    """Firmware of one Crazyflie on a test stand that follows every command at once."""
-
-    def __init__(self, protocol: int = 12) -> None:
-        self.events: list[tuple[str, dict[str, Any]]] = []
-        self.firmware = Firmware(lambda name, **details: self.events.append((name, details)), tau=0.0)
-        self.estimate = Estimate()
-        self.peer = Peer(self.firmware, self.estimate, protocol)
-        self.t = 0.0
-        self.mode = OFF
-        self.command = (0.0, 0.0, 0.0)
-
-    def ask(self, port: int, channel: int, data: bytes) -> bytes | None:
-        reply = self.peer.receive(crtp.pack(port, channel, data), self.t)
-        return None if reply is None else reply[1:]
-
-    def fly(self, seconds: float) -> None:
-        for _ in range(round(seconds * 100)):
-            self.mode, self.command = self.firmware.step(self.t, 0.01, self.estimate.position)
-            p = tuple(a + 0.01 * b for a, b in zip(self.estimate.position, self.command, strict=True))
-            self.estimate.position, self.estimate.velocity = (p[0], p[1], max(p[2], 0.0)), self.command
-            self.t += 0.01
-
-    def velocity(self, *v: float) -> None:
-        self.ask(crtp.GENERIC_COMMANDER, 0, struct.pack("<B4f", 8, *v, 0.0))
-
-    def take_off(self) -> None:
-        assert self.ask(crtp.SUPERVISOR, 1, b"\x01\x01") == b"\x81\x01\x01"
-        self.fly(0.02)
-        self.ask(crtp.HIGH_LEVEL, 0, struct.pack("<BBff?f", 7, 0, 1.0, 0.0, True, 1.0))
-        self.fly(1.2)
-        assert self.estimate.position[2] == pytest.approx(1.0, abs=0.1)
-
-    @property
-    def state(self) -> str:
-        return self.firmware.supervisor.state
 
 
 # -- packets and tables -----------------------------------------------------------------------------------------------
@@ -140,145 +96,6 @@ def test_parameters() -> None:
     assert craft.ask(2, 2, fixed + b"\x00") == fixed + b"\x01"
 
 
-# -- firmware ---------------------------------------------------------------------------------------------------------
-@settings(deadline=None)
-@given(finite, finite, finite, st.floats(0.2, 10))
-def test_paths_begin_and_end_as_they_should(p0: float, v0: float, p1: float, duration: float) -> None:
-    path = planner.septic(p0, v0, p1, duration)
-    assert planner.evaluate(path, 0.0) == (p0, v0, 0.0)
-    p, v, a = planner.evaluate(path, duration)
-    assert (p, v, a) == pytest.approx((p1, 0.0, 0.0), abs=1e-6 / duration**2)
-
-
-def test_a_flight_by_high_level_commands() -> None:
-    craft = Craft()
-    assert craft.mode == OFF
-    craft.take_off()
-    craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<B3B5f", 12, 0, 0, 0, 0.5, -0.5, 0.8, math.pi / 2, 1.0))
-    craft.fly(1.5)
-    assert craft.estimate.position == pytest.approx((0.5, -0.5, 0.8), abs=0.02)
-    assert craft.firmware.yaw == pytest.approx(math.pi / 2)
-    craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 1.0))
-    craft.fly(1.2)
-    assert (craft.mode, craft.state) == (OFF, "flying")  # the firmware waits for two seconds
-    craft.fly(2.0)
-    assert craft.state == "landed"
-    craft.fly(3.1)
-    assert not craft.firmware.supervisor.armed
-
-
-def test_high_level_commands_have_no_effect_while_setpoints_are_streamed() -> None:
-    craft = Craft()
-    craft.take_off()
-    craft.velocity(0.0, 0.0, 0.0)
-    land = struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 1.0)
-    craft.ask(crtp.HIGH_LEVEL, 0, land)
-    craft.fly(0.4)
-    assert craft.estimate.position[2] > 0.9
-    craft.ask(crtp.GENERIC_COMMANDER, 1, struct.pack("<BI", 0, 0))
-    craft.ask(crtp.HIGH_LEVEL, 0, land)
-    craft.fly(1.2)
-    assert craft.estimate.position[2] < 0.05
-
-
-def test_old_setpoints_level_out_then_fall() -> None:
-    craft = Craft()
-    craft.take_off()
-    craft.velocity(0.3, 0.0, 0.0)
-    craft.fly(0.49)
-    assert (craft.mode, craft.command) == (FLY, pytest.approx((0.3, 0.0, 0.0)))
-    craft.fly(0.05)
-    assert (craft.mode, craft.state) == (LEVEL, "level out")
-    craft.velocity(0.3, 0.0, 0.0)
-    craft.fly(0.02)
-    assert (craft.mode, craft.state) == (FLY, "flying")
-    craft.fly(2.1)
-    assert (craft.mode, craft.state) == (OFF, "crashed")
-    craft.velocity(0.3, 0.0, 0.0)
-    craft.fly(0.1)
-    assert craft.mode == OFF
-    assert craft.ask(9, 1, b"\x02") == b"\x82\x01\x01"  # recovered: it stands upright
-    craft.fly(0.05)
-    assert craft.state == "pre-flight checks passed"
-
-
-def test_the_emergency_watchdog_begins_with_its_first_packet_and_latches() -> None:
-    craft = Craft()
-    craft.take_off()
-    for _ in range(4):
-        craft.ask(9, 1, b"\x04")
-        craft.fly(0.9)
-        assert craft.mode == FLY
-    craft.fly(0.15)
-    assert (craft.mode, craft.state) == (OFF, "locked")
-    craft.ask(9, 1, b"\x04")
-    craft.fly(0.1)
-    assert craft.ask(9, 1, b"\x01\x01") == b"\x81\x00\x00"
-    craft.firmware.reset()
-    craft.take_off()
-
-
-@pytest.mark.parametrize(("port", "channel", "protocol"), [(9, 1, 12), (6, 1, 10)])
-def test_emergency_stop(port: int, channel: int, protocol: int) -> None:
-    craft = Craft(protocol)
-    craft.firmware.supervisor.request_arming(True)
-    craft.fly(0.02)
-    craft.velocity(0.0, 0.0, 0.5)
-    craft.fly(0.3)
-    assert craft.mode == FLY
-    craft.ask(port, channel, b"\x03")
-    craft.fly(0.02)
-    assert (craft.mode, craft.state) == (OFF, "locked")
-
-
-def test_arming_needs_a_crazyflie_that_may_fly() -> None:
-    craft = Craft()
-    craft.firmware.supervisor.refuse_arming = True
-    assert craft.ask(9, 1, b"\x01\x01") == b"\x81\x00\x00"
-    craft.firmware.supervisor.refuse_arming = False
-    craft.velocity(0.0, 0.0, 1.0)
-    craft.fly(0.1)
-    assert craft.mode == OFF  # not armed: no thrust
-    assert craft.ask(9, 1, b"\x01\x01") == b"\x81\x01\x01"
-    craft.fly(30.5)  # nobody takes off
-    assert not craft.firmware.supervisor.armed
-
-
-def test_full_state_setpoints_and_yaw() -> None:
-    craft = Craft()
-    craft.take_off()
-    bits = compress(quaternion(0.0, 0.0, 1.0))
-    packet = struct.pack("<B9hI3h", 6, 200, -100, 1100, 0, 0, 0, 0, 0, 0, bits, 0, 0, 0)
-    for _ in range(40):
-        craft.ask(crtp.GENERIC_COMMANDER, 0, packet)
-        craft.fly(0.1)
-    assert craft.estimate.position == pytest.approx((0.2, -0.1, 1.1), abs=0.01)
-    assert craft.firmware.yaw == pytest.approx(1.0, abs=0.01)
-
-
-@settings(deadline=None)
-@given(st.floats(-3.1, 3.1))
-def test_heading_survives_compression(yaw: float) -> None:
-    assert yaw_of(compress(quaternion(0.1, -0.2, yaw))) == pytest.approx(yaw, abs=0.01)
-
-
-def test_a_quadcopter_leans_where_it_accelerates() -> None:
-    roll, pitch = attitude((2.0, 0.0, 0.0), 0.0)
-    assert (roll, pitch > 0.1) == (pytest.approx(0.0), True)  # forward: nose down, positive in REP-103
-    roll, pitch = attitude((0.0, 2.0, 0.0), 0.0)
-    assert (roll < -0.1, pitch) == (True, pytest.approx(0.0))  # to the left: left side down
-
-
-def test_battery_drains_in_flight_and_can_be_forced() -> None:
-    battery = Battery()
-    full = battery.voltage
-    battery.update(210.0, motors=True)
-    assert battery.charge == pytest.approx(0.5)
-    assert battery.voltage < full - 0.4
-    battery.force(3.0, motors=True)
-    assert battery.voltage == pytest.approx(3.0)
-
-
 # -- fleet ------------------------------------------------------------------------------------------------------------
 def base_port(count: int) -> int:
     """Ports that are free now."""
@@ -303,14 +120,13 @@ def hop(seed: int, truth: Path | None = None, **fault: Any) -> Fleet:
     for firmware in fleet.firmware:
         firmware.supervisor.request_arming(True)
     for tick in range(500):
-        for k, firmware in enumerate(fleet.firmware):
-            estimate = fleet.estimates[k]
+        for firmware in fleet.firmware:
             if tick == 10:
                 data = struct.pack("<BBff?f", 7, 0, 0.8, 0.0, True, 1.5)
-                firmware.high_level(data, fleet.time, estimate.position, estimate.velocity)
+                firmware.high_level(data, fleet.time)
             if tick == 250:
                 data = struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 2.0)
-                firmware.high_level(data, fleet.time, estimate.position, estimate.velocity)
+                firmware.high_level(data, fleet.time)
         if tick == 220 and fault:
             fleet.fault(fault)
         fleet.step()

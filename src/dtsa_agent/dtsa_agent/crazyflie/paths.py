@@ -7,7 +7,7 @@ its path, and a landing stops the motors at the end of the path, wherever the ve
 from __future__ import annotations
 
 PEAK = 35 / 16  # largest over mean speed of such a polynomial, at its middle
-SHORTEST_S = 0.1  # the firmware divides by the duration
+SHORTEST_S = 0.1  # of any path, however short
 
 
 def shortest_s(distance: float, limit: float) -> float:

@@ -18,8 +18,8 @@ from dtsa_agent.crazyflie.safety import Watched
 from dtsa_agent.crazyflie.state_machine import State, StateMachine
 from dtsa_agent.crazyflie.units import Setpoint, VehicleState, to_map, velocity_world, yaw_of
 
-# A path that is planned from high speed swings out by metres: before a landing and before holding a place the vehicle
-# is first braked by streamed setpoints of zero velocity.
+# A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
+# landing and before holding a place the vehicle is first braked by streamed setpoints of zero velocity.
 SLOW_MPS = 0.25
 BRAKE_LIMIT_S = 1.5
 HOLD_S = 0.5  # s, duration of the path to the place that is held
@@ -161,16 +161,23 @@ class Vehicle:
             self.link.mailbox.put_setpoint(setpoint)
             return True
 
-    def _high_level(self, action: Callable[[Any], None], duration: float) -> None:
-        """An order to the high-level commander; the stream of setpoints is declared over before it."""
+    def _high_level(self, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
+        """An order to the high-level commander, and only then the end of the stream of setpoints.
+
+        The other way round the high-level commander would have nothing to fly for a moment, and would stop the motors.
+
+        :param again: if a stream ends, the order is given once more: the first one might have got lost.
+        """
         streaming, self._streaming, self._held = self._streaming, False, False
         self._guard_until = time.monotonic() + duration
         self._brake = None
 
         def run(cf: Any) -> None:
+            action(cf)
             if streaming:
                 cf.commander.send_notify_setpoint_stop()
-            action(cf)
+                if again:
+                    action(cf)
 
         self.link.order(run)
 
@@ -196,9 +203,15 @@ class Vehicle:
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
             self._deaf = False
+            on_ground = self.state == State.ARMED
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
-            self._high_level(lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration)
+            if on_ground or self.last is None:
+                self._high_level(lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration)
+            else:  # the firmware takes off from the ground only
+                x, y, _ = self.last.position
+                yaw = yaw_of(self.last.orientation)
+                self._high_level(lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
             return ""
 
     def go_to(self, place: tuple[float, float, float], yaw: float, duration: float, relative: bool) -> str:
@@ -211,7 +224,9 @@ class Vehicle:
                 return f"{self.name}: {problem}"
             self.action = "go_to"
             x, y, z = place
-            self._high_level(lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative), duration)
+            self._high_level(
+                lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative), duration, again=not relative
+            )
             return ""
 
     def hold(self, reason: str, *, stale: bool = False) -> None:
@@ -323,9 +338,11 @@ class Vehicle:
         with self.lock:
             if self.state not in ACCEPTS_COMMANDS:
                 return f"{self.name} is {self.state.name.lower()}"
-            self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop(remain_ms))
-            self._streaming = False
-            self.hold("the stream of commands was declared over")
+            if self.state == State.FLYING:
+                self.hold("the stream of commands was declared over")  # tells the firmware, too
+            else:
+                self._streaming = False
+                self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop(remain_ms))
             return ""
 
     def lose(self, reason: str, now: float) -> None:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from dtsa_bench.fake_crazyflie.firmware import Firmware
-from dtsa_bench.fake_crazyflie.planner import Triple
+from dtsa_bench.fake_crazyflie.planner import IDLE, Triple
 
 GRAVITY = 9.81
 VARIANCE_RESET = 1.0  # m^2, right after the estimator was reset
@@ -71,7 +71,9 @@ def log_values(estimate: Estimate, firmware: Firmware, t: float) -> dict[str, fl
     roll, pitch = attitude(estimate.acceleration, firmware.yaw)
     supervisor, cell = firmware.supervisor, firmware.battery
     variance = estimate.variance(t)
-    info = supervisor.info(planner_state=firmware.planner.state, trajectory_finished=firmware.planner.finished(t))
+    info = supervisor.info(
+        planner_active=firmware.planner.state != IDLE, trajectory_finished=firmware.planner.finished(t)
+    )
     rate = firmware.setpoint.yaw_rate if firmware.setpoint is not None else 0.0
     degrees = math.degrees
     return {

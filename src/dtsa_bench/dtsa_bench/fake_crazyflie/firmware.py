@@ -1,19 +1,21 @@
 """One Crazyflie's flight firmware: setpoints in, a velocity command for the vehicle model out.
 
 Everything that a person could do wrong with a real one goes wrong here, too: a high-level command while setpoints are
-streamed has no effect until the stream is declared over, old setpoints end in a fall, an emergency stop is for good.
+streamed has no effect until the stream is declared over; a stream that is declared over while the high-level commander
+has nothing to fly stops the motors; old setpoints end in a fall, an emergency stop is for good. What is followed is the
+firmware of 2025.02 and later.
 """
 
 from __future__ import annotations
 
+import errno
 import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from dtsa_bench.fake_crazyflie import planner as plan
 from dtsa_bench.fake_crazyflie.battery import Battery
-from dtsa_bench.fake_crazyflie.planner import Planner, Triple
+from dtsa_bench.fake_crazyflie.planner import Goal, Planner, Triple
 from dtsa_bench.fake_crazyflie.supervisor import LEVEL_OUT, Supervisor
 
 # What the vehicle does during a step.
@@ -109,6 +111,7 @@ class Firmware:
         self.setpoint: Setpoint | None = None
         self._priority = PRIORITY_NONE
         self._streaming = False
+        self._here = Goal()  # where a path would begin: on the present path, or where the vehicle is
         self.yaw = 0.0
         self.setpoints_received = 0
 
@@ -132,7 +135,7 @@ class Firmware:
     def _accept(self, setpoint: Setpoint) -> None:
         self._priority = PRIORITY_STREAM
         self.setpoint = setpoint
-        self.planner.disable()
+        self.planner.stop()
         if not self._streaming:
             self._streaming = True
             self._report("streaming")
@@ -144,45 +147,49 @@ class Firmware:
             self._streaming = False
             self._report("stream ended")
 
-    def high_level(self, data: bytes, t: float, position: Triple, velocity: Triple) -> None:
-        """A packet of the high-level commander."""
+    def high_level(self, data: bytes, t: float) -> int:
+        """A packet of the high-level commander; 0, or an error number of the firmware's."""
         kind = data[0] if data else -1
         if kind == 3:
             self.planner.stop()
             self._report("high-level stop")
-        elif kind in (7, 8) and len(data) >= 15:
-            _, height, yaw, keep_yaw, duration = struct.unpack_from("<Bff?f", data, 1)
-            yaw = self.yaw if keep_yaw else yaw
-            if kind == 7:
-                goal = (position[0], position[1], height)
-                self.planner.fly(t, position, velocity, goal, yaw, duration)
-                self._report("takeoff", height=round(height, 3))
-            else:
-                self.planner.land(t, position, velocity, height, yaw, duration)
-                self._report("land")
-        elif kind == 12 and len(data) >= 24:
+            return 0
+        lengths = {7: 15, 8: 15, 12: 24}
+        if len(data) < lengths.get(kind, math.inf):
+            return errno.ENOEXEC
+        if not self.supervisor.motors_allowed:
+            return errno.EBUSY
+        here = self._here
+        if kind == 12:
             _, relative, _, x, y, z, yaw, duration = struct.unpack_from("<B??5f", data, 1)
             if relative:
-                x, y, z, yaw = x + position[0], y + position[1], z + position[2], yaw + self.yaw
-            self.planner.fly(t, position, velocity, (x, y, z), yaw, duration)
+                x, y, z = (a + b for a, b in zip((x, y, z), here.position, strict=True))
+                yaw += self.yaw
+            self.planner.go_to(t, here, (x, y, z), yaw, duration)
             self._report("go_to", goal=[round(v, 3) for v in (x, y, z)])
+            return 0
+        _, height, yaw, keep_yaw, duration = struct.unpack_from("<Bff?f", data, 1)
+        name, order = ("takeoff", self.planner.takeoff) if kind == 7 else ("land", self.planner.land)
+        if not order(t, here, height, self.yaw if keep_yaw else yaw, duration):
+            return 1
+        self._report(name, height=round(height, 3))
+        return 0
 
     # -- one step of control ----------------------------------------------------------------------------------------
-    def step(self, t: float, dt: float, position: Triple) -> tuple[str, Triple]:
+    def step(self, t: float, dt: float, position: Triple, velocity: Triple) -> tuple[str, Triple]:
         """What the vehicle does from t to t + dt.
 
-        :param position: m, what the estimator says.
+        :param position: m, what the estimator says. :param velocity: m/s, the same.
         :return: OFF, FLY or LEVEL, and the velocity command in m/s.
         """
-        if self._priority <= PRIORITY_HIGH_LEVEL and self.planner.state != plan.DISABLED:
-            wanted = self.planner.setpoint(t)
-            if wanted is None:
-                self.setpoint = Setpoint(t, motors=False)
-            else:
-                self.setpoint = Setpoint(t, *wanted, yaw=self.planner.path.yaw if self.planner.path else None)
-            self._priority = PRIORITY_HIGH_LEVEL
-        setpoint = self.setpoint
-        thrust = setpoint is not None and setpoint.motors and self.supervisor.motors_allowed
+        allowed = self.supervisor.motors_allowed
+        if allowed:
+            self._follow_planner(t, position, velocity)
+        else:
+            self.planner.stop()
+            self._here = Goal(position, velocity, yaw=self.yaw)
+        setpoint = self.setpoint if allowed else None
+        thrust = setpoint is not None and setpoint.motors
         age = math.inf if setpoint is None else t - setpoint.time
         self.supervisor.update(t, setpoint_age=age, thrust=thrust)
         self.battery.update(dt, motors=thrust)
@@ -192,6 +199,18 @@ class Firmware:
         if self.supervisor.state == LEVEL_OUT:
             return LEVEL, command
         return FLY, command
+
+    def _follow_planner(self, t: float, position: Triple, velocity: Triple) -> None:
+        """The high-level commander's setpoint: where to be, or motors off if it has nothing to fly."""
+        goal = self.planner.goal(t)
+        self._here = goal or Goal(position, velocity, yaw=self.yaw)
+        if self._priority > PRIORITY_HIGH_LEVEL:
+            return
+        self._priority = PRIORITY_HIGH_LEVEL
+        if goal is None:
+            self.setpoint = Setpoint(t, motors=False)
+        else:
+            self.setpoint = Setpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
 
     def _velocity(self, s: Setpoint, position: Triple, dt: float) -> Triple:
         if s.yaw is not None:

@@ -185,7 +185,7 @@ class Fleet:
         t = self.time
         modes, command = [], np.zeros_like(self.vehicles.position)
         for k, firmware in enumerate(self.firmware):
-            mode, wanted = firmware.step(t, TICK_S, self.estimates[k].position)
+            mode, wanted = firmware.step(t, TICK_S, self.estimates[k].position, self.estimates[k].velocity)
             modes.append(mode)
             command[:, k] = wanted
         for k in self.vehicles.step(TICK_S, modes, command):

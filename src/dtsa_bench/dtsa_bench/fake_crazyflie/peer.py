@@ -147,8 +147,7 @@ class Peer:
             self.firmware.notify_stop()
 
     def _high_level(self, data: bytes, t: float) -> bytes:
-        self.firmware.high_level(data, t, self.estimate.position, self.estimate.velocity)
-        return data[:3] + b"\0"
+        return data[:3] + bytes((self.firmware.high_level(data, t),))
 
     def _log_settings(self, data: bytes, t: float) -> bytes | None:
         command = data[0]

@@ -7,31 +7,42 @@ from dataclasses import dataclass
 Triple = tuple[float, float, float]
 
 # States of the planner, as the firmware names them.
-DISABLED = "disabled"  # produces no setpoints: a streamed command took over, or none was given yet
+IDLE = "idle"  # holds the motors off: nothing was ordered yet, a landing is over, or a streamed command took over
 FLYING = "flying"
 LANDING = "landing"
-STOPPED = "stopped"  # holds the motors off
 
 
-def septic(p0: float, v0: float, p1: float, duration: float) -> tuple[float, ...]:
-    """Coefficients (constant first) of the polynomial of degree 7 from (p0, v0) to rest at p1.
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """Where the planner wants a vehicle to be, or where it was last."""
 
-    Acceleration and jerk are zero at both ends.
+    position: Triple = (0.0, 0.0, 0.0)  # m
+    velocity: Triple = (0.0, 0.0, 0.0)  # m/s
+    acceleration: Triple = (0.0, 0.0, 0.0)  # m/s^2
+    yaw: float = 0.0  # rad
 
-    :param p0: start, m. :param v0: speed at the start, m/s. :param p1: end, m.
-    :param duration: s, positive.
+
+def septic(p0: float, v0: float, a0: float, p1: float, duration: float) -> tuple[float, ...]:
+    """Coefficients (constant first) of the polynomial of degree 7 from (p0, v0, a0) to rest at p1.
+
+    Jerk is zero at both ends, acceleration at the end.
+
+    :param p0: start, m. :param v0: speed at the start, m/s. :param a0: acceleration there, m/s^2. :param p1: end, m.
+    :param duration: s; without one the end is reached at once.
     """
     t = duration
-    d = p1 - p0
+    if t <= 0.0:
+        return (p1,)
+    d, v, a = p1 - p0, v0 * t, a0 * t * t
     return (
         p0,
         v0,
+        a0 / 2,
         0.0,
-        0.0,
-        (35 * d - 20 * v0 * t) / t**4,
-        (-84 * d + 45 * v0 * t) / t**5,
-        (70 * d - 36 * v0 * t) / t**6,
-        (-20 * d + 10 * v0 * t) / t**7,
+        (35 * d - 20 * v - 5 * a) / t**4,
+        (-84 * d + 45 * v + 10 * a) / t**5,
+        (70 * d - 36 * v - 7.5 * a) / t**6,
+        (-20 * d + 10 * v + 2 * a) / t**7,
     )
 
 
@@ -52,57 +63,62 @@ class Path:
     start: float  # s
     duration: float  # s
     axes: tuple[tuple[float, ...], ...]  # x, y, z
-    end: Triple  # m
-    yaw: float  # rad, at the end
+    end: Goal
 
 
 class Planner:
-    """Setpoints between high-level commands. Time is an argument."""
+    """Paths between high-level commands. Time is an argument."""
 
     def __init__(self) -> None:
-        self.state = DISABLED
+        self.state = IDLE
         self.path: Path | None = None
-        self._last: Triple = (0.0, 0.0, 0.0)
-
-    def disable(self) -> None:
-        """A streamed command has taken over: forget the path."""
-        self.state = DISABLED
-        self.path = None
 
     def stop(self) -> None:
-        """Motors off."""
-        self.state = STOPPED
-        self.path = None
+        """Motors off, and the path is forgotten."""
+        self.state = IDLE
 
-    def fly(self, t: float, position: Triple, velocity: Triple, goal: Triple, yaw: float, duration: float) -> None:
-        """Take-off and go-to: fly to `goal` (m) within `duration` (s) and hold it."""
-        self._plan(t, position, velocity, goal, yaw, duration)
+    def takeoff(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
+        """Climb to `height` (m above the floor) within `duration` (s), from rest; False: only an idle planner does."""
+        if self.state != IDLE:
+            return False
+        self._from_rest(t, here, height, yaw, duration)
+        self.state = FLYING
+        return True
+
+    def land(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
+        """Sink to `height` within `duration`, from rest, then stop the motors; False: it is landing already."""
+        if self.state == LANDING:
+            return False
+        self._from_rest(t, here, height, yaw, duration)
+        self.state = LANDING
+        return True
+
+    def go_to(self, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
+        """Fly to a place within `duration` and hold it, beginning with speed and acceleration as they are."""
+        self._plan(t, here, place, yaw, duration)
         self.state = FLYING
 
-    def land(self, t: float, position: Triple, velocity: Triple, height: float, yaw: float, duration: float) -> None:
-        """Sink to `height` (m above the floor) within `duration` (s), then stop the motors."""
-        x, y = self.path.end[:2] if self.path and self.finished(t) else position[:2]
-        self._plan(t, position, velocity, (x, y, height), yaw, duration)
-        self.state = LANDING
+    def _from_rest(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> None:
+        x, y, _ = here.position
+        self._plan(t, Goal(here.position), (x, y, height), yaw, duration)
 
-    def _plan(self, t: float, p: Triple, v: Triple, goal: Triple, yaw: float, duration: float) -> None:
-        duration = max(duration, 0.1)
-        axes = tuple(septic(p[i], v[i], goal[i], duration) for i in range(3))
-        self.path = Path(t, duration, axes, goal, yaw)
+    def _plan(self, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
+        starts = zip(here.position, here.velocity, here.acceleration, place, strict=True)
+        axes = tuple(septic(p, v, a, end, duration) for p, v, a, end in starts)
+        self.path = Path(t, duration, axes, Goal(place, yaw=yaw))
 
     def finished(self, t: float) -> bool:
         """True once the last path has been flown (or there is none)."""
         return self.path is None or t >= self.path.start + self.path.duration
 
-    def setpoint(self, t: float) -> tuple[Triple, Triple, Triple] | None:
-        """Position, velocity and acceleration to hold now; None when the planner produces no movement."""
-        if self.path is None:
+    def goal(self, t: float) -> Goal | None:
+        """What to hold now; None while idle, which a landing that is over makes it."""
+        if self.state == LANDING and self.finished(t):
+            self.state = IDLE
+        if self.state == IDLE or self.path is None:
             return None
         if self.finished(t):
-            if self.state == LANDING:
-                self.stop()
-                return None
-            return self.path.end, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+            return self.path.end
         s = t - self.path.start
         x, y, z = (evaluate(axis, s) for axis in self.path.axes)
-        return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
+        return Goal((x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2]), self.path.end.yaw)

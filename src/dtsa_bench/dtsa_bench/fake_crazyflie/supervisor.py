@@ -1,6 +1,7 @@
 """The firmware's supervisor: may the motors run, and what happens when things go wrong.
 
-States, timeouts and their order are those of the Crazyflie's firmware (supervisor.c, supervisor_state_machine.c).
+States, timeouts and the order of rules are those of the Crazyflie's firmware from 2025.02 on (supervisor.c,
+supervisor_state_machine.c).
 Times are arguments in seconds.
 """
 
@@ -17,10 +18,10 @@ LEVEL_OUT = "level out"
 LOCKED = "locked"
 CRASHED = "crashed"
 
-MOTORS_ALLOWED = frozenset({READY, FLYING, LANDED, LEVEL_OUT})
+MOTORS_ALLOWED = frozenset({READY, FLYING, LANDED, LEVEL_OUT})  # "can fly"
 
 LEVEL_OUT_S = 0.5  # age of the setpoint at which a flying Crazyflie levels out
-SHUTDOWN_S = 2.0  # ... and at which it stops its motors
+SHUTDOWN_S = 2.0  # ... and at which it stops its motors, for good
 FLYING_HYSTERESIS_S = 2.0  # low thrust for that long: not flying any more
 EMERGENCY_WATCHDOG_S = 1.0
 PREFLIGHT_TIMEOUT_S = 30.0  # armed, but not taken off
@@ -28,7 +29,7 @@ LANDING_TIMEOUT_S = 3.0  # landed: disarmed after that long
 
 CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
 IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
-HL_ACTIVE, HL_FINISHED, HL_DISABLED = 256, 512, 1024
+HL_ACTIVE, HL_FINISHED = 256, 512
 
 
 class Supervisor:
@@ -43,6 +44,7 @@ class Supervisor:
         self.armed = False
         self.tumbled = False
         self.refuse_arming = False
+        self.crashed = False  # until somebody asks for recovery
         self.emergency = ""  # why an emergency stop is in force; latches until a reboot
         self._watchdog: float | None = None  # time of the last watchdog packet
         self._thrust: float | None = None  # time of the last thrust
@@ -70,10 +72,10 @@ class Supervisor:
 
     def request_recovery(self) -> bool:
         """Leave the crashed state once the Crazyflie stands upright."""
-        if self.state == CRASHED and not self.tumbled:
+        if self.crashed and not self.tumbled:
+            self.crashed = False
             self._report("recovered")
-            self._enter(NOT_READY, self._since)
-        return self.state != CRASHED
+        return not self.crashed
 
     def stop(self, reason: str) -> None:
         """Emergency stop: latches until a reboot."""
@@ -100,42 +102,55 @@ class Supervisor:
             self._enter(state, t)
 
     def _next(self, t: float, age: float, in_air: bool) -> str:
-        state = self.state
-        if self.emergency:
-            return LOCKED
-        if state in (LOCKED, CRASHED):
-            return state
+        """The next state; the first rule that holds counts. States that last for one step only are left out."""
+        state, late = self.state, age > SHUTDOWN_S
         if state == NOT_READY:
-            return state if self.tumbled else CHECKED
+            return LOCKED if self.emergency else state if self.tumbled else CHECKED
         if state == CHECKED:
-            if self.tumbled:
-                return NOT_READY
-            return READY if self.armed else CHECKED
+            return LOCKED if self.emergency else NOT_READY if self.tumbled else READY if self.armed else state
         if state == READY:
+            if self.emergency:
+                return LOCKED
             if self.tumbled or not self.armed or t - self._since > PREFLIGHT_TIMEOUT_S:
                 return NOT_READY
-            return FLYING if in_air else READY
-        if state in (FLYING, LEVEL_OUT):
-            if self.tumbled or not self.armed or age > SHUTDOWN_S:
+            return FLYING if in_air else state
+        if state == FLYING:
+            if late or self.emergency:
+                return LOCKED
+            if self.tumbled:
                 return CRASHED
-            if not in_air:
-                return LANDED
-            return LEVEL_OUT if age > LEVEL_OUT_S else FLYING
-        if self.tumbled or not self.armed or t - self._since > LANDING_TIMEOUT_S:  # landed
-            return NOT_READY
-        return FLYING if in_air else LANDED
+            if not self.armed:
+                return NOT_READY
+            if age > LEVEL_OUT_S:
+                return LEVEL_OUT
+            return state if in_air else LANDED
+        if state == LEVEL_OUT:
+            if late or self.tumbled or self.emergency:
+                return LOCKED
+            return state if age > LEVEL_OUT_S else FLYING
+        if state == LANDED:  # not even an emergency stop counts here; it does once the motors are off
+            if not self.armed or t - self._since > LANDING_TIMEOUT_S:
+                return NOT_READY
+            return FLYING if in_air else state
+        if state == CRASHED:
+            if not self.crashed and not self.tumbled:
+                return NOT_READY
+            return LOCKED if self.emergency else state
+        return state
 
     def _enter(self, state: str, t: float) -> None:
         before, self.state, self._since = self.state, state, t
-        details = {"reason": self.emergency} if state == LOCKED else {}
+        details = {}
         if state == CRASHED:
-            details["reason"] = "tumbled" if self.tumbled else "disarmed" if not self.armed else "setpoints ceased"
+            self.crashed, details["reason"] = True, "tumbled"
+        elif state == LOCKED:
+            details["reason"] = self.emergency or ("tumbled" if self.tumbled else "setpoints ceased")
         self._report("state", state=state, before=before, **details)
         if state not in MOTORS_ALLOWED and self.armed:
             self.armed = False
             self._report("disarmed")
 
-    def info(self, *, planner_state: str, trajectory_finished: bool) -> int:
+    def info(self, *, planner_active: bool, trajectory_finished: bool) -> int:
         """The bit field `supervisor.info`."""
         bits = IS_ARMED if self.armed else 0
         bits |= CAN_BE_ARMED if self.state == CHECKED and not self.refuse_arming else 0
@@ -143,8 +158,7 @@ class Supervisor:
         bits |= IS_FLYING if self.flying else 0
         bits |= IS_TUMBLED if self.tumbled else 0
         bits |= IS_LOCKED if self.state == LOCKED else 0
-        bits |= IS_CRASHED if self.state == CRASHED else 0
-        bits |= HL_ACTIVE if planner_state in ("flying", "landing") else 0
+        bits |= IS_CRASHED if self.crashed else 0
+        bits |= HL_ACTIVE if planner_active else 0
         bits |= HL_FINISHED if trajectory_finished else 0
-        bits |= HL_DISABLED if planner_state == "disabled" else 0
         return bits
