@@ -188,68 +188,80 @@ def foxglove(agents: int = AGENTS) -> dict[str, Any]:
 # ---- PlotJuggler ----
 
 DISTANCE = """return math.sqrt((value - v3)^2 + (v1 - v4)^2 + (v2 - v5)^2)"""
+# Seconds since the last success in which the agent was the first sender. Other data may be loaded: then time goes back.
 AGE_GLOBAL = "last = nil"
-AGE = """if value == {agent} then last = time end
-if last == nil then return 0 end
+AGE = """if last == nil or time < last or (value == 1 and v1 == {agent}) then last = time end
 return time - last"""
+
+# Title, curves with their colours, style, limits of the y axis.
+Panel = tuple[str, list[tuple[str, str]], str, dict[str, str]]
 
 
 def plotjuggler(agents: int = AGENTS) -> str:
     """The layout for PlotJuggler.
+
+    It uses `/swarm/reception` and the odometry only: PlotJuggler refuses the 64-bit digests of other topics.
 
     :param agents: number of agents.
     """
     root = ElementTree.Element("root")
     tabs = ElementTree.SubElement(root, "tabbed_widget", name="Main Window", parent="main_window")
     numbers = range(1, agents + 1)
-    _tab(
-        tabs,
-        "slots",
-        [
-            [("/swarm/reception/outcome", COLOURS[0])],
-            [("/swarm/reception/sender[0]", COLOURS[1])],
-            [(f"age of cf{k}", colour(k - 1)) for k in numbers],
-        ],
-        dots={1},
-    )
+    outcome, sender, place = "/swarm/reception/outcome", "/swarm/reception/sender[0]", "odom/pose/pose/position"
+    ages = [(f"age of cf{k}", colour(k - 1)) for k in numbers]
+    slots: list[Panel] = [
+        ("Slots: 0 idle, 1 success, 2 collision", [(outcome, COLOURS[0])], "StepsInv", {"min": "-0.1", "max": "2.1"}),
+        ("Who sends (first of the senders)", [(sender, COLOURS[1])], "Dots", {"min": "0"}),
+        ("Age of news (s)", ages, "Lines", {"min": "0"}),
+    ]
+    _rows(_tab(tabs, "slots"), slots, [0.2, 0.3, 0.5])
     others = range(2, min(agents, PAIRS + 1) + 1)
-    _tab(
-        tabs,
-        "flight",
-        [
-            [(f"distance cf1 cf{k}", colour(k - 1)) for k in others],
-            *([(f"/cf{k}/odom/pose/pose/position/{axis}", colour(k - 1)) for k in numbers] for axis in "xyz"),
-        ],
-    )
+    distances = [(f"distance cf1 cf{k}", colour(k - 1)) for k in others]
+    flight: list[Panel] = [
+        ("Distance from cf1 (m)", distances, "Lines", {"min": "0"}),
+        *(
+            (f"Odometry: {axis} (m)", [(f"/cf{k}/{place}/{axis}", colour(k - 1)) for k in numbers], "Lines", {})
+            for axis in "zxy"
+        ),
+    ]
+    columns = _splitter(_tab(tabs, "flight"), "|", [0.5, 0.5])
+    _rows(columns, flight[:2], [0.5, 0.5])
+    _rows(columns, flight[2:], [0.5, 0.5])
     ElementTree.SubElement(tabs, "currentTabIndex", index="0")
     ElementTree.SubElement(root, "use_relative_time_offset", enabled="1")
     equations = ElementTree.SubElement(root, "customMathEquations")
     for k in others:
-        place = "odom/pose/pose/position"
         more = [f"/cf1/{place}/y", f"/cf1/{place}/z", *(f"/cf{k}/{place}/{axis}" for axis in "xyz")]
         _equation(equations, f"distance cf1 cf{k}", DISTANCE, f"/cf1/{place}/x", more)
     for k in numbers:
-        source = "/swarm/reception/sender[0]"
-        _equation(equations, f"age of cf{k}", AGE.format(agent=k), source, [], AGE_GLOBAL)
+        _equation(equations, f"age of cf{k}", AGE.format(agent=k), outcome, [sender], AGE_GLOBAL)
     ElementTree.indent(root, " ")
     return "<?xml version='1.0' encoding='UTF-8'?>\n" + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _tab(
-    tabs: ElementTree.Element, name: str, plots: list[list[tuple[str, str]]], dots: set[int] | None = None
-) -> None:
+def _tab(tabs: ElementTree.Element, name: str) -> ElementTree.Element:
     tab = ElementTree.SubElement(tabs, "Tab", tab_name=name, containers="1")
-    share = ";".join([f"{1 / len(plots):.4f}"] * len(plots))
-    splitter = ElementTree.SubElement(
-        ElementTree.SubElement(tab, "Container"), "DockSplitter", orientation="-", count=str(len(plots)), sizes=share
-    )
-    for number, curves in enumerate(plots):
-        area = ElementTree.SubElement(splitter, "DockArea", name="...")
-        style = "Dots" if number in (dots or ()) else "Lines"
+    return ElementTree.SubElement(tab, "Container")
+
+
+def _splitter(parent: ElementTree.Element, orientation: str, shares: list[float]) -> ElementTree.Element:
+    sizes = ";".join(f"{share:.4f}" for share in shares)
+    return ElementTree.SubElement(parent, "DockSplitter", orientation=orientation, count=str(len(shares)), sizes=sizes)
+
+
+def _rows(parent: ElementTree.Element, panels: list[Panel], shares: list[float]) -> None:
+    """Panels one above the other."""
+    splitter = _splitter(parent, "-", shares)
+    for title, curves, style, limits in panels:
+        area = ElementTree.SubElement(splitter, "DockArea", name=title)
         panel = ElementTree.SubElement(area, "plot", mode="TimeSeries", style=style, flip_x="false", flip_y="false")
-        ElementTree.SubElement(panel, "limitY")
+        ElementTree.SubElement(panel, "limitY", limits)
         for curve, ink in curves:
-            ElementTree.SubElement(panel, "curve", name=curve, color=ink)
+            line = ElementTree.SubElement(panel, "curve", name=curve, color=ink)
+            if curve.startswith("/cf"):
+                # A short name for the legend, which hides half of the plot otherwise. It needs a transform.
+                change = ElementTree.SubElement(line, "transform", name="Scale/Offset", alias=curve.split("/")[1])
+                ElementTree.SubElement(change, "options", value_scale="1", value_offset="0", time_offset="0")
 
 
 def _equation(

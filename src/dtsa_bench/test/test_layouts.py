@@ -56,6 +56,17 @@ def has_field(topic: str, path: str) -> bool:
     return True
 
 
+def numbers(kind: str) -> set[str]:
+    """Types of all numbers and texts in a message type."""
+    found: set[str] = set()
+    fields: Any = typestore().fielddefs[kind][1]
+    for _, (node, detail) in fields:
+        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            node, detail = detail[0]
+        found |= numbers(detail) if node == Nodetype.NAME else {detail[0]}
+    return found
+
+
 def panels(node: Any) -> list[str]:
     """All panels in a layout's tree."""
     return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
@@ -133,8 +144,34 @@ def test_every_plotjuggler_curve_exists(make: ModuleType) -> None:
         match = re.match(r"(/swarm/\w+|/cf\d+/odom)/(.+)", name)
         assert match is not None
         assert has_field(match[1], match[2].replace("/", ".")), name
+        assert not numbers(TYPES[match[1]]) & {"int64", "uint64"}, name  # such bags are not loaded by PlotJuggler
     for splitter in root.iter("DockSplitter"):
-        assert len(splitter) == int(splitter.get("count", 0)) == len(splitter.get("sizes", "").split(";"))
+        sizes = [float(size) for size in splitter.get("sizes", "").split(";")]
+        assert len(splitter) == int(splitter.get("count", 0)) == len(sizes)
+        assert sum(sizes) == pytest.approx(1)
+    for line in root.iter("curve"):
+        for change in line.iter("transform"):
+            assert change.get("alias")  # the legend shows an empty text otherwise
+            assert change.find("options") is not None
+
+
+def test_plotjuggler_equations_name_all_their_sources(make: ModuleType) -> None:
+    for snippet in ElementTree.fromstring(make.plotjuggler()).iter("snippet"):
+        used = set(re.findall(r"\bv\d+\b", snippet.findtext("function", "")))
+        sources = snippet.find("additional_sources")
+        assert sources is not None
+        assert {source.tag for source in sources} == used
+        assert len(used) <= 8  # more are too many for PlotJuggler 3.9
+        if "age of" in snippet.get("name", ""):
+            assert (snippet.findtext("linked_source"), sources[0].text) == (
+                "/swarm/reception/outcome",
+                "/swarm/reception/sender[0]",
+            )
+
+
+def test_the_topics_that_plotjuggler_refuses_are_known() -> None:
+    refused = {topic for topic, kind in TYPES.items() if numbers(kind) & {"int64", "uint64"}}
+    assert refused == {"/swarm/decision", "/swarm/transmission"}  # as docs/recording.md says
 
 
 def test_other_numbers_of_agents(make: ModuleType) -> None:
