@@ -200,8 +200,6 @@ Panel = tuple[str, list[tuple[str, str]], str, dict[str, str]]
 def plotjuggler(agents: int = AGENTS) -> str:
     """The layout for PlotJuggler.
 
-    It uses `/swarm/reception` and the odometry only: PlotJuggler refuses the 64-bit digests of other topics.
-
     :param agents: number of agents.
     """
     root = ElementTree.Element("root")

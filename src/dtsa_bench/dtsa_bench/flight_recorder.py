@@ -125,7 +125,7 @@ class FlightRecorder:
             reason_name=known[0],
             reason_index=known[1],
             reason=array("B", key),
-            digest=array("Q", answers.digest.tobytes()),
+            digest=array("I", answers.digest.tobytes()),
             score=array("d", answers.score.tobytes()),
         )
         return bytes(serialize_message(message))

@@ -142,7 +142,7 @@ class FlightMetrics:
         away = self._last[:, back] - self.scenario.target[:, back]
         return bool((np.sqrt((away * away).sum(axis=0)) <= self.run.swarm.r_min).all())
 
-    def compare_views(self, slot: int, digests: NDArray[np.uint64], chosen: NDArray[np.uint16]) -> None:
+    def compare_views(self, slot: int, digests: NDArray[np.uint32], chosen: NDArray[np.uint16]) -> None:
         """Takes in what all agents believe at the start of a slot, where that may differ.
 
         :param slot: its number.

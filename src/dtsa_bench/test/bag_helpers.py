@@ -123,7 +123,7 @@ class SyntheticRun:
                 "dtsa_msgs/msg/Transmission", stamp=stamp(start), slot=slot, agent=ids,
                 length=np.where(ids == sender, 23, 0).astype(np.uint8), data=frame,
                 offset_ns=np.zeros(0, np.int64), chosen=np.full(n, sender, np.uint16), reason=np.zeros(n, np.uint8),
-                digest=np.full(n, slot, np.uint64), score=np.zeros(n), steps=1,
+                digest=np.full(n, slot, np.uint32), score=np.zeros(n), steps=1,
                 track=place.ravel(), velocity=speed.ravel(), command=speed.ravel(),
                 goal=-place.ravel() if slot == 0 else np.zeros(0),
             ),
@@ -142,7 +142,7 @@ class SyntheticRun:
             cdr(
                 "dtsa_msgs/msg/Decision", stamp=stamp(start), slot=slot, agent=ids,
                 chosen=np.full(n, sender, np.uint16), reason_name=["tdma"], reason_index=np.zeros(n, np.uint8),
-                reason=np.zeros(n, np.uint8), digest=np.full(n, slot, np.uint64), score=np.zeros(n),
+                reason=np.zeros(n, np.uint8), digest=np.full(n, slot, np.uint32), score=np.zeros(n),
             ),
             end, start,
         )  # fmt: skip

@@ -74,7 +74,7 @@ def test_tables_have_the_documented_columns_and_the_bag_s_values(flight: Path, t
     assert tables["decisions"]["chosen"].tolist() == [int(k) for one in decisions for k in one.chosen]
     names = [one.reason_name[k] for one in decisions for k in one.reason_index]
     assert tables["decisions"]["reason"].tolist() == names
-    assert tables["decisions"]["digest"].astype("uint64").tolist() == [int(k) for one in decisions for k in one.digest]
+    assert tables["decisions"]["digest"].astype("uint32").tolist() == [int(k) for one in decisions for k in one.digest]
     states = tables["states"]
     first = states[states["agent"] == 3].reset_index(drop=True)
     for slot in (1, 50, SLOTS - 1):

@@ -158,7 +158,7 @@ def test_columns_of_changing_lengths(rows: list[tuple[list[int], list[str], list
         data = cdr(
             DECISION, stamp=stamp(SECOND), slot=slot, agent=np.array(ids, np.uint16),
             chosen=np.array(ids[::-1], np.uint16), reason_name=texts, reason_index=np.array(reasons, np.uint8),
-            reason=np.array([], np.uint8), digest=np.array(reasons, np.uint64), score=np.array(scores),
+            reason=np.array([], np.uint8), digest=np.array(reasons, np.uint32), score=np.array(scores),
         )  # fmt: skip
         typed.append(store.deserialize_cdr(data, DECISION))
         table.add(SECOND + slot, SECOND, data)

@@ -28,7 +28,7 @@ class Answers:
         self.frames: dict[int, bytes] = {}  # by id, of those that send
         self.chosen = np.zeros(agents, dtype=np.uint16)
         self.reason = np.zeros(agents, dtype=np.uint8)
-        self.digest = np.zeros(agents, dtype=np.uint64)
+        self.digest = np.zeros(agents, dtype=np.uint32)
         self.score = np.zeros(agents)
         self.track = np.zeros((steps, 3, agents))  # m, positions at the control instants of the slot before
         self.velocity = np.zeros((3, agents))  # m/s, now

@@ -231,7 +231,8 @@ class PluginSwarm(Swarm):
             self.sends[index] = chosen == agent and self.present[index]
         self.reason[:] = _PLUGIN_REASON
         self.score[:] = 0.0
-        self.digest[:] = self._view_hash[: len(self.ids)]
+        views = self._view_hash[: len(self.ids)]
+        self.digest[:] = (views ^ views >> np.uint64(32)) & np.uint64(0xFFFFFFFF)
 
     def _begin(self, slot: int) -> tuple[int, ...]:
         self._decide(slot)

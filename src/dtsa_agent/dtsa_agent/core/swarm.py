@@ -136,7 +136,7 @@ class Swarm:
         self.present = np.ones(count, dtype=np.uint8)  # 0: switched off, neither sends nor flies; 2: leaving
         self.chosen = np.zeros(count, dtype=np.uint16)  # id each takes for this slot's sender, 0: nobody
         self.reason = np.zeros(count, dtype=np.uint8)  # index into REASONS
-        self.digest = np.zeros(count, dtype=np.uint64)  # of each agent's table
+        self.digest = np.zeros(count, dtype=np.uint32)  # of each agent's table
         self.score = np.zeros(count)  # g of the chosen
         self.sends = np.zeros(count, dtype=np.uint8)
         self.frame_length = np.zeros(count, dtype=np.uint8)  # bytes, 0: silent

@@ -173,7 +173,7 @@ class SwarmNode:
         message.data = array("B", b"".join(frames))
         message.chosen = array("H", swarm.chosen.tobytes())
         message.reason = array("B", swarm.reason.tobytes())
-        message.digest = array("Q", swarm.digest.tobytes())
+        message.digest = array("I", swarm.digest.tobytes())
         message.score = array("d", swarm.score.tobytes())
         message.track = array("d", swarm.track.tobytes())
         message.velocity = array("d", swarm.velocity.tobytes())

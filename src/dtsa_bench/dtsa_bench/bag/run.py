@@ -52,7 +52,7 @@ class Decisions:
     chosen: NDArray[np.int64]  # ids, 0: nobody
     reason: NDArray[np.int64]  # index into `names`
     score: NDArray[np.float64]
-    digest: NDArray[np.uint64]
+    digest: NDArray[np.uint32]
     names: tuple[str, ...]
 
 
@@ -191,7 +191,7 @@ def _decisions(decision: Columns) -> Decisions:
     count = len(decision.get("slot", ()))
     if not count:
         none, plane = np.zeros(0, np.int64), np.zeros((0, 0), np.int64)
-        return Decisions(none, plane, plane, plane, plane.astype(float), plane.astype(np.uint64), ())
+        return Decisions(none, plane, plane, plane, plane.astype(float), plane.astype(np.uint32), ())
     width = max(len(row) for row in decision["agent"])
     known: dict[str, int] = {}
     reason = np.zeros((count, width), np.int64)
@@ -205,7 +205,7 @@ def _decisions(decision: Columns) -> Decisions:
         _plane(decision["chosen"], width, np.int64),
         reason,
         _plane(decision["score"], width, np.float64),
-        _plane(decision["digest"], width, np.uint64),
+        _plane(decision["digest"], width, np.uint32),
         tuple(known),
     )
 

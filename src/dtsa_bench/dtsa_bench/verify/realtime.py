@@ -74,7 +74,7 @@ class RealtimeCheck:
         self._slots = np.full(self.agents, -1, dtype=np.int64)  # last slot that each has answered
         self._places: list[list[tuple[int, NDArray[np.float64], float]]] = [[] for _ in range(self.agents)]
         self._decided: dict[int, dict[int, tuple[int, int, int, float]]] = {}
-        self._digests = np.zeros(self.agents, dtype=np.uint64)  # in the decisions of the slot before
+        self._digests = np.zeros(self.agents, dtype=np.uint32)  # in the decisions of the slot before
         self._carried: set[tuple[int, int]] = set()  # slot and agent whose report missed the slot's account
         self._events: list[tuple[int, dict[str, Any]]] = []
         self._starts: dict[int, dict[int, int]] = {}  # ns, by slot and agent

@@ -144,7 +144,7 @@ typedef struct swarm {
     uint8_t *active;            /* (l) 0: hovers */
     uint16_t *chosen;           /* (l) */
     uint8_t *reason;            /* (l) */
-    uint64_t *digest;           /* (l) */
+    uint32_t *digest;           /* (l) */
     double *score;              /* (l) */
     uint8_t *sends;             /* (l) */
     uint8_t *frame_len;         /* (l) */

@@ -47,7 +47,7 @@ static const array_spec ARRAYS[] = {
     FIELD(g, 8, 't'), FIELD(h, 8, 't'), FIELD(pos, 8, 'L'), FIELD(vel, 8, 'L'), FIELD(cmd, 8, 'L'), FIELD(goal, 8, 'L'),
     FIELD(track, 8, 'S'), FIELD(active, 1, 'l'), FIELD(final, 1, 'l'), FIELD(present, 1, 'l'),
     FIELD(chosen, 2, 'l'), FIELD(reason, 1, 'l'),
-    FIELD(digest, 8, 'l'), FIELD(score, 8, 'l'), FIELD(sends, 1, 'l'), FIELD(frame_len, 1, 'l'), FIELD(frames, 1, 'F'),
+    FIELD(digest, 4, 'l'), FIELD(score, 8, 'l'), FIELD(sends, 1, 'l'), FIELD(frame_len, 1, 'l'), FIELD(frames, 1, 'F'),
     FIELD(decay, 8, 'd'), FIELD(lease_state, 1, 'e'),
 };
 

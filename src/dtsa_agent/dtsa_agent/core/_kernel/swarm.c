@@ -219,7 +219,8 @@ void swarm_decide(swarm *s, int64_t slot)
         s->chosen[l] = (uint16_t)(c.index + 1);
         s->reason[l] = (uint8_t)c.reason;
         s->score[l] = c.score;
-        s->digest[l] = s->view_hash[view];
+        uint64_t hash = s->view_hash[view];
+        s->digest[l] = (uint32_t)(hash ^ hash >> 32);
         s->sends[l] = c.index == self && s->present[l];
     }
 }
