@@ -59,8 +59,29 @@ def test_targets_are_met_or_not() -> None:
     bridge = {"what": "crazyflie bridge", "crazyflies": 12, "commands_hz": 47.0, "logs_hz": 50.0, "connect_s": 1.0}
     bridge |= {"close_s": 3.5, "latency_p99_ms": 9.0, "bridge_cpu_percent": 61.0}
     rows += [bridge, {"what": "crazyflie bridge", "left_out": "no cflib"}]
+    node = {"what": "nodes in lockstep", "agents": 12, "processes": 12}
+    rows += [node | {"slots_per_s": 199.0, "limit_per_s": 200.0}, node | {"slots_per_s": 201.0, "limit_per_s": 200.0}]
+    rows += [node | {"slots_per_s": 1.0, "limit_per_s": None}, {"what": "nodes in lockstep", "left_out": "no rclpy"}]
     met = [target["met"] for target in parts.targets(rows)]
-    assert met == [False, True, False, True, True, False, True, False]
+    assert met == [False, True, False, True, True, False, True, False, False, True]
+
+
+@pytest.mark.ros
+def test_nodes_and_the_bare_round_beside_them(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("dtsa_msgs", reason="the workspace is not built")
+    monkeypatch.setattr(parts, "NODE_TARGETS", ((2, 2, 1.0), (3, 1, None)))
+    monkeypatch.setattr(parts, "NODE_SLOTS", 20)
+    monkeypatch.setattr(parts, "NODE_REPEATS", 2)
+    assert main(["benchmark", "--parts", "nodes", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    first, second = content["nodes"]
+    assert first["slots"] == second["slots"] == 20
+    assert first["slots_per_s"] >= first["median_per_s"] > 0
+    assert first["ratio"] == pytest.approx(first["bare_rounds_per_s"] / first["slots_per_s"])
+    assert "ratio" not in second
+    assert [target["met"] for target in content["targets"]] == [True]
 
 
 def test_unknown_parts_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,6 +26,9 @@ from .crazyflie import crazyflie as crazyflie
 Row = dict[str, Any]
 SIZES = (18, 70, 200)
 POLICIES = ("tdma", "age", "dtsa")
+NODES = "nodes in lockstep"
+NODE_TARGETS = ((4, 4, None), (12, 12, 200.0), (18, 1, 500.0), (70, 2, 200.0))  # agents, processes, slots/s
+NODE_SLOTS, NODE_REPEATS = 300, 3
 COST_SIZES = (10, 20, 40, 70, 100, 140, 200, 280, 400)
 
 
@@ -191,27 +194,36 @@ def flights(repeats: int = 12) -> Iterator[Row]:
 
 
 def nodes() -> Iterator[Row]:
-    """Real nodes in lockstep: one process an agent, and all agents in two processes."""
+    """Real nodes in lockstep, recorded, and beside one process an agent the same round of messages without protocol."""
     try:
         import rclpy  # noqa: F401
 
         from ..fly.flight import FlightOptions, fly
+        from .bare_round import rounds_per_s
     except ImportError as error:
-        yield {"what": "nodes in lockstep", "left_out": f"{error}"}
+        yield {"what": NODES, "left_out": f"{error}"}
         return
-    for agents, processes in ((4, None), (12, None), (18, 2), (70, 2)):
-        run = run_config({"agents": agents, "timeout_s": 3.0, "stop_on_crash": False})
-        with tempfile.TemporaryDirectory() as place:
-            options = FlightOptions(processes=processes, pictures=False)
-            summary = fly(run, Path(place) / "flight", options, label="benchmark").summary
-        yield {
-            "what": "nodes in lockstep",
+    for agents, processes, limit in NODE_TARGETS:
+        run = run_config({"agents": agents, "timeout_s": NODE_SLOTS / 100, "stop_on_crash": False})
+        rates = []
+        for _ in range(NODE_REPEATS):
+            with tempfile.TemporaryDirectory() as place:
+                options = FlightOptions(processes=processes, pictures=False)
+                summary = fly(run, Path(place) / "flight", options, label="benchmark").summary
+            rates.append(summary["slots"]["total"] / summary["wall_time_s"])
+        row = {
+            "what": NODES,
             "agents": agents,
-            "processes": processes or agents,
+            "processes": processes,
             "slots": summary["slots"]["total"],
-            "slots_per_s": summary["slots"]["total"] / summary["wall_time_s"],
-            "realtime_factor": summary["realtime_factor"],
+            "slots_per_s": max(rates),
+            "median_per_s": statistics.median(rates),
+            "limit_per_s": limit,
         }
+        if processes == agents:
+            row["bare_rounds_per_s"] = max(rounds_per_s(processes, NODE_SLOTS, NODE_REPEATS))
+            row["ratio"] = row["bare_rounds_per_s"] / row["slots_per_s"]
+        yield row
 
 
 def targets(rows: list[Row]) -> list[Row]:
@@ -230,6 +242,9 @@ def targets(rows: list[Row]) -> list[Row]:
                 continue
             what = f"whole slot of {row['agents']}, {row['policy']}, against pyrvo's avoidance alone [us]"
             found.append(_target(what, row["core_us"], row["pyrvo_ten_us"]))
+        elif row["what"] == NODES and row.get("limit_per_s"):
+            what = f"nodes in lockstep, {row['agents']} agents, processes: {row['processes']} [slots/s]"
+            found.append(_target(what, row["slots_per_s"], row["limit_per_s"], least=True))
         elif row["what"] == bridge.WHAT and "left_out" not in row:
             found += [_target(*target) for target in bridge.targets(row)]
     return found

@@ -1,0 +1,125 @@
+"""A round of messages without any protocol: what the middleware alone costs a slot.
+
+One process publishes a number, every other process answers it, and the round is over when all answers are there: what a
+flight in lockstep does in every slot, with the same loop, quality of service and number of processes. As a module, this
+is the process that answers.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import UInt32
+
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.ros import names
+from dtsa_agent.ros.loop import Loop, Stop
+from dtsa_agent.ros.process import node_options, run_node
+
+from ..fly.children import Children
+from ..fly.domain import ros_domain
+from ..fly.flight import ENVIRONMENT
+
+_ASK, _ANSWER, _OVER = "/bare_round/ask", "/bare_round/answer", 2**32 - 1
+_START_S = 60.0
+
+
+def rounds_per_s(processes: int, rounds: int, repeats: int) -> list[float]:
+    """Rounds per second, one value a repetition.
+
+    :param processes: number of processes that answer.
+    :param rounds: rounds in one repetition.
+    :param repeats: number of repetitions.
+    :raises DtsaError: if a process ends, or they do not find each other.
+    """
+    with ros_domain() as domain, tempfile.TemporaryDirectory() as place:
+        for name, value in ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
+        context = Context()
+        children = Children(Path(place), {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": place})
+        try:
+            for number in range(1, processes + 1):
+                children.start(f"process {number}", [], __name__, [])
+            rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            return _Asker(context, children, processes).measure(rounds, repeats)
+        finally:
+            context.try_shutdown()
+            children.stop()
+
+
+class _Asker:
+    def __init__(self, context: Context, children: Children, processes: int) -> None:
+        node = Node("bare_round", context=context, **node_options(True))
+        self._children, self._processes = children, processes
+        self._publisher = node.create_publisher(UInt32, _ASK, names.lockstep_qos())
+        self._loop = Loop(node, UInt32, _ANSWER, names.lockstep_qos(processes))
+        self._number = 0
+
+    def measure(self, rounds: int, repeats: int) -> list[float]:
+        try:
+            self._meet()
+            found = []
+            for _ in range(repeats):
+                begin = time.perf_counter()
+                for _ in range(rounds):
+                    self._round()
+                found.append(rounds / (time.perf_counter() - begin))
+            return found
+        finally:
+            self._publisher.publish(UInt32(data=_OVER))
+            time.sleep(0.2)
+            self._loop.close()
+
+    def _meet(self) -> None:
+        """Asks until all have answered one question."""
+        deadline = time.monotonic() + _START_S
+        heard = 0
+        while heard < self._processes:
+            self._children.check()
+            if time.monotonic() > deadline:
+                raise DtsaError(f"only {heard} of {self._processes} processes answer after {_START_S:g} s")
+            self._number += 1
+            self._publisher.publish(UInt32(data=self._number))
+            end, heard = time.monotonic() + 0.2, 0
+            while time.monotonic() < end and heard < self._processes:
+                message = self._loop.wait()
+                heard += message is not None and message.data == self._number
+
+    def _round(self) -> None:
+        self._number += 1
+        self._publisher.publish(UInt32(data=self._number))
+        heard = 0
+        while heard < self._processes:
+            message = self._loop.wait()
+            if message is None:
+                self._children.check()
+            else:
+                heard += message.data == self._number
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    node = Node(f"bare_round_{os.getpid()}", **node_options(supervised))
+    publisher = node.create_publisher(UInt32, _ANSWER, names.lockstep_qos())
+    loop = Loop(node, UInt32, _ASK, names.lockstep_qos())
+
+    def answer(message: UInt32) -> bool:
+        if message.data != _OVER:
+            publisher.publish(message)
+        return bool(message.data != _OVER)
+
+    try:
+        loop.run(answer, lambda: None, stop)
+    finally:
+        loop.close()
+
+
+if __name__ == "__main__":
+    sys.exit(run_node("bare_round", _body))
