@@ -231,8 +231,7 @@ class PluginSwarm(Swarm):
             self.sends[index] = chosen == agent and self.present[index]
         self.reason[:] = _PLUGIN_REASON
         self.score[:] = 0.0
-        views = self._view_hash[: len(self.ids)]
-        self.digest[:] = (views ^ views >> np.uint64(32)) & np.uint64(0xFFFFFFFF)
+        self.digest[:] = self._view_hash[: len(self.ids)]
 
     def _begin(self, slot: int) -> tuple[int, ...]:
         self._decide(slot)

@@ -122,8 +122,8 @@ class Swarm:
         self.estimate_velocity = np.zeros(planes)  # m/s
         self.priority = np.zeros((views, agents))  # g, where the policy computed it
         self.counter = np.zeros((views, agents), dtype=np.int64)  # h (eq:secondary), likewise
-        self._entry_hash = np.zeros((views, agents), dtype=np.uint64)
-        self._view_hash = np.zeros(views, dtype=np.uint64)
+        self._entry_hash = np.zeros((views, agents), dtype=np.uint32)
+        self._view_hash = np.zeros(views, dtype=np.uint32)
 
     def _make_agents(self, count: int, steps: int) -> None:
         self.position = np.zeros((3, count))  # m, frame map, true state

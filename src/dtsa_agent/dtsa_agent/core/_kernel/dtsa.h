@@ -134,8 +134,8 @@ typedef struct swarm {
     int64_t *sent_slot;         /* (v, n), -1: never */
     int64_t *last;              /* (v, n) slot in which this table last took the agent for the sender; h = slot - 1 - last */
     uint8_t *in_ap;             /* (v, n) */
-    uint64_t *entry_hash;       /* (v, n) */
-    uint64_t *view_hash;        /* (v) */
+    uint32_t *entry_hash;       /* (v, n) */
+    uint32_t *view_hash;        /* (v) */
     double *est_p, *est_v;      /* (v, 3, n) */
     double *g;                  /* (v, n) */
     int64_t *h;                 /* (v, n) */

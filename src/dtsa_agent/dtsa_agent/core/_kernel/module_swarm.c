@@ -43,7 +43,7 @@ typedef struct {
 static const array_spec ARRAYS[] = {
     FIELD(local, 4, 'l'), FIELD(observer, 4, 'v'), FIELD(start, 8, 'N'), FIELD(target, 8, 'N'),
     FIELD(sent_p, 8, 'T'), FIELD(sent_v, 8, 'T'), FIELD(sent_c, 8, 'T'), FIELD(sent_slot, 8, 't'), FIELD(last, 8, 't'),
-    FIELD(in_ap, 1, 't'), FIELD(entry_hash, 8, 't'), FIELD(view_hash, 8, 'v'), FIELD(est_p, 8, 'T'), FIELD(est_v, 8, 'T'),
+    FIELD(in_ap, 1, 't'), FIELD(entry_hash, 4, 't'), FIELD(view_hash, 4, 'v'), FIELD(est_p, 8, 'T'), FIELD(est_v, 8, 'T'),
     FIELD(g, 8, 't'), FIELD(h, 8, 't'), FIELD(pos, 8, 'L'), FIELD(vel, 8, 'L'), FIELD(cmd, 8, 'L'), FIELD(goal, 8, 'L'),
     FIELD(track, 8, 'S'), FIELD(active, 1, 'l'), FIELD(final, 1, 'l'), FIELD(present, 1, 'l'),
     FIELD(chosen, 2, 'l'), FIELD(reason, 1, 'l'),

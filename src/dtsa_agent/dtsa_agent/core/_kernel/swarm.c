@@ -37,8 +37,9 @@ static void rehash(swarm *s, int view, int k)
         x = mix64(x ^ bits(s->sent_p[plane + (long)i * s->n]));
         x = mix64(x ^ bits(s->sent_v[plane + (long)i * s->n]));
     }
-    s->view_hash[view] ^= s->entry_hash[at] ^ x;
-    s->entry_hash[at] = x;
+    const uint32_t hash = (uint32_t)(x ^ x >> 32); /* players of bags refuse numbers that a double cannot hold */
+    s->view_hash[view] ^= s->entry_hash[at] ^ hash;
+    s->entry_hash[at] = hash;
 }
 
 void swarm_reset_view(swarm *s, int view)
@@ -219,8 +220,7 @@ void swarm_decide(swarm *s, int64_t slot)
         s->chosen[l] = (uint16_t)(c.index + 1);
         s->reason[l] = (uint8_t)c.reason;
         s->score[l] = c.score;
-        uint64_t hash = s->view_hash[view];
-        s->digest[l] = (uint32_t)(hash ^ hash >> 32);
+        s->digest[l] = s->view_hash[view];
         s->sends[l] = c.index == self && s->present[l];
     }
 }
