@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rclpy.duration import Duration
 
 from dtsa_agent.core.alignment import ClockAligner
+from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 from dtsa_agent.core.swarm import PRESENT_LEAVING
 
@@ -26,7 +27,6 @@ from .wire import split_frames, unpack_received
 _PPB = 1_000_000_000
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
-_C_S, _FAREWELL = 2, 255  # byte of an extended frame, and its value in the last one of an agent that leaves
 _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
 _LEAD = 0.25  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time
 
@@ -290,8 +290,9 @@ class RealtimeNode(SwarmNode):
                 swarm.frame_length[index] = 0
                 offsets[index] = starts[index]
                 self.unsent += 1
-            elif swarm.present[index] == PRESENT_LEAVING and swarm.frames[index, _C_S] == _FAREWELL:
-                self._gone[index] = True
+            elif swarm.present[index] == PRESENT_LEAVING:
+                frame = swarm.frames[index, : swarm.frame_length[index]].tobytes()
+                self._gone[index] = decode_extended(frame).leaving
         self._message.offset_ns = array("q", offsets.tobytes())
         seconds, nanoseconds = divmod(names.slot_time_ns(slot, self.slot_ns), _PPB)
         self.slot = slot
