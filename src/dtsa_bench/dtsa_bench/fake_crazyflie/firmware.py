@@ -183,11 +183,12 @@ class Firmware:
         :return: OFF, FLY or LEVEL, and the velocity command in m/s.
         """
         allowed = self.supervisor.motors_allowed
-        if allowed:
-            self._follow_planner(t, position, velocity)
-        else:
+        if not allowed:
             self.planner.stop()
-            self._here = Goal(position, velocity, yaw=self.yaw)
+        goal = self.planner.goal(t)
+        self._here = goal or Goal(position, velocity, yaw=self.yaw)
+        if allowed and self._priority <= PRIORITY_HIGH_LEVEL:
+            self._follow_planner(t, goal)
         setpoint = self.setpoint if allowed else None
         thrust = setpoint is not None and setpoint.motors
         age = math.inf if setpoint is None else t - setpoint.time
@@ -200,12 +201,8 @@ class Firmware:
             return LEVEL, command
         return FLY, command
 
-    def _follow_planner(self, t: float, position: Triple, velocity: Triple) -> None:
+    def _follow_planner(self, t: float, goal: Goal | None) -> None:
         """The high-level commander's setpoint: where to be, or motors off if it has nothing to fly."""
-        goal = self.planner.goal(t)
-        self._here = goal or Goal(position, velocity, yaw=self.yaw)
-        if self._priority > PRIORITY_HIGH_LEVEL:
-            return
         self._priority = PRIORITY_HIGH_LEVEL
         if goal is None:
             self.setpoint = Setpoint(t, motors=False)
