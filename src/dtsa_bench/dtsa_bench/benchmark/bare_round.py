@@ -7,6 +7,7 @@ is the process that answers.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import tempfile
@@ -26,7 +27,7 @@ from dtsa_agent.ros.process import node_options, run_node
 
 from ..fly.children import Children
 from ..fly.domain import ros_domain
-from ..fly.flight import ENVIRONMENT
+from ..fly.flight import run_environment
 
 _ASK, _ANSWER, _OVER = "/bare_round/ask", "/bare_round/answer", 2**32 - 1
 _START_S = 60.0
@@ -41,10 +42,8 @@ def rounds_per_s(processes: int, rounds: int, repeats: int) -> list[float]:
     :raises DtsaError: if a process ends, or they do not find each other.
     """
     with ros_domain() as domain, tempfile.TemporaryDirectory() as place:
-        for name, value in ENVIRONMENT.items():
-            os.environ.setdefault(name, value)
         context = Context()
-        children = Children(Path(place), {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": place})
+        children = Children(Path(place), run_environment(domain, Path(place)))
         try:
             for number in range(1, processes + 1):
                 children.start(f"process {number}", [], __name__, [])
@@ -81,28 +80,22 @@ class _Asker:
     def _meet(self) -> None:
         """Asks until all have answered one question."""
         deadline = time.monotonic() + _START_S
-        heard = 0
-        while heard < self._processes:
-            self._children.check()
+        while (heard := self._round(patience_s=0.2)) < self._processes:
             if time.monotonic() > deadline:
                 raise DtsaError(f"only {heard} of {self._processes} processes answer after {_START_S:g} s")
-            self._number += 1
-            self._publisher.publish(UInt32(data=self._number))
-            end, heard = time.monotonic() + 0.2, 0
-            while time.monotonic() < end and heard < self._processes:
-                message = self._loop.wait()
-                heard += message is not None and message.data == self._number
 
-    def _round(self) -> None:
+    def _round(self, patience_s: float = math.inf) -> int:
+        """Asks once; how many have answered that within a time."""
         self._number += 1
         self._publisher.publish(UInt32(data=self._number))
-        heard = 0
-        while heard < self._processes:
+        end, heard = time.monotonic() + patience_s, 0
+        while heard < self._processes and time.monotonic() < end:
             message = self._loop.wait()
             if message is None:
                 self._children.check()
             else:
                 heard += message.data == self._number
+        return heard
 
 
 def _body(stop: Stop, supervised: bool) -> None:
@@ -111,9 +104,10 @@ def _body(stop: Stop, supervised: bool) -> None:
     loop = Loop(node, UInt32, _ASK, names.lockstep_qos())
 
     def answer(message: UInt32) -> bool:
-        if message.data != _OVER:
-            publisher.publish(message)
-        return bool(message.data != _OVER)
+        if message.data == _OVER:
+            return False
+        publisher.publish(message)
+        return True
 
     try:
         loop.run(answer, lambda: None, stop)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import threading
@@ -45,7 +44,7 @@ from dtsa_channel_sim.channel_node import declare_channel
 
 from .children import Child, Children, describe_end
 from .domain import ros_domain
-from .flight import ENVIRONMENT, Flight, FlightOptions, SupervisedRealtimeChannel
+from .flight import Flight, FlightOptions, SupervisedRealtimeChannel, run_environment
 from .progress import ProgressLine
 
 PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
@@ -196,12 +195,13 @@ class Mission:
         self._spinner.join(2.0)
         self._pulse.join(2.0)
 
-    def call(self, kind: Any, name: str, timeout: float = 10.0, **fields: Any) -> Any:
+    def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
         """Call a service.
 
         :raises MissionError: it does not answer or says no.
         """
-        future = self._clients[name].call_async(kind.Request(**fields))
+        client = self._clients[name]
+        future = client.call_async(client.srv_type.Request(**fields))
         end = time.monotonic() + timeout
         while not future.done():
             self.bridge_alive()
@@ -238,13 +238,13 @@ class Mission:
         self._beating.set()
         self.wait("the connection", lambda: self._all(Status.STATE_READY), 10.0)
         self.say("arming")
-        self.call(Arm, "/all/arm", arm=True)
+        self.call("/all/arm", arm=True)
         self.wait("arming", lambda: self._all(Status.STATE_ARMED), 5.0)
         height = self.settings.station.room_origin_in_world[2]
         limit = self.settings.station.max_speed_mps
         seconds = max(2.0, height / CLIMB_MPS, shortest_s(height, limit))
         self.say("take-off")
-        self.call(Takeoff, "/all/takeoff", height=height, duration=_duration(seconds))
+        self.call("/all/takeoff", height=height, duration=_duration(seconds))
         time.sleep(seconds)
         self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
         self.wait("odometry", lambda: len(self.place) == len(self.settings.robots), 5.0)
@@ -252,7 +252,7 @@ class Mission:
             way = float(np.linalg.norm(np.subtract(start, self.place[robot.name])))
             seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))
             goal = Point(x=start[0], y=start[1], z=start[2])
-            self.call(GoTo, f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
+            self.call(f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
         self.wait("the way to the start", self._at_start, 20.0)
         time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count
         # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
@@ -328,10 +328,7 @@ def fly_crazyflies(
         directory = new_directory(out)
         logs = directory / "log"
         logs.mkdir()
-        for name, value in ENVIRONMENT.items():
-            os.environ.setdefault(name, value)
-        environment = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs.resolve())}
-        os.environ["ROS_LOG_DIR"] = environment["ROS_LOG_DIR"]
+        environment = run_environment(domain, logs)
         context = Context()
         progress = ProgressLine("fly")
         bridge, agents = Children(logs, environment), Children(logs, environment)

@@ -46,6 +46,18 @@ ENVIRONMENT = {
 }
 
 
+def run_environment(domain: int, logs: Path) -> dict[str, str]:
+    """Variables for the processes of a run; this process gets those that its own node needs.
+
+    :param domain: ROS domain.
+    :param logs: directory for ROS's logs.
+    """
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    os.environ["ROS_LOG_DIR"] = str(logs.resolve())
+    return {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs.resolve())}
+
+
 @dataclass(frozen=True, slots=True)
 class FlightOptions:
     """How a flight is carried out; none of it changes what happens in it."""
@@ -230,12 +242,8 @@ def fly(
     with ros_domain(options.domain) as domain:
         directory = new_directory(out)
         (directory / "log").mkdir()
-        for name, value in ENVIRONMENT.items():
-            os.environ.setdefault(name, value)
-        environment = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str((directory / "log").resolve())}
-        os.environ["ROS_LOG_DIR"] = environment["ROS_LOG_DIR"]
         context = Context()
-        children = Children(directory / "log", environment)
+        children = Children(directory / "log", run_environment(domain, directory / "log"))
         progress = ProgressLine(label)
         # Started first: the interpreter of each process needs longer than all that follows here.
         late = _start_agents(children, run, options, directory)
