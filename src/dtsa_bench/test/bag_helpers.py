@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -160,3 +161,13 @@ def synthetic_bag(directory: Path, slots: int = 100, **options: Any) -> Syntheti
         for slot in range(slots):
             run.slot(slot)
     return run
+
+
+def ros_environment() -> dict[str, str]:
+    """Environment for nodes that hear nobody else."""
+    return {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(os.getpid() % 90 + 10),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+    }

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from bag_helpers import SECOND, SyntheticRun, synthetic_bag
+from bag_helpers import SECOND, SyntheticRun, ros_environment, synthetic_bag
 from metronome import flown_again_when_overloaded
 
 from dtsa_agent.core.errors import ConfigError
@@ -176,16 +176,6 @@ def test_reading_ahead_is_bounded(run: SyntheticRun, monkeypatch: pytest.MonkeyP
 
 
 # ---- with ROS ----
-
-
-def ros_environment() -> dict[str, str]:
-    """Environment for nodes that hear nobody else."""
-    return {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(os.getpid() % 90 + 10),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "PYTHONUNBUFFERED": "1",
-    }
 
 
 def need_ros() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from bag_helpers import SECOND, SyntheticRun, synthetic_bag
+from bag_helpers import SECOND, SyntheticRun, ros_environment, synthetic_bag
 from metronome import flown_again_when_overloaded
 
 from dtsa_bench.bag.errors import UnusableBag
@@ -30,12 +30,7 @@ def has_ros2_bag() -> bool:
 pytestmark = pytest.mark.skipif(
     not has_ros2_bag(), reason="no `ros2 bag` on this machine: it comes with an installation of ROS 2"
 )
-ENVIRONMENT = {
-    **os.environ,
-    "ROS_DOMAIN_ID": str(os.getpid() % 90 + 10),
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    "PYTHONUNBUFFERED": "1",
-}
+ENVIRONMENT = ros_environment()
 
 
 def ros2(*words: str, timeout: float = 60) -> str:
@@ -202,21 +197,23 @@ def test_info_and_reindex_take_a_recovered_bag(tmp_path: Path) -> None:
         ros2("reindex", str(tmp_path / "saved"))
 
 
-def test_split_bags_are_joined_as_the_reader_says(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            {"max_bagfile_duration": 1, "storage_preset_profile": "zstd_small"},
+            r"holds 2 .mcap files: .* join them with `ros2 bag convert`",
+        ),
+        ({"compression_mode": "file", "compression_format": "zstd"}, "compressed as a whole; `ros2 bag convert`"),
+    ],
+    ids=["split", "packed"],
+)
+def test_bags_are_made_plain_as_the_reader_says(tmp_path: Path, options: dict[str, object], said: str) -> None:
     run = synthetic_bag(tmp_path / "flight", slots=150)
-    convert(run.writer.directory, tmp_path / "split", max_bagfile_duration=1, storage_preset_profile="zstd_small")
-    with pytest.raises(UnusableBag, match=r"holds 2 .mcap files: .* join them with `ros2 bag convert`"):
-        Bag(tmp_path / "split")
-    convert(tmp_path / "split", tmp_path / "joined")
-    assert rows(tmp_path / "joined") == rows(run.writer.directory)
-
-
-def test_packed_files_are_unpacked_as_the_reader_says(tmp_path: Path) -> None:
-    run = synthetic_bag(tmp_path / "flight", slots=50)
-    convert(run.writer.directory, tmp_path / "packed", compression_mode="file", compression_format="zstd")
-    with pytest.raises(UnusableBag, match="compressed as a whole; `ros2 bag convert`"):
-        Bag(tmp_path / "packed")
-    convert(tmp_path / "packed", tmp_path / "plain")
+    convert(run.writer.directory, tmp_path / "other", **options)
+    with pytest.raises(UnusableBag, match=said):
+        Bag(tmp_path / "other")
+    convert(tmp_path / "other", tmp_path / "plain")
     assert rows(tmp_path / "plain") == rows(run.writer.directory)
 
 

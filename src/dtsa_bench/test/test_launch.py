@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from bag_helpers import ros_environment
 
 from dtsa_bench.bag.reader import Bag
 
@@ -19,12 +19,6 @@ pytestmark = pytest.mark.skipif(shutil.which("ros2") is None, reason="no `ros2` 
 
 def launch(tmp_path: Path, *words: str) -> str:
     """Output of `ros2 launch dtsa_bench swarm_launch.py ...`."""
-    environment = {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(os.getpid() % 90 + 10),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_LOG_DIR": str(tmp_path / "log"),
-    }
     result = subprocess.run(
         ["ros2", "launch", "dtsa_bench", "swarm_launch.py", *words],
         stdin=subprocess.DEVNULL,
@@ -32,7 +26,7 @@ def launch(tmp_path: Path, *words: str) -> str:
         stderr=subprocess.STDOUT,
         text=True,
         timeout=120,
-        env=environment,
+        env=ros_environment() | {"ROS_LOG_DIR": str(tmp_path / "log")},
         check=False,
     )
     return result.stdout
