@@ -22,5 +22,5 @@ setup(
     maintainer_email="maintainers@dtsa.example",
     description="The radio channel that a swarm shares: slots, collisions, losses, ranges, clocks.",
     license="Apache-2.0",
-    entry_points={"console_scripts": ["channel = dtsa_channel_sim.channel_node:main"]},
+    entry_points={"console_scripts": ["channel = dtsa_channel_sim.ros.channel_node:main"]},
 )

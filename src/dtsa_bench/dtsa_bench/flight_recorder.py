@@ -12,14 +12,14 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import REASONS
-from dtsa_agent.ros import names
-from dtsa_agent.ros.wire import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.wire import pack_received
 from dtsa_bench.bag.cdr import HEADER, SECOND, CdrBuilder, OdometryPacker
 from dtsa_bench.bag.writer import BagWriter
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim import Change
-from dtsa_channel_sim.answers import Answers
-from dtsa_channel_sim.verdict import Verdict
+from dtsa_channel_sim.model.verdict import Verdict
+from dtsa_channel_sim.ros.answers import Answers
 
 
 def stamp(time_ns: int) -> Time:

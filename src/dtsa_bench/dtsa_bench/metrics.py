@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core import Scenario, Swarm, _kernel
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
-from dtsa_channel_sim.verdict import COLLISION, IDLE, SUCCESS
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .run_config import RunConfig
 

@@ -17,10 +17,10 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.ros import names
-from dtsa_agent.ros.loop import Stop
-from dtsa_agent.ros.parameters import declare_from_dataclass
-from dtsa_agent.ros.process import run_node
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.parameters import declare_from_dataclass
+from dtsa_agent.ros.common.process import run_node
 from dtsa_bench.bag.cdr import (
     COLLIDED,
     QUIET,
@@ -34,11 +34,11 @@ from dtsa_bench.metrics import FlightMetrics, metrics_tables
 from dtsa_bench.options import FROM_SWARM, new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig, RunLimits
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.answers import Answers
-from dtsa_channel_sim.channel_node import ChannelStatus, declare_limits, follow_parameters
-from dtsa_channel_sim.lockstep import LockstepChannel
-from dtsa_channel_sim.realtime_channel import RealtimeChannel
-from dtsa_channel_sim.verdict import COLLISION, Verdict
+from dtsa_channel_sim.model.verdict import COLLISION, Verdict
+from dtsa_channel_sim.ros.answers import Answers
+from dtsa_channel_sim.ros.channel_node import ChannelStatus, declare_limits, follow_parameters
+from dtsa_channel_sim.ros.lockstep import LockstepChannel
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 BAG = "bag"  # the bag's directory within a flight's directory
 _MARKER_PERIOD_S = 0.04  # wall time, where somebody watches

@@ -17,7 +17,7 @@ from dtsa_agent.core import Scenario, Swarm, make_scenario
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim import Channel
-from dtsa_channel_sim.verdict import SUCCESS
+from dtsa_channel_sim.model.verdict import SUCCESS
 
 from .metrics import FlightMetrics
 from .run_config import RunConfig

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.ros.wire import split_frames
+from dtsa_agent.ros.common.wire import split_frames
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.verify import verify_bag
 

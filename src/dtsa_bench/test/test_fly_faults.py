@@ -116,7 +116,7 @@ rclpy.spin(node)
 )
 def test_a_node_that_sends_garbage_is_named_and_the_others_end(tmp_path: Path, kind: str, said: str) -> None:
     with ros_graph(tmp_path) as graph:
-        channel = graph.start("dtsa_channel_sim.channel_node", "-p", "agents:=2")
+        channel = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2")
         agent = graph.start("dtsa_agent.ros.agent_node", "-p", "id:=1", "-p", "agents:=2")
         noise = subprocess.Popen([sys.executable, "-c", NOISE, kind], env=graph.environment, stderr=subprocess.DEVNULL)
         try:

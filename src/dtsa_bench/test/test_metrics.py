@@ -11,7 +11,7 @@ from dtsa_agent.core import Scenario, Swarm, SwarmConfig, make_scenario
 from dtsa_bench.metrics import COMPLETED, CRASHED, TIMED_OUT, FlightMetrics, metrics_tables
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.verdict import COLLISION, IDLE, SUCCESS
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 
 def pair_on_a_line(**limits: float) -> tuple[FlightMetrics, Scenario]:

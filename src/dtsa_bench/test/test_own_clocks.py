@@ -9,7 +9,7 @@ import pytest
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.protocol_bench.own_clocks import OwnClocks
 from dtsa_channel_sim import ChannelConfig
-from dtsa_channel_sim.clocks import AgentClock
+from dtsa_channel_sim.model.clocks import AgentClock
 
 S = 1_000_000_000
 

@@ -24,7 +24,7 @@ from dtsa_bench.bag.reader import Bag
 from dtsa_bench.metrics import COMPLETED, FlightMetrics
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_bench.verify import verify_bag
-from dtsa_channel_sim.verdict import SUCCESS
+from dtsa_channel_sim.model.verdict import SUCCESS
 
 PATIENCE_S = 100.0
 # Room enough that nobody is where another one appears again; without OPEN turns and adoption no frames may ever meet.
@@ -235,7 +235,7 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
     from dtsa_msgs.msg import Slot
     from node_helpers import end_of, ros_graph
 
-    from dtsa_agent.ros import names
+    from dtsa_agent.ros.common import names
 
     with ros_graph(tmp_path) as graph:
         channel = graph.node.create_publisher(Slot, "/swarm/slot", names.lockstep_qos(4))

@@ -1,14 +1,14 @@
 """The radio channel that a swarm shares: slots, collisions, losses, ranges and clocks."""
 
-from .airtime import Airtime
-from .channel import Channel
-from .clocks import AgentClock, ClockConfig, make_clocks
-from .config import CHANGEABLE, Change, ChannelConfig
-from .config_fields import FieldInfo, fields_of
-from .medium import OnAir
-from .realtime import FrameVerdict, RealtimeArbiter
-from .topology import LinkLoss
-from .verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
+from .model.airtime import Airtime
+from .model.channel import Channel
+from .model.clocks import AgentClock, ClockConfig, make_clocks
+from .model.config import CHANGEABLE, Change, ChannelConfig
+from .model.config_fields import FieldInfo, fields_of
+from .model.medium import OnAir
+from .model.realtime import FrameVerdict, RealtimeArbiter
+from .model.topology import LinkLoss
+from .model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
 
 __all__ = [
     "CHANGEABLE",

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_channel_sim import CHANGEABLE, Change, Channel, ChannelConfig, LinkLoss
-from dtsa_channel_sim.timeline import Timeline
-from dtsa_channel_sim.topology import format_ids, format_partition, parse_ids, parse_partition
+from dtsa_channel_sim.model.timeline import Timeline
+from dtsa_channel_sim.model.topology import format_ids, format_partition, parse_ids, parse_partition
 
 
 @pytest.mark.parametrize(

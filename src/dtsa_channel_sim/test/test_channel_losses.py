@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.draws import STATE, WordBlocks, sender_factors, threshold
-from dtsa_channel_sim.gilbert import Chains, GilbertElliott
+from dtsa_channel_sim.model.draws import STATE, WordBlocks, sender_factors, threshold
+from dtsa_channel_sim.model.gilbert import Chains, GilbertElliott
 
 MODELS = {
     "independent": {"loss": 0.3},

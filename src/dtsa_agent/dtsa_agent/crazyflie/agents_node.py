@@ -23,10 +23,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_agent.crazyflie.units import rotate
-from dtsa_agent.ros import names
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.process import run_node
 from dtsa_agent.ros.hosting import declare_swarm
-from dtsa_agent.ros.loop import Stop
-from dtsa_agent.ros.process import run_node
 from dtsa_agent.ros.realtime import RealtimeNode
 from dtsa_agent.ros.swarm_node import parse_ids
 

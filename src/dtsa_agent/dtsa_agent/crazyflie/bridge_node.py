@@ -30,7 +30,7 @@ from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
 from dtsa_agent.crazyflie.priority import stay_on_one_processor, take_priority
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
-from dtsa_agent.ros.process import follow_supervisor
+from dtsa_agent.ros.common.process import follow_supervisor
 
 STATUS_HZ = 5.0
 SWITCH_S = 0.0005

@@ -11,10 +11,10 @@ from rclpy.node import Node
 from dtsa_agent.core.config import MAX_AGENTS
 from dtsa_agent.core.errors import ConfigError
 
-from . import names
+from .common import names
+from .common.loop import Stop
+from .common.process import node_options, run_node
 from .hosting import declare_swarm, host_agents
-from .loop import Stop
-from .process import node_options, run_node
 
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
 

@@ -12,9 +12,9 @@ from rclpy.node import Node
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 
-from . import names
-from .loop import Stop
-from .parameters import declare_from_dataclass
+from .common import names
+from .common.loop import Stop
+from .common.parameters import declare_from_dataclass
 from .swarm_node import SwarmNode
 
 MODES = ("lockstep", "realtime")

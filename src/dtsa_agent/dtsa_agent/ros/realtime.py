@@ -18,11 +18,11 @@ from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 from dtsa_agent.core.swarm import PRESENT_LEAVING
 
-from . import names
+from .common import names
+from .common.loop import Stop
+from .common.wire import split_frames, unpack_received
 from .joining import Listeners, Newcomers
-from .loop import Stop
 from .swarm_node import SwarmNode
-from .wire import split_frames, unpack_received
 
 _PPB = 1_000_000_000
 _PATIENCE_NS = 50_000_000

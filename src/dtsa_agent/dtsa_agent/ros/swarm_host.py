@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
-from . import names
+from .common import names
+from .common.loop import Stop
+from .common.process import node_options, run_node
 from .hosting import declare_swarm, host_agents
-from .loop import Stop
-from .process import node_options, run_node
 from .swarm_node import parse_ids
 
 

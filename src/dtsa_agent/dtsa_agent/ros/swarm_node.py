@@ -20,9 +20,9 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtoc
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.keys import with_key
 
-from . import names
-from .loop import Loop, Stop
-from .wire import split_frames, unpack_received
+from .common import names
+from .common.loop import Loop, Stop
+from .common.wire import split_frames, unpack_received
 
 _ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
 _GONE_S = 2.0  # a channel that nobody has seen for so long will not come back

@@ -21,9 +21,9 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt32
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros import names
-from dtsa_agent.ros.loop import Loop, Stop
-from dtsa_agent.ros.process import node_options, run_node
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Loop, Stop
+from dtsa_agent.ros.common.process import node_options, run_node
 
 from ..fly.children import Children
 from ..fly.domain import ros_domain

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.ros.process import follow_supervisor
+from dtsa_agent.ros.common.process import follow_supervisor
 from dtsa_bench.fake_crazyflie import crtp
 from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig
 

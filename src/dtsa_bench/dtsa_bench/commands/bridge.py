@@ -74,7 +74,7 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     import yaml
 
     from dtsa_agent.crazyflie.config import load_swarm
-    from dtsa_agent.ros.process import SUPERVISOR
+    from dtsa_agent.ros.common.process import SUPERVISOR
     from dtsa_bench.fake_crazyflie.ports import FIRST, free_base_port
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     directory = _directory(args.out)
 
-    from dtsa_agent.ros.loop import Stop
+    from dtsa_agent.ros.common.loop import Stop
     from dtsa_bench.fly.flight import Flight, fly
     from dtsa_bench.trajectories import draw_flights
 

@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     directory = Path(args.out)
 
-    from dtsa_agent.ros.loop import Stop
+    from dtsa_agent.ros.common.loop import Stop
     from dtsa_bench.fly.flight import FlightOptions, fly
 
     options = FlightOptions(
@@ -141,7 +141,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     path = Path(args.config)
     settings = load_swarm(path)
-    from dtsa_agent.ros.loop import Stop
+    from dtsa_agent.ros.common.loop import Stop
     from dtsa_bench.fly.crazyflie import fly_crazyflies, mission_defaults
     from dtsa_bench.fly.flight import FlightOptions
 

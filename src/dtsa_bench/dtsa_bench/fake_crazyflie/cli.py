@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
         request_fault(args)
         return 0
     if "DTSA_SUPERVISOR" in os.environ:  # the bridge started this fleet for itself, and has rclpy
-        from dtsa_agent.ros.process import follow_supervisor
+        from dtsa_agent.ros.common.process import follow_supervisor
 
         follow_supervisor()
     if not 0 <= args.priority <= 90:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.process import SUPERVISOR
+from dtsa_agent.ros.common.process import SUPERVISOR
 
 _LEAVE_S = 1.0  # to end by themselves once the run is over
 _TERM_S = 1.0  # to end after SIGTERM

@@ -34,13 +34,13 @@ from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.paths import shortest_s
 from dtsa_agent.crazyflie.priority import give_way, take_priority
 from dtsa_agent.crazyflie.units import to_map
-from dtsa_agent.ros import names
-from dtsa_agent.ros.loop import Stop
-from dtsa_agent.ros.parameters import to_parameters
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_bench.options import new_directory
 from dtsa_bench.recorded_channel import BAG, write_results
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
-from dtsa_channel_sim.channel_node import declare_channel
+from dtsa_channel_sim.ros.channel_node import declare_channel
 
 from .children import Child, Children, describe_end
 from .domain import ros_domain

@@ -20,19 +20,19 @@ from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros import names
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.joining import check_joinable
-from dtsa_agent.ros.loop import Stop
-from dtsa_agent.ros.parameters import to_parameters
 from dtsa_bench.metrics import FlightMetrics
 from dtsa_bench.options import new_directory
 from dtsa_bench.recorded_channel import BAG, RealtimeRecordedChannel, RecordedChannel, write_results
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
 from dtsa_channel_sim import make_clocks
-from dtsa_channel_sim.answers import named
-from dtsa_channel_sim.channel_node import declare_channel
-from dtsa_channel_sim.realtime_channel import LOST_AFTER_S
+from dtsa_channel_sim.ros.answers import named
+from dtsa_channel_sim.ros.channel_node import declare_channel
+from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S
 
 from .children import Child, Children, NodeError, describe_end
 from .domain import ros_domain

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from dtsa_agent.core import Swarm, SwarmConfig, decode_frame
 from dtsa_agent.core.timebase import LISTENING, RESTARTED, TimeBase
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.clocks import AgentClock
-from dtsa_channel_sim.realtime import RealtimeArbiter
+from dtsa_channel_sim.model.clocks import AgentClock
+from dtsa_channel_sim.model.realtime import RealtimeArbiter
 
 from .experiment import FAR, still_scenario
 

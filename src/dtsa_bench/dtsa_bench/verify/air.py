@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.medium import OnAir
-from dtsa_channel_sim.realtime import RealtimeArbiter
+from dtsa_channel_sim.model.medium import OnAir
+from dtsa_channel_sim.model.realtime import RealtimeArbiter
 
 from .result import Difference, Mismatch
 
@@ -205,6 +205,6 @@ def _shown(received: Mask, lost: int, collided: int) -> tuple[str, str, str]:
 
 
 def _ids(mask: Mask) -> str:
-    from dtsa_channel_sim.answers import named
+    from dtsa_channel_sim.ros.answers import named
 
     return named((np.flatnonzero(mask) + 1).tolist())

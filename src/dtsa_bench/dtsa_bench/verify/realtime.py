@@ -20,11 +20,11 @@ from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.frame import Frame, decode_frame, encode_frame
 from dtsa_agent.core.frame_extended import ExtendedFrame, decode_extended, encode_extended
 from dtsa_agent.keys import VARIABLE
-from dtsa_agent.ros import names
-from dtsa_agent.ros.wire import split_frames, unpack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.wire import split_frames, unpack_received
 from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.run_config import RunConfig
-from dtsa_channel_sim.verdict import COLLISION, IDLE, SUCCESS
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .air import Air
 from .lockstep import parameter_value

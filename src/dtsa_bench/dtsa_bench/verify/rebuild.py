@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from dtsa_agent.core import REASONS, make_scenario
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
-from dtsa_agent.ros import names
-from dtsa_agent.ros.wire import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.wire import pack_received
 from dtsa_bench.bag.cdr import OdometryPacker
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim import Channel
-from dtsa_channel_sim.verdict import SUCCESS, Verdict
+from dtsa_channel_sim.model.verdict import SUCCESS, Verdict
 
 from .layout import Layout
 

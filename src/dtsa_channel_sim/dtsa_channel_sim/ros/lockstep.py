@@ -11,12 +11,12 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.ros import names
+from dtsa_agent.ros.common import names
+from dtsa_channel_sim.model.channel import Channel
+from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import named
-from .channel import Channel
 from .ros_channel import RosChannel, put_frames, slot_stamp
-from .verdict import Verdict
 
 _REPEAT_S = 0.1  # until all agents have answered slot 0, it is sent again and again
 _GARBAGE_PATIENCE_S = 0.5

@@ -12,14 +12,14 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.ros import names
+from dtsa_agent.ros.common import names
+from dtsa_channel_sim.model.airtime import LONGEST_FRAME
+from dtsa_channel_sim.model.channel import Channel
+from dtsa_channel_sim.model.realtime import FrameVerdict, RealtimeArbiter
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 
-from .airtime import LONGEST_FRAME
 from .answers import Answers, named
-from .channel import Channel
-from .realtime import FrameVerdict, RealtimeArbiter
 from .ros_channel import RosChannel, put_frames, slot_stamp
-from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 _NS = 1_000_000_000
 _TICK_NS = 500_000

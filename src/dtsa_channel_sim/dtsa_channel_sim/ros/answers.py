@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import RemoteProtocolError
-from dtsa_agent.ros.wire import split_frames
+from dtsa_agent.ros.common.wire import split_frames
 
 Array = NDArray[np.float64]
 

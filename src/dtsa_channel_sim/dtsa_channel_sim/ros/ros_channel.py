@@ -12,13 +12,13 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from dtsa_agent.ros import names
-from dtsa_agent.ros.loop import Loop
-from dtsa_agent.ros.wire import pack_received
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Loop
+from dtsa_agent.ros.common.wire import pack_received
+from dtsa_channel_sim.model.channel import Channel
+from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Answers
-from .channel import Channel
-from .verdict import Verdict
 
 _REPEAT_S = 0.1
 

@@ -71,7 +71,7 @@ class Channel:
         """Change settings while the channel runs; return the change, to be recorded and made again.
 
         :param slot: first slot with the new values; None: the one after the last slot arbitrated.
-        :param values: new values by name, of :data:`~dtsa_channel_sim.config.CHANGEABLE` settings.
+        :param values: new values by name, of :data:`~dtsa_channel_sim.model.config.CHANGEABLE` settings.
         :raises ConfigError: when a value is not allowed, or the slot has already been arbitrated. Nothing is
             changed then.
         """
@@ -113,7 +113,7 @@ class Channel:
             all start with the slot and any two overlap. Needs ``lengths``. What is still on air when its slot
             ends disturbs the next slot's frames; its own verdict has been given by then (settle frames in
             real time with
-            :class:`~dtsa_channel_sim.realtime.RealtimeArbiter` where that matters).
+            :class:`~dtsa_channel_sim.model.realtime.RealtimeArbiter` where that matters).
         :raises LocalProtocolError: when the arguments do not go together.
         """
         if not self._first <= slot < self._end:
