@@ -8,18 +8,6 @@ import shutil
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent.parent
-SOURCES = ROOT / "src"
-REQUIREMENTS = ROOT / "requirements"
-VENV = ROOT / ".venv"
-PYTHON = VENV / "bin" / "python"
-BUILD = ROOT / "build"
-INSTALL = ROOT / "install"
-COLCON_LOG = ROOT / "log"
-STATE = ROOT / ".dtsa"
-STEP_LOGS = STATE / "log"
-VENV_STAMPS = VENV / ".dtsa"
-
 DISTRIBUTION = "jazzy"
 EXTRAS = {
     "cflib": "the bridge to Crazyflie quadcopters",
@@ -45,6 +33,42 @@ class SetupError(Exception):
 def has_ros_installation() -> bool:
     """Whether an installation of ROS 2 Jazzy (apt, conda) is sourced; the wheels are not used then."""
     return os.environ.get("ROS_DISTRO") == DISTRIBUTION
+
+
+def kind() -> str:
+    """Where ROS comes from: `system` (apt, conda) or `wheels`."""
+    return "system" if has_ros_installation() else "wheels"
+
+
+def suffix(root: Path) -> str:
+    """Ending of the names of everything that is made for this kind of machine and this Python.
+
+    The first kind in a checkout has plain names (`.venv`, `build`); an installed ROS has `-jazzy`; another Python than
+    the one that is there has its version added. No kind takes away what another one uses.
+
+    :param root: the checkout.
+    """
+    plain = f"-{DISTRIBUTION}" if has_ros_installation() else ""
+    made_for = owner(root / f".venv{plain}")
+    return plain if made_for in ((), (python_version(),), (python_version(), kind())) else f"{plain}-{python_version()}"
+
+
+def owner(venv: Path) -> tuple[str, ...]:
+    """What a virtual environment was made for: version of Python and kind, as far as it is known.
+
+    :param venv: its directory.
+    :returns: nothing where there is none, or where its interpreter is gone.
+    """
+    if not (venv / "bin" / "python").exists():
+        return ()
+    stamped = read(venv / ".dtsa" / "venv").split()
+    if len(stamped) >= 2:
+        return stamped[0], stamped[1]
+    fields = dict(
+        (part.strip() for part in line.split("=", 1)) for line in read(venv / "pyvenv.cfg").splitlines() if "=" in line
+    )
+    version = fields.get("version", fields.get("version_info", ""))
+    return (".".join(version.split(".")[:2]),) if version else ()
 
 
 def base_python() -> str:
@@ -87,3 +111,17 @@ def write(path: Path, text: str) -> None:
     temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
+
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+SOURCES = ROOT / "src"
+REQUIREMENTS = ROOT / "requirements"
+SUFFIX = suffix(ROOT)
+VENV = ROOT / f".venv{SUFFIX}"
+PYTHON = VENV / "bin" / "python"
+BUILD = ROOT / f"build{SUFFIX}"
+INSTALL = ROOT / f"install{SUFFIX}"
+COLCON_LOG = ROOT / f"log{SUFFIX}"
+STATE = ROOT / ".dtsa"
+STEP_LOGS = STATE / f"log{SUFFIX}"
+VENV_STAMPS = VENV / ".dtsa"

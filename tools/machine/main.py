@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from machine import layout, prepare, workspace
+from machine import layout, prepare, processes, workspace
 from machine.layout import SetupError
 
 OWN_COMMANDS = {
@@ -17,6 +17,22 @@ OWN_COMMANDS = {
     "test": "run the whole test suite; arguments go to pytest",
     "ros2": "the ros2 command, or a small stand-in: run, pkg, interface",
     "clean": "remove what the build made; --all: the virtual environment, too",
+}
+HELP = ("-h", "--help")
+USAGE = {
+    "shell": """usage: tools/dtsa shell [BASH ARGUMENTS]
+
+Opens a shell in which the workspace is sourced; `tools/dtsa shell -c COMMAND` runs one command in it.""",
+    "test": """usage: tools/dtsa test [PYTEST ARGUMENTS]
+
+Installs what the tests need and runs them: all, or those that pytest's arguments choose.
+  tools/dtsa test -k frame -x                        tests with `frame` in their names, until one fails
+  tools/dtsa test src/dtsa_agent/test/test_frame.py  one file
+  tools/dtsa shell -c 'python3 -m pytest --help'     pytest's own help""",
+    "clean": """usage: tools/dtsa clean [--all]
+
+Removes what the build made for this kind of machine and this Python; what processes use stays.
+  --all   the virtual environment, too""",
 }
 TEST_EXTRAS = {"test", "dev", "cflib", "benchmark", "cluster"}
 BENCH = layout.SOURCES / "dtsa_bench"
@@ -30,8 +46,14 @@ def main(arguments: list[str]) -> int:
     """
     command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     try:
-        if command in ("-h", "--help", "help"):
+        if command in (*HELP, "help"):
             print(help_text())
+            return 0
+        if command == "--version":
+            print(f"dtsa {version()}")
+            return 0
+        if command in USAGE and rest[:1] and rest[0] in HELP:
+            print(USAGE[command])
             return 0
         if command in OWN_COMMANDS:
             own = (run_setup, run_shell, run_test, run_ros2, run_clean)
@@ -57,14 +79,23 @@ def bench_commands() -> dict[str, str]:
     return dict(available())
 
 
+def version() -> str:
+    """The project's version; nothing has to be installed for that."""
+    sys.path.insert(0, str(BENCH))
+    import dtsa_bench  # type: ignore[import-not-found, unused-ignore]
+
+    return str(dtsa_bench.__version__)
+
+
 def help_text() -> str:
     """Usage and all commands."""
-    lines = ["usage: tools/dtsa COMMAND [ARGUMENTS]        (tools/dtsa COMMAND --help says more)", ""]
+    lines = ["usage: tools/dtsa COMMAND [ARGUMENTS] | --version        (tools/dtsa COMMAND --help says more)", ""]
     for title, commands in (("flights and experiments:", bench_commands()), ("machine:", OWN_COMMANDS)):
         lines += [title, *(f"  {name:<16} {text}" for name, text in commands.items()), ""]
     lines += [
         "The first command on a machine makes .venv, installs the pinned packages and builds the workspace;",
-        "later ones rebuild only what changed. ROS 2 Jazzy from apt is used where ROS_DISTRO=jazzy is set.",
+        "later ones rebuild only what changed. ROS 2 Jazzy from apt is used where ROS_DISTRO=jazzy is set,",
+        "with an environment of its own (.venv-jazzy); so has another Python (.venv-3.12).",
     ]
     return "\n".join(lines)
 
@@ -92,7 +123,7 @@ def run_setup(arguments: list[str]) -> int:
     allowed = f"--extra {'|'.join(layout.EXTRAS)}, --all"
     for word in words:
         name = next(words, "") if word == "--extra" else word.removeprefix("--extra=")
-        if word in ("-h", "--help"):
+        if word in HELP:
             print("usage: tools/dtsa setup [--extra NAME]... [--all]\n\nextras:")
             print("\n".join(f"  {name:<16} {text}" for name, text in layout.EXTRAS.items()))
             return 0
@@ -120,7 +151,7 @@ def run_shell(arguments: list[str]) -> int:
     prepare.prepare(set())
     if arguments:
         return start("bash", arguments)
-    start_file = layout.STATE / "bashrc"
+    start_file = layout.STATE / f"bashrc{layout.SUFFIX}"
     unless = "command -v ros2 >/dev/null || " if layout.has_ros_installation() else ""
     layout.write(
         start_file,
@@ -159,6 +190,7 @@ def run_clean(arguments: list[str]) -> int:
     if arguments:
         directories.append(layout.VENV)
     with prepare.lock():
+        processes.refuse_if_used(directories)
         for directory in directories:
             shutil.rmtree(directory, ignore_errors=True)
         workspace.remove_kernel()

@@ -6,10 +6,16 @@ import fcntl
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TextIO
 
 from machine import layout, wheels, workspace
+from machine.layout import SetupError
+
+PATIENCE_S = 1800.0  # for the set-up of another process; a first one takes a few minutes
+POLL_S = 0.2
 
 
 def ready(extras: set[str]) -> bool:
@@ -31,7 +37,10 @@ def prepare(extras: set[str]) -> None:
             return
         from machine import checks
 
+        # All that can be missing is looked for before the first directory is touched.
         checks.check()
+        wheels.check_system_packages(extras)
+        workspace.colcon()
         if not wheels.has_venv():
             wheels.make_venv()
         missing = wheels.missing_sets(extras)
@@ -49,20 +58,44 @@ def interrupt(number: int, frame: object) -> None:
 
 @contextmanager
 def lock() -> Iterator[None]:
-    """One set-up at a time in this checkout."""
+    """One set-up at a time in this checkout.
+
+    :raises SetupError: if another one holds the lock for longer than `PATIENCE_S`.
+    """
     layout.STATE.mkdir(exist_ok=True)
     with (layout.STATE / "lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            print(
-                f"dtsa: waiting for the set-up of process {file.read().strip()} ...",
-                file=sys.stderr,
-                flush=True,
-            )
-            fcntl.flock(file, fcntl.LOCK_EX)
+        if not try_lock(file):
+            wait_for_lock(file)
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
         yield
+
+
+def try_lock(file: TextIO) -> bool:
+    """Take the lock if it is free."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def wait_for_lock(file: TextIO) -> None:
+    """Wait until the set-up of another process has ended.
+
+    :raises SetupError: if that takes too long.
+    """
+    file.seek(0)
+    holder = file.read().strip() or "unknown"
+    print(
+        f"dtsa: waiting for the set-up of process {holder}, at most {PATIENCE_S:.0f} s ...", file=sys.stderr, flush=True
+    )
+    deadline = time.monotonic() + PATIENCE_S
+    while not try_lock(file):
+        if time.monotonic() > deadline:
+            raise SetupError(
+                f"the set-up of process {holder} has not ended within {PATIENCE_S:.0f} s; wait for it or end it, "
+                "then run the same command again"
+            )
+        time.sleep(POLL_S)

@@ -11,10 +11,11 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from machine import cmake_paths, layout
+from machine import cmake_paths, layout, processes
 from machine.layout import SetupError
 from machine.progress import Step, step
 
@@ -42,8 +43,7 @@ def clean_environment() -> dict[str, str]:
 
 def venv_key() -> str:
     """Changes when the environment has to be made anew: other Python, other place, other kind of machine."""
-    kind = "system" if layout.has_ros_installation() else "wheels"
-    return f"{layout.python_version()} {kind} {layout.ROOT}"
+    return f"{layout.python_version()} {layout.kind()} {layout.ROOT}"
 
 
 def required_sets(extras: set[str]) -> list[str]:
@@ -69,10 +69,14 @@ def has_venv() -> bool:
 
 
 def make_venv() -> None:
-    """Make the virtual environment; one without a stamp that fits this Python is taken over as it is."""
-    with step("venv", "virtual environment (.venv)") as current:
+    """Make the virtual environment; one without a stamp that fits this Python is taken over as it is.
+
+    :raises SetupError: if the one that is there does not fit, and is in use.
+    """
+    with step("venv", f"virtual environment ({layout.VENV.name})") as current:
         environment = clean_environment()
         if not usable():
+            processes.refuse_if_used([layout.VENV])
             command = [layout.base_python(), "-m", "venv", "--clear"]
             if layout.has_ros_installation():
                 command.append("--system-site-packages")
@@ -98,12 +102,9 @@ def install(names: list[str]) -> None:
     :param names: the sets.
     """
     environment = clean_environment()
-    present = system_distributions() if layout.has_ros_installation() else set()
+    present = system_distributions(str(layout.PYTHON)) if layout.has_ros_installation() else set()
     for name in names:
-        lines = applicable(layout.read(layout.REQUIREMENTS / f"{name}.txt"))
-        if layout.has_ros_installation():
-            lines = [line for line in lines if line.split("==")[0] not in present]
-            require_system_packages(lines)
+        lines = [line for line in pinned(name) if line.split("==")[0] not in present]
         if lines:
             with step(f"install-{name}", f"{len(lines)} packages of requirements/{name}.txt") as current:
                 install_set(current, lines, environment)
@@ -112,18 +113,31 @@ def install(names: list[str]) -> None:
         layout.write(layout.VENV_STAMPS / name, set_key(name))
 
 
-def system_distributions() -> set[str]:
-    """Names of the packages that the system's Python, with the installed ROS, has already."""
-    command = [str(layout.PYTHON), "-c", PROBE]
+def pinned(name: str) -> list[str]:
+    """Requirements `name==version` of a set, for this Python."""
+    return applicable(layout.read(layout.REQUIREMENTS / f"{name}.txt"))
+
+
+def system_distributions(python: str) -> set[str]:
+    """Names of the packages that a Python, with the installed ROS, has already.
+
+    :param python: the interpreter.
+    """
+    command = [python, "-c", PROBE]
     return set(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.split())
 
 
-def require_system_packages(lines: list[str]) -> None:
-    """NumPy and what is built on it come from the system there: the messages of ROS are built with it.
+def check_system_packages(extras: set[str]) -> None:
+    """Beside an installed ROS, NumPy and what is built on it come from the system: its messages are built with it.
 
+    :param extras: sets of requirements beyond those of every machine.
     :raises SetupError: with the packages that are missing.
     """
-    needed = [SYSTEM_PACKAGES[name] for line in lines if (name := line.split("==")[0]) in SYSTEM_PACKAGES]
+    if not layout.has_ros_installation():
+        return
+    present = system_distributions(layout.base_python())
+    names = {line.split("==")[0] for part in required_sets(extras) for line in pinned(part)}
+    needed = [package for name, package in SYSTEM_PACKAGES.items() if name in names - present]
     if needed:
         raise SetupError(f"missing beside ROS 2 Jazzy: sudo apt install {' '.join(needed)}", code=2)
 
@@ -152,8 +166,12 @@ def install_set(current: Step, lines: list[str], environment: Mapping[str, str])
         current.note = f"(fetching {start} of {len(lacking)})"
         current.show()
         batch = lacking[start : start + BATCH]
-        fetch = ["wheel", *options, "--no-cache-dir", "--wheel-dir", str(store)]
-        current.run([*pip, *fetch, *batch], environment)
+        # Other checkouts use the store as well: a wheel gets into it whole, in one go.
+        with tempfile.TemporaryDirectory(prefix=".part-", dir=store) as part:
+            fetch = ["wheel", *options, "--no-cache-dir", "--wheel-dir", part]
+            current.run([*pip, *fetch, *batch], environment)
+            for wheel in Path(part).glob("*.whl"):
+                os.replace(wheel, store / wheel.name)
     current.note = ""
     current.run([*pip, "install", *options, "--no-index", *lines], environment)
 

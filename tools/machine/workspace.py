@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
+import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +24,7 @@ INSTALLED_FILES = {"package.xml", "setup.py", "setup.cfg", "CMakeLists.txt"}
 INSTALLED_DIRECTORIES = ("resource", "launch", "config", "msg", "srv", "action")
 COMPILED_SUFFIXES = (".c", ".h")
 PREFIX_PATHS = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH")
+JOBS = re.compile(r"(?:^|\s)(?:-?j|--jobs\b)")  # in MAKEFLAGS
 SETTINGS = "symlink-install ninja 1"  # changes when the way to build changes
 
 
@@ -78,8 +81,7 @@ def products(package: str) -> bool:
         return False
     if package == "dtsa_msgs":
         return True
-    kernel = layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "core"
-    if package == "dtsa_agent" and not any(name.endswith(".so") for name in os.listdir(kernel)):
+    if package == "dtsa_agent" and not kernel().exists():
         return False
     return any((installed / "lib").glob("python*/site-packages/*.egg-link"))
 
@@ -101,6 +103,12 @@ def changed_packages() -> list[str]:
 def build_environment() -> dict[str, str]:
     """Environment of `colcon build`."""
     environment = wheels.clean_environment()
+    # Without a number of jobs colcon adds a limit of the load (`-j2 -l2`): ninja then stands still for as long as
+    # others keep the machine busy.
+    jobs = len(os.sched_getaffinity(0))
+    if not JOBS.search(environment.get("MAKEFLAGS", "")):
+        environment["MAKEFLAGS"] = f"{environment.get('MAKEFLAGS', '')} -j{jobs}".strip()
+    environment.setdefault("CMAKE_BUILD_PARALLEL_LEVEL", str(jobs))
     if layout.has_ros_installation():
         if "PYTHONPATH" in os.environ:
             environment["PYTHONPATH"] = os.environ["PYTHONPATH"]
@@ -141,19 +149,25 @@ def build(packages: list[str]) -> None:
                     remove_kernel()
         (layout.INSTALL / ".dtsa-environment.json").unlink(missing_ok=True)
         arguments = ["--base-paths", str(layout.SOURCES), "--symlink-install", "--packages-select", *packages]
+        arguments += ["--build-base", str(layout.BUILD), "--install-base", str(layout.INSTALL)]
         arguments += ["--event-handlers", "console_cohesion+"]
         cmake = ["--cmake-args", "-DBUILD_TESTING=OFF", "-DCMAKE_BUILD_TYPE=Release"]
         if not layout.has_ros_installation():
             cmake += ["-GNinja", f"-DPython3_EXECUTABLE={layout.PYTHON}"]
-        current.run([colcon(), "build", *arguments, *cmake], build_environment())
+        current.run([colcon(), "--log-base", str(layout.COLCON_LOG), "build", *arguments, *cmake], build_environment())
         for package in packages:
             stamp(package)
 
 
+def kernel() -> Path:
+    """This Python's compiled kernel; `--symlink-install` puts it into the source tree."""
+    name = f"_kernel{sysconfig.get_config_var('EXT_SUFFIX')}"
+    return layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "core" / name
+
+
 def remove_kernel() -> None:
-    """Remove the compiled kernel from the source tree (`--symlink-install` puts it there)."""
-    for file in (layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "core").glob("_kernel.*.so"):
-        file.unlink(missing_ok=True)
+    """Remove this Python's compiled kernel from the source tree."""
+    kernel().unlink(missing_ok=True)
 
 
 def environment() -> dict[str, str]:

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from dtsa_bench import __version__
 from dtsa_bench.registry import available, module_name
 
 PROGRAM = "dtsa"
@@ -33,6 +34,7 @@ def build_parser(command: str | None) -> tuple[argparse.ArgumentParser, object |
     :returns: the parser, and the chosen command's module or None.
     """
     parser = OneLineParser(prog=PROGRAM, description="Channel access in quadcopter swarms.")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     subparsers = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, parser_class=OneLineParser, title="commands"
     )

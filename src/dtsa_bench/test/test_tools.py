@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import fcntl
+import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
-from machine import checks, cmake_paths, layout, main, prepare, progress, ros2, wheels, workspace
+import dtsa_bench
+from machine import checks, cmake_paths, layout, main, prepare, processes, progress, ros2, wheels, workspace
 
 DTSA = layout.ROOT / "tools" / "dtsa"
 
@@ -53,7 +58,7 @@ def pretend_built(package: str) -> None:
     (share / "package.sh").touch()
     (packages / f"{package}.egg-link").touch()
     if package == "dtsa_agent":
-        (layout.SOURCES / package / package / "core" / "_kernel.cpython-3.so").touch()
+        workspace.kernel().touch()
     workspace.stamp(package)
 
 
@@ -116,6 +121,112 @@ def test_a_moved_checkout_gets_a_new_environment(checkout: Path, monkeypatch: py
     assert wheels.has_venv()
     monkeypatch.setattr(layout, "ROOT", checkout / "elsewhere")
     assert not wheels.has_venv()
+
+
+def pretend_environment(directory: Path, stamp: str) -> None:
+    """Make the files by which a virtual environment is recognised.
+
+    :param stamp: version of Python and kind.
+    """
+    python = directory / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.symlink_to(sys.executable)
+    layout.write(directory / ".dtsa" / "venv", f"{stamp} {directory.parent}")
+
+
+def test_each_kind_of_machine_has_an_environment_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here = layout.python_version()
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+    assert layout.suffix(tmp_path) == ""
+    pretend_environment(tmp_path / ".venv", f"{here} wheels")
+    assert layout.suffix(tmp_path) == ""
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    assert layout.suffix(tmp_path) == "-jazzy"
+    pretend_environment(tmp_path / ".venv-jazzy", "3.9 system")
+    assert layout.suffix(tmp_path) == f"-jazzy-{here}"
+
+
+@pytest.mark.parametrize("stamp", ["3.9 wheels", f"{layout.python_version()} system"])
+def test_an_environment_of_another_kind_is_left_alone(
+    stamp: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+    pretend_environment(tmp_path / ".venv", stamp)
+    assert layout.suffix(tmp_path) == f"-{layout.python_version()}"
+    (tmp_path / ".venv" / "bin" / "python").unlink()  # the interpreter is gone: of no use to anybody
+    assert layout.suffix(tmp_path) == ""
+
+
+def test_an_environment_that_somebody_else_made_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+    pretend_environment(tmp_path / ".venv", "")
+    configuration = tmp_path / ".venv" / "pyvenv.cfg"
+    configuration.write_text(f"home = /usr/bin\nversion = {layout.python_version()}.1\n")
+    assert layout.suffix(tmp_path) == ""
+    configuration.write_text("home = /usr/bin\nversion_info = 3.9.2.final.0\n")
+    assert layout.suffix(tmp_path) == f"-{layout.python_version()}"
+
+
+@pytest.fixture
+def running(checkout: Path) -> Iterator[int]:
+    """Id of a process that runs from the checkout's virtual environment."""
+    layout.PYTHON.parent.mkdir(parents=True)
+    layout.PYTHON.symlink_to(sys.executable)
+    program = [str(layout.PYTHON), "-c", "print(flush=True); input()"]
+    process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.readline()
+    yield process.pid
+    process.communicate(b"\n", timeout=30)
+
+
+@pytest.mark.parametrize("remove", [wheels.make_venv, lambda: main.run_clean(["--all"])])
+def test_an_environment_in_use_is_never_removed(running: int, remove: Callable[[], object]) -> None:
+    with pytest.raises(layout.SetupError, match=rf"in use by process {running}; .*nothing was removed") as raised:
+        remove()
+    assert raised.value.code == 2
+    assert layout.PYTHON.exists()
+
+
+def test_a_waiting_set_up_does_not_use_the_environment(checkout: Path) -> None:
+    layout.PYTHON.parent.mkdir(parents=True)
+    layout.PYTHON.symlink_to(sys.executable)
+    command = [str(layout.PYTHON), "-I", "-S", "-c", "print(flush=True); input()"]  # as tools/dtsa starts itself
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert processes.users_of([layout.VENV]) == []
+        process.communicate(b"\n", timeout=30)
+
+
+def test_what_is_missing_is_said_before_anything_is_removed(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    monkeypatch.setattr(checks, "check", lambda: None)
+    monkeypatch.setattr(wheels, "system_distributions", lambda python: {"numpy", "pyyaml"})
+    kept = layout.VENV / "kept"
+    kept.parent.mkdir()
+    kept.touch()
+    with pytest.raises(layout.SetupError, match=r"sudo apt install python3-matplotlib$"):
+        prepare.prepare(set())
+    assert kept.exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"), [("", "-j3"), ("-s", "-s -j3"), ("-j8", "-j8"), ("--jobs=8 -l4", "--jobs=8 -l4")]
+)
+def test_the_build_has_a_number_of_jobs_and_no_limit_of_the_load(
+    given: str, wanted: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAKEFLAGS", given)
+    monkeypatch.delenv("CMAKE_BUILD_PARALLEL_LEVEL", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1, 2})
+    environment = workspace.build_environment()
+    assert environment["MAKEFLAGS"] == wanted
+    assert environment["CMAKE_BUILD_PARALLEL_LEVEL"] == "3"
+    if importlib.util.find_spec("colcon_cmake"):
+        from colcon_cmake.task.cmake.build import CmakeBuildTask
+
+        assert CmakeBuildTask._get_make_arguments(None, environment) == []  # colcon adds none of its own
 
 
 def test_every_pinned_set_is_complete() -> None:
@@ -250,6 +361,68 @@ def test_one_set_up_at_a_time(checkout: Path) -> None:
         assert other.read() == str(os.getpid())
     with (checkout / ".dtsa" / "lock").open() as other:
         fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def test_waiting_for_another_set_up_ends(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(prepare, "PATIENCE_S", 0.3)
+    with prepare.lock():
+        with pytest.raises(layout.SetupError, match=rf"set-up of process {os.getpid()} has not ended"), prepare.lock():
+            pass
+        assert f"waiting for the set-up of process {os.getpid()}" in capsys.readouterr().err
+    with prepare.lock():
+        pass
+
+
+def test_a_wheel_gets_into_the_store_in_one_go(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = checkout / "store"
+    store.mkdir()
+    seen = []
+
+    def run(step: progress.Step, command: list[object], environment: dict[str, str]) -> None:
+        words = [str(word) for word in command]
+        if "wheel" in words:
+            part = Path(words[words.index("--wheel-dir") + 1])
+            (part / "six-1.0-py3-none-any.whl").write_text("half")
+            seen.append(wheels.stored(store, "six==1.0"))
+            (part / "six-1.0-py3-none-any.whl").write_text("whole")
+
+    monkeypatch.setattr(wheels, "wheel_store", lambda environment: store)
+    monkeypatch.setattr(progress.Step, "run", run)
+    with progress.step("install", "packages") as step:
+        wheels.install_set(step, ["six==1.0"], {})
+    assert seen == [False]
+    assert [file.name for file in store.iterdir()] == ["six-1.0-py3-none-any.whl"]
+    assert (store / "six-1.0-py3-none-any.whl").read_text() == "whole"
+
+
+@pytest.mark.parametrize("command", ["test", "clean", "shell", "setup"])
+@pytest.mark.parametrize("word", ["--help", "-h"])
+def test_help_of_a_command_does_nothing_else(
+    command: str, word: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise AssertionError("something was done")
+
+    monkeypatch.setattr(prepare, "prepare", refuse)
+    monkeypatch.setattr(prepare, "lock", refuse)
+    monkeypatch.setattr(shutil, "rmtree", refuse)
+    assert main.main([command, word]) == 0
+    assert capsys.readouterr().out.startswith(f"usage: tools/dtsa {command} ")
+
+
+def test_all_parts_have_one_version() -> None:
+    assert call("--version").stdout == f"dtsa {dtsa_bench.__version__}\n"
+    found = {}
+    for package in workspace.PACKAGES:
+        root = layout.SOURCES / package
+        found[f"{package}/package.xml"] = ElementTree.parse(root / "package.xml").findtext("version")
+        setup = layout.read(root / "setup.py")
+        if setup:
+            found[f"{package}/setup.py"] = re.findall(r'version="(.*?)"', setup)[0]
+    assert len(found) == 7
+    assert set(found.values()) == {dtsa_bench.__version__}, found
 
 
 def test_help_lists_all_commands_without_a_set_up() -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
@@ -20,6 +19,7 @@ from typing import Any, NoReturn
 from mcap.writer import CompressionType, Writer
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench import __version__
 from dtsa_bench.bag import metadata, schema
 from dtsa_bench.bag.digest import KEY, BagDigest
 from dtsa_bench.bag.errors import BagError
@@ -28,14 +28,6 @@ from dtsa_bench.bag.qos import Profile, dump, resolve
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
 FLUSH_S = 0.5
-
-
-def project_version() -> str:
-    """Version of this project, as stored in each bag."""
-    try:
-        return version("dtsa_bench")
-    except PackageNotFoundError:  # run straight from the source tree
-        return "0.1.0"
 
 
 class BagWriter:
@@ -72,7 +64,7 @@ class BagWriter:
         if config is not None:
             self.custom_data |= {
                 "project": "dtsa",
-                "version": project_version(),
+                "version": __version__,
                 "seed": str({**config, **config.get("swarm", {})}.get("seed", "")),
                 "configuration": json.dumps(config, sort_keys=True),
             }
@@ -96,7 +88,7 @@ class BagWriter:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         self._mcap = Writer(self._stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
         try:
-            self._mcap.start(profile="ros2", library=f"dtsa {project_version()}")
+            self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
             self._add_metadata_record()
             self._stream.flush()
         except OSError as error:
