@@ -73,8 +73,8 @@ def test_robot_beats_type_beats_all() -> None:
         (swarm(robots={"cf1": {"uri": "udp://h:1"}, "a1": {"uri": "udp://h:2"}}), "robots.a1"),
         (swarm(all={"battery": {"voltage_critical": 4.0}}), "robots.cf1.battery.voltage_critical"),
         (swarm(station={"min_connected": 2}), "station.min_connected"),
-        (swarm(station={"safety": {"geofence_min": [2, 0, 0]}}), "safety.geofence_min"),
-        (swarm(station={"safety": {"command_age_s": 0.6}}), "command_age_s"),
+        (swarm(station={"safety": {"geofence_min": [2, 0, 0]}}), "station.safety.geofence_min"),
+        (swarm(station={"safety": {"command_age_s": 0.6}}), "station.safety.command_age_s"),
         (swarm(station={"safety": {"geofenze": True}}), "station.safety.geofenze"),
     ],
 )

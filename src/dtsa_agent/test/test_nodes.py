@@ -21,9 +21,9 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import format_values, parse_values, settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.wire import pack_received, split_frames, unpack_received
-from dtsa_agent.settings import format_values, parse_values, settings_of
 
 AGENT, HOST = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host"
 

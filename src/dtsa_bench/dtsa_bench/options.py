@@ -9,7 +9,7 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.settings import Setting, settings_of
+from dtsa_agent.core.settings import Setting, settings_of
 from dtsa_bench.run_config import LOCKSTEP, RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
+from dtsa_agent.core.settings import settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import declare_from_dataclass
@@ -228,7 +229,7 @@ def declare_run(node: Node) -> RunConfig:
     file = node.declare_parameter("channel_file", "", described).value
     derived = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed}
     if file:
-        defaults = {spec.name: spec.default for spec in ChannelConfig.fields()}
+        defaults = {spec.name: spec.default for spec in settings_of(ChannelConfig)}
         given = {name: value for name, value in channel.items() if value != defaults[name]}
         air = ChannelConfig.from_yaml(file, **given, **derived)
     else:

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtsa_agent.core.config import SwarmConfig, check_fields, option
+from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import Settings, setting
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
 SECTIONS = ("swarm", "channel", "limits", "mode", "clocks", "align")
@@ -16,22 +17,19 @@ LOCKSTEP, REALTIME = MODES = ("lockstep", "realtime")
 
 
 @dataclass(frozen=True, slots=True)
-class RunLimits:
+class RunLimits(Settings):
     """What ends a run, and what counts as a crash."""
 
-    timeout_s: float = option(
+    timeout_s: float = setting(
         60.0,
         "a run that is not complete by then ends and is counted apart",
         unit="s",
         minimum=0.01,
         maximum=86400,
     )
-    tail_s: float = option(1.0, "a complete run flies on for this long", unit="s", minimum=0, maximum=3600)
-    collision_m: float = option(0.2, "two agents closer than this have crashed", unit="m", minimum=0, maximum=10)
-    stop_on_crash: bool = option(True, "a crash ends the run, as in the paper")
-
-    def __post_init__(self) -> None:
-        check_fields(self)
+    tail_s: float = setting(1.0, "a complete run flies on for this long", unit="s", minimum=0, maximum=3600)
+    collision_m: float = setting(0.2, "two agents closer than this have crashed", unit="m", minimum=0, maximum=10)
+    stop_on_crash: bool = setting(True, "a crash ends the run, as in the paper")
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from launch_ros.actions import Node
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.settings import settings_of
+from dtsa_agent.core.settings import settings_of
 from dtsa_bench.options import FROM_SWARM
 from dtsa_bench.run_config import RunLimits
 from dtsa_channel_sim import ChannelConfig

@@ -4,7 +4,6 @@ from .model.airtime import Airtime
 from .model.channel import Channel
 from .model.clocks import AgentClock, ClockConfig, make_clocks
 from .model.config import CHANGEABLE, Change, ChannelConfig
-from .model.config_fields import FieldInfo, fields_of
 from .model.medium import OnAir
 from .model.realtime import FrameVerdict, RealtimeArbiter
 from .model.topology import LinkLoss
@@ -22,12 +21,10 @@ __all__ = [
     "Channel",
     "ChannelConfig",
     "ClockConfig",
-    "FieldInfo",
     "FrameVerdict",
     "LinkLoss",
     "OnAir",
     "RealtimeArbiter",
     "Verdict",
-    "fields_of",
     "make_clocks",
 ]

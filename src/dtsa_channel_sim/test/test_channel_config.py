@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import settings_of
 from dtsa_channel_sim import CHANGEABLE, Change, Channel, ChannelConfig, LinkLoss
 from dtsa_channel_sim.model.timeline import Timeline
 from dtsa_channel_sim.model.topology import format_ids, format_partition, parse_ids, parse_partition
@@ -75,7 +76,7 @@ def test_bad_settings_name_the_field(settings, field):
 
 
 def test_every_setting_describes_itself():
-    infos = {info.name: info for info in ChannelConfig.fields()}
+    infos = {info.name: info for info in settings_of(ChannelConfig)}
     assert set(CHANGEABLE) <= set(infos)
     for info in infos.values():
         assert info.help

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
-from .errors import ConfigError, range_text
+from .errors import ConfigError
+from .settings import Settings, check, setting
 
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
@@ -21,153 +20,108 @@ MAX_AGENTS = 1024
 MAX_LEASE_AGENTS = 254
 
 
-def option(
-    default: Any,
-    help: str,
-    *,
-    unit: str = "",
-    minimum: float | None = None,
-    maximum: float | None = None,
-    choices: tuple[str, ...] | None = None,
-    open_choices: bool = False,
-) -> Any:
-    """A documented dataclass field.
-
-    :param default: its default value.
-    :param help: one line for ``--help`` and for the ROS parameter's description.
-    :param unit: unit of the value.
-    :param minimum: smallest value allowed.
-    :param maximum: largest value allowed.
-    :param choices: the words allowed.
-    :param open_choices: other words are allowed too: they name plug-ins.
-    """
-    metadata = {
-        "help": help,
-        "unit": unit,
-        "minimum": minimum,
-        "maximum": maximum,
-        "choices": choices,
-        "open_choices": open_choices,
-    }
-    if isinstance(default, dict):
-        return field(default_factory=dict, metadata=metadata)
-    return field(default=default, metadata=metadata)
-
-
-def check_fields(config: Any) -> None:
-    """Checks every field of a dataclass made of :func:`option` against its own metadata.
-
-    :raises ConfigError: naming the field, the value and what is allowed.
-    """
-    for spec in dataclasses.fields(config):
-        value, meta = getattr(config, spec.name), spec.metadata
-        if not meta or value is None:
-            continue
-        choices, low, high = meta.get("choices"), meta.get("minimum"), meta.get("maximum")
-        if choices is not None:
-            if not isinstance(value, str) or (value not in choices and not meta.get("open_choices")):
-                raise ConfigError(spec.name, value, ", ".join(choices))
-            continue
-        if low is None and high is None:
-            continue
-        bounds = range_text(low, high, meta.get("unit", ""))
-        whole = str(spec.type).startswith("int")
-        if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
-            raise ConfigError(spec.name, value, ("a whole number, " if whole else "a number, ") + bounds)
-        if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
-            raise ConfigError(spec.name, value, bounds)
-
-
 @dataclass(frozen=True, slots=True)
-class SwarmConfig:
+class SwarmConfig(Settings):
     """Everything that all agents of one swarm must agree on.
 
     :raises ConfigError: at creation, naming the field, the value and what is allowed.
     """
 
-    agents: int = option(12, "number of agents, N = |A|", minimum=1, maximum=MAX_AGENTS)
-    moving: int | None = option(
+    agents: int = setting(12, "number of agents, N = |A|", minimum=1, maximum=MAX_AGENTS, group="The swarm")
+    moving: int | None = setting(
         None, "how many of them move, an even number (antipodal pairs); default: all", minimum=0, maximum=MAX_AGENTS
     )
-    policy: str = option("dtsa", "who sends next", choices=POLICIES, open_choices=True)
-    estimator: str = option("linear", "where the others are by now", choices=ESTIMATORS, open_choices=True)
-    avoider: str = option("orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS, open_choices=True)
-    slot_ms: float = option(10.0, "length of a time slot, t_s", unit="ms", minimum=0.5, maximum=1000)
-    seed: int = option(1, "seed of the whole run", minimum=0, maximum=2**63 - 1)
+    policy: str = setting("dtsa", "who sends next", choices=POLICIES, open_choices=True)
+    estimator: str = setting("linear", "where the others are by now", choices=ESTIMATORS, open_choices=True)
+    avoider: str = setting("orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS, open_choices=True)
+    slot_ms: float = setting(10.0, "length of a time slot, t_s", unit="ms", minimum=0.5, maximum=1000)
+    seed: int = setting(1, "seed of the whole run", minimum=0, maximum=2**63 - 1)
 
-    epsilon: float = option(0.5, "least relative difference of priorities that counts (eq:pfs)", minimum=0, maximum=1)
-    selection: str = option("candidates", "reading of the selection function", choices=SELECTIONS)
-    boot_round: bool = option(True, "everyone sends once, in id order, before priorities decide")
-    age_cap: float = option(
+    epsilon: float = setting(
+        0.5,
+        "least relative difference of priorities that counts (eq:pfs)",
+        minimum=0,
+        maximum=1,
+        group="Priority and selection",
+    )
+    selection: str = setting("candidates", "reading of the selection function", choices=SELECTIONS)
+    boot_round: bool = setting(True, "everyone sends once, in id order, before priorities decide")
+    age_cap: float = setting(
         1.5, "an agent silent for age_cap * N_p slots goes first; 0: never (the paper's text)", minimum=0, maximum=1000
     )
-    return_every: int = option(
+    return_every: int = setting(
         20,
         "one of so many slots belongs to an agent outside A_p; 0: none (the paper's text)",
         minimum=0,
         maximum=100000,
     )
-    r_min: float = option(
+    r_min: float = setting(
         0.3,
         "distance to the target at which an agent has arrived (eq:remaining_t_slots)",
         unit="m",
         minimum=0.001,
         maximum=100,
     )
-    c_r: int = option(1, "the constant C sent while not arrived (eq:remaining_t_slots)", minimum=1, maximum=255)
-    targets_known: bool = option(True, "all know everyone's target: who has arrived is taken to stand there")
+    c_r: int = setting(1, "the constant C sent while not arrived (eq:remaining_t_slots)", minimum=1, maximum=255)
+    targets_known: bool = setting(True, "all know everyone's target: who has arrived is taken to stand there")
 
-    frame: str = option("auto", "frames on the air; auto: extended with policy lease, else paper", choices=FRAMES)
-    gossip: bool = option(True, "extended frames carry what their sender last heard of others")
-    anchor_every: int = option(
+    frame: str = setting(
+        "auto",
+        "frames on the air; auto: extended with policy lease, else paper",
+        choices=FRAMES,
+        group="Frames and leases",
+    )
+    gossip: bool = setting(True, "extended frames carry what their sender last heard of others")
+    anchor_every: int = setting(
         5, "lease: every so many rounds an agent's turn is its own whatever happens, M", minimum=1, maximum=15
     )
-    open_every: int = option(
+    open_every: int = setting(
         11,
         "lease: one of so many leased turns is open to all who wake, S (or the next coprime to N); 0: none",
         minimum=0,
         maximum=1000,
     )
-    adoption: bool = option(True, "lease: the turns of the dead are given away by the next agent alive")
-    depth_rate: float = option(0.1, "lease: turns given away ahead, per round of idleness, c", minimum=0, maximum=15)
-    lease_share: float = option(
+    adoption: bool = setting(True, "lease: the turns of the dead are given away by the next agent alive")
+    depth_rate: float = setting(0.1, "lease: turns given away ahead, per round of idleness, c", minimum=0, maximum=15)
+    lease_share: float = setting(
         1.0, "lease: no leases when more than this share of the agents has something to say", minimum=0, maximum=1
     )
 
-    auth: bool = option(
+    auth: bool = setting(
         False,
         "frames carry a 4-byte code that only holders of the key can make; the key is in the "
         "environment: DTSA_AUTH_KEY, 32 to 64 hexadecimal digits",
+        group="Authentication",
     )
-    auth_session: int = option(
+    auth_session: int = setting(
         0,
         "number of the flight for that code; a new one whenever slots count from 0 again",
         minimum=0,
         maximum=2**63 - 1,
     )
 
-    scenario: str = option("exchange", "what the swarm does", choices=SCENARIOS)
-    shape: str = option("circle", "where the agents start", choices=SHAPES)
-    axis_x_m: float = option(
+    scenario: str = setting("exchange", "what the swarm does", choices=SCENARIOS, group="What it does")
+    shape: str = setting("circle", "where the agents start", choices=SHAPES)
+    axis_x_m: float = setting(
         0.0, "half axis of the start shape in x; 0: from the number of agents", unit="m", minimum=0, maximum=1000
     )
-    axis_y_m: float = option(0.0, "half axis in y; 0: as x (circle) or 5/3 of x", unit="m", minimum=0, maximum=1000)
-    axis_z_m: float = option(0.0, "half axis in z (ellipsoid); 0: as x", unit="m", minimum=0, maximum=1000)
-    jitter_m: float = option(
+    axis_y_m: float = setting(0.0, "half axis in y; 0: as x (circle) or 5/3 of x", unit="m", minimum=0, maximum=1000)
+    axis_z_m: float = setting(0.0, "half axis in z (ellipsoid); 0: as x", unit="m", minimum=0, maximum=1000)
+    jitter_m: float = setting(
         0.05, "starts are moved at random by up to this in x, y and z", unit="m", minimum=0, maximum=1
     )
-    permute: bool = option(True, "ids are dealt out at random around the shape")
-    stagger_slots: int = option(100, "staggered: slots between the starts of two pairs", minimum=0, maximum=100000)
-    stops: int = option(2, "waypoints, stop-and-go: goals on the way to the last one", minimum=1, maximum=100)
-    pause_slots: int = option(50, "waypoints, stop-and-go: slots of rest at each of them", minimum=0, maximum=1000000)
-    announce: bool = option(True, "an agent with a new goal does not move before it has sent a frame that says so")
-    control_ms: float = option(10.0, "longest control period", unit="ms", minimum=0.5, maximum=100)
-    options: Mapping[str, float] = option({}, "values that replace those of the flight model, by name")
+    permute: bool = setting(True, "ids are dealt out at random around the shape")
+    stagger_slots: int = setting(100, "staggered: slots between the starts of two pairs", minimum=0, maximum=100000)
+    stops: int = setting(2, "waypoints, stop-and-go: goals on the way to the last one", minimum=1, maximum=100)
+    pause_slots: int = setting(50, "waypoints, stop-and-go: slots of rest at each of them", minimum=0, maximum=1000000)
+    announce: bool = setting(True, "an agent with a new goal does not move before it has sent a frame that says so")
+    control_ms: float = setting(10.0, "longest control period", unit="ms", minimum=0.5, maximum=100)
+    options: Mapping[str, float] = setting({}, "values that replace those of the flight model, by name")
 
     def __post_init__(self) -> None:
-        if self.moving is None and isinstance(self.agents, int):
+        check(self)
+        if self.moving is None:
             object.__setattr__(self, "moving", self.agents - self.agents % 2)
-        check_fields(self)
         if self.movers > self.agents:
             raise ConfigError("moving", self.moving, f"0 to {self.agents}, the number of agents")
         if self.movers % 2:
@@ -222,22 +176,3 @@ class SwarmConfig:
     def steps(self) -> int:
         """Control instants in one slot."""
         return max(1, math.ceil(self.slot_ms / self.control_ms - 1e-9))
-
-    def to_dict(self) -> dict[str, Any]:
-        """The settings as plain values; :meth:`from_dict` reads them back."""
-        result = {spec.name: getattr(self, spec.name) for spec in dataclasses.fields(self)}
-        result["options"] = dict(self.options)
-        return result
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> SwarmConfig:
-        """Builds a configuration from plain values.
-
-        :param values: field names and values; fields that are left out keep their defaults.
-        :raises ConfigError: for unknown names and values that are not allowed.
-        """
-        known = [spec.name for spec in dataclasses.fields(cls)]
-        for name, value in values.items():
-            if name not in known:
-                raise ConfigError(name, value, "one of the settings " + ", ".join(known))
-        return cls(**values)

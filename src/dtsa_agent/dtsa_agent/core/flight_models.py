@@ -6,16 +6,16 @@ Formulas and the reasons for the values: ``docs/avoiders.md``.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ConfigError, range_text
+from .errors import ConfigError
+from .settings import REQUIRED, Settings, check, setting, settings_of
 
 Array = NDArray[np.float64]
 
@@ -23,71 +23,54 @@ Array = NDArray[np.float64]
 KINDS = ("orca", "potential", "bvc", "none")
 
 
-def _value(default: float, unit: str, help: str, minimum: float, maximum: float) -> Any:
-    metadata = {"unit": unit, "help": help, "minimum": minimum, "maximum": maximum}
-    return field(default=default, metadata=metadata)
-
-
-def _check(params: Any) -> None:
-    """Makes floats of all fields and checks them against their ranges.
-
-    :raises ConfigError: naming the field, the value and what is allowed.
-    """
-    for spec in dataclasses.fields(params):
-        value, meta = getattr(params, spec.name), spec.metadata
-        allowed = range_text(meta["minimum"], meta["maximum"], meta["unit"])
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ConfigError(spec.name, value, "a number, " + allowed)
-        if not math.isfinite(value) or not meta["minimum"] <= value <= meta["maximum"]:
-            raise ConfigError(spec.name, value, allowed)
-        object.__setattr__(params, spec.name, float(value))
-
-
 @dataclass(frozen=True, slots=True)
-class AvoiderParams:
+class AvoiderParams(Settings):
     """Parameters of the avoiders; which of them count depends on the avoider.
 
     :raises ConfigError: for values outside their range.
     """
 
-    v_max: float = _value(1.5, "m/s", "largest commanded speed", 0.01, 20)
-    gain: float = _value(2.0, "1/s", "K_P: speed towards the goal per distance to it", 0.01, 100)
-    radius: float = _value(0.336, "m", "orca: R_c, of a pair; bvc: of one agent", 0.01, 10)
-    horizon: float = _value(1.0, "s", "orca: T, look-ahead; bvc: the cell ends at horizon * v_max", 0.05, 60)
-    softness: float = _value(30.0, "1", "orca: rho, weight of a violated half-plane", 0.01, 1e6)
-    bias: float = _value(0.2, "1", "orca: beta, share by which all keep to the right", -1, 1)
-    period: float = _value(0.2, "s", "orca: T_s, time in which an overlap is resolved", 0.001, 10)
-    influence: float = _value(1.31, "m", "potential: r_inf, range of the field", 0.03, 100)
-    strength: float = _value(0.33, "m^2/s", "potential: k, strength of the field", 0, 100)
-    core: float = _value(0.1, "m", "potential: d_c, distance of infinite repulsion", 0, 100)
-    tangential: float = _value(0.3, "1", "potential: share of the force that acts sideways", -2, 2)
-    margin_rate: float = _value(0.0, "m/s", "growth of a safety margin with the age of the news", 0, 10)
-    margin_max: float = _value(0.3, "m", "largest such margin", 0, 10)
-    sidestep: float = _value(0.25, "m", "bvc: closer to the wall than this, step to the right", 1e-6, 10)
-    stretch_z: float = _value(1.0, "1", "bvc: height of an agent over its width (downwash)", 0.1, 20)
+    v_max: float = setting(1.5, "largest commanded speed", unit="m/s", minimum=0.01, maximum=20)
+    gain: float = setting(2.0, "K_P: speed towards the goal per distance to it", unit="1/s", minimum=0.01, maximum=100)
+    radius: float = setting(0.336, "orca: R_c, of a pair; bvc: of one agent", unit="m", minimum=0.01, maximum=10)
+    horizon: float = setting(
+        1.0, "orca: T, look-ahead; bvc: the cell ends at horizon * v_max", unit="s", minimum=0.05, maximum=60
+    )
+    softness: float = setting(30.0, "orca: rho, weight of a violated half-plane", unit="1", minimum=0.01, maximum=1e6)
+    bias: float = setting(0.2, "orca: beta, share by which all keep to the right", unit="1", minimum=-1, maximum=1)
+    period: float = setting(0.2, "orca: T_s, time in which an overlap is resolved", unit="s", minimum=0.001, maximum=10)
+    influence: float = setting(1.31, "potential: r_inf, range of the field", unit="m", minimum=0.03, maximum=100)
+    strength: float = setting(0.33, "potential: k, strength of the field", unit="m^2/s", minimum=0, maximum=100)
+    core: float = setting(0.1, "potential: d_c, distance of infinite repulsion", unit="m", minimum=0, maximum=100)
+    tangential: float = setting(
+        0.3, "potential: share of the force that acts sideways", unit="1", minimum=-2, maximum=2
+    )
+    margin_rate: float = setting(
+        0.0, "growth of a safety margin with the age of the news", unit="m/s", minimum=0, maximum=10
+    )
+    margin_max: float = setting(0.3, "largest such margin", unit="m", minimum=0, maximum=10)
+    sidestep: float = setting(
+        0.25, "bvc: closer to the wall than this, step to the right", unit="m", minimum=1e-6, maximum=10
+    )
+    stretch_z: float = setting(
+        1.0, "bvc: height of an agent over its width (downwash)", unit="1", minimum=0.1, maximum=20
+    )
 
     def __post_init__(self) -> None:
-        _check(self)
+        check(self)
         if self.core >= self.influence:
             raise ConfigError("core", self.core, f"less than influence, {self.influence:g} m")
 
-    def to_dict(self) -> dict[str, float]:
-        """All values by name, as the compiled kernel reads them."""
-        return {spec.name: getattr(self, spec.name) for spec in dataclasses.fields(self)}
-
 
 @dataclass(frozen=True, slots=True)
-class VehicleParams:
+class VehicleParams(Settings):
     """Point mass that follows a velocity command: a = clip((v_cmd - v) / tau, a_max).
 
     :raises ConfigError: for values outside their range.
     """
 
-    tau: float = _value(0.25, "s", "time constant of the velocity response", 0.01, 10)
-    a_max: float = _value(2.0, "m/s^2", "largest acceleration (norm)", 0.01, 200)
-
-    def __post_init__(self) -> None:
-        _check(self)
+    tau: float = setting(0.25, "time constant of the velocity response", unit="s", minimum=0.01, maximum=10)
+    a_max: float = setting(2.0, "largest acceleration (norm)", unit="m/s^2", minimum=0.01, maximum=200)
 
     def step(self, dt: float, position: Array, velocity: Array, command: Array) -> None:
         """Moves vehicles on by one step; ``position`` and ``velocity`` are updated in place.
@@ -103,31 +86,22 @@ class VehicleParams:
 
 
 @dataclass(frozen=True, slots=True)
-class FlightModel:
+class FlightModel(Settings):
     """An avoider with its parameters, a vehicle, and the room an exchange of places needs.
 
-    :param name: what ``SwarmConfig.avoider`` calls it.
-    :param avoider_kind: the avoider's name, one of :data:`KINDS`.
-    :param avoider: its parameters.
-    :param vehicle: the vehicle's parameters.
-    :param spacing: s, m: agents on the start circle are this far apart.
-    :param min_radius: r0, m: smallest start circle; R = max(r0, s N / 2 pi).
     :raises ConfigError: for an unknown avoider or values outside their range.
     """
 
-    name: str
-    avoider_kind: str
-    avoider: AvoiderParams
-    vehicle: VehicleParams
-    spacing: float
-    min_radius: float
-
-    def __post_init__(self) -> None:
-        if self.avoider_kind not in KINDS:
-            raise ConfigError("avoider_kind", self.avoider_kind, ", ".join(KINDS))
-        for name, value in (("spacing", self.spacing), ("min_radius", self.min_radius)):
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= 1000:
-                raise ConfigError(name, value, "more than 0, up to 1000 m")
+    name: str = setting(REQUIRED, "what the setting avoider calls it")
+    avoider_kind: str = setting(REQUIRED, "the avoider in the compiled kernel", choices=KINDS)
+    avoider: AvoiderParams = setting(REQUIRED, "the avoider's parameters", section=AvoiderParams)
+    vehicle: VehicleParams = setting(REQUIRED, "the vehicle's parameters", section=VehicleParams)
+    spacing: float = setting(
+        REQUIRED, "s: agents on the start circle are this far apart", unit="m", minimum=1e-6, maximum=1000
+    )
+    min_radius: float = setting(
+        REQUIRED, "r0: smallest start circle; R = max(r0, s N / 2 pi)", unit="m", minimum=1e-6, maximum=1000
+    )
 
     @property
     def kind(self) -> int:
@@ -204,8 +178,8 @@ def flight_model(name: str, options: Mapping[str, float] | None = None) -> Fligh
 
         model = avoider_model(name)
     groups: dict[str, dict[str, Any]] = {"avoider": {}, "vehicle": {}, "room": {}}
-    owners = {spec.name: "avoider" for spec in dataclasses.fields(AvoiderParams)}
-    owners |= {spec.name: "vehicle" for spec in dataclasses.fields(VehicleParams)}
+    owners = {spec.name: "avoider" for spec in settings_of(AvoiderParams)}
+    owners |= {spec.name: "vehicle" for spec in settings_of(VehicleParams)}
     owners |= {"spacing": "room", "min_radius": "room"}
     for key, value in (options or {}).items():
         if "." in key:  # a plug-in's own

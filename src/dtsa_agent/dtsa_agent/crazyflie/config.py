@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.core.config import check_fields, option
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import check, named, setting
 from dtsa_agent.crazyflie.budget import radio_of
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.units import Vector
@@ -41,23 +41,23 @@ class RobotSettings:
 
     name: str
     uri: str
-    id: int = option(0, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
+    id: int = setting(0, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
     enabled: bool = True
     type: str = ""
     initial_position: Vector = (0.0, 0.0, 0.0)  # m, world
-    command_rate_hz: float = option(50.0, "rate of the streamed commands", unit="Hz", minimum=1, maximum=100)
-    log_rate_hz: float = option(50.0, "rate of the state log", unit="Hz", minimum=4, maximum=100)
-    connect_timeout_s: float = option(20.0, "time for one attempt to connect", unit="s", minimum=0.2, maximum=300)
-    connect_attempts: int = option(3, "attempts to connect", minimum=1, maximum=100)
-    estimator_timeout_s: float = option(10.0, "time for the estimator to settle", unit="s", minimum=0.1, maximum=300)
+    command_rate_hz: float = setting(50.0, "rate of the streamed commands", unit="Hz", minimum=1, maximum=100)
+    log_rate_hz: float = setting(50.0, "rate of the state log", unit="Hz", minimum=4, maximum=100)
+    connect_timeout_s: float = setting(20.0, "time for one attempt to connect", unit="s", minimum=0.2, maximum=300)
+    connect_attempts: int = setting(3, "attempts to connect", minimum=1, maximum=100)
+    estimator_timeout_s: float = setting(10.0, "time for the estimator to settle", unit="s", minimum=0.1, maximum=300)
     reset_estimator: bool = True
-    battery_warning_v: float = option(3.4, "warning below this voltage", unit="V", minimum=2.0, maximum=5.0)
-    battery_critical_v: float = option(3.2, "landing below this voltage", unit="V", minimum=2.0, maximum=5.0)
+    battery_warning_v: float = setting(3.4, "warning below this voltage", unit="V", minimum=2.0, maximum=5.0)
+    battery_critical_v: float = setting(3.2, "landing below this voltage", unit="V", minimum=2.0, maximum=5.0)
     firmware_params: Mapping[str, float] = dataclasses.field(default_factory=dict)  # group.name -> value
 
     def __post_init__(self) -> None:
         try:
-            check_fields(self)
+            check(self)
             radio_of(self.uri)
         except ConfigError as error:
             raise ConfigError(f"robots.{self.name}.{error.field}", error.value, error.allowed) from None
@@ -76,22 +76,22 @@ class StationSettings:
     :raises ConfigError: a value is out of range.
     """
 
-    min_connected: int = option(1, "fewer connected Crazyflies than this: nobody flies", minimum=1, maximum=1000)
+    min_connected: int = setting(1, "fewer connected Crazyflies than this: nobody flies", minimum=1, maximum=1000)
     room_origin_in_world: Vector = (0.0, 0.0, 0.95)  # m: where the Crazyflies' world sees the origin of `map`
     force_budget: bool = False  # fly even if the radios cannot carry it
     toc_cache: str = ""  # folder of the variables' tables; empty: ~/.cache/dtsa/crazyflie
-    land_speed_mps: float = option(0.4, "mean speed of a landing", unit="m/s", minimum=0.05, maximum=2)
-    max_speed_mps: float = option(
+    land_speed_mps: float = setting(0.4, "mean speed of a landing", unit="m/s", minimum=0.05, maximum=2)
+    max_speed_mps: float = setting(
         1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
     )
-    landing_timeout_s: float = option(20.0, "longest wait for all to land", unit="s", minimum=1, maximum=300)
-    priority: int = option(
+    landing_timeout_s: float = setting(20.0, "longest wait for all to land", unit="s", minimum=1, maximum=300)
+    priority: int = setting(
         20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
     )
     safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,9 +195,9 @@ def _robot(name: str, own: dict[str, Any], types: dict[str, Any], common: dict[s
     values = {key: value for key, value in merged.items() if key in ROBOT_KEYS}
     battery = _mapping(f"{field}.battery", values.pop("battery", None))
     _known(f"{field}.battery", battery, ("voltage_warning", "voltage_critical"))
-    for key, setting in (("voltage_warning", "battery_warning_v"), ("voltage_critical", "battery_critical_v")):
+    for key, field_name in (("voltage_warning", "battery_warning_v"), ("voltage_critical", "battery_critical_v")):
         if key in battery:
-            values[setting] = battery[key]
+            values[field_name] = battery[key]
     for key in ("enabled", "reset_estimator"):
         if key in values and not isinstance(values[key], bool):
             raise ConfigError(f"{field}.{key}", values[key], "true or false")
@@ -240,4 +240,6 @@ def _station(values: dict[str, Any]) -> StationSettings:
         values["room_origin_in_world"] = _vector("station.room_origin_in_world", values["room_origin_in_world"])
     if not isinstance(values.get("force_budget", False), bool):
         raise ConfigError("station.force_budget", values["force_budget"], "true or false")
-    return StationSettings(safety=SafetySettings(**safety), **values)
+    with named("station.safety"):
+        rules = SafetySettings(**safety)
+    return StationSettings(safety=rules, **values)

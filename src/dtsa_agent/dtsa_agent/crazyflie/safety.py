@@ -20,8 +20,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dtsa_agent.core.config import check_fields, option
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import Settings, check, setting
 from dtsa_agent.crazyflie.state_machine import IN_AIR, State
 from dtsa_agent.crazyflie.units import Vector
 
@@ -38,59 +38,49 @@ class Action(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class SafetySettings:
+class SafetySettings(Settings):
     """Limits of all rules.
 
     :raises ConfigError: a value is out of range.
     """
 
-    geofence: bool = option(True, "watch that no vehicle leaves the box")
-    geofence_min: tuple[float, ...] = option((-1.5, -2.3, -0.95), "lower corner of the box, m, frame map")
-    geofence_max: tuple[float, ...] = option((1.5, 2.3, 0.95), "upper corner of the box, m, frame map")
-    geofence_tolerance_m: float = option(
+    geofence: bool = setting(True, "watch that no vehicle leaves the box")
+    geofence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
+    geofence_max: Vector = setting((1.5, 2.3, 0.95), "upper corner of the box, frame map", unit="m")
+    geofence_tolerance_m: float = setting(
         0.05, "measuring error that the fence lets pass", unit="m", minimum=0, maximum=1
     )
-    geofence_hard_m: float = option(0.8, "this far outside the motors are stopped", unit="m", minimum=0.05, maximum=100)
-    battery: bool = option(True, "watch the batteries")
-    battery_s: float = option(1.0, "how long the voltage must be low", unit="s", minimum=0, maximum=60)
-    link_age_s: float = option(
+    geofence_hard_m: float = setting(
+        0.8, "this far outside the motors are stopped", unit="m", minimum=0.05, maximum=100
+    )
+    battery: bool = setting(True, "watch the batteries")
+    battery_s: float = setting(1.0, "how long the voltage must be low", unit="s", minimum=0, maximum=60)
+    link_age_s: float = setting(
         0.5, "silence that makes a flying vehicle lost; 0: never", unit="s", minimum=0, maximum=10
     )
-    command_age_s: float = option(
+    command_age_s: float = setting(
         0.25, "age of the streamed command at which the place is held; 0: never", unit="s", minimum=0, maximum=0.45
     )
-    command_land_s: float = option(
+    command_land_s: float = setting(
         3.0, "age of the streamed command at which the vehicle lands", unit="s", minimum=0.1, maximum=600
     )
-    heartbeat_s: float = option(
+    heartbeat_s: float = setting(
         1.0,
         "silence of the ground station, once heard, that stops all motors; 0: never",
         unit="s",
         minimum=0,
         maximum=60,
     )
-    min_distance_m: float = option(
+    min_distance_m: float = setting(
         0.15, "two flying vehicles closer than this land; 0: never", unit="m", minimum=0, maximum=10
     )
-    emergency_watchdog: bool = option(True, "the firmware stops the motors 1 s after it last heard the bridge")
+    emergency_watchdog: bool = setting(True, "the firmware stops the motors 1 s after it last heard the bridge")
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        for name in ("geofence", "battery", "emergency_watchdog"):
-            if not isinstance(getattr(self, name), bool):
-                raise ConfigError(f"safety.{name}", getattr(self, name), "true or false")
-        for name in ("geofence_min", "geofence_max"):
-            corner = getattr(self, name)
-            if not isinstance(corner, (tuple, list)) or len(corner) != 3 or not all(_number(v) for v in corner):
-                raise ConfigError(f"safety.{name}", corner, "three numbers: x, y, z in m")
-            object.__setattr__(self, name, tuple(float(v) for v in corner))
+        check(self)
         for axis, low, high in zip("xyz", self.geofence_min, self.geofence_max, strict=True):
             if low >= high:
-                raise ConfigError("safety.geofence_min", list(self.geofence_min), f"below geofence_max in {axis}")
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+                raise ConfigError("geofence_min", list(self.geofence_min), f"below geofence_max in {axis}")
 
 
 @dataclass(frozen=True, slots=True)

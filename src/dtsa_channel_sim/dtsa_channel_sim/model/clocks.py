@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import Settings, setting
 
-from .config_fields import FieldInfo, checked, fields_of, option
 from .draws import CLOCK, generator
 
 _PPB = 1_000_000_000
@@ -19,52 +17,16 @@ _BLOCK = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class ClockConfig:
+class ClockConfig(Settings):
     """How far the agents' clocks are from the channel's.
 
     :raises ConfigError: when a setting is not usable.
     """
 
-    offset_ns: int = option(
-        0, kind="int", unit="ns", minimum=0, maximum=10**15, help="largest offset of a clock at the start"
-    )
-    drift_ppm: float = option(
-        0.0,
-        kind="float",
-        unit="ppm",
-        minimum=0.0,
-        maximum=1000.0,
-        help="largest drift of a clock, either way",
-    )
-    jitter_ns: float = option(
-        0.0, kind="float", unit="ns", minimum=0.0, maximum=1e9, help="standard deviation of an event's time"
-    )
-    seed: int = option(0, kind="int", minimum=0, maximum=2**63 - 1, help="seed of all clocks")
-
-    def __post_init__(self) -> None:
-        for info in self.fields():
-            object.__setattr__(self, info.name, checked(info, getattr(self, info.name)))
-
-    @classmethod
-    def fields(cls) -> tuple[FieldInfo, ...]:
-        """Return the description of every setting (for ROS parameters and the command line)."""
-        return fields_of(cls)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers that :meth:`from_dict` reads back."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> ClockConfig:
-        """Return the settings, validated.
-
-        :raises ConfigError: when a name is unknown or a value is not allowed.
-        """
-        known = [info.name for info in cls.fields()]
-        for name in settings:
-            if name not in known:
-                raise ConfigError(str(name), settings[name], f"one of the settings {', '.join(known)}")
-        return cls(**settings)
+    offset_ns: int = setting(0, "largest offset of a clock at the start", unit="ns", minimum=0, maximum=10**15)
+    drift_ppm: float = setting(0.0, "largest drift of a clock, either way", unit="ppm", minimum=0.0, maximum=1000.0)
+    jitter_ns: float = setting(0.0, "standard deviation of an event's time", unit="ns", minimum=0.0, maximum=1e9)
+    seed: int = setting(0, "seed of all clocks", minimum=0, maximum=2**63 - 1)
 
 
 @dataclass(frozen=True, slots=True)

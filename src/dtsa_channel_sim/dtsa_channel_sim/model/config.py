@@ -9,95 +9,92 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import REQUIRED, Setting, Settings, build, check, setting, settings_of
 
 from .airtime import Airtime
-from .config_fields import FieldInfo, checked, fields_of, option
 from .gilbert import GilbertElliott
 from .topology import LinkLoss, format_partition, parse_matrix, parse_partition
 
 _NS_PER_S = 1_000_000_000
+_SLOT_MS = Setting("slot_ms", "float", None, "length of a slot", unit="ms", minimum=1e-6, maximum=1e6)
+_SLOT = Setting("slot", "int", None, "a slot", minimum=0, maximum=2**53)
+_SECONDS = Setting("at_s", "float", None, "seconds after the start of slot 0", unit="s", minimum=0, maximum=1e9)
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelConfig:
+class ChannelConfig(Settings):
     """Everything that the channel's behaviour depends on. Models and formulas: docs/channel.md.
 
     :raises ConfigError: when a setting, or a combination of settings, is not usable.
     """
 
-    agents: int = option(kind="int", help="number of agents; their ids are 1 to this number", minimum=1, maximum=65535)
-    slot_ns: int = option(10_000_000, kind="int", help="length of a slot", unit="ns", minimum=1, maximum=10**12)
-    seed: int = option(0, kind="int", help="seed of all losses", minimum=0, maximum=2**63 - 1)
-    loss: float = option(
-        0.0, kind="float", minimum=0.0, maximum=1.0, changeable=True,
-        help="mean share of frames that a receiver loses, each receiver for itself",
-    )  # fmt: skip
-    burst_length: float = option(
-        0.0, kind="float", unit="slots", minimum=0.0, maximum=1e9, changeable=True,
-        help="mean length of a bad phase (Gilbert-Elliott); 0: every loss is independent",
-    )  # fmt: skip
-    burst_scope: str = option(
-        "receiver", kind="text", choices=("receiver", "link"),
-        help="what has bad phases: a receiver (it loses all senders) or each directed link",
-    )  # fmt: skip
-    p_good: float = option(
-        0.0, kind="float", minimum=0.0, maximum=1.0, changeable=True, help="loss within a good phase"
+    agents: int = setting(REQUIRED, "number of agents; their ids are 1 to this number", minimum=1, maximum=65535)
+    slot_ns: int = setting(10_000_000, "length of a slot", unit="ns", minimum=1, maximum=10**12)
+    seed: int = setting(0, "seed of all losses", minimum=0, maximum=2**63 - 1)
+    loss: float = setting(
+        0.0,
+        "mean share of frames that a receiver loses, each receiver for itself",
+        minimum=0.0,
+        maximum=1.0,
+        changeable=True,
     )
-    p_bad: float = option(1.0, kind="float", minimum=0.0, maximum=1.0, changeable=True, help="loss within a bad phase")
-    jam: bool = option(False, kind="bool", changeable=True, help="all frames are lost")
-    partition: str = option(
-        "", kind="text", changeable=True,
-        help='groups that do not hear each other, as "1-6 | 7-12"; empty: all together',
-    )  # fmt: skip
-    range_m: float = option(
-        0.0, kind="float", unit="m", minimum=0.0, maximum=1e6, changeable=True,
-        help="distance up to which a frame is received; 0: everywhere",
-    )  # fmt: skip
-    interference_factor: float = option(
-        1.0, kind="float", minimum=1.0, maximum=100.0,
-        help="a frame disturbs others up to this many times range_m",
-    )  # fmt: skip
-    capture_db: float = option(
-        0.0, kind="float", unit="dB", minimum=0.0, maximum=100.0,
-        help="a frame this much stronger than all that overlap it is received; 0: no capture",
-    )  # fmt: skip
-    path_loss_exponent: float = option(
-        2.0,
-        kind="float",
-        minimum=1.0,
-        maximum=6.0,
-        help="power falls with this power of the distance (capture)",
+    burst_length: float = setting(
+        0.0,
+        "mean length of a bad phase (Gilbert-Elliott); 0: every loss is independent",
+        unit="slots",
+        minimum=0.0,
+        maximum=1e9,
+        changeable=True,
     )
-    bitrate: int = option(
-        2_000_000, kind="int", unit="bit/s", minimum=1000, maximum=10**9, help="bits on air per second"
+    burst_scope: str = setting(
+        "receiver",
+        "what has bad phases: a receiver (it loses all senders) or each directed link",
+        choices=("receiver", "link"),
     )
-    ramp_up_ns: int = option(
-        130_000,
-        kind="int",
+    p_good: float = setting(0.0, "loss within a good phase", minimum=0.0, maximum=1.0, changeable=True)
+    p_bad: float = setting(1.0, "loss within a bad phase", minimum=0.0, maximum=1.0, changeable=True)
+    jam: bool = setting(False, "all frames are lost", changeable=True)
+    partition: str = setting(
+        "", 'groups that do not hear each other, as "1-6 | 7-12"; empty: all together', changeable=True, custom=True
+    )
+    range_m: float = setting(
+        0.0,
+        "distance up to which a frame is received; 0: everywhere",
+        unit="m",
+        minimum=0.0,
+        maximum=1e6,
+        changeable=True,
+    )
+    interference_factor: float = setting(
+        1.0, "a frame disturbs others up to this many times range_m", minimum=1.0, maximum=100.0
+    )
+    capture_db: float = setting(
+        0.0,
+        "a frame this much stronger than all that overlap it is received; 0: no capture",
+        unit="dB",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    path_loss_exponent: float = setting(
+        2.0, "power falls with this power of the distance (capture)", minimum=1.0, maximum=6.0
+    )
+    bitrate: int = setting(2_000_000, "bits on air per second", unit="bit/s", minimum=1000, maximum=10**9)
+    ramp_up_ns: int = setting(130_000, "from the order to send to the first bit", unit="ns", minimum=0, maximum=10**9)
+    link_delay_ns: int = setting(
+        300_000,
+        "between radio and flight processor, on each side (arrival times in real time)",
         unit="ns",
         minimum=0,
         maximum=10**9,
-        help="from the order to send to the first bit",
     )
-    link_delay_ns: int = option(
-        300_000, kind="int", unit="ns", minimum=0, maximum=10**9,
-        help="between radio and flight processor, on each side (arrival times in real time)",
-    )  # fmt: skip
-    loss_matrix: tuple[tuple[float, ...], ...] = option(
-        (), kind="structure", help="loss of each link on top of loss: row = sender, column = receiver"
+    loss_matrix: tuple[tuple[float, ...], ...] = setting(
+        (), "loss of each link on top of loss: row = sender, column = receiver"
     )
-    link_loss: tuple[LinkLoss, ...] = option(
-        (), kind="structure", changeable=True, help="loss of some links, laid over loss_matrix"
-    )
-    schedule: tuple[Change, ...] = option((), kind="structure", help="changes at known slots")
+    link_loss: tuple[LinkLoss, ...] = setting((), "loss of some links, laid over loss_matrix", changeable=True)
+    schedule: tuple[Change, ...] = setting((), "changes at known slots")
 
     def __post_init__(self) -> None:
-        for info in self.fields():
-            value = getattr(self, info.name)
-            if info.kind in ("int", "float", "bool"):
-                object.__setattr__(self, info.name, checked(info, value))
-            elif info.choices and value not in info.choices:
-                raise ConfigError(info.name, value, info.allowed)
+        check(self)
         groups = parse_partition(self.partition, self.agents)
         object.__setattr__(self, "partition", format_partition(groups))
         object.__setattr__(self, "loss_matrix", parse_matrix(self.loss_matrix, self.agents))
@@ -117,27 +114,14 @@ class ChannelConfig:
         )
         if self.schedule:
             # Entries may be fine one by one and wrong together: try every state that the channel will be in.
-            from .timeline import check
+            from .timeline import check as check_timeline
 
-            check(self)
-
-    @classmethod
-    def fields(cls) -> tuple[FieldInfo, ...]:
-        """Return the description of every setting (for ROS parameters and the command line)."""
-        return fields_of(cls)
+            check_timeline(self)
 
     @property
     def airtime(self) -> Airtime:
         """The radio's times."""
         return Airtime(self.bitrate, self.ramp_up_ns)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers, text and lists that :meth:`from_dict` and YAML read back."""
-        result = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        result["loss_matrix"] = [list(row) for row in self.loss_matrix]
-        result["link_loss"] = [link.to_dict() for link in self.link_loss]
-        result["schedule"] = [change.to_dict() for change in self.schedule]
-        return result
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> ChannelConfig:
@@ -149,15 +133,8 @@ class ChannelConfig:
         if "slot_ms" in values:
             if "slot_ns" in values:
                 raise ConfigError("slot_ms", values["slot_ms"], "either slot_ms or slot_ns, not both")
-            info = FieldInfo("slot_ms", "float", None, "", unit="ms", minimum=1e-6, maximum=1e6)
-            values["slot_ns"] = round(checked(info, values.pop("slot_ms")) * 1_000_000)
-        known = [field.name for field in dataclasses.fields(cls)]
-        for name in values:
-            if name not in known:
-                raise ConfigError(str(name), values[name], f"one of the settings {', '.join(known)}")
-        if "agents" not in values:
-            raise ConfigError("agents", None, "a whole number from 1 to 65535")
-        return cls(**values)
+            values["slot_ns"] = round(_SLOT_MS.check(values.pop("slot_ms")) * 1_000_000)
+        return build(cls, values)
 
     @classmethod
     def from_yaml(cls, path: str | Path, **overrides: Any) -> ChannelConfig:
@@ -239,11 +216,11 @@ class Change:
 
 def _normal(config: ChannelConfig, name: str, value: object, entry: str) -> tuple[str, Any]:
     """Return one changed setting as the configuration stores it; the combination is checked later."""
-    info = next((info for info in config.fields() if info.name == name and info.changeable), None)
-    if info is None:
+    spec = next((spec for spec in settings_of(ChannelConfig) if spec.name == name and spec.changeable), None)
+    if spec is None:
         raise ConfigError(f"{entry}.{name}", value, f"a setting that may change: {', '.join(CHANGEABLE)}")
-    if info.kind in ("int", "float", "bool"):
-        return name, checked(info, value, f"{entry}.{name}")
+    if spec.kind in ("int", "float", "bool"):
+        return name, spec.check(value, f"{entry}.{name}")
     if name == "partition":
         return name, format_partition(parse_partition(value, config.agents, f"{entry}.partition"))
     links = _listed(value, f"{entry}.{name}")
@@ -254,11 +231,9 @@ def _when(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, 
     if slot_key in entry and time_key in entry:
         raise ConfigError(f"{name}.{time_key}", entry[time_key], f"either {slot_key} or {time_key}, not both")
     if entry.get(slot_key) is not None:
-        info = FieldInfo(slot_key, "int", None, "", minimum=0, maximum=2**53)
-        return int(checked(info, entry[slot_key], f"{name}.{slot_key}"))
+        return int(_SLOT.check(entry[slot_key], f"{name}.{slot_key}"))
     if entry.get(time_key) is not None:
-        info = FieldInfo(time_key, "float", None, "", unit="s", minimum=0, maximum=1e9)
-        seconds: float = checked(info, entry[time_key], f"{name}.{time_key}")
+        seconds: float = _SECONDS.check(entry[time_key], f"{name}.{time_key}")
         return -(-round(seconds * _NS_PER_S) // slot_ns)
     return None
 
@@ -272,4 +247,4 @@ def _listed(value: object, name: str) -> Sequence[Any]:
 
 
 #: Settings that may change while the channel runs, by the schedule or by :meth:`Channel.set`.
-CHANGEABLE: tuple[str, ...] = tuple(info.name for info in fields_of(ChannelConfig) if info.changeable)
+CHANGEABLE: tuple[str, ...] = tuple(spec.name for spec in settings_of(ChannelConfig) if spec.changeable)

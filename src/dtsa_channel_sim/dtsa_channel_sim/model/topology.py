@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
-
-from .config_fields import FieldInfo, checked
+from dtsa_agent.core.settings import Setting
 
 _RANGE = re.compile(r"(\d+)(?:\s*-\s*(\d+))?")
-_PROBABILITY = FieldInfo("loss", "float", None, "", minimum=0.0, maximum=1.0)
+_PROBABILITY = Setting("loss", "float", None, "loss of a link", minimum=0.0, maximum=1.0)
 
 
 def parse_ids(value: object, agents: int, name: str) -> tuple[int, ...]:
@@ -146,7 +145,7 @@ class LinkLoss:
         return cls(
             sender=format_ids(parse_ids(entry["from"], agents, f"{name}.from")),
             receiver=format_ids(parse_ids(entry["to"], agents, f"{name}.to")),
-            loss=checked(_PROBABILITY, entry["loss"], f"{name}.loss"),
+            loss=_PROBABILITY.check(entry["loss"], f"{name}.loss"),
             both_ways=both_ways,
         )
 

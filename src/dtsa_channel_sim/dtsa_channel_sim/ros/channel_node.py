@@ -16,11 +16,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import declare_from_dataclass, from_parameter
 from dtsa_agent.ros.common.process import run_node
-from dtsa_agent.settings import settings_of
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, Change, ChannelConfig
 from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict

@@ -9,8 +9,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dtsa_agent.core.errors import ConfigError, range_text
-from dtsa_agent.settings import Setting, format_values, settings_of
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import Setting, format_values, settings_of
 
 _UNBOUNDED = 2.0**62
 _NOTHING = -1  # stands for None in a parameter that may be left open
@@ -71,7 +71,7 @@ def _declare(node: Node, setting: Setting, default: Any, read_only: bool) -> Par
     except Exception as error:  # rclpy has no common base for wrong types and values out of range
         given = node._parameter_overrides.get(setting.name)
         value = given.value if given is not None else default
-        raise ConfigError(setting.name, value, allowed_text(setting)) from error
+        raise ConfigError(setting.name, value, setting.allowed) from error
 
 
 def from_parameter(setting: Setting, value: Any) -> Any:
@@ -86,17 +86,6 @@ def from_parameter(setting: Setting, value: Any) -> Any:
     if setting.kind == "float" and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     return value
-
-
-def allowed_text(setting: Setting) -> str:
-    """What a setting may be, in words."""
-    if setting.choices:
-        return ", ".join(setting.choices)
-    words = {"int": "a whole number", "float": "a number", "bool": "true or false", "values": "name=number, ..."}
-    text = words.get(setting.kind, "a text")
-    if setting.minimum is not None and setting.maximum is not None:
-        text += ", " + range_text(setting.minimum, setting.maximum)
-    return f"{text} {setting.unit}".rstrip()
 
 
 def to_parameters(values: Mapping[str, Any], cls: type) -> dict[str, Any]:
