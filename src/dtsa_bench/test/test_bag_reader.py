@@ -17,7 +17,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.bag import metadata
 from dtsa_bench.bag.columns import Table
 from dtsa_bench.bag.errors import BagError, UnusableBag
-from dtsa_bench.bag.reader import Bag, Message, find_file
+from dtsa_bench.bag.place import find_file
+from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.bag.recover import recover
 from dtsa_bench.bag.writer import BagWriter
 

@@ -19,12 +19,15 @@ from flight_helpers import flight_bag
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.bag.errors import UnusableBag
 from dtsa_bench.bag.reader import Bag
+from dtsa_bench.bag.recover import recover
 from dtsa_bench.bag.run import load_run
 from dtsa_bench.bag.writer import BagWriter
+from dtsa_bench.cli import main
 from dtsa_bench.report.data import pair_distances, run_data
 from dtsa_bench.report.page import render, write_report
 from dtsa_bench.run_config import RunConfig
 from dtsa_bench.simulate import simulate
+from dtsa_bench.verify import verify_bag
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -51,6 +54,35 @@ def data(flights: dict[str, Path]) -> dict[str, Any]:
 def numbers(text: str, kind: str) -> np.ndarray:
     """A packed array."""
     return np.frombuffer(base64.b64decode(text), kind)
+
+
+def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(
+    flights: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(flights["clean"], tmp_path / "a" / "bag")
+    file = next((tmp_path / "a" / "bag").glob("*.mcap"))
+    known = load_run(file)
+    with Bag(file) as bag:
+        assert load_run(bag).slots.tolist() == known.slots.tolist()
+    for given in (tmp_path / "a", tmp_path / "a" / "bag", file):
+        for path in (given, str(given)):
+            assert load_run(path).slots.tolist() == known.slots.tolist()
+            assert run_data(path)["agents"] == 6
+            assert verify_bag(path).mode == "lockstep"
+        assert recover(given, tmp_path / f"saved-{given.name}").count > 0
+        assert main(["export", str(given), "--to", "csv", "--out", str(tmp_path / f"csv-{given.name}")]) == 0
+    capsys.readouterr()
+
+
+def test_results_of_a_run_directory_stay_in_it(
+    flights: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "a"
+    shutil.copytree(flights["clean"], run / "bag")
+    assert main(["report", str(run)]) == main(["export", str(run)]) == main(["recover", str(run)]) == 0
+    capsys.readouterr()
+    assert {path.name for path in run.iterdir()} == {"bag", "report.html", "bag_tables", "bag_recovered"}
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 def test_results_are_those_of_the_simulator(data: dict[str, Any], flights: dict[str, Path]) -> None:

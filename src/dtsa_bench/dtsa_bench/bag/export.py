@@ -15,7 +15,6 @@ import pyarrow.parquet
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_frame
 from dtsa_bench.bag.errors import BagError
-from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.run import OUTCOMES, RecordedRun, load_run
 
 FORMATS = ("parquet", "csv")
@@ -78,7 +77,7 @@ def export(
 ) -> list[Exported]:
     """Write the tables of a bag and a description of their columns.
 
-    :param path: the bag.
+    :param path: run directory, bag directory or .mcap file.
     :param directory: where they go; must not exist, or be empty.
     :param kind: "parquet" or "csv".
     :param tables: names from `COLUMNS`; None: all.
@@ -94,8 +93,7 @@ def export(
     target = Path(directory)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ConfigError("out", str(directory), "a directory that is empty or does not exist yet")
-    with Bag(path) as bag:
-        run = load_run(bag)
+    run = load_run(path)
     written = []
     try:
         target.mkdir(parents=True, exist_ok=True)

@@ -25,9 +25,8 @@ from rosbags.typesys.store import Typestore
 from dtsa_bench.bag import columns as tables
 from dtsa_bench.bag import container, metadata, qos
 from dtsa_bench.bag.errors import BagError, UnusableBag
+from dtsa_bench.bag.place import find_file
 
-SQLITE = "an sqlite3 bag; `ros2 bag convert` makes an mcap bag of it"
-PACKED = "its file is compressed as a whole; `ros2 bag convert` makes a plain bag of it"
 PACKED_MESSAGES = "its messages are compressed one by one; `ros2 bag convert` makes a plain bag of it"
 
 
@@ -57,7 +56,7 @@ class Topic:
 class Bag:
     """A recorded run, open for reading. A context manager.
 
-    :param path: a bag directory or a .mcap file alone.
+    :param path: a bag directory, the directory of a run with one in it, or a .mcap file alone.
     :raises UnusableBag: if it is none, or is damaged; the text says what would help.
     """
 
@@ -299,33 +298,3 @@ class Bag:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def find_file(path: Path) -> Path:
-    """The .mcap file of what was given as a bag.
-
-    :param path: a bag directory or a file.
-    :raises UnusableBag: if there is none, or several.
-    """
-    if not path.exists():
-        raise UnusableBag(path, "there is no such file or directory")
-    if not path.is_dir():
-        if path.suffix == ".db3":
-            raise UnusableBag(path, SQLITE)
-        if path.suffix == ".zstd":
-            raise UnusableBag(path, PACKED)
-        return path
-    found = sorted(path.glob("*.mcap"))
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise UnusableBag(
-            path, f"holds {len(found)} .mcap files: name one of them, or join them with `ros2 bag convert`"
-        )
-    if any(path.glob("*.db3")):
-        raise UnusableBag(path, SQLITE)
-    if any(path.glob("*.mcap.zstd")):
-        raise UnusableBag(path, PACKED)
-    below = sorted(entry.parent.name for entry in path.glob("*/*.mcap"))
-    hint = f"; did you mean one of {', '.join(below[:5])} in it?" if below else ""
-    raise UnusableBag(path, f"the directory holds no .mcap file{hint}")

@@ -24,7 +24,8 @@ from mcap.records import Channel, Metadata, Schema
 from dtsa_bench.bag import container, metadata, qos
 from dtsa_bench.bag.digest import KEY
 from dtsa_bench.bag.errors import UnusableBag
-from dtsa_bench.bag.reader import PACKED_MESSAGES, find_file
+from dtsa_bench.bag.place import bag_of, find_file
+from dtsa_bench.bag.reader import PACKED_MESSAGES
 from dtsa_bench.bag.schema import Definition
 from dtsa_bench.bag.writer import BagWriter
 
@@ -219,7 +220,7 @@ def recover(
 ) -> Recovery:
     """Save all readable messages of a bag to a new one.
 
-    :param path: the damaged bag: a directory or a .mcap file. It is only read.
+    :param path: the damaged bag: run directory, bag directory or .mcap file. It is only read.
     :param directory: where the new bag is made; None: beside the old one, with `_recovered` appended to
         its name.
     :param keep_damaged: keep what can be read of chunks whose checksum does not fit, too.
@@ -227,8 +228,8 @@ def recover(
     :raises ConfigError: if the new directory is in use, or nothing at all can be read.
     :raises BagError: if the new bag cannot be written.
     """
-    source = find_file(Path(path))
-    target = Path(directory) if directory is not None else _beside(Path(path))
+    source = find_file(path)
+    target = Path(directory) if directory is not None else _beside(bag_of(path))
     try:
         with source.open("rb") as stream:
             size = source.stat().st_size

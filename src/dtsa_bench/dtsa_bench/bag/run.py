@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -86,12 +87,19 @@ class RecordedRun:
         return np.asarray(slot * (self.slot_ns / 1e9), dtype=np.float64)
 
 
-def load_run(bag: Bag) -> RecordedRun:
+def load_run(source: Bag | str | Path) -> RecordedRun:
     """Read a whole run.
 
-    :param bag: an open bag of this project.
-    :raises UnusableBag: if it holds no configuration, or neither receptions nor odometry.
+    :param source: run directory, bag directory or .mcap file; or an open bag.
+    :raises UnusableBag: if it is no bag of this project: it holds no configuration, or neither receptions nor odometry.
     """
+    if isinstance(source, Bag):
+        return _load(source)
+    with Bag(source) as bag:
+        return _load(bag)
+
+
+def _load(bag: Bag) -> RecordedRun:
     config = bag.config
     odometry = sorted((int(m[1]), name) for name in bag.topics if (m := ODOMETRY.match(name)))
     wanted = [name for name in (RECEPTION, DECISION, TRANSMISSION) if name in bag.topics]

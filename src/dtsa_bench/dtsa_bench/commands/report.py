@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from dtsa_bench.bag.place import GIVEN, bag_of
+
 DESCRIPTION = """\
 Writes one self-contained HTML page about one recorded run, or several side by side: the flight in 3D, the
 slots,
@@ -21,7 +23,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bags", nargs="+", metavar="BAG", help="bag directories or .mcap files, up to 6")
+    parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{GIVEN}; up to 6")
     parser.add_argument("--out", metavar="FILE", help="the page (default: report.html beside the first bag)")
 
 
@@ -29,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the report."""
     from dtsa_bench.report.page import write_report
 
-    first = Path(args.bags[0]).resolve()
+    first = bag_of(args.bags[0]).resolve()
     out = Path(args.out) if args.out else first.parent / "report.html"
 
     def progress(bag: str) -> None:

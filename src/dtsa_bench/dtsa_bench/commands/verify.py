@@ -6,6 +6,8 @@ import argparse
 import json
 import sys
 
+from dtsa_bench.bag.place import GIVEN
+
 DESCRIPTION = """\
 Rebuilds every agent and the channel from the recorded configuration, feeds them what they heard, and compares
 every message of the bag, byte by byte. Exit code 0: all equal; 1: a difference, which is shown."""
@@ -19,7 +21,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bag", nargs="+", help="bag directory, flight directory or .mcap file")
+    parser.add_argument("bag", nargs="+", help=GIVEN)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

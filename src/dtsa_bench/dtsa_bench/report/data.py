@@ -42,7 +42,7 @@ class Distances:
 def run_data(path: str | Path) -> dict[str, Any]:
     """Everything that the page needs to know about one run, as JSON types.
 
-    :param path: the bag.
+    :param path: run directory, bag directory or .mcap file.
     :raises UnusableBag: if it is none of a swarm's run.
     """
     with Bag(path) as bag:

@@ -17,13 +17,13 @@ from .result import Difference, Mismatch, Result
 def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) -> Result:
     """Checks a recorded run.
 
-    :param path: a bag directory, the directory of a flight with one in it, or an .mcap file.
+    :param path: a bag directory, the directory of a run with one in it, or a .mcap file.
     :param progress: is called with the slot now and then.
     :returns: what was checked, and the first difference if there is one.
     :raises UnusableBag: if it cannot be read as a bag of this project at all.
     """
     begin = time.perf_counter()
-    with Bag(bag_directory(Path(path))) as bag:
+    with Bag(path) as bag:
         mode = str(bag.config.get("mode", "lockstep"))
         result = Result(str(path), mode)
         try:
@@ -47,9 +47,3 @@ def _check(bag: Bag, mode: str, result: Result, progress: Callable[[int], None] 
     from .realtime import RealtimeCheck
 
     RealtimeCheck(bag, result).check()
-
-
-def bag_directory(path: Path) -> Path:
-    """The bag of a flight's directory, or the path itself."""
-    inner = path / "bag"
-    return inner if inner.is_dir() and not any(path.glob("*.mcap")) else path
