@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 
-from dtsa_agent.core import ConfigError, Swarm
-from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core import AbstractSwarm, ConfigError
+from dtsa_agent.core.authentication import AuthenticatedSwarm, Authenticator
 
 VARIABLE = "DTSA_AUTH_KEY"
 
 
-def with_key(swarm: Swarm) -> Swarm:
-    """The swarm, with its frames sealed if its settings say so (``auth``).
+def with_key(swarm: AbstractSwarm) -> AbstractSwarm:
+    """The swarm, with its frames authenticated if its settings say so (``auth``).
 
     :param swarm: as it was made.
     :raises ConfigError: if there is no key, or none that is usable.
@@ -20,5 +20,5 @@ def with_key(swarm: Swarm) -> Swarm:
         text = os.environ.get(VARIABLE, "")
         if not text:
             raise ConfigError(VARIABLE, text, "32 to 64 hexadecimal digits in the environment, because auth is on")
-        swarm.authenticate(Authenticator.from_hex(text, swarm.config.auth_session))
+        return AuthenticatedSwarm(swarm, Authenticator.from_hex(text, swarm.config.auth_session))
     return swarm

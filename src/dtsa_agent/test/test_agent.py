@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from dtsa_agent.core import Agent, Swarm, SwarmConfig, decode_frame
+from dtsa_agent.core import Agent, AgentGroup, ConfigError, SlotOutcome, Swarm, SwarmConfig, decode_frame
+from dtsa_agent.core.authentication import Authenticator
 
 
 def test_agents_that_share_bytes_only_fly_like_the_swarm() -> None:
@@ -21,8 +23,7 @@ def test_agents_that_share_bytes_only_fly_like_the_swarm() -> None:
             for sender, data in frames.items():
                 if sender != agent.id:
                     assert agent.on_frame(data, slot)
-            if not frames:
-                agent.on_silence(slot)
+            agent.on_slot_end(SlotOutcome.FRAME if frames else SlotOutcome.SILENCE)
         swarm.fly(slot)
         for index in senders:
             swarm.hear(slot, swarm.frame(index))
@@ -57,3 +58,43 @@ def test_commands_lead_to_the_goal_at_any_instant_of_a_slot() -> None:
     command = np.array(agent.command(position, (0.0, 0.0, 0.0), 0, 3))
     assert command @ goal > 0.99 * np.linalg.norm(command) * np.linalg.norm(goal)
     assert 0 < np.linalg.norm(command) <= 1.5 + 1e-9
+
+
+def test_a_key_belongs_to_authenticated_swarms_and_only_there() -> None:
+    sealed, key = SwarmConfig(agents=2, policy="tdma", auth=True), Authenticator(bytes(16))
+    for config, authenticator in ((sealed, None), (SwarmConfig(agents=2), key)):
+        with pytest.raises(ConfigError, match="authenticator"):
+            Agent(1, config, authenticator=authenticator)
+    sender, receiver = (Agent(k, sealed, authenticator=Authenticator(bytes(16))) for k in (1, 2))
+    frame = sender.on_slot(0)
+    assert frame is not None
+    assert receiver.on_slot(0) is None
+    assert receiver.on_frame(frame, 0)
+    assert not receiver.on_frame(frame[:-1], 0)
+    assert receiver.swarm.rejected == 1
+
+
+@pytest.mark.parametrize("policy", ["tdma", "dtsa"])
+def test_a_group_shares_a_table_until_the_first_frame_that_not_all_have_heard(policy: str) -> None:
+    config = SwarmConfig(agents=5, policy=policy, seed=6)
+    group, plain = AgentGroup(Swarm(config, shared_view=True)), Swarm(config)
+    for slot in range(120):
+        plain.scenario.advance(slot, plain)
+        senders = group.on_slot(slot)
+        assert senders == plain.begin(slot)
+        frames = [plain.frame(index) for index in senders]
+        heard = np.ones((len(senders), 5), dtype=np.uint8)
+        heard[np.arange(len(senders)), list(senders)] = 0
+        if slot == 60:
+            heard[:] = 0  # nobody else: only its sender knows what it said
+        for swarm in (group.swarm, plain):
+            swarm.fly(slot)
+        assert group.swarm.shared == (slot <= 60)
+        group.on_frames(slot, [index + 1 for index in senders], frames, heard)
+        for data, mask in zip(frames, heard, strict=True):
+            plain.hear(slot, data, mask)
+        group.on_slot_end()
+        plain.end(slot)
+        assert group.swarm.shared == (slot < 60)
+        assert np.array_equal(group.swarm.position, plain.position)
+    assert np.array_equal(group.swarm.digest, plain.digest)

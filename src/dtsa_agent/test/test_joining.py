@@ -7,7 +7,7 @@ import pytest
 
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.joining import JOINABLE, Listeners, Newcomers, check_joinable
+from dtsa_agent.core.joining import JOINABLE, Listeners, Newcomers, check_joinable
 
 MS = 1_000_000
 

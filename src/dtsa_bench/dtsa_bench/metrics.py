@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario, Swarm, _kernel
+from dtsa_agent.core import AbstractSwarm, Scenario, _kernel
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
@@ -30,7 +30,7 @@ _ARRIVED: int = _kernel.METRICS_ARRIVED
 COMPLETED, CRASHED, TIMED_OUT, STOPPED = "completed", "crashed", "timed out", "stopped"
 
 
-def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> Swarm:
+def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> AbstractSwarm:
     """Tables that follow a flight from what the air carried, for whoever does not host all agents.
 
     :param run: the run.
@@ -77,7 +77,7 @@ class FlightMetrics:
         # First number of slots at which the flight is over whatever happens.
         self._limit = max(1, math.ceil(limits.timeout_s * 1e9 / swarm.slot_ns - 1e-6))
 
-    def update(self, slot: int, track: Array, tables: Swarm | None, outcome: int) -> str:
+    def update(self, slot: int, track: Array, tables: AbstractSwarm | None, outcome: int) -> str:
         """Takes in a slot that has just ended.
 
         :param slot: its number; slots come one after the other from 0.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario, Swarm, make_scenario
+from dtsa_agent.core import AbstractSwarm, Scenario, make_scenario
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim import Channel
@@ -49,7 +49,7 @@ class Flight:
     run: RunConfig
     scenario: Scenario
     metrics: FlightMetrics
-    swarm: Swarm  # as it was at the end
+    swarm: AbstractSwarm  # as it was at the end
     trace: Trace | None
     wall_time_s: float
 
@@ -107,7 +107,9 @@ def simulate(
     return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
 
 
-def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int, ages: bool) -> None:
+def _fly(
+    swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int, ages: bool
+) -> None:
     """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
     advance, begin, fly, hear, end = swarm.scenario.advance, swarm.begin, swarm.fly, swarm.hear, swarm.end
     frame, arbitrate, update = swarm.frame, channel.arbitrate, metrics.update
@@ -139,7 +141,7 @@ def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | N
         slot += 1
 
 
-def _keep(kept: Trace, swarm: Swarm, slot: int, senders: tuple[int, ...], outcome: int, view: int) -> None:
+def _keep(kept: Trace, swarm: AbstractSwarm, slot: int, senders: tuple[int, ...], outcome: int, view: int) -> None:
     kept.senders.append(senders)
     kept.outcomes.append(outcome)
     kept.reasons.append(int(swarm.reason[view]))

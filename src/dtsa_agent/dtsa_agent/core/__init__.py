@@ -1,14 +1,17 @@
 """The protocol and flight logic of DTSA: no ROS, no clock, no I/O."""
 
-from .agent import Agent, Decision
+from .abstract_swarm import AbstractSwarm
+from .agent import Agent, AgentGroup, Decision
 from .config import SwarmConfig
 from .errors import ConfigError, DtsaError, LocalProtocolError, RemoteProtocolError
 from .frame import Frame, decode_frame, encode_frame
+from .outcome import SlotOutcome
 from .priority import priority, select
 from .scenario import Scenario, make_scenario
 from .swarm import REASONS, Swarm
 
 __all__ = [
-    "REASONS", "Agent", "ConfigError", "Decision", "DtsaError", "Frame", "LocalProtocolError", "RemoteProtocolError",
-    "Scenario", "Swarm", "SwarmConfig", "decode_frame", "encode_frame", "make_scenario", "priority", "select",
+    "REASONS", "AbstractSwarm", "Agent", "AgentGroup", "ConfigError", "Decision", "DtsaError", "Frame",
+    "LocalProtocolError", "RemoteProtocolError", "Scenario", "SlotOutcome", "Swarm", "SwarmConfig", "decode_frame",
+    "encode_frame", "make_scenario", "priority", "select",
 ]  # fmt: skip

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 
+from .abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
 from .errors import ConfigError, LocalProtocolError
 
 TAG_LENGTH = 4  # bytes
@@ -91,3 +92,45 @@ class Authenticator:
                 return frame
         self.forged += 1
         return None
+
+
+class AuthenticatedSwarm(SwarmWrapper):
+    """A swarm whose frames leave with a tag; only frames with a right one come in, others are counted.
+
+    :param inner: the swarm.
+    :param authenticator: holds the key; one for this swarm alone, because it counts.
+    """
+
+    def __init__(self, inner: AbstractSwarm, authenticator: Authenticator) -> None:
+        super().__init__(inner)
+        self.authenticator = authenticator
+        self._slot = 0  # the one that frames are sealed for
+
+    def emit(self, slot: int) -> tuple[int, ...]:
+        self._slot = slot
+        return self.inner.emit(slot)
+
+    def begin(self, slot: int) -> tuple[int, ...]:
+        self._slot = slot
+        return self.inner.begin(slot)
+
+    def frame(self, local_index: int) -> bytes:
+        data = self.inner.frame(local_index)
+        return self.authenticator.seal(data, self._slot) if data else data
+
+    def hear(self, slot: int, data: bytes, mask: Bytes | None = None) -> bool:
+        frame = self.authenticator.open(bytes(data), slot, late=1)
+        return frame is not None and self.inner.hear(slot, frame, mask)
+
+    def unseal(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
+        return self.authenticator.open(data, slot, late)
+
+    def with_own_tables(self, slot: int) -> AuthenticatedSwarm:
+        swarm = AuthenticatedSwarm(self.inner.with_own_tables(slot), self.authenticator)
+        swarm._slot = slot
+        return swarm
+
+    @property
+    def rejected(self) -> int:
+        """Frames heard that were not authentic: forged, changed, replayed or cut."""
+        return self.authenticator.rejected

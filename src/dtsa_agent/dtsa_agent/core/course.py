@@ -59,6 +59,11 @@ class Course:
         self.goal: Array = self._start.copy()  # (3, L) m, frame map, where each flies to now
         self.changed = np.full(len(local), -1, dtype=np.int64)  # slot in which that became its goal
 
+    def reset(self) -> None:
+        """Back to the start of the flight."""
+        self.leg[:] = self._since[:] = self.changed[:] = -1
+        self.goal = self._start.copy()
+
     @property
     def active(self) -> NDArray[np.bool_]:
         """Who flies now, (L,); the others hover."""

@@ -19,10 +19,10 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
 from .config import AVOIDERS, ESTIMATORS, POLICIES, SwarmConfig
 from .errors import ConfigError, LocalProtocolError
 from .flight_models import FLIGHT_MODELS, FlightModel
-from .frame import PROFILE_PAPER_INTENT
 from .scenario import Scenario
 from .swarm import REASONS, Swarm
 
@@ -56,7 +56,7 @@ class View:
         "sent_velocity",
     )
 
-    def __init__(self, swarm: Swarm, view: int) -> None:
+    def __init__(self, swarm: AbstractSwarm, view: int) -> None:
         self.agent = int(swarm.observer[view]) + 1  # id of the observer, 0: one that hears everything
         self.config = swarm.config
         self.scenario = swarm.scenario
@@ -78,10 +78,7 @@ class Policy(Protocol):
     """Who sends next."""
 
     def choose(self, view: View, slot: int) -> int:
-        """The id that this observer takes for the sender of a slot, 0:
-
-        nobody. It sends if that is its own.
-        """
+        """The id that this observer takes for the sender of a slot, 0: nobody. It sends if that is its own."""
 
 
 class Estimator(Protocol):
@@ -173,37 +170,38 @@ def make_swarm(
     local: Sequence[int] | None = None,
     shared_view: bool = False,
     observers: Sequence[int] | None = None,
-) -> Swarm:
-    """A :class:`Swarm`, or one that asks plug-ins if the configuration names any.
+) -> AbstractSwarm:
+    """A :class:`Swarm`, in a :class:`PluginSwarm` if the configuration names plug-ins.
 
-    Parameters are those of ``Swarm``.
+    Parameters are those of ``Swarm``; with plug-ins every agent has a table of its own.
 
     :raises ConfigError: for ids and plug-ins that do not exist.
     """
     if not uses_plugins(config):
         return Swarm(config, scenario, local, shared_view, observers)
-    return PluginSwarm(config, scenario, local, False, observers)
+    return PluginSwarm(Swarm(config, scenario, local, False, observers, _intent(config)))
 
 
-class PluginSwarm(Swarm):
-    """A swarm some of whose parts are Python objects from other packages.
+def _intent(config: SwarmConfig) -> bool | None:
+    """Whether an estimator plug-in makes frames carry the commanded velocity; None: it is not a plug-in."""
+    if config.estimator in ESTIMATORS:
+        return None
+    return bool(getattr(find("estimator", config.estimator), "needs_intent", False))
 
-    Every agent has its own instances.
+
+class PluginSwarm(SwarmWrapper):
+    """A swarm some of whose parts are Python objects from other packages. Every observer has its own instances.
+
+    :param inner: the swarm; its kernel leaves to this class what is not built in.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, inner: AbstractSwarm) -> None:
+        super().__init__(inner)
         ids = [int(index) + 1 for index in self.observer]
         self._views = [View(self, view) for view in range(len(ids))]
         self._policies = self._instances("policy", ids)
         self._estimators = self._instances("estimator", ids)
         self._avoiders = self._instances("avoider", ids)
-        if self._policies:
-            self.decide, self.begin = self._decide, self._begin
-        if self._estimators:
-            self.estimate, self.end = self._estimate, self._end
-        if self._estimators or self._avoiders:
-            self.steer, self.fly = self._steer, self._fly
 
     def _instances(self, kind: str, ids: list[int]) -> list[Any]:
         name = getattr(self.config, kind)
@@ -212,14 +210,10 @@ class PluginSwarm(Swarm):
         factory = find(kind, name)
         return [factory(self.config, agent) for agent in ids]
 
-    def _parameters(self, count: int) -> dict[str, Any]:
-        parameters = super()._parameters(count)
-        foreign = self.config.estimator not in ESTIMATORS and self.config.policy != "lease"
-        if foreign and getattr(find("estimator", self.config.estimator), "needs_intent", False):
-            parameters["profile"] = PROFILE_PAPER_INTENT
-        return parameters
-
-    def _decide(self, slot: int) -> None:
+    def decide(self, slot: int) -> None:
+        if not self._policies:
+            self.inner.decide(slot)
+            return
         for index, agent in enumerate(self.ids):
             chosen = self._policies[index].choose(self._views[index], slot)
             if not 0 <= chosen <= self.config.agents:
@@ -231,34 +225,40 @@ class PluginSwarm(Swarm):
             self.sends[index] = chosen == agent and self.present[index]
         self.reason[:] = _PLUGIN_REASON
         self.score[:] = 0.0
-        self.digest[:] = self._view_hash[: len(self.ids)]
+        self.digest[:] = self.table_hash[: len(self.ids)]
 
-    def _begin(self, slot: int) -> tuple[int, ...]:
-        self._decide(slot)
-        senders: tuple[int, ...] = self.kernel.emit(slot)
-        return senders
+    def begin(self, slot: int) -> tuple[int, ...]:
+        self.decide(slot)
+        return self.inner.emit(slot)
 
-    def _estimate(self, slot: int, step: int = 0) -> None:
+    def estimate(self, slot: int, step: int = 0) -> None:
+        if not self._estimators:
+            self.inner.estimate(slot, step)
+            return
         for index, view in enumerate(self._views):
             position, velocity = self.estimate_position[index], self.estimate_velocity[index]
             self._estimators[index].estimate(view, slot, step, position, velocity)
 
-    def _end(self, slot: int) -> None:
-        self.kernel.end(slot)
-        self._estimate(slot + 1)  # what the metrics compare with the truth
+    def end(self, slot: int, collided: Bytes | None = None) -> None:
+        self.inner.end(slot, collided)
+        if self._estimators:
+            self.estimate(slot + 1)  # what the metrics compare with the truth
 
-    def _steer(self, slot: int, step: int, estimate: bool = True) -> None:
+    def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         if estimate and self._estimators:
-            self._estimate(slot, step)
-        self.kernel.steer(slot, step, estimate and not self._estimators)
+            self.estimate(slot, step)
+        self.inner.steer(slot, step, estimate and not self._estimators)
         for index, avoider in enumerate(self._avoiders):
             if index < len(self.ids) and self.active[index] and self.present[index]:
                 self.command[:, index] = avoider.command(self._views[index], slot, step)
 
-    def _fly(self, slot: int) -> None:
+    def fly(self, slot: int) -> None:
+        if not (self._estimators or self._avoiders):
+            self.inner.fly(slot)
+            return
         for step in range(self.config.steps):
-            self._steer(slot, step)
-            self.kernel.move(step)
+            self.steer(slot, step)
+            self.inner.move(step)
 
 
 def _window(array: NDArray[Any]) -> NDArray[Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from .config import SwarmConfig
 from .course import Course, Plan
 from .flight_models import flight_model
-
-if TYPE_CHECKING:
-    from .swarm import Swarm
 
 Array = NDArray[np.float64]
 
@@ -30,6 +27,22 @@ def generator(seed: int, stream: int, *more: int) -> np.random.Generator:
     :param more: further indices, e.g. an agent's id.
     """
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, *more])))
+
+
+class Pilots(Protocol):
+    """What a scenario looks at and sets: a part of :class:`~dtsa_agent.core.abstract_swarm.SwarmState`."""
+
+    config: SwarmConfig
+    course: Course | None
+    shared: bool
+    rows: NDArray[np.intp]
+    local: NDArray[np.int32]
+    sent_slot: NDArray[np.int64]
+    position: Array
+    goal: Array
+    known_goal: Array
+    final: NDArray[np.uint8]
+    active: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +66,7 @@ class Scenario:
         """
         return None if self.plan is None else Course(self.plan, local)
 
-    def advance(self, slot: int, swarm: Swarm) -> None:
+    def advance(self, slot: int, swarm: Pilots) -> None:
         """Sets goals and activity of the swarm's local agents for a slot; called before the slot begins.
 
         :param slot: the slot that is about to begin.

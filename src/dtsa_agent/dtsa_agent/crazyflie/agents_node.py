@@ -3,7 +3,7 @@
     python -m dtsa_agent.crazyflie.agents_node --ros-args -p agents:=12 -p policy:=lease ...
 
 The node is a `swarm_host` whose vehicles are flown by somebody else. Protocol, estimator and avoider are untouched:
-only the two places at which a simulated vehicle would move are replaced.
+only the motion of the vehicles is not simulated (:mod:`dtsa_agent.crazyflie.external_vehicles`).
 """
 
 from __future__ import annotations
@@ -16,13 +16,17 @@ from typing import Any
 import numpy as np
 from dtsa_msgs.msg import Slot, VelocityWorld
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core.plugins import make_swarm
+from dtsa_agent.crazyflie.external_vehicles import ExternalVehicles
 from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_agent.crazyflie.units import rotate
+from dtsa_agent.keys import with_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.process import run_node
@@ -33,29 +37,24 @@ from dtsa_agent.ros.swarm_node import parse_ids
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 STALE_S = 0.3  # an agent that does not know where it is gives no commands: the bridge then holds its vehicle
 LONGEST_PREDICTION_S = 0.15
-HOLD_GAIN = 1.0  # 1/s, for agents that hover: real air does not leave them where they are
-HOLD_MPS = 0.3
 
 
-class ExternalVehicles(RealtimeNode):
+class StationNode(RealtimeNode):
     """Agents that open their slots by the station's clock and whose vehicles are flown elsewhere.
 
     :param node: the ROS node.
-    :param config: the settings that all agents share.
-    :param ids: ids of the agents that live here.
+    :param swarm: the agents that live here.
     :param command_hz: rate of the commands, Hz; at most one a slot.
     """
 
-    def __init__(
-        self, node: Node, config: SwarmConfig, ids: Sequence[int], *args: Any, command_hz: float, **more: Any
-    ) -> None:
-        super().__init__(node, config, ids, *args, **more)
-        self.swarm.fly = self._fly
+    def __init__(self, node: Node, swarm: AbstractSwarm, *args: Any, command_hz: float, **more: Any) -> None:
+        every = max(1, round(1.0 / command_hz / swarm.config.slot_s))
+        self._vehicles = ExternalVehicles(swarm, every, self._command)
+        super().__init__(node, self._vehicles, *args, **more)
         count = len(self.swarm.ids)
         self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
         self._stamp = np.zeros(count)  # s, system clock, of that
-        self._every = max(1, round(1.0 / command_hz / config.slot_s))
         self._inputs, self._outputs = [], []
         for index, agent in enumerate(self.swarm.ids):
             space = names.agent_namespace(agent)
@@ -65,7 +64,6 @@ class ExternalVehicles(RealtimeNode):
 
             self._inputs.append(node.create_subscription(Odometry, f"{space}/{names.ODOMETRY}", keep, LATEST))
             self._outputs.append(node.create_publisher(VelocityWorld, f"{space}/cmd_velocity_world", 1))
-        self._hold = self.swarm.scenario.start[:, self.swarm.local].copy()
 
     @property
     def _blind(self) -> bool:
@@ -79,8 +77,7 @@ class ExternalVehicles(RealtimeNode):
                 self._note(index, taken[0])
         # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
         age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
-        self.swarm.position[:] = self._measured + self.swarm.velocity * age
-        self.swarm.track[:] = self.swarm.position
+        self._vehicles.place(self._measured + self.swarm.velocity * age)
 
     def _note(self, index: int, message: Odometry) -> None:
         place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
@@ -90,23 +87,14 @@ class ExternalVehicles(RealtimeNode):
         self.swarm.velocity[:, index] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
         self._heard[index] = time.monotonic()
 
-    def _fly(self, slot: int) -> None:
-        """In place of simulated motion: commands to the vehicles."""
-        swarm = self.swarm
-        if slot % self._every:
-            return
-        swarm.steer(slot, 0, True)
-        still = swarm.active == 0
-        if still.any():
-            swarm.command[:, still] = np.clip(
-                HOLD_GAIN * (self._hold[:, still] - swarm.position[:, still]), -HOLD_MPS, HOLD_MPS
-            )
+    def _command(self, velocities: NDArray[np.float64]) -> None:
+        """Publishes the commands to the vehicles, (3, L), m/s, frame map."""
         now = time.monotonic()
         message = VelocityWorld()
         for index, publisher in enumerate(self._outputs):
             if now - self._heard[index] < STALE_S:
                 v = message.vel
-                v.x, v.y, v.z = swarm.command[:, index].tolist()
+                v.x, v.y, v.z = velocities[:, index].tolist()
                 publisher.publish(message)
 
     def _prepare(self, message: Slot) -> bool:
@@ -126,7 +114,7 @@ def _body(stop: Stop, supervised: bool) -> None:
     try:
         config = declare_swarm(node)
         shared = ParameterDescriptor(description="namespace of what the whole swarm shares", read_only=True)
-        swarm = str(node.declare_parameter("swarm_namespace", names.SWARM, shared).value).rstrip("/")
+        space = str(node.declare_parameter("swarm_namespace", names.SWARM, shared).value).rstrip("/")
         listed = ParameterDescriptor(description="ids of the agents in this process; [0]: all", read_only=True)
         ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
         span = FloatingPointRange(from_value=1.0, to_value=100.0, step=0.0)
@@ -137,9 +125,8 @@ def _body(stop: Stop, supervised: bool) -> None:
         take_priority(int(node.declare_parameter("priority", 0, level).value))
         ids = parse_ids(ids, config.agents)
         zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
-        agents = ExternalVehicles(
-            node, config, ids, False, swarm, command_hz=command_hz, offset_ns=zero, drift_ppb=zero, align=False
-        )
+        swarm = with_key(make_swarm(config, local=ids))
+        agents = StationNode(node, swarm, space, command_hz=command_hz, offset_ns=zero, drift_ppb=zero, align=False)
         try:
             agents.run(stop)
         finally:

@@ -9,8 +9,10 @@ from typing import Any
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
-from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core import AbstractSwarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.plugins import make_swarm, shareable
+from dtsa_agent.keys import with_key
 
 from .common import names
 from .common.loop import Stop
@@ -52,15 +54,18 @@ def host_agents(
     :param spaces: namespace of each agent; default: ``/cf1``, ``/cf2``, ...
     :raises ConfigError: for settings that are not usable.
     """
-    swarm = str(_declare(node, "swarm_namespace", names.SWARM, "namespace of what the whole swarm shares")).rstrip("/")
+    if shared and not shareable(config):
+        raise ConfigError("shared_view", True, f"false with policy {config.policy}")
+    space = str(_declare(node, "swarm_namespace", names.SWARM, "namespace of what the whole swarm shares")).rstrip("/")
     odometry = _declare(node, "odometry", True, "offer each agent's true motion as <agent>/odom")
     mode = _declare(node, "mode", MODES[0], "lockstep: all wait for each other; realtime: each agent has its own clock")
     if mode not in MODES:
         raise ConfigError("mode", mode, ", ".join(MODES))
+    swarm = with_key(make_swarm(config, local=sorted(ids), shared_view=shared and mode == "lockstep"))
     if mode == "lockstep":
-        agents: SwarmNode = SwarmNode(node, config, ids, shared, swarm)
+        agents: SwarmNode = SwarmNode(node, swarm, space)
     else:
-        agents = _realtime(node, ids, config, swarm)
+        agents = _realtime(node, swarm, space)
     if odometry:
         agents.offer_odometry(spaces)
     try:
@@ -69,10 +74,10 @@ def host_agents(
         agents.loop.close()
 
 
-def _realtime(node: Node, ids: Sequence[int], config: SwarmConfig, swarm: str) -> SwarmNode:
+def _realtime(node: Node, swarm: AbstractSwarm, space: str) -> SwarmNode:
     from .realtime import RealtimeNode
 
-    count = len(ids)
+    count = len(swarm.ids)
     text = "offset of each agent's clock at the start, one for all or one an agent; positive: early (ns)"
     offset = _whole_numbers(node, "clock_offset_ns", [0], count, text)
     drift = _whole_numbers(
@@ -93,10 +98,8 @@ def _realtime(node: Node, ids: Sequence[int], config: SwarmConfig, swarm: str) -
         raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
     return RealtimeNode(
         node,
-        config,
-        ids,
-        False,
         swarm,
+        space,
         offset_ns=offset,
         drift_ppb=drift,
         jitter_ns=jitter,

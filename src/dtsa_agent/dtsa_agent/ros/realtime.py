@@ -13,15 +13,15 @@ from dtsa_msgs.msg import Slot
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 
+from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING
 from dtsa_agent.core.alignment import ClockAligner
 from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.joining import Listeners
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
-from dtsa_agent.core.swarm import PRESENT_LEAVING
 
 from .common import names
 from .common.loop import Stop
 from .common.wire import split_frames, unpack_received
-from .joining import Listeners, Newcomers
 from .swarm_node import SwarmNode
 
 _PPB = 1_000_000_000
@@ -54,7 +54,7 @@ class RealtimeNode(SwarmNode):
 
     A process that was there at the channel's call begins with slot 0. One that comes later is told where the time line
     lies, too, because the stamps of messages are on it; but its agents take the time of their slots from the first
-    frame that each hears, and know nothing: :mod:`dtsa_agent.ros.joining`.
+    frame that each hears, and know nothing: :mod:`dtsa_agent.core.joining`.
 
     :param args: as for :class:`SwarmNode`.
     :param offset_ns: (L,) ns, offset of each agent's clock: positive clocks are early.
@@ -96,12 +96,11 @@ class RealtimeNode(SwarmNode):
         self._timeless: NDArray[np.bool_] = np.zeros(
             count, dtype=np.bool_
         )  # came late, and takes its time from the next frame
-        self._newcomers = Newcomers(count)
         self._first = 0  # slot with which this process began, or began anew
         # Whoever stood still for so long does not wait until the others think it dead, and knows too little.
         self._too_long_ns = max(500, 3 * self.config.anchor_every * self.config.agents) * self.slot_ns
         self._leaves_by: int | None = None  # slot: leaving; ends then at the latest
-        self._gone: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)  # who has said farewell, on the air
+        self._gone: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)  # who has said on the air that it leaves
         self._signals = 0
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
         self._early: list[Slot] = []  # frames of a slot that is still to come here
@@ -121,7 +120,7 @@ class RealtimeNode(SwarmNode):
         return np.asarray(time_ns + time_ns * self._drift // _PPB + self._offset)
 
     def run(self, stop: Stop) -> None:
-        """Flies until the run is over or a signal comes; with policy ``lease`` agents say farewell first.
+        """Flies until the run is over or a signal comes; with policy ``lease`` agents first say that they leave.
 
         :raises ConfigError: in a flight under way that agents of this policy cannot come into.
         """
@@ -191,7 +190,7 @@ class RealtimeNode(SwarmNode):
         following = (ahead - int(self.starts(ahead // self.slot_ns).min())) // self.slot_ns + 1
         self._first, self.slot = following, following - 1
         for index in range(len(self.swarm.ids)):
-            self._newcomers.add(self.swarm, index, following)
+            self.agents.restart(index, following)
         for aligner in self._aligners:
             aligner.reset()
 
@@ -233,7 +232,7 @@ class RealtimeNode(SwarmNode):
             if self._timeless[index]:
                 self._take_time(index, late)
                 if abs(late[index]) >= self.slot_ns // 2:
-                    self._newcomers.add(self.swarm, index, self.slot + 1)
+                    self.agents.restart(index, self.slot + 1)
             elif self._aligners:
                 aligner = self._aligners[index]
                 self._shift[index] += aligner.hear(int(late[index]))
@@ -245,8 +244,7 @@ class RealtimeNode(SwarmNode):
         assert self._listeners is not None
         heard = unpack_received(memoryview(message.received), len(message.sender), self.config.agents)
         (frame,) = split_frames(memoryview(message.data), message.length)
-        key = self.swarm.authenticator
-        if key is not None and key.open(frame, message.heard_slot) is None:
+        if self.swarm.unseal(frame, message.heard_slot) is None:
             return
         late, began = self._lateness(message), self.local_ns(self._began_ns(message))
         for index in np.flatnonzero(heard[0, self.swarm.local]):
@@ -273,12 +271,10 @@ class RealtimeNode(SwarmNode):
         """Closes the last slot and opens the next: decide, send, fly."""
         swarm = self.swarm
         if slot > self._first:
-            swarm.end(slot - 1)
+            self.agents.on_slot_end()
         if self._leaves_by is not None:
             swarm.present[~self._gone] = PRESENT_LEAVING
-        swarm.scenario.advance(slot, swarm)
-        self._newcomers.hold(swarm, slot)
-        senders = swarm.begin(slot)
+        senders = self.agents.on_slot(slot)
         starts = self.starts(slot)
         now = time.monotonic_ns() - self._zero - slot * self.slot_ns
         offsets = starts.copy()

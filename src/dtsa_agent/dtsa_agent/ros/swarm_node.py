@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from dtsa_agent.core import Scenario, Swarm, SwarmConfig
+from dtsa_agent.core import AbstractSwarm, AgentGroup
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
-from dtsa_agent.core.plugins import make_swarm, shareable
-from dtsa_agent.keys import with_key
 
 from .common import names
 from .common.loop import Loop, Stop
@@ -35,34 +33,20 @@ class SwarmNode:
     and only then fly through slot i, while the channel is already at work.
 
     :param node: the ROS node.
-    :param config: the settings that all agents share.
-    :param ids: ids of the agents that live here.
-    :param shared_view: one table serves all agents here, for as long as all hear the same.
+    :param swarm: the agents that live here.
     :param swarm_namespace: namespace of the swarm's topics.
-    :param scenario: starts and goals; default: made from ``config``.
     :param waiting: a quarter of the messages that may wait to be read: 1 is enough in lockstep.
-    :raises ConfigError: for ids that do not exist, or a policy whose agents cannot share a table.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        config: SwarmConfig,
-        ids: Sequence[int],
-        shared_view: bool = False,
-        swarm_namespace: str = names.SWARM,
-        scenario: Scenario | None = None,
-        waiting: int = 1,
-    ) -> None:
-        if shared_view and not shareable(config):
-            raise ConfigError("shared_view", True, f"false with policy {config.policy}")
+    def __init__(self, node: Node, swarm: AbstractSwarm, swarm_namespace: str = names.SWARM, waiting: int = 1) -> None:
         self.node = node
-        self.config = config
-        self.swarm = with_key(make_swarm(config, scenario, local=sorted(ids), shared_view=shared_view))
+        self.config = config = swarm.config
+        self.agents = AgentGroup(swarm)
         self.slot = -1  # the slot that has been answered
         self._goal = b""  # as last told
+        self._nothing = np.zeros((0, config.agents), dtype=np.uint8)  # heard by whom, in a slot without frames
         self._message = Transmission()
-        self._message.agent = array("H", self.swarm.ids)
+        self._message.agent = array("H", swarm.ids)
         self._message.steps = config.steps
         self._channel_seen = 0.0  # time.monotonic()
         self._odometry: list[tuple[int, Publisher]] = []
@@ -70,6 +54,11 @@ class SwarmNode:
         qos = names.lockstep_qos(waiting)
         self._publisher = node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
         self.loop = Loop(node, Slot, f"{swarm_namespace}/{names.SLOT}", qos)
+
+    @property
+    def swarm(self) -> AbstractSwarm:
+        """The agents that live here."""
+        return self.agents.swarm
 
     def offer_odometry(self, namespaces: Sequence[str] | None = None) -> None:
         """Offers each agent's true motion as ``odom``; published only while somebody subscribes.
@@ -114,15 +103,12 @@ class SwarmNode:
             return True
         if slot:
             self._hear(message, slot - 1)
-            self.swarm.end(slot - 1)
-        swarm = self.swarm
-        swarm.scenario.advance(slot, swarm)
-        senders = swarm.begin(slot)
-        self._answer(slot, message.stamp, senders)
+            self.agents.on_slot_end()
+        self._answer(slot, message.stamp, self.agents.on_slot(slot))
         self.slot = slot
         if self._watched:
             self._publish_odometry(message.stamp)
-        swarm.fly(slot)
+        self.swarm.fly(slot)
         return True
 
     def _hear(self, message: Slot, slot: int) -> NDArray[np.uint8] | None:
@@ -132,35 +118,16 @@ class SwarmNode:
         :returns: (F, L) who of the local agents received them; None if they share a table, or there are none.
         """
         count = len(message.sender)
-        if self.swarm.shared:
-            sent = [self.swarm.ids[index] for index in np.flatnonzero(self.swarm.sends)]
-            if any(agent not in message.sender for agent in sent):
-                self._unshare(slot)  # nobody heard it: only its sender knows what it said
         if not count:
-            return None
-        swarm, agents = self.swarm, self.config.agents
+            return self.agents.on_frames(slot, (), (), self._nothing)
         try:
-            heard = unpack_received(memoryview(message.received), count, agents)
+            heard = unpack_received(memoryview(message.received), count, self.config.agents)
             frames = split_frames(memoryview(message.data), message.length)
+            if len(frames) != count:
+                raise ValueError(f"{len(frames)} frames of {count} senders")
         except ValueError as error:
             raise RemoteProtocolError(f"the channel's message for slot {message.slot} is unusable: {error}") from None
-        if swarm.shared:
-            received = heard.copy()
-            received[np.arange(count), np.array(message.sender) - 1] = 1  # its own sender does not need to hear it
-            if received[:, swarm.local].all():
-                for frame in frames:
-                    swarm.hear(slot, frame)
-                return None
-            swarm = self._unshare(slot)
-        local = np.ascontiguousarray(heard[:, swarm.local])
-        for frame, mask in zip(frames, local, strict=True):
-            swarm.hear(slot, frame, mask)
-        return local
-
-    def _unshare(self, slot: int) -> Swarm:
-        """From the first frame on that not all have heard every agent keeps a table of its own."""
-        self.swarm = self.swarm.with_own_tables(slot)
-        return self.swarm
+        return self.agents.on_frames(slot, message.sender, frames, heard)
 
     def _answer(self, slot: int, stamp: Time, senders: Sequence[int]) -> None:
         swarm, message = self.swarm, self._message

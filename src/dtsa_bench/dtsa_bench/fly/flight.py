@@ -20,10 +20,10 @@ from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
-from dtsa_agent.ros.joining import check_joinable
 from dtsa_bench.metrics import FlightMetrics
 from dtsa_bench.options import new_directory
 from dtsa_bench.recorded_channel import BAG, RealtimeRecordedChannel, RecordedChannel, write_results

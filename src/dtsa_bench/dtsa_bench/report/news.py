@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Swarm
+from dtsa_agent.core import AbstractSwarm
 from dtsa_bench.bag.run import RecordedRun
 from dtsa_bench.metrics import FlightMetrics
 
@@ -21,7 +21,7 @@ class News:
     error: NDArray[np.float64]  # m, (M, N)
 
 
-def follow(run: RecordedRun, tables: Swarm, metrics: FlightMetrics, moving: NDArray[np.bool_]) -> News:
+def follow(run: RecordedRun, tables: AbstractSwarm, metrics: FlightMetrics, moving: NDArray[np.bool_]) -> News:
     """Feed the recorded frames to tables like those of the agents, and the metrics with what they then know.
 
     :param run: a run whose slots are complete from 0 on and that has odometry of all agents.

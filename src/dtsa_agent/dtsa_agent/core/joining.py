@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.timebase import LISTENING, TimeBase
+from .abstract_swarm import AbstractSwarm
+from .config import SwarmConfig
+from .errors import ConfigError
+from .timebase import LISTENING, TimeBase
 
 # Who sends next depends on the slot's number there, or on what the sender itself has been told; never on a table that
 # all must have equal, which nobody can have who was not there from the start.
@@ -84,8 +85,9 @@ class Newcomers:
 
     def __init__(self, count: int) -> None:
         self._since: NDArray[np.int64] = np.full(count, -1, dtype=np.int64)  # first slot, -1: not new
+        self._some = False  # most processes never have any
 
-    def add(self, swarm: Swarm, index: Any, slot: int) -> None:
+    def add(self, swarm: AbstractSwarm, index: Any, slot: int) -> None:
         """An agent begins anew, knowing nothing.
 
         :param swarm: the agents, between two slots.
@@ -94,13 +96,16 @@ class Newcomers:
         """
         swarm.restart(index)
         self._since[index] = slot
+        self._some = True
 
-    def hold(self, swarm: Swarm, slot: int) -> None:
+    def hold(self, swarm: AbstractSwarm, slot: int) -> None:
         """Keeps those that are still new where they are.
 
         :param swarm: the agents, after ``scenario.advance``.
         :param slot: the slot that is about to begin.
         """
+        if not self._some:
+            return
         for index in np.flatnonzero(self._since >= 0):
             swarm.active[index] = 0
             if self._known(swarm, index, slot):
@@ -109,7 +114,7 @@ class Newcomers:
                 flies = swarm.scenario.moving[swarm.local] if course is None else course.active
                 swarm.active[index] = flies[index]
 
-    def _known(self, swarm: Swarm, index: Any, slot: int) -> bool:
+    def _known(self, swarm: AbstractSwarm, index: Any, slot: int) -> bool:
         config = swarm.config
         since = self._since[index]
         if slot < since + config.agents or swarm.sent_slot[index, swarm.local[index]] < since:
