@@ -36,7 +36,7 @@ setup(
             libraries=["m"],
         )
     ],
-    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml"]},
+    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.ros.common.dds import clean_shared_memory
 
 # Ports of RTPS: 7400 + 250 domain + 10 + 2 participant (+ 1). Beyond domain 101 they meet Linux's ephemeral ports.
 LAST_FREE_DOMAIN = 101
@@ -21,7 +22,7 @@ _SPREAD = 37  # runs that start at the same time look at different domains first
 
 @contextmanager
 def ros_domain(wanted: int | None = None) -> Iterator[int]:
-    """Takes a domain for as long as the context lasts.
+    """Takes a domain for as long as the context lasts, and removes what dead processes have left in shared memory.
 
     :param wanted: take this one; None: any that is free.
     :raises ConfigError: if the wanted one is in use.
@@ -39,7 +40,11 @@ def ros_domain(wanted: int | None = None) -> Iterator[int]:
             continue
         try:
             if _ports_free(domain):
-                yield domain
+                clean_shared_memory()
+                try:
+                    yield domain
+                finally:
+                    clean_shared_memory()
                 return
         finally:
             os.close(lock)

@@ -16,6 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
+from .dds import limit_to_machine
 from .loop import Stop
 
 _PR_SET_PDEATHSIG = 1
@@ -56,6 +57,7 @@ def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence
     :returns: exit code: 0 for a clean end (by a signal, too), 2 for settings that are not usable, 1 for other errors.
     """
     supervised = follow_supervisor()
+    limit_to_machine(os.environ)
     with Stop() as stop:
         try:
             rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)

@@ -1,0 +1,90 @@
+"""Fast DDS on one machine: no socket beyond loopback, and nothing left behind in shared memory."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import time
+from collections.abc import Iterator, MutableMapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+# Fast DDS 2 reads the first, Fast DDS 3 the second.
+PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+PROFILE = Path(__file__).with_name("loopback.xml")
+
+_SHARED_MEMORY = Path("/dev/shm")
+_SEGMENT = re.compile(r"fast(?:rtps|dds)_(?:port\d+|[0-9a-f]{16})")
+_LOCKS = ("_el", "_sl")  # exclusive: its one owner's; shared: of all who listen to a port
+_YOUNG_S = 1.0  # a lock file that is being made is not locked yet
+_ABANDONED_S = 60.0  # a port without any lock file: its listeners have gone in good order, a writer had it open
+
+
+def limit_to_machine(environment: MutableMapping[str, str]) -> None:
+    """Makes ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` mean loopback and shared memory alone.
+
+    rmw_fastrtps adds a UDP transport of its own under LOCALHOST, which listens on all interfaces. With SYSTEM_DEFAULT
+    it takes the transports of our profile instead. Another range, another middleware, or a profile of the user stays.
+
+    :param environment: variables of a process that has not used the middleware yet; changed in place.
+    """
+    foreign = not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
+    if environment.get(RANGE) != "LOCALHOST" or foreign or any(name in environment for name in PROFILES):
+        return
+    environment[RANGE] = "SYSTEM_DEFAULT"
+    for name in PROFILES:
+        environment[name] = str(PROFILE)
+
+
+def clean_shared_memory(directory: Path = _SHARED_MEMORY) -> list[str]:
+    """Removes what Fast DDS participants that are dead have left in shared memory, as after ``kill -9``.
+
+    The kernel holds a lock for every living owner of a segment and every living listener of a port: what nobody has
+    locked belongs to nobody. What is young, or another user's, stays.
+
+    :param directory: where shared memory lies.
+    :returns: names of the segments removed.
+    """
+    removed = []
+    for path in sorted(directory.glob("fast*")):
+        if not _SEGMENT.fullmatch(path.name):
+            continue
+        locks = [lock for suffix in _LOCKS if (lock := directory / f"{path.name}{suffix}").exists()]
+        with _dead(locks) as dead:
+            if not dead and not (not locks and "port" in path.name and _age_s(path) >= _ABANDONED_S):
+                continue
+            for file in (path, directory / f"sem.{path.name}_mutex", *locks):
+                with suppress(OSError):
+                    file.unlink()
+        removed.append(path.name)
+    return removed
+
+
+def _age_s(path: Path) -> float:
+    """How long ago a file was changed last, s; 0 for one that has gone."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+@contextmanager
+def _dead(locks: list[Path]) -> Iterator[bool]:
+    """Whether nobody holds any of some lock files; while the context lasts, we do."""
+    descriptors: list[int] = []
+    try:
+        free = bool(locks)
+        for lock in locks:
+            descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
+            descriptors.append(descriptor)
+            free = free and time.time() - os.fstat(descriptor).st_mtime >= _YOUNG_S
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # locked, another user's, or gone meanwhile
+        free = False
+    try:
+        yield free
+    finally:
+        for descriptor in descriptors:
+            os.close(descriptor)

@@ -1,0 +1,111 @@
+"""Fast DDS on one machine: sockets on loopback alone, shared memory of the dead removed and of the living kept."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+import socket
+import struct
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from node_helpers import ros_graph
+
+from dtsa_agent.ros.common.dds import PROFILE, PROFILES, RANGE, clean_shared_memory, limit_to_machine
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def addresses(pid: int) -> set[str]:
+    """Local addresses of all UDP and TCP sockets of a process."""
+    inodes = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        target = os.readlink(entry)
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    found = set()
+    for table in ("udp", "tcp", "udp6", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[9] in inodes:
+                raw = fields[1].split(":")[0]
+                found.add(socket.inet_ntoa(struct.pack("<I", int(raw, 16))) if len(raw) == 8 else raw)
+    return found
+
+
+def segments_of(pid: int) -> set[str]:
+    """Names of the shared memory segments and ports whose locks a process has open: its own."""
+    targets = (os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir())
+    return {Path(target).name[:-3] for target in targets if target.startswith("/dev/shm/fast")}
+
+
+def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
+    plain = {RANGE: "LOCALHOST"}
+    limit_to_machine(plain)
+    assert plain == {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(PROFILE), PROFILES[1]: str(PROFILE)}
+    for other in (
+        {},
+        {RANGE: "SUBNET"},
+        {RANGE: "LOCALHOST", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
+        {RANGE: "LOCALHOST", PROFILES[0]: "/mine.xml"},
+    ):
+        before = dict(other)
+        limit_to_machine(other)
+        assert other == before
+
+
+@pytest.mark.ros
+def test_a_node_listens_on_loopback_only_and_leaves_nothing_after_kill_9(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        node = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2")
+        names = graph.node.get_node_names_and_namespaces
+        # Found by a node that knows nothing of our profile: what the `ros2` command would see.
+        graph.until(lambda: ("channel", "/swarm") in names())
+        assert addresses(node.pid) == {"127.0.0.1"}
+        segments = segments_of(node.pid)
+        assert segments
+        clean_shared_memory()
+        assert all((SHARED_MEMORY / name).exists() for name in segments), "removed what is in use"
+        time.sleep(1.1)  # the age below which nothing is touched
+        node.send_signal(signal.SIGKILL)
+        node.wait()
+        clean_shared_memory()
+        assert not [name for name in segments if (SHARED_MEMORY / name).exists()]
+
+
+def test_only_what_nobody_has_locked_and_is_not_young_is_removed(tmp_path: Path) -> None:
+    def make(name: str, age_s: float = 100.0, locks: tuple[str, ...] = ("_el",)) -> Path:
+        for suffix in ("", *locks):
+            file = tmp_path / f"{name}{suffix}"
+            file.write_bytes(b"")
+            os.utime(file, (time.time() - age_s,) * 2)
+        return tmp_path / name
+
+    dead, young, held = make(f"fastrtps_{1:016x}"), make(f"fastrtps_{2:016x}", 0.0), make(f"fastrtps_{3:016x}")
+    port, fresh_port = make("fastrtps_port7000", locks=()), make("fastrtps_port7001", 1.0, ())
+    other = make("something_else")
+    mutex = tmp_path / f"sem.{port.name}_mutex"
+    mutex.write_bytes(b"")
+    holder = subprocess.Popen(["flock", "-x", f"{held}_el", "sleep", "60"], start_new_session=True)
+    try:
+        with Path(f"{held}_el").open() as probe:
+            deadline = time.monotonic() + 10
+            while time.monotonic() < deadline:
+                try:
+                    fcntl.flock(probe, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    fcntl.flock(probe, fcntl.LOCK_UN)
+                except OSError:
+                    break
+                time.sleep(0.02)
+        assert sorted(clean_shared_memory(tmp_path)) == [dead.name, port.name]
+    finally:
+        os.killpg(holder.pid, signal.SIGKILL)
+        holder.wait()
+    assert not dead.exists()
+    assert not Path(f"{dead}_el").exists()
+    assert not port.exists()
+    assert not mutex.exists()
+    assert all(file.exists() for file in (young, held, fresh_port, other))
