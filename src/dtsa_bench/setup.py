@@ -27,7 +27,7 @@ setup(
     entry_points={
         "console_scripts": [
             "dtsa = dtsa_bench.cli:main",
-            "recorded_channel = dtsa_bench.recorded_channel:main",
+            "recorded_channel = dtsa_bench.fly.recorded_channel:main",
             "fake_crazyflie = dtsa_bench.fake_crazyflie.cli:main",
         ],
     },

@@ -22,7 +22,7 @@ from metronome import flown_again_when_overloaded
 from dtsa_agent.core.alignment import ClockAligner
 from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.bag.writer import BagWriter
-from dtsa_bench.clock_statistics import ClockStatistics
+from dtsa_bench.fly.clock_statistics import ClockStatistics
 from dtsa_bench.verify import Result, verify_bag
 from dtsa_bench.verify.air import Air
 from dtsa_bench.verify.result import Mismatch
@@ -391,9 +391,9 @@ def test_two_frames_at_one_time_are_never_both_heard() -> None:
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:
     statistics = ClockStatistics(3)
-    statistics.report(0, [1, 2], [0, 400_000], [0, 0])
-    statistics.report(0, [3], [3_200_000], [24])  # late by 3 ms: not a clock that is off
-    statistics.report(1, [1, 2, 3], [100_000, 0, 100_000], [0, 24, 0])
+    statistics.add(0, [1, 2], [0, 400_000], [0, 0])
+    statistics.add(0, [3], [3_200_000], [24])  # late by 3 ms: not a clock that is off
+    statistics.add(1, [1, 2, 3], [100_000, 0, 100_000], [0, 24, 0])
     summary = statistics.summary()
     assert summary["clock_spread_max_ms"] == pytest.approx(0.4)
     assert summary["clock_spread_mean_ms"] == pytest.approx(0.2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import threading
@@ -38,14 +37,16 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_bench.options import new_directory
-from dtsa_bench.recorded_channel import BAG, write_results
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim.ros.channel_node import declare_channel
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .children import Child, Children, describe_end
 from .domain import ros_domain
-from .flight import Flight, FlightOptions, SupervisedRealtimeChannel, run_environment
-from .progress import ProgressLine
+from .flight import END_S, Flight, FlightOptions, run_environment
+from .progress import FlightProgress, ProgressLine
+from .recorded_channel import BAG, RecordedFlight
+from .supervisor import RealtimeSupervisor, Supervisor
 
 PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
 ARRIVED_M = 0.12  # m: at its start when this close
@@ -92,21 +93,6 @@ def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
                 "where this scenario begins",
             )  # fmt: skip
     return scenario
-
-
-class MissionChannel(SupervisedRealtimeChannel):
-    """A supervised channel that watches over the bridge, too."""
-
-    bridge: Children | None = None
-
-    def idle(self) -> None:
-        """Called about ten times a second.
-
-        :raises NodeError: the bridge has ended.
-        """
-        if self.bridge is not None:
-            self.bridge.check()
-        super().idle()
 
 
 @dataclass(slots=True)
@@ -379,19 +365,21 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
     node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
     try:
         declare_channel(node, run.air)
-        channel = MissionChannel(node, run, directory, agents, progress, startup_s=options.startup_s, answer_s=2.0)
-        channel.bridge = bridge
+        flight = RecordedFlight(node, run, directory, options.startup_s, answer_s=2.0, end_s=END_S)
+        channel, measurement = flight.channel, flight.measurement
+        assert isinstance(channel, RealtimeChannel)
+        shown = FlightProgress(progress, measurement, run.swarm.agents, run.swarm.slot_ns)
+        channel.observe(Supervisor(bridge), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
         try:
             channel.run(ended)
-            channel.show()
+            shown.show()
         finally:
             channel.close()
             progress.end()
         give_way()  # the bridge does not: it has to land them
-        summary = write_results(channel, directory, pictures=options.pictures and not ended)
-        summary |= {"backend": "cflib", "cut_short": ended.reason}
-        (directory / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        return Flight(summary, channel.scenario, np.array(channel.positions), directory / BAG)
+        pictures = options.pictures and not ended
+        summary = flight.write_results(pictures, backend="cflib", cut_short=ended.reason)
+        return Flight(summary, flight.scenario, np.array(measurement.positions), directory / BAG)
     finally:
         node.destroy_node()
 

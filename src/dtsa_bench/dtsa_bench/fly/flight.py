@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,19 +23,19 @@ from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
-from dtsa_bench.metrics import FlightMetrics
 from dtsa_bench.options import new_directory
-from dtsa_bench.recorded_channel import BAG, RealtimeRecordedChannel, RecordedChannel, write_results
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
 from dtsa_channel_sim import make_clocks
 from dtsa_channel_sim.ros.answers import named
 from dtsa_channel_sim.ros.channel_node import declare_channel
-from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .children import Child, Children, NodeError, describe_end
+from .children import Children
 from .domain import ros_domain
-from .progress import ProgressLine, flight_text
+from .progress import FlightProgress, ProgressLine
+from .recorded_channel import BAG, RecordedFlight
+from .supervisor import LateStart, RealtimeSupervisor, Supervisor
 
 ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -44,6 +43,8 @@ ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
 }
+
+END_S = 1.0  # wall time in which the nodes are to hear of the end; those that have not are ended then
 
 
 def run_environment(domain: int, logs: Path) -> dict[str, str]:
@@ -79,109 +80,6 @@ class Flight:
     scenario: Scenario
     positions: NDArray[np.float64]  # (T, 3, N) m, frame map, at the start of each slot
     bag: Path
-
-
-class Supervision:
-    """What makes a recorded channel look after the agents' processes and show how far it is; mixed into its class."""
-
-    farewell_s = 1.0  # the supervisor ends those that have not heard
-
-    def __init__(
-        self, node: Node, run: RunConfig, directory: Path, children: Children, progress: ProgressLine, **more: Any
-    ) -> None:
-        super().__init__(node, run, directory, **more)  # type: ignore[call-arg]
-        self._children, self._progress = children, progress
-        self._start = time.monotonic()
-
-    def idle(self) -> None:
-        """Called about ten times a second."""
-        super().idle()  # type: ignore[misc]
-        self._look()
-        if not self._progress.due():
-            return
-        if not self.begin_s:  # type: ignore[attr-defined]
-            missing, agents = self.answers.missing, self.agents  # type: ignore[attr-defined]
-            waited = time.monotonic() - self._start
-            self._progress.show(f"starting, {waited:.0f} s, waiting for {missing} of {agents} agents")
-        else:
-            self.show()
-
-    def _look(self) -> None:
-        """Whether all processes are alive: in lockstep the flight cannot go on without one of them."""
-        self._children.check()
-
-    def show(self) -> None:
-        """Brings the progress line up to date."""
-        metrics: FlightMetrics = self.metrics  # type: ignore[attr-defined]
-        flown = metrics.slots * self.slot_ns / 1e9  # type: ignore[attr-defined]
-        closest, pair = metrics.closest()
-        text = flight_text(metrics.slots, flown, self.wall_time_s, closest, pair)  # type: ignore[attr-defined]
-        self._progress.show(text)
-
-
-class SupervisedChannel(Supervision, RecordedChannel):
-    """A lockstep flight under supervision."""
-
-
-@dataclass(frozen=True, slots=True)
-class LateStart:
-    """An agent whose process is started while the flight is under way."""
-
-    after_s: float  # s after slot 0
-    agent: int
-    start: Callable[[], None]
-
-
-class SupervisedRealtimeChannel(Supervision, RealtimeRecordedChannel):
-    """A flight in real time under supervision: the others fly on when a process dies, and it may be started again."""
-
-    def __init__(self, *args: Any, respawn_s: float | None = None, late: Sequence[LateStart] = (), **more: Any) -> None:
-        super().__init__(*args, **more)
-        self._respawn_s = respawn_s
-        self._late = sorted(late, key=lambda start: start.after_s)
-        self._dead: list[tuple[float, Child]] = []  # time.monotonic() at which each is started again
-        self._new = {start.agent for start in late}  # those that have never taken part
-        for start in late:
-            self.metrics.awaited.add(start.agent)
-            self.expect_later(start.agent, self.scenario.start[:, start.agent - 1])
-
-    def _look(self) -> None:
-        for child in self._children.ended():
-            if not self.begin_s:
-                self._children.check()
-            left = not child.process.returncode
-            self._progress.say(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
-            for agent in child.agents:
-                self.lose(agent)
-            if self._respawn_s is not None and not left:
-                self._dead.append((time.monotonic() + self._respawn_s, child))
-                self.metrics.awaited.update(child.agents)
-            if len(self.lost) == self.agents and not self._dead and not self._late:
-                raise NodeError(f"nobody is left: {describe_end(child)}")
-        while self._dead and time.monotonic() >= self._dead[0][0]:
-            self._start_again(self._dead.pop(0)[1])
-        while self._late and self.begin_s and time.monotonic() - self.begin_s >= self._late[0].after_s:
-            start = self._late.pop(0)
-            start.start()
-            self._progress.say(f"{named([start.agent])} is started")
-
-    def _start_again(self, child: Child) -> None:
-        """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
-        text = ", ".join(f"{value:.6f}" for agent in child.agents for value in self.last_place(agent))
-        self._children.again(child, ["-p", f"resume_at:=[{text}]"])
-        self._progress.say(f"{child.name} is started again")
-
-    def back(self, agents: list[int]) -> None:
-        super().back(agents)
-        again = "" if self._new.issuperset(agents) else " again"
-        self._new.difference_update(agents)
-        self._progress.say(f"{named(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
-
-    def silent(self, agent: int) -> None:
-        super().silent(agent)
-        known = {agent for child in self._children.all if child.process.poll() is not None for agent in child.agents}
-        if agent not in known | {start.agent for start in self._late}:
-            self._progress.say(f"{named([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")
 
 
 def split(agents: int, processes: int) -> list[list[int]]:
@@ -270,24 +168,24 @@ def _fly(
     node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
     try:
         declare_channel(node, run.air)
-        limits = {"startup_s": options.startup_s, "answer_s": options.answer_s}
-        channel: SupervisedChannel | SupervisedRealtimeChannel
-        if run.mode == LOCKSTEP:
-            channel = SupervisedChannel(node, run, directory, children, progress, **limits)
-        else:
+        flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)
+        channel, measurement = flight.channel, flight.measurement
+        shown = FlightProgress(progress, measurement, run.swarm.agents, run.swarm.slot_ns)
+        if isinstance(channel, RealtimeChannel):
             again = options.respawn_s
-            channel = SupervisedRealtimeChannel(
-                node, run, directory, children, progress, respawn_s=again, late=late, **limits
-            )
+            channel.observe(RealtimeSupervisor(children, channel, measurement, progress.say, again, late))
+        else:
+            channel.observe(Supervisor(children))
+        channel.observe(shown)
         try:
             channel.run(stop)
-            channel.show()
+            shown.show()
         finally:
             channel.close()
             progress.end()
         children.stop()
-        summary = write_results(channel, directory, pictures=options.pictures and not stop)
-        return Flight(summary, channel.scenario, np.array(channel.positions), directory / BAG)
+        summary = flight.write_results(pictures=options.pictures and not stop)
+        return Flight(summary, flight.scenario, np.array(measurement.positions), directory / BAG)
     finally:
         node.destroy_node()
 

@@ -6,6 +6,10 @@ import sys
 import time
 from typing import TextIO
 
+from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+
+from .measurement import FlightMeasurement
+
 _TERMINAL_S, _LOG_S = 0.2, 5.0
 
 
@@ -56,3 +60,35 @@ def flight_text(slot: int, simulated_s: float, wall_s: float, closest_m: float, 
     factor = simulated_s / wall_s if wall_s > 0.0 else 0.0
     near = f"closest cf{pair[0]} cf{pair[1]} {closest_m:.3f} m" if pair[0] else "closest: one agent alone"
     return f"slot {slot}  simulated {simulated_s:.2f} s  wall {wall_s:.1f} s  real-time factor {factor:.2f}  {near}"
+
+
+class FlightProgress(ChannelObserver):
+    """Keeps the line up to date while a flight is under way.
+
+    :param line: the line.
+    :param measurement: the flight so far.
+    :param agents: number of agents N.
+    :param slot_ns: ns, length of a slot.
+    """
+
+    def __init__(self, line: ProgressLine, measurement: FlightMeasurement, agents: int, slot_ns: int) -> None:
+        self._line, self._measurement = line, measurement
+        self._agents, self._slot_ns = agents, slot_ns
+        self._start = time.monotonic()
+
+    def idle(self, status: ChannelStatus) -> None:
+        if not self._line.due():
+            return
+        if self._measurement.begin_s:
+            self.show()
+        else:
+            waited = time.monotonic() - self._start
+            missing = len(status.awaited)
+            self._line.show(f"starting, {waited:.0f} s, waiting for {missing} of {self._agents} agents")
+
+    def show(self) -> None:
+        """Brings the line up to date."""
+        metrics = self._measurement.metrics
+        flown_s = metrics.slots * self._slot_ns / 1e9
+        closest, pair = metrics.closest()
+        self._line.show(flight_text(metrics.slots, flown_s, self._measurement.wall_time_s, closest, pair))

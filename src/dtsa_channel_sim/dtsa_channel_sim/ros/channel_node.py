@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -23,12 +22,10 @@ from dtsa_agent.ros.common.parameters import declare_from_dataclass, from_parame
 from dtsa_agent.ros.common.process import run_node
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, Change, ChannelConfig
-from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
 
-from .answers import Answers
+from .diagnostics import Diagnostics
 from .lockstep import LockstepChannel
-
-DERIVED = ("agents", "slot_ns", "seed")  # of the channel's settings: the swarm's settings say the same
+from .observer import SlotLimit
 
 
 def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str, Any]:
@@ -78,57 +75,6 @@ def declare_limits(node: Node) -> tuple[float, float]:
     return values[0], values[1]
 
 
-class ChannelStatus:
-    """What the channel tells on ``/diagnostics`` once a second, while somebody listens."""
-
-    def __init__(self, node: Node) -> None:
-        self.counts = [0, 0, 0]  # slots by outcome
-        self._node = node
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._ticks = 0
-
-    def tick(self, slot: int, unusable: int, missing: list[int]) -> None:
-        """To be called about ten times a second."""
-        self._ticks += 1
-        if self._ticks % 10 or not self._publisher.get_subscription_count():
-            return
-        level = DiagnosticStatus.WARN if unusable else DiagnosticStatus.OK
-        values = {
-            "slot": slot,
-            "unusable messages": unusable,
-            "agents awaited": missing,
-            **{f"slots: {name}": count for name, count in zip(OUTCOMES, self.counts, strict=True)},
-        }
-        status = DiagnosticStatus(
-            level=level,
-            name="channel",
-            message=f"slot {slot}",
-            hardware_id="simulated",
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(array)
-
-
-class PlainChannel(LockstepChannel):
-    """A channel that counts, and ends after a given number of slots."""
-
-    def __init__(self, node: Node, channel: Channel, steps: int, slots: int, **more: Any) -> None:
-        super().__init__(node, channel, steps, **more)
-        self._slots = slots
-        self._status = ChannelStatus(node)
-
-    def judged(self, slot: int, frames: dict[int, bytes], verdict: Verdict) -> None:
-        self._status.counts[verdict.outcome] += 1
-
-    def answered(self, slot: int, answers: Answers) -> bool:
-        return not self._slots or slot < self._slots
-
-    def idle(self) -> None:
-        self._status.tick(self.slot, self.unusable, self.answers.silent)
-
-
 def _body(stop: Stop, supervised: bool) -> None:
     node = Node("channel", namespace=names.SWARM)
     try:
@@ -147,8 +93,9 @@ def _body(stop: Stop, supervised: bool) -> None:
         steps = node.declare_parameter("steps", 1, control).value
         startup_s, answer_s = declare_limits(node)
         medium = Channel(ChannelConfig.from_dict(values))
-        channel = PlainChannel(node, medium, steps, slots, startup_s=startup_s, answer_s=answer_s)
-        follow_parameters(node, medium)
+        channel = LockstepChannel(node, medium, steps, answer_s, referee=SlotLimit(slots), startup_s=startup_s)
+        channel.observe(Diagnostics(node))
+        follow_parameters(node, medium, channel.change_settings)
         try:
             channel.run(stop)
         finally:

@@ -38,12 +38,13 @@ class LockstepChannel(RosChannel):
         self._complaint, self._complaint_time = "", 0.0
         self._bytes = b""
 
-    def run(self, stop: Any) -> None:
+    def run(self, stop: object) -> None:
         """Runs slot after slot until the run is over or ``stop`` is true. The agents are told to end.
 
         :param stop: looked at in every slot, true once a signal has come.
         :raises LocalProtocolError: when an agent does not answer in time.
         :raises RemoteProtocolError: when an answer is unusable.
+        :raises DtsaError: when an observer fails.
         """
         try:
             verdict: Verdict | None = None
@@ -52,13 +53,13 @@ class LockstepChannel(RosChannel):
             while not stop:
                 self._open(slot, frames, verdict)
                 if slot and verdict is not None:
-                    self.recorded(slot - 1, self.answers, verdict)
+                    self._observers.slot_over(slot - 1, self.answers, verdict)
                 self.answers.open()
-                if not self._collect(slot, stop) or not self.answered(slot, self.answers):
+                if not self._collect(slot, stop) or not self._goes_on(slot, self.answers):
                     return
                 frames = self.answers.frames
                 verdict = self._judge(slot, frames)
-                self.judged(slot, frames, verdict)
+                self._observers.judged(slot, self.answers, frames, verdict)
                 slot += 1
         finally:
             self._publish_end()
@@ -66,7 +67,7 @@ class LockstepChannel(RosChannel):
     def _judge(self, slot: int, frames: dict[int, bytes]) -> Verdict:
         senders = sorted(frames)
         lengths = [len(frames[sender]) for sender in senders]
-        return self.channel.arbitrate(slot, senders, lengths, self.answers.position)
+        return self.model.arbitrate(slot, senders, lengths, self.answers.position)
 
     def _open(self, slot: int, frames: dict[int, bytes], verdict: Verdict | None) -> None:
         """Publishes the message that opens a slot."""
@@ -81,9 +82,9 @@ class LockstepChannel(RosChannel):
         self._bytes = serialize_message(message)
         self._publisher.publish(self._bytes)
         self._tell_time(message.stamp)
-        self.published(slot, self._bytes, time_ns)
+        self._observers.slot_published(slot, self._bytes, time_ns)
 
-    def _collect(self, slot: int, stop: Any) -> bool:
+    def _collect(self, slot: int, stop: object) -> bool:
         """Takes in answers until all agents have given theirs; False when stopped."""
         loop, answers = self.loop, self.answers
         begin = repeat = time.monotonic()
@@ -100,7 +101,7 @@ class LockstepChannel(RosChannel):
 
     def _wait(self, slot: int, begin: float, repeat: float) -> float:
         """Nothing has come for a while: complain if that takes too long; says when slot 0 was last sent."""
-        self.idle()
+        self._idle()
         now = time.monotonic()
         if self._complaint and now > self._complaint_time + _GARBAGE_PATIENCE_S:
             raise RemoteProtocolError(f"{named(self.answers.silent)} sent garbage in slot {slot}: {self._complaint}")
@@ -128,7 +129,7 @@ class LockstepChannel(RosChannel):
             self._complain(f"a message for agents {list(message.agent)[:8]}")
             return
         if self.answers.add(message):
-            self.received(slot, message.agent.tobytes(), data)
+            self._observers.answer_received(slot, message.agent.tobytes(), data)
 
     def _complain(self, text: str) -> None:
         """Unreadable messages name no sender: if an answer then is missing, this is why."""

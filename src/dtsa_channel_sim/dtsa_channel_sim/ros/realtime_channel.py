@@ -66,23 +66,11 @@ class RealtimeChannel(RosChannel):
         self._grace_ns = round(_GRACE * self.slot_ns)
         self._close_ns = self._grace_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
 
-    # Three more hooks.
-
-    def reported(self, message: Transmission) -> None:
-        """A usable report has come in, here decoded; late ones too."""
-
-    def silent(self, agent: int) -> None:
-        """An agent has fallen silent."""
-
-    def back(self, agents: list[int]) -> None:
-        """Agents that had fallen silent report again."""
-
-    # The run.
-
-    def run(self, stop: Any) -> None:
+    def run(self, stop: object) -> None:
         """Runs until the run is over or ``stop`` is true.
 
         :raises LocalProtocolError: when an agent does not report at the start.
+        :raises DtsaError: when an observer fails.
         """
         try:
             if self._prepare(stop):
@@ -106,7 +94,7 @@ class RealtimeChannel(RosChannel):
             self.lost.add(agent)
             self.returned.discard(agent)
             self._given_up[agent] = (time.monotonic_ns() - self._zero) // self.slot_ns
-            self.silent(agent)
+            self._observers.agent_silent(agent)
 
     def last_place(self, agent: int) -> NDArray[np.float64]:
         """Where an agent has reported to be last, (3,) m."""
@@ -120,9 +108,9 @@ class RealtimeChannel(RosChannel):
         if again:
             self.lost.difference_update(again)
             self.returned.update(again)
-            self.back(again)
+            self._observers.agents_back(again)
 
-    def _prepare(self, stop: Any) -> bool:
+    def _prepare(self, stop: object) -> bool:
         """Waits until all agents have reported, and tells them when slot 0 starts."""
         begin = time.monotonic()
         repeat = 0.0
@@ -152,7 +140,7 @@ class RealtimeChannel(RosChannel):
         self._told = time.monotonic()
         self._publisher.publish(Slot(phase=Slot.START, stamp=slot_stamp(self._zero)))
 
-    def _fly(self, stop: Any) -> None:
+    def _fly(self, stop: object) -> None:
         tick = now = 0
         while not stop:
             data = self.loop.wait(_TICK_NS)
@@ -206,8 +194,8 @@ class RealtimeChannel(RosChannel):
             return
         if not fresh:
             return
-        self.received(slot, message.agent.tobytes(), data)
-        self.reported(message)
+        self._observers.answer_received(slot, message.agent.tobytes(), data)
+        self._observers.report(message)
         for agent, offset, length in zip(message.agent, message.offset_ns, message.length, strict=True):
             self._heard_ns[agent - 1] = now
             self._offset_ns[agent - 1] = offset
@@ -234,7 +222,7 @@ class RealtimeChannel(RosChannel):
         put_frames(message, [sender], [frame], verdict.received[None])
         data = bytes(serialize_message(message))
         self._publisher.publish(data)
-        self.published(max(slot, self.slot + 1), data, time_ns)
+        self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     def _due(self, now: int) -> bool:
         """Whether the next slot can be closed: its frames are settled, all agents have reported for the one after."""
@@ -247,21 +235,21 @@ class RealtimeChannel(RosChannel):
         return following is not None and not set(following.silent) - self.lost
 
     def _close_slot(self) -> bool:
-        """Hands a slot over to the hooks; False when the run is over."""
+        """Tells the observers of a slot that has passed; False when the run is over."""
         slot = self.slot + 1
         book = self._completed(slot)
-        if not slot and not self.answered(0, book):
+        if not slot and not self._goes_on(0, book):
             return False
         self.answers = book
         frames, verdict = self._verdict(slot)
-        self.judged(slot, frames, verdict)
+        self._observers.judged(slot, book, frames, verdict)
         self._tell_time(slot_stamp(names.slot_time_ns(slot, self.slot_ns)))
-        self.recorded(slot, book, verdict)
+        self._observers.slot_over(slot, book, verdict)
         self.slot = slot
         self._lag_ns = int(np.median(self._offset_ns[[k for k in range(self.agents) if k + 1 not in self.lost] or [0]]))
         following = self._completed(slot + 1)
         self._book.pop(slot, None)
-        return self.answered(slot + 1, following)
+        return self._goes_on(slot + 1, following)
 
     def _completed(self, slot: int) -> Answers:
         """A slot's reports, those that are missing taken from the slot before."""

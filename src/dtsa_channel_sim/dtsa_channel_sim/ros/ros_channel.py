@@ -1,4 +1,4 @@
-"""What the channel's two modes have in common on the graph: topics, hooks for a recorder, and an end that is heard."""
+"""What the channel's two modes have in common on the graph: topics, observers, and an end that is heard."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Loop
 from dtsa_agent.ros.common.wire import pack_received
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.verdict import Verdict
+from dtsa_channel_sim.model.config import Change
 
 from .answers import Answers
+from .observer import ChannelObserver, ChannelStatus, Observers, Referee, SlotLimit
 
 _REPEAT_S = 0.1
 
@@ -26,18 +27,17 @@ _REPEAT_S = 0.1
 class RosChannel:
     """A medium whose agents are nodes.
 
-    What is built on it (a recorder, metrics) overrides :meth:`published`, :meth:`received`, :meth:`answered`,
-    :meth:`judged`, :meth:`recorded` and :meth:`idle`.
+    It tells its observers what happens; a referee says when the run is over.
 
     :param node: the ROS node.
     :param channel: the medium.
     :param steps: control instants in a slot.
     :param waiting: messages that may wait to be read, for each agent.
+    :param referee: ends the run; None: a signal does.
     :param swarm_namespace: namespace of the swarm's topics.
     :param startup_s: s of wall time that all agents have to answer for the first time.
+    :param end_s: s of wall time that the nodes have to hear of the end.
     """
-
-    farewell_s = 4.0  # wall time that the nodes have to hear of the end
 
     def __init__(
         self,
@@ -45,70 +45,57 @@ class RosChannel:
         channel: Channel,
         steps: int,
         waiting: int,
+        referee: Referee | None = None,
         swarm_namespace: str = names.SWARM,
         startup_s: float = 60.0,
+        end_s: float = 4.0,
     ) -> None:
-        self.node, self.channel = node, channel
+        self.node, self.model = node, channel
         self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
         self.slot = -1
         self.answers = Answers(self.agents, steps)
         self.unusable = 0  # messages that could not be read, or came from agents that do not exist
-        self._startup_s = startup_s
+        self._observers = Observers()
+        self._referee = referee or SlotLimit()
+        self._startup_s, self._end_s = startup_s, end_s
         self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", names.lockstep_qos(waiting))
         self._clock = node.create_publisher(Clock, "/clock", 10)
         self._clock_watched = False
         answers_qos = names.lockstep_qos(waiting * self.agents)
         self.loop = Loop(node, Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", answers_qos, raw=True)
 
-    # What a recorder overrides.
+    def observe(self, *observers: ChannelObserver) -> None:
+        """Adds observers; they are told in this order, after those that are there already."""
+        for observer in observers:
+            self._observers.add(observer)
 
-    def published(self, slot: int, data: bytes, time_ns: int) -> None:
-        """A slot message has been sent.
+    def run(self, stop: object) -> None:
+        """Runs until the run is over or ``stop`` is true. The agents are told to end.
 
-        :param slot: the slot that it opens, or whose frame it delivers.
-        :param data: the message as CDR.
-        :param time_ns: ns, simulated time.
+        :param stop: looked at again and again, true once a signal has come.
+        :raises DtsaError: when an agent or an observer fails.
         """
+        raise NotImplementedError
 
-    def received(self, slot: int, ids: bytes, data: bytes) -> None:
-        """A usable transmission message has come in.
-
-        :param slot: the slot that it answers.
-        :param ids: the ids of its agents, as in the message.
-        :param data: the message as CDR.
-        """
-
-    def answered(self, slot: int, answers: Answers) -> bool:
-        """All agents (that still live) have answered a slot. Whether the run goes on.
-
-        :param slot: the slot; its answers carry the true motion during the slot before.
-        :param answers: the answers.
-        """
-        return True
-
-    def judged(self, slot: int, frames: dict[int, bytes], verdict: Verdict) -> None:
-        """The air has carried a slot's frames.
-
-        :param slot: the slot.
-        :param frames: the frames by sender.
-        :param verdict: who received what.
-        """
-
-    def recorded(self, slot: int, answers: Answers, verdict: Verdict) -> None:
-        """The slot is over: time for what nobody waits for. Arguments as above."""
-
-    def idle(self) -> None:
-        """Called about ten times a second, and while waiting for an answer.
-
-        :raises DtsaError: to end the run.
-        """
+    def change_settings(self, change: Change) -> None:
+        """Tells the observers of a change of the medium's settings."""
+        self._observers.settings_changed(change)
 
     # For the two modes.
 
     def _housekeeping(self) -> None:
         if self.loop.housekeeping():
             self._clock_watched = self._clock.get_subscription_count() > 0
-            self.idle()
+            self._idle()
+
+    def _idle(self) -> None:
+        awaited = self.answers.silent if self.answers.missing else []
+        self._observers.idle(ChannelStatus(self.slot, self.unusable, awaited))
+
+    def _goes_on(self, slot: int, answers: Answers) -> bool:
+        """All agents have answered a slot; whether the run goes on."""
+        self._observers.all_answered(slot, answers)
+        return not self._referee.over(slot, answers)
 
     def _tell_time(self, stamp: Time) -> None:
         if self._clock_watched:
@@ -120,14 +107,24 @@ class RosChannel:
             self._publisher.publish(Slot(slot=max(0, self.slot + 1), phase=Slot.END))
 
     def close(self) -> None:
-        """Waits until all nodes know that the run is over, or have left, and gives the handles back."""
-        deadline = time.monotonic() + self.farewell_s
+        """Closes the observers first, waits until all nodes know that the run is over or have left, frees the handles.
+
+        :raises DtsaError: when an observer could not be closed.
+        """
+        try:
+            self._observers.close()
+        finally:
+            self._see_off()
+            self.loop.close()
+
+    def _see_off(self) -> None:
+        """Waits until all nodes know that the run is over, or have left."""
+        deadline = time.monotonic() + self._end_s
         while self.node.context.ok() and time.monotonic() < deadline:
             # The middleware asks for acknowledgements, and repeats what was lost, every 3 s only: so say it again.
             if self._publisher.wait_for_all_acked(Duration(seconds=_REPEAT_S)):
                 break
             self._publish_end()
-        self.loop.close()
 
 
 def slot_stamp(time_ns: int) -> Time:

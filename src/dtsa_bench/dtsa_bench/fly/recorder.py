@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from array import array
 from pathlib import Path
 
-import numpy as np
-from builtin_interfaces.msg import Time
-from dtsa_msgs.msg import Decision, Reception
 from rcl_interfaces.msg import ParameterType
-from rclpy.serialization import serialize_message
 
-from dtsa_agent.core import REASONS
+from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.wire import pack_received
 from dtsa_bench.bag.cdr import HEADER, SECOND, CdrBuilder, OdometryPacker
 from dtsa_bench.bag.writer import BagWriter
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim import Change
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
+from dtsa_channel_sim.ros.observer import ChannelObserver
+
+from .slot_messages import SlotMessages
+
+_MARKER_RECORD_NS = 100_000_000  # simulated time from one picture of the swarm to the next
 
 
-def stamp(time_ns: int) -> Time:
-    """A time as a message."""
-    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
-    return Time(sec=seconds, nanosec=nanoseconds)
-
-
-class FlightRecorder:
+class FlightRecorder(ChannelObserver):
     """Writes a flight into a bag, slot after slot; see docs/recording.md for topics and times.
 
     A slot counts as flown once all agents have told where it took them, in their answers to the next one. What a flight
@@ -36,10 +29,13 @@ class FlightRecorder:
 
     :param directory: the bag's directory.
     :param run: the run.
+    :param scenario: its scenario.
     """
 
-    def __init__(self, directory: Path, run: RunConfig) -> None:
-        self.run = run
+    def __init__(self, directory: Path, run: RunConfig, scenario: Scenario) -> None:
+        self._slot_ns = run.swarm.slot_ns
+        self._marker_slots = max(1, round(_MARKER_RECORD_NS / self._slot_ns))
+        self._packed = SlotMessages(scenario, self._slot_ns)
         agents = run.swarm.agents
         self.bag = BagWriter(directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed)})
         add = self.bag.add_topic
@@ -54,31 +50,26 @@ class FlightRecorder:
         self._packer = OdometryPacker([f"{space[1:]}/base_link" for space in spaces], names.FRAME)
         self._messages: dict[int, list[tuple[bytes, int]]] = {}
         self._answers: dict[int, list[tuple[bytes, bytes]]] = {}
-        self._reasons: dict[bytes, tuple[list[str], array[int]]] = {}
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
         self._complete = -1  # last slot that all have answered
-        self.decision = self.reception = b""  # the last slot's, as CDR
 
-    def time_ns(self, slot: int) -> int:
+    def _time_ns(self, slot: int) -> int:
         """Simulated time at which a slot starts, ns."""
-        return names.slot_time_ns(slot, self.run.swarm.slot_ns)
+        return names.slot_time_ns(slot, self._slot_ns)
 
-    def opened(self, slot: int, data: bytes, time_ns: int) -> None:
-        """Keeps a slot message for its turn."""
+    def slot_published(self, slot: int, data: bytes, time_ns: int) -> None:
         self._messages.setdefault(slot, []).append((data, time_ns))
 
-    def answer(self, slot: int, ids: bytes, data: bytes) -> None:
-        """Keeps a transmission message for its turn."""
+    def answer_received(self, slot: int, ids: bytes, data: bytes) -> None:
         self._answers.setdefault(slot, []).append((ids, data))
 
-    def complete(self, slot: int) -> None:
-        """All agents have answered a slot."""
+    def all_answered(self, slot: int, answers: Answers) -> None:
         self._complete = slot
 
     def _write_messages(self, slot: int) -> None:
         """Writes a slot's own message and all answers to it, in the order of their ids."""
-        at = self.time_ns(slot)
+        at = self._time_ns(slot)
         for data, time_ns in self._messages.pop(slot, []):
             self.bag.write(self._slot, data, time_ns, time_ns)
         for _, answer in sorted(self._answers.pop(slot, [])):
@@ -92,67 +83,21 @@ class FlightRecorder:
                 self.bag.write(channel, data, at, at)
             self._pending = []
 
-    def write(self, slot: int, answers: Answers, verdict: Verdict) -> None:
-        """Takes in everything about a slot whose frames the air has carried.
-
-        :param slot: the slot.
-        :param answers: what the agents answered to it.
-        :param verdict: the channel's verdict on it.
-        """
+    def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self._write_pending()
-        begin, end = self.time_ns(slot), self.time_ns(slot + 1)
-        self.decision = self._decision_cdr(slot, begin, answers)
-        self.reception = self._reception_cdr(slot, end, verdict)
+        begin, end = self._time_ns(slot), self._time_ns(slot + 1)
         motion = self._packer.pack(begin, answers.position, answers.velocity)
         self._pending_slot = slot
-        self._pending = [(self._decision, self.decision, begin)]
+        self._pending = [(self._decision, self._packed.decision(slot, answers), begin)]
         self._pending += [(channel, data, begin) for channel, data in zip(self._odometry, motion, strict=True)]
-        self._pending.append((self._reception, self.reception, end))
+        self._pending.append((self._reception, self._packed.reception(slot, verdict), end))
+        if slot % self._marker_slots == 0:
+            self._pending.append((self._markers, self._packed.markers(slot, answers, verdict), begin))
 
-    def _decision_cdr(self, slot: int, begin: int, answers: Answers) -> bytes:
-        key = answers.reason.tobytes()
-        known = self._reasons.get(key)
-        if known is None:
-            used = np.unique(answers.reason)
-            labels = [REASONS[code] if code < len(REASONS) else str(code) for code in used]
-            known = labels, array("B", np.searchsorted(used, answers.reason).astype(np.uint8).tobytes())
-            self._reasons[key] = known
-        message = Decision(
-            stamp=stamp(begin),
-            slot=slot,
-            agent=array("H", range(1, answers.agents + 1)),
-            chosen=array("H", answers.chosen.tobytes()),
-            reason_name=known[0],
-            reason_index=known[1],
-            reason=array("B", key),
-            digest=array("I", answers.digest.tobytes()),
-            score=array("d", answers.score.tobytes()),
-        )
-        return bytes(serialize_message(message))
-
-    def _reception_cdr(self, slot: int, end: int, verdict: Verdict) -> bytes:
-        nothing = (0,) * len(verdict.senders)
-        received = pack_received(verdict.mask(self.run.swarm.agents)) if verdict.senders else b""
-        message = Reception(
-            stamp=stamp(end),
-            slot=slot,
-            outcome=verdict.outcome,
-            sender=array("H", verdict.senders),
-            received=array("B", received),
-            lost=array("H", verdict.lost or nothing),
-            collided=array("H", verdict.collided or nothing),
-        )
-        return bytes(serialize_message(message))
-
-    def show(self, slot: int, data: bytes) -> None:
-        """Takes in a picture of the swarm at the start of the slot that was written last."""
-        self._pending.append((self._markers, data, self.time_ns(slot)))
-
-    def channel_changed(self, change: Change) -> None:
-        """Writes a change of the channel's settings, made while it ran, as a ParameterEvent at its first slot."""
-        if not self._event:
+    def settings_changed(self, change: Change) -> None:
+        if not self._event:  # the topic is in the bags of such flights only
             self._event = self.bag.add_topic("/parameter_events", "rcl_interfaces/msg/ParameterEvent")
-        at = self.time_ns(change.slot)
+        at = self._time_ns(change.slot)
         self.bag.write(self._event, _parameter_event(at, f"{names.SWARM}/channel", change), at, at)
 
     def close(self) -> None:

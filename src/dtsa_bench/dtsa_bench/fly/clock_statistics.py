@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_channel_sim.ros.observer import ChannelObserver
+
 ON_TIME_NS = 1_000_000  # a frame this far from the swarm's common time is not on time any more
 _END = 50  # slots
 
 
-class ClockStatistics:
+class ClockStatistics(ChannelObserver):
     """Collects when slots start and frames leave, and sums it up.
 
     :param agents: number of agents N.
@@ -23,7 +25,10 @@ class ClockStatistics:
         self._starts: dict[int, NDArray[np.float64]] = {}  # (N,) ns by slot: own slot's start where silent
         self._sends: list[tuple[int, int, int]] = []  # slot, agent's id, ns
 
-    def report(self, slot: int, ids: Sequence[int], offsets_ns: Sequence[int], lengths: Sequence[int]) -> None:
+    def report(self, message: Any) -> None:
+        self.add(message.slot, message.agent, message.offset_ns, message.length)
+
+    def add(self, slot: int, ids: Sequence[int], offsets_ns: Sequence[int], lengths: Sequence[int]) -> None:
         """Takes in one report.
 
         :param slot: as its agents count.

@@ -1,0 +1,79 @@
+"""Measures a flight of nodes and knows when it is over."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import Scenario
+from dtsa_bench.metrics import FlightMetrics, metrics_tables
+from dtsa_bench.run_config import RunConfig
+from dtsa_channel_sim.model.verdict import Verdict
+from dtsa_channel_sim.ros.answers import Answers
+from dtsa_channel_sim.ros.observer import ChannelObserver, Referee
+
+
+class FlightMeasurement(ChannelObserver, Referee):
+    """Follows a flight with the metrics; as its referee, ends it when they say so.
+
+    :param run: the run.
+    :param scenario: its scenario.
+    """
+
+    def __init__(self, run: RunConfig, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.metrics = FlightMetrics(run, scenario)
+        self.positions: list[NDArray[np.float64]] = []  # (3, N) m, at each slot's start
+        self.begin_s = self.end_s = 0.0  # wall clock: slot 0 answered by all, flight over; 0: not yet
+        self._tables = metrics_tables(run, scenario, everyone=True)
+        self._agents = run.swarm.agents
+        self._oracle = run.swarm.estimator == "oracle"
+        self._outcome = 0
+        self._compared = self._tables.digest, self._tables.chosen  # of the slot that is being flown
+
+    @property
+    def wall_time_s(self) -> float:
+        """Wall-clock time of the flight so far, s."""
+        return (self.end_s or time.monotonic()) - self.begin_s if self.begin_s else 0.0
+
+    def all_answered(self, slot: int, answers: Answers) -> None:
+        self.positions.append(answers.position.copy())
+        if not slot:
+            self.begin_s = time.monotonic()
+            return
+        self.metrics.compare_views(slot - 1, *self._compared)
+        if self._oracle:
+            self._tables.estimate_position[:] = answers.position
+        if self.metrics.update(slot - 1, answers.track, self._tables, self._outcome):
+            self.end_s = time.monotonic()
+
+    def over(self, slot: int, answers: Answers) -> bool:
+        return bool(self.metrics.end)
+
+    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        self._outcome = verdict.outcome
+        self._compared = answers.digest.copy(), answers.chosen.copy()
+        self.scenario.advance(slot, self._tables)  # what all know about each other's goals
+        if verdict.senders:
+            mask = verdict.mask(self._agents)
+            for row, sender in enumerate(verdict.senders):
+                if mask[row].any():
+                    self._tables.hear(slot, frames[sender], mask[row])
+        self._tables.end(slot)
+
+    def agent_silent(self, agent: int) -> None:
+        self.metrics.lose(agent)
+
+    def agents_back(self, agents: list[int]) -> None:
+        for agent in agents:
+            self.metrics.regain(agent)
+
+    def close(self) -> None:
+        self.end_s = self.end_s or (time.monotonic() if self.begin_s else 0.0)
+
+    def summary(self) -> dict[str, Any]:
+        """The results so far, with the keys of ``summary.json``."""
+        return self.metrics.summary(self.wall_time_s)

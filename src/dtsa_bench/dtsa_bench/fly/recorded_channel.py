@@ -1,0 +1,149 @@
+"""The channel with a recorder and the metrics in one process: what makes a run of nodes a recorded flight."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+
+from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core.settings import settings_of
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.parameters import declare_from_dataclass
+from dtsa_agent.ros.common.process import run_node
+from dtsa_bench.options import FROM_SWARM, new_directory
+from dtsa_bench.run_config import LOCKSTEP, RunConfig, RunLimits
+from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim.ros.channel_node import declare_limits, follow_parameters
+from dtsa_channel_sim.ros.diagnostics import Diagnostics
+from dtsa_channel_sim.ros.lockstep import LockstepChannel
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+
+from .clock_statistics import ClockStatistics
+from .live_topics import LiveTopics
+from .measurement import FlightMeasurement
+from .recorder import FlightRecorder
+
+BAG = "bag"  # the bag's directory within a flight's directory
+
+
+class RecordedFlight:
+    """A channel, and those that observe it in a recorded flight.
+
+    :param node: the ROS node; the channel's settings are its parameters.
+    :param run: the run.
+    :param directory: the flight's directory; the bag becomes a directory in it.
+    :param startup_s: s of wall time that all agents have to answer for the first time.
+    :param answer_s: s of wall time that all agents have to answer any later slot, in lockstep.
+    :param end_s: s of wall time that the nodes have to hear of the end.
+    """
+
+    def __init__(
+        self, node: Node, run: RunConfig, directory: Path, startup_s: float, answer_s: float, end_s: float = 4.0
+    ) -> None:
+        self.run_config, self.directory = run, directory
+        self.scenario = make_scenario(run.swarm)
+        self.measurement = FlightMeasurement(run, self.scenario)
+        model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
+        self.channel: LockstepChannel | RealtimeChannel
+        if run.mode == LOCKSTEP:
+            self.channel = LockstepChannel(
+                node, model, steps, answer_s, referee=referee, startup_s=startup_s, end_s=end_s
+            )
+        else:
+            self.channel = RealtimeChannel(node, model, steps, referee=referee, startup_s=startup_s, end_s=end_s)
+        # The recorder comes first: whatever happens to the others, the bag is complete.
+        self.channel.observe(
+            FlightRecorder(directory / BAG, run, self.scenario),
+            self.measurement,
+            LiveTopics(node, self.scenario, run.swarm.slot_ns),
+            Diagnostics(node),
+        )
+        self._clocks = ClockStatistics(run.swarm.agents)
+        if run.mode != LOCKSTEP:
+            self.channel.observe(self._clocks)
+        follow_parameters(node, model, self.channel.change_settings)
+
+    def summary(self) -> dict[str, Any]:
+        """The flight's results."""
+        channel = self.channel
+        result = {**self.measurement.summary(), "unusable_messages": channel.unusable}
+        if isinstance(channel, RealtimeChannel):
+            result |= {
+                "mode": self.run_config.mode,
+                "late_frames": channel.arbiter.late,
+                "missed_reports": channel.missed,
+                "returned_agents": sorted(channel.returned),
+                **self._clocks.summary(),
+            }
+        return result
+
+    def write_results(self, pictures: bool = True, **more: Any) -> dict[str, Any]:
+        """Writes ``summary.json`` and ``trajectories.png``; the channel is closed.
+
+        :param pictures: whether the picture is drawn.
+        :param more: further results.
+        :returns: the summary.
+        """
+        summary = {**self.summary(), **more}
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        (self.directory / "summary.json").write_text(text, encoding="utf-8")
+        positions = self.measurement.positions
+        if positions and pictures:
+            from dtsa_bench.trajectories import draw_flight
+
+            picture = self.directory / "trajectories.png"
+            draw_flight(picture, self.run_config, self.scenario, np.array(positions), summary)
+        return summary
+
+
+def declare_run(node: Node) -> RunConfig:
+    """Declares all settings of a run as parameters and reads them.
+
+    :raises ConfigError: for settings that are not usable.
+    """
+    swarm = SwarmConfig.from_dict(declare_from_dataclass(node, SwarmConfig))
+    channel = declare_from_dataclass(node, ChannelConfig, skip=FROM_SWARM, changeable=True)
+    described = ParameterDescriptor(description="YAML file with further settings of the channel", read_only=True)
+    file = node.declare_parameter("channel_file", "", described).value
+    derived = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed}
+    if file:
+        defaults = {spec.name: spec.default for spec in settings_of(ChannelConfig)}
+        given = {name: value for name, value in channel.items() if value != defaults[name]}
+        air = ChannelConfig.from_yaml(file, **given, **derived)
+    else:
+        air = ChannelConfig.from_dict({**channel, **derived})
+    return RunConfig(swarm, air, RunLimits(**declare_from_dataclass(node, RunLimits)))
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    node = Node("channel", namespace=names.SWARM)
+    try:
+        run = declare_run(node)
+        where = ParameterDescriptor(description="directory for the bag and the results", read_only=True)
+        directory = new_directory(node.declare_parameter("out", "flight", where).value)
+        startup_s, answer_s = declare_limits(node)
+        flight = RecordedFlight(node, run, directory, startup_s, answer_s)
+        try:
+            flight.channel.run(stop)
+        finally:
+            flight.channel.close()
+        node.get_logger().info(f"flight {flight.write_results()['end']}; results in {directory}")
+    finally:
+        node.destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node ``recorded_channel``."""
+    return run_node("recorded_channel", _body, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""Observers of the channel: who is told what, in which order, and what happens when one of them fails."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fly_helpers import readable
+from node_helpers import end_of, ros_graph
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from rclpy.node import Node
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import DtsaError, LocalProtocolError
+from dtsa_bench.fly.recorded_channel import RecordedFlight
+from dtsa_bench.run_config import RunConfig, RunLimits
+from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim.model.verdict import Verdict
+from dtsa_channel_sim.ros.answers import Answers
+from dtsa_channel_sim.ros.channel_node import declare_channel
+from dtsa_channel_sim.ros.lockstep import LockstepChannel
+from dtsa_channel_sim.ros.observer import ChannelObserver, ObserverError, Observers, SlotLimit
+
+
+class Diary(ChannelObserver):
+    """Writes down what it is told."""
+
+    def __init__(self, pages: list[str], name: str = "") -> None:
+        self.pages, self.name = pages, name
+
+    def slot_published(self, slot: int, data: bytes, time_ns: int) -> None:
+        self.pages.append(f"{self.name}published {slot}")
+
+    def all_answered(self, slot: int, answers: Answers) -> None:
+        self.pages.append(f"{self.name}answered {slot}")
+
+    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        assert sorted(frames) == list(verdict.senders)
+        self.pages.append(f"{self.name}judged {slot}")
+
+    def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        self.pages.append(f"{self.name}over {slot}")
+
+    def close(self) -> None:
+        self.pages.append(f"{self.name}closed")
+
+
+class Failing(ChannelObserver):
+    """Raises an error of Python's in one slot, or when it is closed."""
+
+    def __init__(self, slot: int | None) -> None:
+        self.slot = slot
+
+    def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        if slot == self.slot:
+            raise ValueError("no room")
+
+    def close(self) -> None:
+        if self.slot is None:
+            raise OSError("disk full")
+
+
+def test_observers_are_told_in_the_order_in_which_they_came() -> None:
+    pages: list[str] = []
+    observers = Observers()
+    for name in "abc":
+        observers.add(Diary(pages, name))
+    observers.slot_published(3, b"", 0)
+    assert pages == ["apublished 3", "bpublished 3", "cpublished 3"]
+
+
+def test_all_observers_are_closed_once_even_if_one_fails() -> None:
+    pages: list[str] = []
+    observers = Observers()
+    for observer in (Diary(pages, "a"), Failing(None), Diary(pages, "b")):
+        observers.add(observer)
+    with pytest.raises(ObserverError, match="Failing failed: OSError"):
+        observers.close()
+    observers.close()
+    assert pages == ["aclosed", "bclosed"]
+
+
+def test_an_error_of_the_projects_own_says_by_itself_what_is_wrong() -> None:
+    class Broken(ChannelObserver):
+        def agent_silent(self, agent: int) -> None:
+            raise LocalProtocolError(f"cf{agent} is gone")
+
+    observers = Observers()
+    observers.add(Broken())
+    with pytest.raises(DtsaError, match=r"^cf4 is gone$"):
+        observers.agent_silent(4)
+
+
+@pytest.mark.ros
+def test_a_channel_needs_no_observer_and_a_slot_is_told_in_order(tmp_path: Path) -> None:
+    pages: list[str] = []
+    with ros_graph(tmp_path) as graph:
+        host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=3")
+        for observers in ((), (Diary(pages),)):
+            node = Node("channel", context=graph.node.context, enable_rosout=False)
+            channel = LockstepChannel(node, Channel(ChannelConfig(agents=3)), 1, referee=SlotLimit(2))
+            channel.observe(*observers)
+            try:
+                channel.run(stop=False)
+            finally:
+                channel.close()
+                node.destroy_node()
+            assert channel.slot == 2
+            assert end_of(host) == (0, "")
+            if not observers:
+                host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=3")
+    assert pages == [
+        "published 0", "answered 0", "judged 0",
+        "published 1", "over 0", "answered 1", "judged 1",
+        "published 2", "over 1", "answered 2", "closed",
+    ]  # fmt: skip
+
+
+@pytest.mark.ros
+def test_an_observer_that_fails_ends_the_flight_by_name_and_the_bag_is_readable(tmp_path: Path) -> None:
+    swarm = SwarmConfig(agents=3)
+    run = RunConfig(swarm, ChannelConfig(agents=3), RunLimits(tail_s=60.0))
+    out = tmp_path / "out"
+    out.mkdir()
+    with ros_graph(tmp_path) as graph:
+        host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=3")
+        node = Node("channel", namespace="/swarm", context=graph.node.context, enable_rosout=False)
+        declare_channel(node, run.air)
+        flight = RecordedFlight(node, run, out, startup_s=60.0, answer_s=10.0)
+        flight.channel.observe(Failing(25))
+        try:
+            with pytest.raises(ObserverError, match=r"^Failing failed: ValueError: no room$"):
+                flight.channel.run(stop=False)
+        finally:
+            flight.channel.close()
+            node.destroy_node()
+        assert end_of(host) == (0, "")
+    assert readable(out) == 25
+    assert flight.write_results(pictures=False)["end"] == "stopped"
+    assert json.loads((out / "summary.json").read_text())["slots"]["total"] == 25
+    assert np.array(flight.measurement.positions).shape == (26, 3, 3)
