@@ -51,7 +51,7 @@ def test_robot_beats_type_beats_all() -> None:
     first, second = settings.robots
     assert (first.name, first.id, first.command_rate_hz, first.log_rate_hz) == ("cf1", 1, 30, 30)
     assert (second.command_rate_hz, second.log_rate_hz) == (20, 20)
-    assert (second.battery_warning_v, second.battery_critical_v) == (3.6, 3.1)
+    assert (second.battery.voltage_warning, second.battery.voltage_critical) == (3.6, 3.1)
     assert second.firmware_params == {"stabilizer.estimator": 2}
 
 

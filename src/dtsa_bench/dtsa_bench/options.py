@@ -9,13 +9,13 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import Setting, settings_of
-from dtsa_bench.run_config import LOCKSTEP, RunConfig, RunLimits
+from dtsa_agent.core.settings import Setting, Settings, settings_of
+from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
 # Settings of the channel that follow from the swarm's.
 FROM_SWARM = ("agents", "slot_ns", "seed")
-_SECTIONS: tuple[tuple[str, type, tuple[str, ...]], ...] = (
+_SECTIONS: tuple[tuple[str, type[Settings], tuple[str, ...]], ...] = (
     ("swarm", SwarmConfig, ()),
     ("channel", ChannelConfig, FROM_SWARM),
     ("limits", RunLimits, ()),
@@ -29,12 +29,10 @@ def add_run_options(parser: argparse.ArgumentParser, skip: Iterable[str] = ()) -
     :param parser: the command's parser.
     :param skip: settings that the command does not offer.
     """
-    left_out = set(skip)
+    left_out = tuple(skip)
     for section, cls, derived in _SECTIONS:
         group = parser.add_argument_group(_TITLES[section])
-        for setting in settings_of(cls):
-            if setting.kind != "structure" and setting.name not in derived and setting.name not in left_out:
-                _add(group, setting, section)
+        add_options(group, cls, section, skip=(*derived, *left_out))
         if section == "channel":
             group.add_argument(
                 "--channel",
@@ -51,25 +49,41 @@ def add_mode_options(parser: argparse.ArgumentParser) -> None:
     :param parser: the command's parser.
     """
     group = parser.add_argument_group("real time")
-    group.add_argument(
-        "--mode",
-        metavar="NAME",
-        default=None,
-        help="lockstep: all wait for each other, as fast as the "
-        "machine allows; realtime: every agent on its own clock [lockstep]",
-    )
-    for setting in settings_of(ClockConfig):
-        if setting.name != "seed":
-            _add(group, setting, "clocks", "clock-")
-    group.add_argument(
-        "--align",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="agents align their clocks by what they hear [True]",
-    )
+    add_options(group, RunConfig, "run")
+    add_options(group, ClockConfig, "clocks", "clock-", skip=("seed",))
 
 
-def _add(group: Any, setting: Setting, section: str, prefix: str = "") -> None:
+def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "", skip: Iterable[str] = ()) -> None:
+    """Adds an option for every setting of a settings class that fits into one.
+
+    :param group: parser, or group of its options.
+    :param cls: the settings class.
+    :param section: what :func:`given` calls these options.
+    :param prefix: stands before the setting's name in the option's.
+    :param skip: settings that become no option.
+    """
+    for setting in settings_of(cls):
+        if setting.kind not in ("structure", "vector") and setting.name not in skip:
+            _add(group, setting, section, prefix)
+
+
+def given(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
+    """The values of those options of :func:`add_options` that were given, by name.
+
+    :param args: parsed options.
+    :param cls: the settings class.
+    :param section: as for :func:`add_options`.
+    :raises ConfigError: for a text that is no value of its setting's kind.
+    """
+    found = {}
+    for setting in settings_of(cls):
+        value = getattr(args, f"{section}.{setting.name}", None)
+        if value is not None:
+            found[setting.name] = setting.parse(value) if isinstance(value, str) else value
+    return found
+
+
+def _add(group: Any, setting: Setting, section: str, prefix: str) -> None:
     option = f"--{prefix}" + setting.name.replace("_", "-")
     where = f"{section}.{setting.name}"
     text = setting.description.replace("%", "%%")
@@ -95,22 +109,16 @@ def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
     :param fixed: settings of the swarm that win over the options.
     :raises ConfigError: naming the option, the value and what is allowed.
     """
-    values: dict[str, dict[str, Any]] = {}
-    for section, cls in (*((section, cls) for section, cls, _ in _SECTIONS), ("clocks", ClockConfig)):
-        chosen = values[section] = {}
-        for setting in settings_of(cls):
-            given = getattr(args, f"{section}.{setting.name}", None)
-            if given is not None:
-                chosen[setting.name] = setting.parse(given) if isinstance(given, str) else given
+    values = {section: given(args, cls, section) for section, cls, _ in _SECTIONS}
     swarm = SwarmConfig.from_dict({**values["swarm"], **fixed})
     derived = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed}
     if getattr(args, "channel", None):
         channel = ChannelConfig.from_yaml(args.channel, **values["channel"], **derived)
     else:
         channel = ChannelConfig.from_dict({**values["channel"], **derived})
-    mode = getattr(args, "mode", None) or LOCKSTEP
-    clocks = ClockConfig(seed=swarm.seed, **values["clocks"])
-    return RunConfig(swarm, channel, RunLimits(**values["limits"]), mode, clocks, getattr(args, "align", True))
+    clocks = ClockConfig(seed=swarm.seed, **given(args, ClockConfig, "clocks"))
+    limits = RunLimits(**values["limits"])
+    return RunConfig(swarm, channel, limits, clocks=clocks, **given(args, RunConfig, "run"))
 
 
 def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:
@@ -118,13 +126,7 @@ def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:
 
     :raises ConfigError: if it is none, or out of range.
     """
-    try:
-        value = int(text)
-    except ValueError:
-        value = minimum - 1
-    if not minimum <= value <= maximum:
-        raise ConfigError(name, text, f"a whole number, {minimum} to {maximum}")
-    return value
+    return int(Setting(name, "int", None, name, minimum=minimum, maximum=maximum).read(text))
 
 
 def new_directory(path: str | Path, name: str = "out") -> Path:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import Settings, setting
+from dtsa_agent.core.settings import Settings, check, nested, setting
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
-SECTIONS = ("swarm", "channel", "limits", "mode", "clocks", "align")
 LOCKSTEP, REALTIME = MODES = ("lockstep", "realtime")
 
 
@@ -33,26 +29,30 @@ class RunLimits(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class RunConfig:
+class RunConfig(Settings):
     """Everything that decides what happens in a run. Equal configurations give equal flights, bit for bit."""
 
-    swarm: SwarmConfig = field(default_factory=SwarmConfig)
-    channel: ChannelConfig | None = None  # None: loss-free, made from ``swarm``
-    limits: RunLimits = field(default_factory=RunLimits)
-    mode: str = LOCKSTEP  # REALTIME: every agent on its own clock
-    clocks: ClockConfig = field(default_factory=ClockConfig)  # real time only
-    align: bool = True  # real time only: agents align their clocks by what they hear
+    swarm: SwarmConfig = nested(SwarmConfig, "the swarm")
+    channel: ChannelConfig | None = setting(
+        None, "the radio channel; None: loss-free, made from the swarm's settings", section=ChannelConfig
+    )
+    limits: RunLimits = nested(RunLimits, "the end of a run")
+    mode: str = setting(
+        LOCKSTEP,
+        "in lockstep all wait for each other, as fast as the machine allows; in real time each has a clock of its own",
+        choices=MODES,
+    )
+    clocks: ClockConfig = nested(ClockConfig, "real time: the agents' clocks")
+    align: bool = setting(True, "real time: agents align their clocks by what they hear")
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ConfigError("mode", self.mode, ", ".join(MODES))
+        check(self)
         if self.channel is None:
             channel = ChannelConfig(agents=self.swarm.agents, slot_ns=self.swarm.slot_ns, seed=self.swarm.seed)
             object.__setattr__(self, "channel", channel)
-        channel = self.air
         for name, there, here in (
-            ("agents", channel.agents, self.swarm.agents),
-            ("slot_ns", channel.slot_ns, self.swarm.slot_ns),
+            ("agents", self.air.agents, self.swarm.agents),
+            ("slot_ns", self.air.slot_ns, self.swarm.slot_ns),
         ):
             if there != here:
                 raise ConfigError(f"channel.{name}", there, f"{here}, as in the swarm")
@@ -62,27 +62,3 @@ class RunConfig:
         """The channel's settings."""
         assert self.channel is not None
         return self.channel
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, in sections; :meth:`from_dict` reads them back."""
-        limits = {spec.name: getattr(self.limits, spec.name) for spec in dataclasses.fields(self.limits)}
-        result = {"swarm": self.swarm.to_dict(), "channel": self.air.to_dict(), "limits": limits}
-        if self.mode != LOCKSTEP:
-            result.update(mode=self.mode, clocks=self.clocks.to_dict(), align=self.align)
-        return result
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> RunConfig:
-        """Builds a run from plain values in sections.
-
-        :raises ConfigError: naming what is not allowed.
-        """
-        for name in values:
-            if name not in SECTIONS:
-                raise ConfigError(name, values[name], f"one of the sections {', '.join(SECTIONS)}")
-        channel = values.get("channel")
-        return cls(
-            SwarmConfig.from_dict(values.get("swarm", {})),
-            None if channel is None else ChannelConfig.from_dict(channel),
-            RunLimits(**values.get("limits", {})),
-        )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ REQUIRED: Any = dataclasses.MISSING
 _KIND_OF_TYPE = {"int": "int", "float": "float", "bool": "bool", "str": "text", "Vector": "vector"}
 _NUMBERS = {"int": "a whole number", "float": "a number"}
 _WORDS = {"bool": "true or false", "text": "a text", "values": "name=number, separated by commas"}
+_NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 
 Choices = tuple[Any, ...] | Callable[[], tuple[Any, ...]]
@@ -89,6 +91,8 @@ class Setting:
         """What may be given, in words."""
         if self.choices:
             return ", ".join(map(str, self.choices))
+        if self.custom:
+            return self.help
         if self.kind == "vector":
             return f"three numbers: x, y, z in {self.unit}" if self.unit else "three numbers"
         if self.kind not in _NUMBERS:
@@ -171,6 +175,17 @@ class Setting:
         except ValueError:
             pass
         raise ConfigError(self.name, text, self.allowed)
+
+    def read(self, text: str) -> Any:
+        """The value that a text means, checked.
+
+        :param text: as the user typed it.
+        :raises ConfigError: if it is none, or not allowed.
+        """
+        try:
+            return self.check(self.parse(text))
+        except ConfigError:
+            raise ConfigError(self.name, text, self.allowed) from None
 
 
 def setting(
@@ -354,10 +369,13 @@ def _is_number(value: object) -> bool:
 
 
 def _checked_values(value: object, name: str) -> dict[str, float]:
-    for key, number in names_with_values(value, name).items():
-        if isinstance(number, bool) or not isinstance(number, (int, float)):
+    values = names_with_values(value, name)
+    for key, number in values.items():
+        if not isinstance(key, str) or not _NAME.fullmatch(key):
+            raise ConfigError(name, key, "names of letters, digits, dots, dashes and underscores")
+        if not _is_number(number):
             raise ConfigError(f"{name}.{key}", number, "a number")
-    return {str(key): float(number) for key, number in names_with_values(value, name).items()}
+    return {key: float(number) for key, number in values.items()}
 
 
 def parse_values(text: str) -> dict[str, float]:

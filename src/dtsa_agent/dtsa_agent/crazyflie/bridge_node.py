@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import named
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.bridge_inputs import Inputs
 from dtsa_agent.crazyflie.bridge_outputs import Outputs
@@ -30,6 +31,7 @@ from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
 from dtsa_agent.crazyflie.priority import stay_on_one_processor, take_priority
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
+from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.process import follow_supervisor
 
 STATUS_HZ = 5.0
@@ -41,23 +43,9 @@ def safety_parameters(node: Node, given: SafetySettings) -> SafetySettings:
 
     :raises ConfigError: a value is out of range.
     """
-    values: dict[str, Any] = {}
-    for field in dataclasses.fields(SafetySettings):
-        meta = field.metadata
-        unit = f" [{meta['unit']}]" if meta.get("unit") else ""
-        descriptor = ParameterDescriptor(description=meta["help"] + unit, read_only=True)
-        if meta.get("minimum") is not None and isinstance(getattr(given, field.name), float):
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(meta["minimum"]), to_value=float(meta["maximum"]), step=0.0)
-            ]
-        default = getattr(given, field.name)
-        default = list(default) if isinstance(default, tuple) else default
-        try:
-            value = node.declare_parameter(f"safety.{field.name}", default, descriptor).value
-        except Exception as error:  # rclpy has a class of its own for each way to be wrong
-            raise ConfigError(f"safety.{field.name}", "see the message", str(error)) from error
-        values[field.name] = tuple(value) if isinstance(value, (list, tuple)) or hasattr(value, "typecode") else value
-    return SafetySettings(**values)
+    values = declare_settings(node, SafetySettings, defaults=given.to_dict(), prefix="safety.")
+    with named("safety"):
+        return SafetySettings(**values)
 
 
 class BridgeNode(Node):

@@ -13,7 +13,6 @@ station:
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import check, named, setting
+from dtsa_agent.core.settings import REQUIRED, Settings, build, check, named, nested, setting, settings_of
 from dtsa_agent.crazyflie.budget import radio_of
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.units import Vector
@@ -33,65 +32,107 @@ IGNORED = frozenset({"motion_capture", "big_quad", "firmware_logging", "referenc
 
 
 @dataclass(frozen=True, slots=True)
-class RobotSettings:
+class BatterySettings(Settings):
+    """Voltages of a battery in flight.
+
+    :raises ConfigError: a value is out of range.
+    """
+
+    voltage_warning: float = setting(3.4, "warning below this", unit="V", minimum=2.0, maximum=5.0)
+    voltage_critical: float = setting(3.2, "landing below this", unit="V", minimum=2.0, maximum=5.0)
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.voltage_critical > self.voltage_warning:
+            allowed = f"at most voltage_warning, {self.voltage_warning} V"
+            raise ConfigError("voltage_critical", self.voltage_critical, allowed)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSettings(Settings):
     """One Crazyflie.
 
     :raises ConfigError: a value is out of range.
     """
 
-    name: str
-    uri: str
-    id: int = setting(0, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
-    enabled: bool = True
-    type: str = ""
-    initial_position: Vector = (0.0, 0.0, 0.0)  # m, world
+    name: str = setting(REQUIRED, "key of the robot: letters, then the agent's id")
+    id: int = setting(REQUIRED, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
+    uri: str = setting(REQUIRED, "the Crazyflie's address, such as radio://0/80/2M/E7E7E7E701", custom=True)
+    enabled: bool = setting(True, "false: it takes no part")
+    type: str = setting("", "one of robot_types, whose values it takes over")
+    initial_position: Vector = setting(
+        (0.0, 0.0, 0.0), "place at the start, in the Crazyflies' own world (z = 0 is the floor)", unit="m"
+    )
     command_rate_hz: float = setting(50.0, "rate of the streamed commands", unit="Hz", minimum=1, maximum=100)
     log_rate_hz: float = setting(50.0, "rate of the state log", unit="Hz", minimum=4, maximum=100)
-    connect_timeout_s: float = setting(20.0, "time for one attempt to connect", unit="s", minimum=0.2, maximum=300)
+    connect_timeout_s: float = setting(
+        20.0,
+        "time for one attempt to connect; a first connection over the air reads the tables of variables",
+        unit="s",
+        minimum=0.2,
+        maximum=300,
+    )
     connect_attempts: int = setting(3, "attempts to connect", minimum=1, maximum=100)
-    estimator_timeout_s: float = setting(10.0, "time for the estimator to settle", unit="s", minimum=0.1, maximum=300)
-    reset_estimator: bool = True
-    battery_warning_v: float = setting(3.4, "warning below this voltage", unit="V", minimum=2.0, maximum=5.0)
-    battery_critical_v: float = setting(3.2, "landing below this voltage", unit="V", minimum=2.0, maximum=5.0)
-    firmware_params: Mapping[str, float] = dataclasses.field(default_factory=dict)  # group.name -> value
+    estimator_timeout_s: float = setting(
+        10.0, "time for the estimator's variances to settle", unit="s", minimum=0.1, maximum=300
+    )
+    reset_estimator: bool = setting(True, "restart the Kalman filter and wait until it has settled")
+    battery: BatterySettings = nested(BatterySettings, "voltages in flight")
+    firmware_params: Mapping[str, float] = setting(
+        {}, "parameters of the firmware, {group: {name: value}}, set after connecting", custom=True
+    )
 
     def __post_init__(self) -> None:
-        try:
-            check(self)
-            radio_of(self.uri)
-        except ConfigError as error:
-            raise ConfigError(f"robots.{self.name}.{error.field}", error.value, error.allowed) from None
-        if self.battery_critical_v > self.battery_warning_v:
-            raise ConfigError(
-                f"robots.{self.name}.battery.voltage_critical",
-                self.battery_critical_v,
-                f"at most voltage_warning, {self.battery_warning_v} V",
-            )
+        check(self)
+        object.__setattr__(self, "uri", str(self.uri))
+        radio_of(self.uri)
+        object.__setattr__(self, "firmware_params", _params(self.firmware_params))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as a swarm's YAML has them under the robot's name, which says the id as well."""
+        result = {spec.name: getattr(self, spec.name) for spec in settings_of(RobotSettings)}
+        del result["name"], result["id"]
+        groups: dict[str, dict[str, float]] = {}
+        for name, value in self.firmware_params.items():
+            group, _, parameter = name.partition(".")
+            groups.setdefault(group, {})[parameter] = value
+        position = list(self.initial_position)
+        return {**result, "initial_position": position, "battery": self.battery.to_dict(), "firmware_params": groups}
 
 
 @dataclass(frozen=True, slots=True)
-class StationSettings:
+class StationSettings(Settings):
     """The ground station.
 
     :raises ConfigError: a value is out of range.
     """
 
-    min_connected: int = setting(1, "fewer connected Crazyflies than this: nobody flies", minimum=1, maximum=1000)
-    room_origin_in_world: Vector = (0.0, 0.0, 0.95)  # m: where the Crazyflies' world sees the origin of `map`
-    force_budget: bool = False  # fly even if the radios cannot carry it
-    toc_cache: str = ""  # folder of the variables' tables; empty: ~/.cache/dtsa/crazyflie
-    land_speed_mps: float = setting(0.4, "mean speed of a landing", unit="m/s", minimum=0.05, maximum=2)
+    min_connected: int = setting(
+        1,
+        "fewer usable Crazyflies than this: the bridge ends (exit code 1), nobody takes off",
+        minimum=1,
+        maximum=1000,
+    )
+    room_origin_in_world: Vector = setting(
+        (0.0, 0.0, 0.95),
+        "where the Crazyflies' world sees the origin of the frame map, the room's centre",
+        unit="m",
+    )
+    force_budget: bool = setting(False, "fly although the radios cannot carry it")
+    toc_cache: str = setting("", "folder of the tables of variables; empty: ~/.cache/dtsa/crazyflie")
+    land_speed_mps: float = setting(
+        0.4, "mean speed of a landing without a duration", unit="m/s", minimum=0.05, maximum=2
+    )
     max_speed_mps: float = setting(
         1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
     )
-    landing_timeout_s: float = setting(20.0, "longest wait for all to land", unit="s", minimum=1, maximum=300)
+    landing_timeout_s: float = setting(
+        20.0, "longest wait for all to land at the end", unit="s", minimum=1, maximum=300
+    )
     priority: int = setting(
         20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
     )
-    safety: SafetySettings = dataclasses.field(default_factory=SafetySettings)
-
-    def __post_init__(self) -> None:
-        check(self)
+    safety: SafetySettings = nested(SafetySettings, "the safety rules")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,23 +142,23 @@ class SwarmSettings:
     robots: tuple[RobotSettings, ...]  # the enabled ones, by id
     station: StationSettings
 
+    def to_dict(self) -> dict[str, Any]:
+        """The contents of a swarm's YAML; :func:`parse_swarm` reads them back."""
+        return {
+            "robots": {robot.name: robot.to_dict() for robot in self.robots},
+            "robot_types": {robot.type: {} for robot in self.robots if robot.type},
+            "station": self.station.to_dict(),
+        }
+
 
 def load_swarm(path: Path) -> SwarmSettings:
     """Read and check a swarm's YAML.
 
     :raises ConfigError: the file cannot be read, or something in it is not usable.
     """
-    import yaml
+    from dtsa_agent.yaml_file import read_yaml
 
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError("config", str(path), f"a file that can be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        where = getattr(error, "problem_mark", None)
-        line = f", line {where.line + 1}" if where is not None else ""
-        raise ConfigError("config", str(path), f"a YAML file{line}") from error
-    return parse_swarm(data)
+    return parse_swarm(read_yaml(path, "config"))
 
 
 def parse_swarm(data: object) -> SwarmSettings:
@@ -126,7 +167,9 @@ def parse_swarm(data: object) -> SwarmSettings:
     :raises ConfigError: something in it is not usable.
     """
     top = _mapping("config", data)
-    _known("config", top, SECTIONS)
+    for key in top:
+        if key not in SECTIONS and key not in IGNORED:
+            raise ConfigError(f"config.{key}", top[key], "one of " + ", ".join(SECTIONS))
     types = _mapping("robot_types", top.get("robot_types"))
     common = _mapping("all", top.get("all"))
     robots = []
@@ -145,7 +188,8 @@ def parse_swarm(data: object) -> SwarmSettings:
         if robot.id in numbers:
             raise ConfigError(f"robots.{robot.name}", robot.id, f"a number of its own ({numbers[robot.id]} has it)")
         numbers[robot.id] = robot.name
-    station = _station(_mapping("station", top.get("station")))
+    with named("station"):
+        station = StationSettings.from_dict(_used(_mapping("station", top.get("station"))))
     if station.min_connected > len(robots):
         raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(robots)}, the enabled robots")
     return SwarmSettings(tuple(robots), station)
@@ -159,10 +203,9 @@ def _mapping(field: str, value: object) -> dict[str, Any]:
     return value
 
 
-def _known(field: str, values: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    for key in values:
-        if key not in known and key not in IGNORED:
-            raise ConfigError(f"{field}.{key}", values[key], "one of " + ", ".join(known))
+def _used(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What is not ignored; an empty section is one that was left out."""
+    return {key: value for key, value in values.items() if key not in IGNORED and value is not None}
 
 
 def _merge(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
@@ -174,72 +217,28 @@ def _merge(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-_DERIVED = ("name", "id", "battery_warning_v", "battery_critical_v")
-ROBOT_KEYS = (*(f.name for f in dataclasses.fields(RobotSettings) if f.name not in _DERIVED), "battery")
-
-
 def _robot(name: str, own: dict[str, Any], types: dict[str, Any], common: dict[str, Any]) -> RobotSettings:
-    field = f"robots.{name}"
     match = NAME.match(name)
     if match is None:
         raise ConfigError("robots", name, "names such as cf3: letters, then the agent's number")
     kind = own.get("type", "")
     if kind and kind not in types:
-        raise ConfigError(
-            f"{field}.type", kind, "one of robot_types: " + (", ".join(map(str, types)) or "(there are none)")
-        )
-    merged = _merge(_merge(common, _mapping(f"robot_types.{kind}", types.get(kind))), own)
-    _known(field, merged, ROBOT_KEYS)
-    if "uri" not in merged:
-        raise ConfigError(f"{field}.uri", None, "the Crazyflie's address, such as radio://0/80/2M/E7E7E7E701")
-    values = {key: value for key, value in merged.items() if key in ROBOT_KEYS}
-    battery = _mapping(f"{field}.battery", values.pop("battery", None))
-    _known(f"{field}.battery", battery, ("voltage_warning", "voltage_critical"))
-    for key, field_name in (("voltage_warning", "battery_warning_v"), ("voltage_critical", "battery_critical_v")):
-        if key in battery:
-            values[field_name] = battery[key]
-    for key in ("enabled", "reset_estimator"):
-        if key in values and not isinstance(values[key], bool):
-            raise ConfigError(f"{field}.{key}", values[key], "true or false")
-    if "initial_position" in values:
-        values["initial_position"] = _vector(f"{field}.initial_position", values["initial_position"])
-    params = _mapping(f"{field}.firmware_params", values.pop("firmware_params", None))
-    values["uri"] = str(values["uri"])
-    return RobotSettings(name=name, id=int(match[1]), firmware_params=_params(field, params), **values)
+        allowed = "one of robot_types: " + (", ".join(map(str, types)) or "(there are none)")
+        raise ConfigError(f"robots.{name}.type", kind, allowed)
+    merged = _used(_merge(_merge(common, _mapping(f"robot_types.{kind}", types.get(kind))), own))
+    with named(f"robots.{name}"):
+        for key in ("name", "id"):
+            if key in merged:
+                raise ConfigError(key, merged[key], "nothing: the robot's key says it")
+        return build(RobotSettings, {**merged, "name": name, "id": int(match[1])})
 
 
-def _params(field: str, groups: Mapping[str, Any]) -> dict[str, float]:
+def _params(groups: object) -> dict[str, float]:
+    """Parameters of the firmware as `group.name`; they stay whole numbers where they are."""
     result: dict[str, float] = {}
-    for group, names in groups.items():
-        for name, value in _mapping(f"{field}.firmware_params.{group}", names).items():
+    for group, names in _mapping("firmware_params", groups).items():
+        for name, value in _mapping(f"firmware_params.{group}", names).items():
             if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ConfigError(f"{field}.firmware_params.{group}.{name}", value, "a number")
+                raise ConfigError(f"firmware_params.{group}.{name}", value, "a number")
             result[f"{group}.{name}"] = value
     return result
-
-
-def _vector(field: str, value: object) -> Vector:
-    if not isinstance(value, (list, tuple)) or len(value) != 3:
-        raise ConfigError(field, value, "three numbers: x, y, z in m")
-    for v in value:
-        if isinstance(v, bool) or not isinstance(v, (int, float)):
-            raise ConfigError(field, value, "three numbers: x, y, z in m")
-    return float(value[0]), float(value[1]), float(value[2])
-
-
-STATION_KEYS = tuple(f.name for f in dataclasses.fields(StationSettings))
-SAFETY_KEYS = tuple(f.name for f in dataclasses.fields(SafetySettings))
-
-
-def _station(values: dict[str, Any]) -> StationSettings:
-    _known("station", values, STATION_KEYS)
-    values = dict(values)
-    safety = _mapping("station.safety", values.pop("safety", None))
-    _known("station.safety", safety, SAFETY_KEYS)
-    if "room_origin_in_world" in values:
-        values["room_origin_in_world"] = _vector("station.room_origin_in_world", values["room_origin_in_world"])
-    if not isinstance(values.get("force_budget", False), bool):
-        raise ConfigError("station.force_budget", values["force_budget"], "true or false")
-    with named("station.safety"):
-        rules = SafetySettings(**safety)
-    return StationSettings(safety=rules, **values)

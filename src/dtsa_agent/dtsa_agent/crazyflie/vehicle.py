@@ -195,7 +195,7 @@ class Vehicle:
         with self.lock:
             if self.state not in (State.ARMED, State.FLYING, State.LANDING):
                 return f"{self.name} is {self.state.name.lower()}, not armed"
-            if self.last is not None and self.last.battery < self.robot.battery_critical_v:
+            if self.last is not None and self.last.battery < self.robot.battery.voltage_critical:
                 return f"{self.name}: battery {self.last.battery:.2f} V"
             if not math.isfinite(height):
                 return f"{self.name}: height {height} m is not finite"
@@ -383,8 +383,8 @@ class Vehicle:
                 self.state,
                 None if last is None else to_map(last.position, self.station.room_origin_in_world),
                 math.inf if last is None else last.battery,
-                self.robot.battery_warning_v,
-                self.robot.battery_critical_v,
+                self.robot.battery.voltage_warning,
+                self.robot.battery.voltage_critical,
                 self.log_age(now),
                 now - self._command_time
                 if (self._streaming or self._held) and self._command_time is not None

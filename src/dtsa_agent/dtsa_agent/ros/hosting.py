@@ -16,7 +16,7 @@ from dtsa_agent.keys import with_key
 
 from .common import names
 from .common.loop import Stop
-from .common.parameters import declare_from_dataclass
+from .common.parameters import declare_settings
 from .swarm_node import SwarmNode
 
 MODES = ("lockstep", "realtime")
@@ -114,4 +114,4 @@ def declare_swarm(node: Node) -> SwarmConfig:
 
     :raises ConfigError: for settings that are not usable.
     """
-    return SwarmConfig.from_dict(declare_from_dataclass(node, SwarmConfig))
+    return SwarmConfig.from_dict(declare_settings(node, SwarmConfig))

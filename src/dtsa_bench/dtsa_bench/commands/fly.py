@@ -145,7 +145,8 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     from dtsa_bench.fly.crazyflie import fly_crazyflies, mission_defaults
     from dtsa_bench.fly.flight import FlightOptions
 
-    args.mode = args.mode or "realtime"
+    if getattr(args, "run.mode") is None:
+        setattr(args, "run.mode", "realtime")
     given = {key.partition(".")[2]: value for key, value in vars(args).items() if key.startswith("swarm.")}
     config = run_config(args, **mission_defaults(settings, given))
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)

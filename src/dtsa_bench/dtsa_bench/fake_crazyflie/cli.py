@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import signal
 import sys
@@ -14,8 +15,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import FAULTS, send_fault
-from dtsa_bench.fake_crazyflie.fleet import MAX_COUNT, Fleet, FleetConfig
-from dtsa_bench.fake_crazyflie.peer import PROTOCOLS
+from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig
+from dtsa_bench.options import add_options, given, whole_number
 
 DESCRIPTION = """\
 Simulated Crazyflies over UDP: cflib, its client and the Crazyflie bridge connect to them as to real ones.
@@ -24,21 +25,15 @@ They fly, drain their batteries and fail on command; Ctrl-C ends them."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("--count", type=int, help=f"number of vehicles, 1 to {MAX_COUNT} (default 12)")
+    add_options(parser, FleetConfig, "fleet", skip=("host", "collision_m", "crash_m"))
     parser.add_argument("--config", type=Path, help="swarm.yaml: count, ports and start positions come from its robots")
-    parser.add_argument("--base-port", type=int, default=19850, help="UDP port of the first (default %(default)s)")
-    parser.add_argument("--control-port", type=int, default=0, help="UDP port for faults (default: base port - 1)")
     parser.add_argument("--layout", choices=layout.LAYOUTS, default="ellipse", help="start positions (%(default)s)")
     parser.add_argument(
         "--half-axes", type=float, nargs=2, default=(1.2, 2.0), metavar=("X", "Y"), help="m, of the layout (1.2 2.0)"
     )
-    parser.add_argument("--seed", type=int, default=1, help="of noise and loss (default %(default)s)")
-    parser.add_argument("--protocol", type=int, default=12, choices=PROTOCOLS, help="version told to the host")
-    parser.add_argument("--model", default="orca", help="flight model whose vehicle they are (%(default)s)")
-    parser.add_argument("--no-noise", action="store_true", help="perfect sensors")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="record of what really happened (JSON lines)")
     parser.add_argument(
-        "--priority", type=int, default=30, help="real-time priority, 0 to 90: the world waits for nobody (%(default)s)"
+        "--priority", metavar="N", default="30", help="real-time priority, 0 to 90: the world waits for nobody [30]"
     )
     parser.add_argument("--quiet", action="store_true", help="no status line")
     faults = parser.add_argument_group("faults", "sent to a fleet that is already running, instead of starting one")
@@ -55,29 +50,20 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
 
     :raises ConfigError: a value is out of range.
     """
-    options: dict[str, Any] = {
-        "control_port": args.control_port,
-        "seed": args.seed,
-        "protocol": args.protocol,
-        "noise": not args.no_noise,
-        "truth": args.truth,
-        "model": args.model,
-    }
+    options = {**given(args, FleetConfig, "fleet"), "truth": args.truth}
     if args.config is not None:
-        return _from_swarm(args, options)
-    count = 12 if args.count is None else args.count
-    if not 1 <= count <= MAX_COUNT:
-        raise ConfigError("count", count, f"1 to {MAX_COUNT}")
-    start = layout.positions(args.layout, count, tuple(args.half_axes))
-    return FleetConfig(count=count, base_port=args.base_port, start=start, **options)
+        return _from_swarm(args.config, options)
+    config = FleetConfig(**options)
+    start = layout.positions(args.layout, config.count, tuple(args.half_axes))
+    return dataclasses.replace(config, start=start)
 
 
-def _from_swarm(args: argparse.Namespace, options: dict[str, Any]) -> FleetConfig:
+def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
     import numpy as np
 
     from dtsa_agent.crazyflie.config import load_swarm
 
-    robots = load_swarm(args.config).robots
+    robots = load_swarm(path).robots
     ports = []
     for robot in robots:
         if not robot.uri.startswith("udp://"):
@@ -85,10 +71,10 @@ def _from_swarm(args: argparse.Namespace, options: dict[str, Any]) -> FleetConfi
         ports.append(int(robot.uri.rpartition(":")[2]))
     if ports != list(range(ports[0], ports[0] + len(ports))):
         raise ConfigError("robots", ports, "ports that follow each other, in the order of the robots")
-    if args.count not in (None, len(ports)):
-        raise ConfigError("count", args.count, f"{len(ports)}, as in {args.config}")
+    if options.get("count") not in (None, len(ports)):
+        raise ConfigError("count", options["count"], f"{len(ports)}, as in {path}")
     start = np.array([robot.initial_position for robot in robots]).T
-    return FleetConfig(count=len(ports), base_port=ports[0], start=start, **options)
+    return FleetConfig(**{**options, "count": len(ports), "base_port": ports[0], "start": start})
 
 
 def request_fault(args: argparse.Namespace) -> None:
@@ -104,7 +90,7 @@ def request_fault(args: argparse.Namespace) -> None:
             raise ConfigError("cf", args.cf, "an id, or all") from None
     names = ("rate", "direction", "voltage", "seconds")
     numbers = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    port = args.control_port or args.base_port - 1
+    port = FleetConfig(**given(args, FleetConfig, "fleet")).control_port
     send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **numbers)
     print(f"{args.fault}: cf {args.cf}")
 
@@ -128,10 +114,9 @@ def run(args: argparse.Namespace) -> int:
         from dtsa_agent.ros.common.process import follow_supervisor
 
         follow_supervisor()
-    if not 0 <= args.priority <= 90:
-        raise ConfigError("priority", args.priority, "0 to 90")
+    priority = whole_number(args.priority, "priority", 0, 90)
     fleet = Fleet(fleet_config(args))
-    take_priority(args.priority)
+    take_priority(priority)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: fleet.stop())
     for uri in fleet.config.uris:

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.core.config import AVOIDERS
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.flight_models import flight_model
+from dtsa_agent.core.settings import Settings, check, setting
 from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import check_fault
 from dtsa_bench.fake_crazyflie.estimate import Estimate
@@ -33,30 +35,35 @@ VELOCITY_NOISE_MPS = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class FleetConfig:
-    """What the fleet is made of."""
+class FleetConfig(Settings):
+    """What the fleet is made of.
 
-    count: int = 12
-    base_port: int = 19850  # vehicle k (from 1) listens on base_port + k - 1
-    control_port: int = 0  # 0: base_port - 1
-    host: str = "127.0.0.1"
-    start: Any = field(default=None, compare=False)  # (3, count), m, world; None: an ellipse
-    seed: int = 1
-    protocol: int = 12
-    noise: bool = True
-    model: str = "orca"  # flight model whose vehicle they are
-    collision_m: float = 0.2  # the record notes two flying vehicles closer than this ...
-    crash_m: float = 0.12  # ... and closer than this they fall
+    :param start: start positions, (3, count), m, world; None: an ellipse.
+    :param truth: file for the record of what really happened; None: no record.
+    :raises ConfigError: a value is out of range.
+    """
+
+    count: int = setting(12, "number of vehicles", minimum=1, maximum=MAX_COUNT)
+    base_port: int = setting(19850, "UDP port of the first; vehicle k listens on base_port + k - 1", minimum=1024,
+                             maximum=65535)  # fmt: skip
+    control_port: int = setting(0, "UDP port for faults; 0: base_port - 1", minimum=0, maximum=65535)
+    host: str = setting("127.0.0.1", "address on which they listen")
+    start: Any = field(default=None, compare=False)
+    seed: int = setting(1, "seed of noise and loss", minimum=0, maximum=2**63 - 1)
+    protocol: int = setting(12, "version of the protocol told to the host", choices=PROTOCOLS)
+    noise: bool = setting(True, "sensors have noise")
+    model: str = setting("orca", "flight model whose vehicle they are", choices=AVOIDERS, open_choices=True)
+    collision_m: float = setting(
+        0.2, "the record notes two flying vehicles closer than this", unit="m", minimum=0, maximum=10
+    )
+    crash_m: float = setting(0.12, "two flying vehicles closer than this fall", unit="m", minimum=0, maximum=10)
     truth: Path | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.count <= MAX_COUNT:
-            raise ConfigError("count", self.count, f"1 to {MAX_COUNT}")
-        if not 1024 <= self.base_port <= 65536 - self.count:
+        check(self)
+        if self.base_port > 65536 - self.count:
             raise ConfigError("base_port", self.base_port, f"1024 to {65536 - self.count} for {self.count} vehicles")
         flight_model(self.model)
-        if self.protocol not in PROTOCOLS:
-            raise ConfigError("protocol", self.protocol, " or ".join(str(p) for p in PROTOCOLS))
         if self.start is None:
             object.__setattr__(self, "start", layout.positions("ellipse", self.count))
         elif np.shape(self.start) != (3, self.count):

@@ -16,7 +16,7 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.settings import settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
-from dtsa_agent.ros.common.parameters import declare_from_dataclass
+from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.process import run_node
 from dtsa_bench.options import FROM_SWARM, new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig, RunLimits
@@ -109,8 +109,8 @@ def declare_run(node: Node) -> RunConfig:
 
     :raises ConfigError: for settings that are not usable.
     """
-    swarm = SwarmConfig.from_dict(declare_from_dataclass(node, SwarmConfig))
-    channel = declare_from_dataclass(node, ChannelConfig, skip=FROM_SWARM, changeable=True)
+    swarm = SwarmConfig.from_dict(declare_settings(node, SwarmConfig))
+    channel = declare_settings(node, ChannelConfig, skip=FROM_SWARM, changeable=True)
     described = ParameterDescriptor(description="YAML file with further settings of the channel", read_only=True)
     file = node.declare_parameter("channel_file", "", described).value
     derived = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed}
@@ -120,7 +120,7 @@ def declare_run(node: Node) -> RunConfig:
         air = ChannelConfig.from_yaml(file, **given, **derived)
     else:
         air = ChannelConfig.from_dict({**channel, **derived})
-    return RunConfig(swarm, air, RunLimits(**declare_from_dataclass(node, RunLimits)))
+    return RunConfig(swarm, air, RunLimits(**declare_settings(node, RunLimits)))
 
 
 def _body(stop: Stop, supervised: bool) -> None:

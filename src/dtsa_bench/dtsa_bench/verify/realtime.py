@@ -55,10 +55,7 @@ class RealtimeCheck:
 
     def __init__(self, bag: Bag, result: Result) -> None:
         self.bag, self.result = bag, result
-        sections: dict[str, Any] = {
-            name: bag.config[name] for name in ("swarm", "channel", "limits") if name in bag.config
-        }
-        self.run = RunConfig.from_dict(sections)
+        self.run = RunConfig.from_dict(bag.config)
         self.own_clocks = result.mode == REALTIME
         self.agents, self.slot_ns = self.run.swarm.agents, self.run.swarm.slot_ns
         kept = {SLOT, TRANSMISSION, DECISION, RECEPTION, EVENTS}

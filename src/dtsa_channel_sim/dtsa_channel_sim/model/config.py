@@ -144,7 +144,7 @@ class ChannelConfig(Settings):
         :param overrides: settings that win over the file's; those that are None are ignored.
         :raises ConfigError: when the file cannot be read or a setting is not usable.
         """
-        from .yaml_file import read_mapping
+        from dtsa_agent.yaml_file import read_mapping
 
         settings = read_mapping(path, "channel")
         given = {name: value for name, value in overrides.items() if value is not None}

@@ -18,7 +18,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
-from dtsa_agent.ros.common.parameters import declare_from_dataclass, from_parameter
+from dtsa_agent.ros.common.parameters import declare_settings, from_parameter
 from dtsa_agent.ros.common.process import run_node
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, Change, ChannelConfig
@@ -36,7 +36,7 @@ def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str
     :raises ConfigError: for values that are not allowed.
     """
     defaults = {} if config is None else config.to_dict()
-    return declare_from_dataclass(node, ChannelConfig, changeable=True, defaults=defaults)
+    return declare_settings(node, ChannelConfig, changeable=True, defaults=defaults)
 
 
 def follow_parameters(node: Node, channel: Channel, changed: Callable[[Change], None] | None = None) -> None:

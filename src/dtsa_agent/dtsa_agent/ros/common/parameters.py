@@ -1,4 +1,4 @@
-"""ROS parameters made from the configuration dataclasses: name, description, range and default stand there, once."""
+"""ROS parameters made from the settings classes: name, description, range and default stand there, once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import Setting, format_values, settings_of
+from dtsa_agent.core.settings import Setting, Settings, format_values, settings_of
 
 _UNBOUNDED = 2.0**62
 _NOTHING = -1  # stands for None in a parameter that may be left open
@@ -33,22 +33,31 @@ def descriptor(setting: Setting, read_only: bool) -> ParameterDescriptor:
     elif setting.kind == "float":
         result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)]
         result.dynamic_typing = True  # `-p slot_ms:=10` shall do as well as 10.0
+    elif setting.kind == "vector":
+        result.dynamic_typing = True
+        result.additional_constraints = setting.allowed
     elif setting.choices:
         result.additional_constraints = "one of: " + ", ".join(setting.choices)
     return result
 
 
-def declare_from_dataclass(
-    node: Node, cls: type, skip: Iterable[str] = (), changeable: bool = False, defaults: Mapping[str, Any] | None = None
+def declare_settings(
+    node: Node,
+    cls: type[Settings],
+    skip: Iterable[str] = (),
+    changeable: bool = False,
+    defaults: Mapping[str, Any] | None = None,
+    prefix: str = "",
 ) -> dict[str, Any]:
-    """Declares a parameter for every setting of a dataclass and gives the values that the node was started with.
+    """Declares a parameter for every setting of a settings class and gives the values that the node was started with.
 
     :param node: the node.
-    :param cls: the configuration dataclass.
+    :param cls: the settings class.
     :param skip: fields that become no parameter.
     :param changeable: settings that say so may be changed while the node runs; all others are read-only.
-    :param defaults: values that replace the dataclass's defaults.
-    :returns: values by field name, for the class's ``from_dict``.
+    :param defaults: values that replace the settings' defaults.
+    :param prefix: stands before the settings' names in the parameters'.
+    :returns: values by the settings' names, for the class's ``from_dict``.
     :raises ConfigError: for a value of the wrong type or out of range.
     """
     values: dict[str, Any] = {}
@@ -56,22 +65,21 @@ def declare_from_dataclass(
         if setting.kind == "structure" or setting.name in skip:
             continue
         default = (defaults or {}).get(setting.name, setting.default)
-        parameter = _declare(node, setting, default, not (changeable and setting.changeable))
+        parameter = _declare(node, setting, prefix, default, not (changeable and setting.changeable))
         values[setting.name] = from_parameter(setting, parameter.value)
     return values
 
 
-def _declare(node: Node, setting: Setting, default: Any, read_only: bool) -> Parameter:
+def _declare(node: Node, setting: Setting, prefix: str, default: Any, read_only: bool) -> Parameter:
+    name = prefix + setting.name
     if default is None:
         default = _NOTHING
-    elif setting.kind == "values":
-        default = format_values(default)
     try:
-        return node.declare_parameter(setting.name, default, descriptor(setting, read_only))
+        return node.declare_parameter(name, to_parameter(setting, default), descriptor(setting, read_only))
     except Exception as error:  # rclpy has no common base for wrong types and values out of range
-        given = node._parameter_overrides.get(setting.name)
+        given = node._parameter_overrides.get(name)
         value = given.value if given is not None else default
-        raise ConfigError(setting.name, value, setting.allowed) from error
+        raise ConfigError(name, value, setting.allowed) from error
 
 
 def from_parameter(setting: Setting, value: Any) -> Any:
@@ -83,23 +91,32 @@ def from_parameter(setting: Setting, value: Any) -> Any:
         return None
     if setting.kind == "values":
         return setting.parse(value)
+    if setting.kind == "vector":
+        return tuple(value) if isinstance(value, Iterable) else value
     if setting.kind == "float" and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     return value
 
 
-def to_parameters(values: Mapping[str, Any], cls: type) -> dict[str, Any]:
+def to_parameter(setting: Setting, value: Any) -> Any:
+    """The value of the parameter that stands for a setting's value; the inverse of :func:`from_parameter`.
+
+    :param setting: the setting.
+    :param value: its value.
+    """
+    if setting.kind == "values" and isinstance(value, Mapping):
+        return format_values(value)
+    return list(value) if setting.kind == "vector" else value
+
+
+def to_parameters(values: Mapping[str, Any], cls: type[Settings]) -> dict[str, Any]:
     """Parameters, as a parameter file holds them, that make a node read back these settings.
 
-    :param values: values by field name, as the class's ``to_dict`` gives them.
-    :param cls: the configuration dataclass.
+    :param values: values by name, as the class's ``to_dict`` gives them.
+    :param cls: the settings class.
     """
-    result = {}
-    for setting in settings_of(cls):
-        if setting.kind == "structure" or setting.name not in values:
-            continue
-        value = values[setting.name]
-        if value is None:
-            continue
-        result[setting.name] = format_values(value) if setting.kind == "values" else value
-    return result
+    return {
+        setting.name: to_parameter(setting, values[setting.name])
+        for setting in settings_of(cls)
+        if setting.kind != "structure" and values.get(setting.name) is not None
+    }

@@ -31,25 +31,35 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_mapping(path: str | Path, section: str) -> dict[str, Any]:
-    """Return the mapping in a YAML file, or the one under ``section`` where there is such a key.
+def read_yaml(path: str | Path, name: str) -> Any:
+    """What a YAML file holds.
 
     :param path: the file.
-    :param section: name of the part of interest in a larger file.
-    :raises ConfigError: when the file cannot be read, is not YAML, or holds no mapping.
+    :param name: what errors call it.
+    :raises ConfigError: if it cannot be read or is not YAML.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not text"
-        raise ConfigError(f"{section} file", str(path), f"a readable YAML file ({reason})") from None
+        raise ConfigError(name, str(path), f"a readable YAML file ({reason})") from None
     try:
-        content = yaml.load(text, _Loader)  # a SafeLoader, see above
+        return yaml.load(text, _Loader)  # a SafeLoader, see above
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "syntax error"
-        raise ConfigError(f"{section} file", f"{path}{where}", f"valid YAML ({problem})") from None
+        raise ConfigError(name, f"{path}{where}", f"valid YAML ({problem})") from None
+
+
+def read_mapping(path: str | Path, section: str) -> dict[str, Any]:
+    """The mapping in a YAML file, or the one under ``section`` where there is such a key.
+
+    :param path: the file.
+    :param section: name of the part of interest in a larger file.
+    :raises ConfigError: if the file cannot be read, is not YAML, or holds no mapping.
+    """
+    content = read_yaml(path, f"{section} file")
     if isinstance(content, Mapping) and isinstance(content.get(section), Mapping):
         content = content[section]
     if content is None:
