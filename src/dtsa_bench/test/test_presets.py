@@ -10,9 +10,8 @@ import pytest
 
 from dtsa_bench import cli
 from dtsa_bench.sweep import spec
-from dtsa_bench.sweep.aggregate import Table
+from dtsa_bench.sweep.aggregate import Table, collected
 from dtsa_bench.sweep.claims import FAILS, HOLDS, OPEN, PARTLY, claims_of, clean_up_to
-from dtsa_bench.sweep.journal import collect
 from dtsa_bench.sweep.report import write_report
 from dtsa_bench.sweep.work import fly_one
 
@@ -30,7 +29,7 @@ VOCABULARIES = {
 
 
 def flown(sweep: spec.Sweep) -> Table:
-    return Table(sweep, collect(sweep, {task.key: fly_one(task) for task in sweep.tasks()}))
+    return Table(sweep, collected(sweep, {task.key: fly_one(task) for task in sweep.tasks()}))
 
 
 def invented(sweep: spec.Sweep, value: Any) -> Table:

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
+from dtsa_bench.batch import pool
+from dtsa_bench.batch.journal import Journal
+from dtsa_bench.batch.pool import run_all
+from dtsa_bench.cli import main
 from dtsa_bench.protocol_bench.cases import PROTOCOLS, cases, run_case
-from dtsa_bench.protocol_bench.table import as_text, run_table, summarise
+from dtsa_bench.protocol_bench.plan import WORK, ProtocolPlan
+from dtsa_bench.protocol_bench.table import as_text, by_case, run_table, summarise
 
 
 def case(name: str):  # type: ignore[no-untyped-def]
@@ -74,6 +81,48 @@ def test_files_and_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert [(r["protocol"], r["seed"]) for r in runs] == [
         (p, s) for p in ("lease S=0", "lease") for s in ("1001", "1002")
     ]
+
+
+def test_the_table_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [case("join of 1 of 12, 12 moving, no loss"), case("12/6 moving, no loss")]
+    plan = ProtocolPlan(rows, range(1001, 1003), 4000)
+    whole = by_case(plan, run_all(plan, WORK))
+    assert list(whole) == [(row.name, protocol) for row in rows for protocol in row.protocols]
+    assert whole[rows[1].name, "lease"] == [run_case(rows[1], "lease", seed, 4000) for seed in (1001, 1002)]
+
+    done: list[int] = []
+
+    def stop(runs: int, cost: float) -> None:
+        done.append(runs)
+        if len(done) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(pool, "CHUNK_COST", 1.0)
+    with pytest.raises(KeyboardInterrupt), closing(Journal(tmp_path, plan, WORK.code())) as journal:
+        run_all(plan, WORK, journal, progress=stop)
+    begun = len((tmp_path / "runs.jsonl").read_text().splitlines())
+    assert begun == 3
+    with closing(Journal(tmp_path, plan, WORK.code())) as again:
+        finished = run_all(plan, WORK, again, jobs=2, progress=lambda runs, cost: done.append(runs))
+    assert sum(done) == 3 + 14 - 3
+    assert by_case(plan, finished) == whole
+
+
+def test_a_directory_of_a_sweep_is_not_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["sweep", "--seeds", "1", "--jobs", "1", "--no-report", "--out", str(tmp_path)]
+    assert main([*words, "--preset", "trajectories"]) == 0
+    assert main([*words, "--preset", "protocol"]) == 2
+    assert "this one holds sweep trajectories" in capsys.readouterr().err
+
+
+def test_show_tells_what_the_preset_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sweep", "--show", "protocol"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert [row["name"] for row in shown["cases"]] == [row.name for row in cases()]
+    assert shown["protocols"] == PROTOCOLS
+    assert main(["sweep", "--show", "nothing"]) == 2
+    assert "allowed: " in (error := capsys.readouterr().err)
+    assert "protocol" in error
 
 
 def test_a_broken_rule_or_an_old_age_is_a_no() -> None:

@@ -17,9 +17,12 @@ import pytest
 import yaml
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_bench.batch import cluster as dask
+from dtsa_bench.batch import journal, pool
 from dtsa_bench.cli import main
-from dtsa_bench.sweep import journal, runner, spec, work
-from dtsa_bench.sweep.aggregate import Table
+from dtsa_bench.sweep import spec
+from dtsa_bench.sweep.aggregate import Table, collected
+from dtsa_bench.sweep.work import WORK
 
 CONTENT: dict[str, Any] = {
     "title": "small",
@@ -42,9 +45,9 @@ def stable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def fly(directory: Path, plan: spec.Sweep, **options: Any) -> list[dict[str, Any]]:
-    book = journal.Journal(directory, plan, work.fingerprint())
+    book = journal.Journal(directory, plan, WORK.code())
     try:
-        return journal.collect(plan, runner.fly_all(book, **options))
+        return collected(plan, pool.run_all(plan, WORK, book, **options))
     finally:
         book.close()
 
@@ -67,6 +70,9 @@ def test_axes_are_combined_and_names_may_be_of_any_section() -> None:
     ("changes", "field"),
     [
         ({"axes": {"color": ["red"]}}, "axes.color"),
+        ({"axes": {"cell": {"a": {}}}}, "axes.cell"),
+        ({"axes": {"status": {"a": {}}}}, "axes.status"),
+        ({"axes": {"seed": [1, 2]}}, "axes.seed"),
         ({"axes": {"policy": []}}, "axes.policy"),
         ({"axes": {"agents": [6, -3]}}, "agents"),
         ({"axes": {"x": {"a": {"nothing": 1}}}}, "nothing"),
@@ -108,18 +114,18 @@ def test_cores_change_nothing(tmp_path: Path) -> None:
 
 def test_chunks_hold_every_run_once_and_keep_all_workers_busy() -> None:
     tasks = list(sweep(axes={"agents": [4, 8, 60]}, seeds=30).tasks())
-    chunks = runner.chunks_of(tasks, 3)
+    chunks = pool.chunks_of(tasks, 3)
     assert [task for chunk in chunks for task in chunk] == tasks
     assert len(chunks) >= 12
     single = max(task.cost for task in tasks)
-    assert all(sum(task.cost for task in chunk) <= max(runner.CHUNK_COST, single) for chunk in chunks)
-    assert runner.chunks_of([], 2) == []
+    assert all(sum(task.cost for task in chunk) <= max(pool.CHUNK_COST, single) for chunk in chunks)
+    assert pool.chunks_of([], 2) == []
 
 
 def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = sweep()
     whole = fly(tmp_path / "whole", plan)
-    monkeypatch.setattr(runner, "CHUNK_COST", 1.0)
+    monkeypatch.setattr(pool, "CHUNK_COST", 1.0)
 
     def stop(runs: int, cost: float) -> None:
         seen.append(runs)
@@ -150,7 +156,7 @@ def test_rows_of_other_code_and_of_other_sweeps_are_never_mixed_in(tmp_path: Pat
     assert not book.rows()
     assert list(tmp_path.glob("runs-of-code-*.jsonl"))
     with pytest.raises(DtsaError, match="other"):
-        runner.fly_all(book)
+        pool.run_all(plan, WORK, book)
     book.close()
     with pytest.raises(ConfigError, match="small"):
         journal.Journal(tmp_path, spec.make_sweep(CONTENT, "big"), "other")
@@ -244,9 +250,7 @@ def test_the_command_writes_everything(tmp_path: Path, capsys: pytest.CaptureFix
 def test_wrong_words_end_with_one_line_and_code_2(
     words: list[str], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from dtsa_bench.sweep import cluster
-
-    monkeypatch.setattr(cluster, "PATIENCE_S", 1.0)
+    monkeypatch.setattr(dask, "PATIENCE_S", 1.0)
     if field == "cluster":
         pytest.importorskip("distributed")
     try:
@@ -329,7 +333,7 @@ def test_a_worker_process_that_dies_costs_no_result(tmp_path: Path, monkeypatch:
             victims.append(next(pid for pid, name in names.items() if "LokyProcess" in name))
             os.kill(victims[0], signal.SIGKILL)
 
-    monkeypatch.setattr(runner, "CHUNK_COST", 20_000.0)
+    monkeypatch.setattr(pool, "CHUNK_COST", 20_000.0)
     rows = fly(tmp_path, plan, jobs=2, progress=kill_one)
     assert victims
     assert len(rows) == 800
@@ -393,7 +397,7 @@ def test_a_worker_of_a_cluster_that_dies_costs_no_result(
     with Client(address, set_as_default=False) as client:
         client.wait_for_workers(2, timeout=60)
     plan = sweep(seeds=100)
-    monkeypatch.setattr(runner, "CHUNK_COST", 20_000.0)
+    monkeypatch.setattr(pool, "CHUNK_COST", 20_000.0)
     done: list[int] = []
 
     def kill_one(runs: int, cost: float) -> None:

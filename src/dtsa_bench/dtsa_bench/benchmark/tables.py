@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from dtsa_bench.batch.table import aligned
+
 Row = dict[str, Any]
 
 
@@ -34,9 +36,7 @@ def table_text(rows: Sequence[Row]) -> str:
     heads = list(dict.fromkeys(key for row in rows for key in row))
     lines = [[head.replace("_", " ") for head in heads]]
     lines += [[_text(row.get(head)) for head in heads] for row in rows]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(heads))]
-    padded = (zip(line, widths, strict=True) for line in lines)
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in line).rstrip() for line in padded)
+    return aligned(lines)
 
 
 def _text(value: object) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from dtsa_bench.batch.table import aligned
 from dtsa_bench.options import new_directory, whole_number
 
 INTERRUPTED = 130
@@ -101,10 +102,7 @@ def table(summaries: Sequence[dict[str, Any]]) -> str:
         cells = [f"{summary['policy'].upper()}, {summary['estimator']}"]
         cells += ["-" if summary[key] is None else form.format(summary[key]) for _, key, form in _TABLE]
         rows.append(cells)
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(lines)
+    return aligned(rows, rule=True)
 
 
 def _check(bag: Path) -> bool:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
-import signal
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dtsa_bench.sweep.journal import Journal
     from dtsa_bench.sweep.spec import Sweep
 
 PROTOCOL = "protocol"  # a preset that flies nothing
@@ -45,6 +42,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Fly what is missing, then sum up."""
+    from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.sweep import spec
 
     if args.list:
@@ -55,8 +53,14 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.preset == PROTOCOL:
         return _protocol(args)
+    if args.show == PROTOCOL:
+        from dtsa_bench.protocol_bench.plan import as_yaml
+
+        print(as_yaml(), end="")
+        return 0
     if args.show:
-        spec.load_preset(args.show)
+        if args.show not in spec.preset_names():
+            raise ConfigError("show", args.show, ", ".join((*spec.preset_names(), PROTOCOL)))
         print((spec.PRESETS / f"{args.show}.yaml").read_text(encoding="utf-8"), end="")
         return 0
     sweeps = _sweeps(args)
@@ -72,20 +76,20 @@ def _protocol(args: argparse.Namespace) -> int:
     """The table of the slot protocols: runs without flight, which have no axes and no report of their own."""
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.options import whole_number
-    from dtsa_bench.protocol_bench import table
+    from dtsa_bench.protocol_bench import plan, table
 
     changed = _base(args.set)
-    slots = changed.pop("slots", table.SLOTS)
+    slots = changed.pop("slots", plan.SLOTS)
     for name in changed:
         raise ConfigError(f"set {name}", changed[name], f"slots=NUMBER with --preset {PROTOCOL}")
     if args.cluster:
         raise ConfigError("cluster", args.cluster, f"nothing with --preset {PROTOCOL}: it runs on this machine")
     return table.run_table(
         Path(args.out) if args.out else Path("runs") / PROTOCOL,
-        table.SEEDS if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1000),
+        plan.SEEDS if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1000),
         slots=whole_number(str(slots), "slots", 4000, 10_000_000),
-        jobs=None if args.jobs is None else whole_number(args.jobs, "jobs", 1, 1024),
-        first_seed=table.FIRST_SEED
+        jobs=_jobs(args),
+        first_seed=plan.FIRST_SEED
         if args.first_seed is None
         else whole_number(args.first_seed, "first-seed", 0, 2**62),
     )
@@ -128,35 +132,15 @@ def _base(words: list[str]) -> dict[str, object]:
 
 
 def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
-    from dtsa_bench.options import whole_number
-    from dtsa_bench.sweep.journal import Journal, collect, write_results
-    from dtsa_bench.sweep.runner import fly_all
-    from dtsa_bench.sweep.work import fingerprint
-
-    jobs = len(os.sched_getaffinity(0)) if args.jobs is None else whole_number(args.jobs, "jobs", 1, 1024)
-    begun = time.monotonic()
-    journal = Journal(directory, sweep, fingerprint())
-    before = signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        with Progress(journal) as progress:
-            finished = fly_all(journal, jobs=jobs, cluster=args.cluster, progress=progress.advance)
-    except KeyboardInterrupt:
-        print(
-            f"dtsa: interrupted; {len(journal.rows())} runs are saved in {directory}, "
-            "the same command goes on from "
-            "there",
-            file=sys.stderr,
-        )
-        raise
-    finally:
-        journal.close()
-        signal.signal(signal.SIGTERM, before)
-    from dtsa_bench.sweep.aggregate import Table
+    from dtsa_bench.batch.progress import run_batch
+    from dtsa_bench.sweep.aggregate import Table, collected, write_table
     from dtsa_bench.sweep.text import claims_text, table_text
+    from dtsa_bench.sweep.work import WORK
 
-    rows = collect(sweep, finished)
+    begun = time.monotonic()
+    rows = collected(sweep, run_batch(sweep, WORK, directory, jobs=_jobs(args), cluster=args.cluster))
     table = Table(sweep, rows)
-    write_results(directory, sweep, rows, table.plain(), journal.code)
+    write_table(directory, table, WORK.code())
     flown = time.monotonic() - begun
     print(table_text(table))
     if claims := claims_text(table):
@@ -164,7 +148,7 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     if not args.no_report:
         from dtsa_bench.sweep.report import write_report
 
-        path = write_report(table, directory, journal.code, f"tools/dtsa {shlex.join(sys.argv[1:])}")
+        path = write_report(table, directory, WORK.code(), f"tools/dtsa {shlex.join(sys.argv[1:])}")
         print(f"report: {path}")
     print(f"{sweep.name}: {len(rows)} runs in {flown:.1f} s, {time.monotonic() - begun:.1f} s with the report")
     failed = sum(row["status"] == "failed" for row in rows)
@@ -176,71 +160,7 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
+def _jobs(args: argparse.Namespace) -> int | None:
+    from dtsa_bench.options import whole_number
 
-
-class Progress:
-    """Says on stderr how far a sweep is: a bar on a terminal, a line now and then elsewhere."""
-
-    def __init__(self, journal: Journal) -> None:
-        done = journal.rows()
-        tasks = list(journal.sweep.tasks())
-        self._name = journal.sweep.name
-        self._total = len(tasks)
-        self._done = sum(task.key in done for task in tasks)
-        self._cost_left = sum(task.cost for task in tasks if task.key not in done)
-        self._cost_done = 0.0
-        self._begun = self._said = time.monotonic()
-        if journal.put_aside:
-            print(
-                f"{self._name}: {journal.put_aside} runs of other code are put aside and flown again",
-                file=sys.stderr,
-            )
-        if self._done:
-            print(f"{self._name}: {self._done} of {self._total} runs are there already", file=sys.stderr)
-        self._bar = _bar(self._name, self._total, self._done) if sys.stderr.isatty() else None
-
-    def __enter__(self) -> Progress:
-        if self._bar is not None:
-            self._bar[0].start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar[0].stop()
-
-    def left_s(self) -> float:
-        """Estimated time left, s, from the cost of the runs done and to do."""
-        if not self._cost_done:
-            return float("nan")
-        return (time.monotonic() - self._begun) / self._cost_done * max(0.0, self._cost_left - self._cost_done)
-
-    def advance(self, runs: int, cost: float) -> None:
-        """Takes note of finished runs."""
-        self._done += runs
-        self._cost_done += cost
-        left = self.left_s()
-        if self._bar is not None:
-            bar, task = self._bar
-            bar.update(task, completed=self._done, left=f"{left:.0f} s left")
-        elif time.monotonic() - self._said > 10.0:
-            self._said = time.monotonic()
-            print(f"{self._name}: {self._done} of {self._total} runs, about {left:.0f} s left", file=sys.stderr)
-
-
-# type: ignore[no-untyped-def]  # rich is imported on terminals alone
-def _bar(name: str, total: int, done: int):
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    bar = Bar(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[left]}"),
-        console=Console(stderr=True),
-        transient=True,
-    )
-    return bar, bar.add_task(name, total=total, completed=done, left="")
+    return None if args.jobs is None else whole_number(args.jobs, "jobs", 1, 1024)

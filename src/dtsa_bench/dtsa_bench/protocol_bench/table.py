@@ -2,64 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-import json
-import os
-import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
-from multiprocessing import Pool
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from ..sweep.work import live_with_the_parent
-from .cases import LEASE, PROTOCOLS, Case, Result, cases, run_case
+from dtsa_agent.core.errors import DtsaError
+
+from ..batch.progress import run_batch
+from ..batch.table import by_cell, markdown, write_results
+from ..batch.task import FAILED, Row
+from .cases import LEASE, PROTOCOLS, Case, Result, cases
 from .cost import slot_cost_us
-
-SEEDS, SLOTS, FIRST_SEED = 8, 20_000, 1001
-
-
-def run_all(rows: Sequence[Case], seeds: Sequence[int], slots: int, jobs: int) -> dict[tuple[str, str], list[Result]]:
-    """Runs every case with every protocol and seed, in several processes; says on stderr how far it is.
-
-    :param rows: the cases.
-    :param seeds: seeds of the runs.
-    :param slots: length of steady and stop-and-go runs.
-    :param jobs: processes.
-    :returns: results by case and protocol, in the order of the seeds.
-    """
-    tasks = [(case, protocol, seed) for case in rows for protocol in case.protocols for seed in seeds]
-    # The longest first, so that all processes end at the same time.
-    tasks.sort(
-        key=lambda task: (
-            -task[0].agents * task[0].slots(task[1], slots) * (20 if task[1] == "dtsa" and task[0].loss else 1)
-        )
-    )
-    found: dict[tuple[str, str, int], Result] = {}
-    begun = said = time.monotonic()
-    for count, result in enumerate(_results(tasks, slots, jobs), 1):
-        found[result.case, result.protocol, result.seed] = result
-        now = time.monotonic()
-        if now - said > 10.0:
-            said = now
-            print(f"protocol: {count} of {len(tasks)} runs in {now - begun:.0f} s", file=sys.stderr)
-    return {(case.name, protocol): [found[case.name, protocol, seed] for seed in seeds]
-            for case in rows for protocol in case.protocols}  # fmt: skip
-
-
-def _results(tasks: list[tuple[Case, str, int]], slots: int, jobs: int) -> Iterator[Result]:
-    if jobs == 1:
-        for case, protocol, seed in tasks:
-            yield run_case(case, protocol, seed, slots)
-        return
-    with Pool(jobs, live_with_the_parent, (os.getpid(),)) as pool:  # terminated when this is left, whatever the reason
-        yield from pool.imap_unordered(_run_task, [(*task, slots) for task in tasks])
-
-
-def _run_task(task: tuple[Case, str, int, int]) -> Result:
-    return run_case(*task)
+from .plan import FIRST_SEED, NAME, SEEDS, SLOTS, WORK, ProtocolPlan, result_of
 
 
 def _age_row(case: Case, by: dict[str, list[Result]]) -> dict[str, Any]:
@@ -132,36 +89,34 @@ def as_text(table: Sequence[dict[str, Any]]) -> str:
     :param table: from :func:`summarise`.
     """
     names = list(PROTOCOLS)
-    lines = [
-        "Mean age of the movers' news, slots (collided slots per 1000)",
-        "",
-        "| case | warm-up | " + " | ".join(names) + " | lease / TDMA | asked | |",
-        "|---" * (len(names) + 5) + "|",
-    ]
+    ages, faults = [], []
     for row in table:
-        for label, key in (("", "ages"), (", also before they are heard", "true ages")):
-            if key not in row:
-                continue
+        if "ages" in row:
+            ages += _age_lines(row, names)
+        else:
+            cells = ["; ".join(f"{what} {_pair(v)}" for what, v in row.get(name, {}).items()) for name in LEASE]
+            faults.append([row["case"], *cells, row["target"], _mark(row)])
+    return "\n".join(
+        (
+            "Mean age of the movers' news, slots (collided slots per 1000)\n",
+            markdown(["case", "warm-up", *names, "lease / TDMA", "asked", ""], ages),
+            "\nFaults and changes, slots: median / largest\n",
+            markdown(["case", *LEASE, "asked", ""], faults),
+        )
+    )
+
+
+def _age_lines(row: dict[str, Any], names: Sequence[str]) -> list[list[str]]:
+    """Cells of a row with ages; in stop-and-go a second line counts those that have not been heard yet."""
+    lines = []
+    for label, key in (("", "ages"), (", also before they are heard", "true ages")):
+        if key in row:
             ages = row[key]
             cells = [f"{ages[n]:.2f} ({1000 * row['collided share'][n]:.2g})" if n in ages else "" for n in names]
-            last = [
-                f"{ages['lease'] / ages['tdma']:.3f}",
-                row["target"] if not label else "",
-                _mark(row) if not label else "",
-            ]
-            lines.append("| " + " | ".join([row["case"] + label, str(row["warm-up"]), *cells, *last]) + " |")
-    lines += [
-        "",
-        "Faults and changes, slots: median / largest",
-        "",
-        "| case | lease S=0 | lease | asked | |",
-        "|---" * 5 + "|",
-    ]
-    for row in table:
-        if "ages" not in row:
-            cells = ["; ".join(f"{what} {_pair(v)}" for what, v in row.get(name, {}).items()) for name in LEASE]
-            lines.append("| " + " | ".join([row["case"], *cells, row["target"], _mark(row)]) + " |")
-    return "\n".join(lines)
+            last = ["", ""] if label else [row["target"], _mark(row)]
+            factor = f"{ages['lease'] / ages['tdma']:.3f}"
+            lines.append([row["case"] + label, str(row["warm-up"]), *cells, factor, *last])
+    return lines
 
 
 def _pair(value: dict[str, float]) -> str:
@@ -192,34 +147,49 @@ def run_table(
     """
     begun = time.monotonic()
     rows = [case for case in cases() if only in case.name]
-    found = run_all(rows, range(first_seed, first_seed + seeds), slots, jobs or len(os.sched_getaffinity(0)))
+    plan = ProtocolPlan(rows, range(first_seed, first_seed + seeds), slots)
+    finished = run_batch(plan, WORK, out, jobs=jobs)
+    failed = [row for row in finished.values() if row["status"] == FAILED]
+    if failed:
+        raise DtsaError(f"{len(failed)} runs failed: {failed[0]['reason']}; the same command tries them again")
+    found = by_case(plan, finished)
     table = summarise(rows, found)
-    text = as_text(table)
-    total = sum(r.slots for (_, name), results in found.items() if name == "lease S=0" for r in results)
     missed = [row["case"] for row in table if not row["ok"]]
-    text += (
-        f"\n\n{total} slots with S = 0 and without adoption. {len(table) - len(missed)} of {len(table)} rows hold"
-        + (f"; not: {'; '.join(missed)}" if missed else "")
-        + "."
-    )
-    default = [r for (_, name), results in found.items() if name == "lease" for r in results]
-    text += (
-        f"\nlease, default, all rows: slots with two senders: {sum(r.open_collisions for r in default)} in OPEN and "
-        f"{sum(r.adopted_collisions for r in default)} in adopted turns, of {sum(r.slots for r in default)}; the "
-        "adopted ones are those of halves that do not hear each other, but for the few after each merge."
-    )
-    costs = ", ".join(f"{slot_cost_us(70, movers):.1f} us with {movers} moving" for movers in (70, 35))
-    text += f"\nEncode, decide and decode for one slot of 70 agents, one thread: {costs}."
-    out.mkdir(parents=True, exist_ok=True)
+    text = f"{as_text(table)}\n\n{_sums(table, found, missed)}"
     (out / "protocol.md").write_text(text + "\n", encoding="utf-8")
-    (out / "protocol.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
-    with (out / "protocol.csv").open("w", newline="", encoding="utf-8") as file:
-        results = [asdict(r) for group in found.values() for r in group]
-        writer = csv.DictWriter(file, list(results[0]) if results else ["case"])
-        writer.writeheader()
-        writer.writerows(
-            {k: " ".join(map(str, v)) if isinstance(v, tuple) else v for k, v in r.items()} for r in results
-        )
+    values = [asdict(result) for group in found.values() for result in group]
+    write_results(out, NAME, [spec.name for spec in fields(Result)] if values else ["case"], values, table)
     print(text)
     print(f"protocol: {len(table)} rows in {time.monotonic() - begun:.1f} s; {out / 'protocol.md'}")
     return 1 if missed else 0
+
+
+def by_case(plan: ProtocolPlan, finished: Mapping[str, Row]) -> dict[tuple[str, str], list[Result]]:
+    """Results by case and protocol, in the order of the seeds.
+
+    :param plan: all runs.
+    :param finished: rows by key; all are there.
+    """
+    rows = by_cell(plan, [finished[task.key] for task in plan.tasks()])
+    return {
+        (cell.labels["case"], cell.labels["protocol"]): [result_of(row) for row in part]
+        for cell, part in zip(plan.cells, rows, strict=True)
+    }
+
+
+def _sums(
+    table: Sequence[dict[str, Any]], found: Mapping[tuple[str, str], Sequence[Result]], missed: Sequence[str]
+) -> str:
+    """What holds over all rows, and what a slot costs."""
+    strict = [r for (_, name), results in found.items() if name == "lease S=0" for r in results]
+    default = [r for (_, name), results in found.items() if name == "lease" for r in results]
+    costs = ", ".join(f"{slot_cost_us(70, movers):.1f} us with {movers} moving" for movers in (70, 35))
+    return (
+        f"{sum(r.slots for r in strict)} slots with S = 0 and without adoption. "
+        f"{len(table) - len(missed)} of {len(table)} rows hold"
+        + (f"; not: {'; '.join(missed)}" if missed else "")
+        + f".\nlease, default, all rows: slots with two senders: {sum(r.open_collisions for r in default)} in OPEN and "
+        f"{sum(r.adopted_collisions for r in default)} in adopted turns, of {sum(r.slots for r in default)}; the "
+        "adopted ones are those of halves that do not hear each other, but for the few after each merge."
+        f"\nEncode, decide and decode for one slot of 70 agents, one thread: {costs}."
+    )

@@ -6,12 +6,14 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from ..batch.table import by_cell, collect, write_results
+from ..batch.task import FAILED, Row
 from ..statistics import Mean, Share, bootstrap_mean, wilson
+from .columns import COMMON, VALUES
 from .spec import Cell, Sweep
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,7 @@ class Group:
         self.cell = cell
         self.labels = cell.labels
         self.rows = list(rows)
-        flown = [row for row in rows if row["status"] != "failed"]
+        flown = [row for row in rows if row["status"] != FAILED]
         self.flown = len(flown)
         self.failed = len(rows) - len(flown)
         self.timed_out = sum(row["status"] == "timed out" for row in flown)
@@ -62,7 +64,7 @@ class Group:
         """Runs that do not count for means of complete flights, by reason."""
         reasons: Counter[str] = Counter()
         for row in self.rows:
-            if row["status"] == "failed":
+            if row["status"] == FAILED:
                 reasons[f"failed ({row['reason']})"] += 1
             elif row["collided"]:
                 reasons["crashed"] += 1
@@ -83,7 +85,7 @@ class Group:
 
 
 def _value(row: Row, spec: Measure) -> float:
-    if row["status"] == "failed" or (spec.complete_only and (row["collided"] or row["status"] != "completed")):
+    if row["status"] == FAILED or (spec.complete_only and (row["collided"] or row["status"] != "completed")):
         return math.nan
     if spec.name == "wasted_share":
         return float(row["slots_total"] - row["slots_success"]) / row["slots_total"]
@@ -95,16 +97,14 @@ class Table:
     """All groups of a sweep.
 
     :param sweep: the sweep.
-    :param rows: its rows, see ``journal.collect``.
+    :param rows: its rows, see :func:`collected`.
     """
 
     def __init__(self, sweep: Sweep, rows: Sequence[Row]) -> None:
         self.sweep = sweep
-        by_cell: dict[int, list[Row]] = {index: [] for index in range(len(sweep.cells))}
-        for row in rows:
-            by_cell[row["cell"]].append(row)
-        self.groups = [Group(cell, by_cell[index]) for index, cell in enumerate(sweep.cells)]
+        self.rows = list(rows)
         self.runs = len(rows)
+        self.groups = [Group(cell, part) for cell, part in zip(sweep.cells, by_cell(sweep, rows), strict=True)]
 
     def levels(self, axis: str) -> list[Any]:
         """The values of an axis, in the sweep's order."""
@@ -149,3 +149,38 @@ def _plain(group: Group) -> Row:
         "crashed": {"count": crashed.count, "of": crashed.total, "low": crashed.low, "high": crashed.high},
         **means,
     }
+
+
+def collected(sweep: Sweep, finished: Mapping[str, Row]) -> list[Row]:
+    """The rows of a sweep in its own order: labels, seed, status, reason, cell and `VALUES`.
+
+    :param sweep: the sweep.
+    :param finished: rows by key.
+    """
+    return collect(sweep, finished, _values)
+
+
+def _values(summary: Row | None) -> Row:
+    if summary is None:
+        return dict.fromkeys(("collided", *VALUES))
+    slots = {f"slots_{name}": count for name, count in summary["slots"].items()}
+    return {"collided": summary["collided"], **{name: slots.get(name, summary.get(name)) for name in VALUES}}
+
+
+def write_table(directory: Path, table: Table, code: str) -> None:
+    """Writes ``results.csv`` and ``results.json``, each in one go.
+
+    :param directory: where.
+    :param table: the sweep's rows and groups.
+    :param code: digest of the code that flew.
+    """
+    sweep = table.sweep
+    content = {
+        "name": sweep.name,
+        "title": sweep.title,
+        "code": code,
+        "sweep": sweep.source,
+        "groups": table.plain(),
+        "runs": [{key: value for key, value in row.items() if key != "cell"} for row in table.rows],
+    }
+    write_results(directory, "results", [*sweep.axes, *COMMON, *VALUES], table.rows, content)

@@ -9,13 +9,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from ..batch.table import write_whole
 from ..figures import charts, flights
 from ..figures.charts import label_of
 from ..figures.style import save, style
 from ..statistics import LEVEL, Mean, Share
 from .aggregate import MEASURES, Group, Table
 from .claims import Claim, claims_of
-from .journal import write_whole
 
 _DRAW: dict[str, Callable[[Table, Any], Figure]] = {
     "bars": charts.bars, "lines": charts.lines, "matrix": charts.matrix, "trajectories": flights.trajectories,

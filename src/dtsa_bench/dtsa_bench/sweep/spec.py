@@ -6,9 +6,7 @@ a base, axes that are combined with each other, and seeds. Read from YAML; see d
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +18,9 @@ from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_channel_sim import ChannelConfig
 
+from ..batch.task import Task, key_of
 from ..run_config import RunConfig, RunLimits
+from .columns import RESERVED
 
 PRESETS = Path(__file__).resolve().parent.parent / "presets"
 FIGURE_KINDS = ("bars", "lines", "matrix", "trajectories", "estimate")
@@ -67,35 +67,19 @@ class Sweep:
         for index, cell in enumerate(self.cells):
             for seed in self.seeds:
                 settings = {**cell.settings, "seed": seed}
-                yield Task(key_of(settings), index, seed, settings)
+                yield Task(key_of(settings), index, seed, settings, cost_of(settings))
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One run of a sweep, small enough to be sent anywhere."""
-
-    key: str  # of the run's settings: equal settings, equal key
-    cell: int
-    seed: int
-    settings: dict[str, Any]
-
-    @property
-    def cost(self) -> float:
-        """A rough guess of the work in it, in arbitrary units."""
-        s = self.settings
-        agents = float(s.get("agents", 12))
-        slots = min(float(s.get("timeout_s", 60.0)), 3.0 + agents / 5) * 1000.0 / float(s.get("slot_ms", 10.0))
-        lossy = any(s.get(name) for name in ("loss", "burst_length", "range_m", "loss_matrix", "schedule"))
-        own = lossy or s.get("policy") in ("aloha", "lease")
-        tables = agents if own else 1.0
-        priority = 0.05 if s.get("policy", "dtsa") == "dtsa" else 0.002
-        return slots * (4.0 + 0.3 * agents + 0.006 * agents * agents + tables * priority * agents * (agents + 4) / 10)
-
-
-def key_of(settings: Mapping[str, Any]) -> str:
-    """A short digest of settings."""
-    text = json.dumps(settings, sort_keys=True, separators=(",", ":"), default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
+def cost_of(settings: Mapping[str, Any]) -> float:
+    """A rough guess of the work in a run, see :class:`~dtsa_bench.batch.task.Task`."""
+    agents = float(settings.get("agents", 12))
+    slot_ms = float(settings.get("slot_ms", 10.0))
+    slots = min(float(settings.get("timeout_s", 60.0)), 3.0 + agents / 5) * 1000.0 / slot_ms
+    lossy = any(settings.get(name) for name in ("loss", "burst_length", "range_m", "loss_matrix", "schedule"))
+    own = lossy or settings.get("policy") in ("aloha", "lease")
+    tables = agents if own else 1.0
+    priority = 0.05 if settings.get("policy", "dtsa") == "dtsa" else 0.002
+    return slots * (4.0 + 0.3 * agents + 0.006 * agents * agents + tables * priority * agents * (agents + 4) / 10)
 
 
 def run_config(settings: Mapping[str, Any]) -> RunConfig:
@@ -216,6 +200,8 @@ def _cells(
 
 def _levels(axis: str, values: object) -> dict[Any, dict[str, Any]]:
     """Levels of an axis: a list of values of the setting it is named after, or names with settings each."""
+    if axis in RESERVED:
+        raise ConfigError(f"axes.{axis}", values, "another name: results have one of this name")
     if isinstance(values, Mapping) and values:
         return {str(name): _mapping(settings, f"axes.{axis}.{name}") for name, settings in values.items()}
     if isinstance(values, list) and values:

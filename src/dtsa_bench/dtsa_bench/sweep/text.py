@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..batch.table import aligned
 from .aggregate import MEASURES, Group, Table
 from .claims import claims_of
 
@@ -21,10 +22,7 @@ def table_text(table: Table) -> str:
     """
     head = [*table.sweep.axes, "crashed", "95 %", "out", *(_HEADS[name] for name in SHOWN)]
     lines = [head, *(_line(table, group) for group in table.groups if group.rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
+    return aligned(lines)
 
 
 def _line(table: Table, group: Group) -> list[str]:

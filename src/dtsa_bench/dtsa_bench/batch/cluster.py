@@ -1,32 +1,33 @@
-"""Flies runs on a Dask cluster.
+"""Runs on a Dask cluster.
 
 A worker that dies costs no result: the scheduler hands its chunk to another one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
-from .journal import Row
-from .spec import Task
-from .work import fingerprint, fly_chunk
+from .task import Row, Task, Work
+from .worker import run_chunk
 
 PATIENCE_S = 20.0  # for the scheduler to answer, and for a first worker
 RETRIES = 3
 
 
-def fly_on_cluster(tasks: list[Task], address: str) -> Iterator[tuple[str, list[Row]]]:
+def run_on_cluster(
+    tasks: list[Task], work: Work, address: str, chunks_of: Callable[[list[Task], int], list[list[Task]]]
+) -> Iterator[tuple[str, list[Row]]]:
     """Rows of all runs, as they come.
 
     :param tasks: the runs.
+    :param work: how a run is done.
     :param address: of the scheduler, ``tcp://HOST:PORT``.
+    :param chunks_of: bundles runs for a number of workers.
     :raises ConfigError: if there is no scheduler, no worker, or workers run other code.
     """
-    from .runner import chunks_of
-
     try:
         from distributed import Client, as_completed
     except ImportError as error:
@@ -39,10 +40,10 @@ def fly_on_cluster(tasks: list[Task], address: str) -> Iterator[tuple[str, list[
         allowed = f"tcp://HOST:PORT of a running Dask scheduler ({reason})"
         raise ConfigError("cluster", address, allowed) from error
     with client:
-        _check_workers(client, address)
+        _check_workers(client, work, address)
         workers = sum(client.nthreads().values())
         chunks = chunks_of(tasks, workers)
-        futures = [client.submit(fly_chunk, chunk, pure=False, retries=RETRIES) for chunk in chunks]
+        futures = [client.submit(run_chunk, work, chunk, pure=False, retries=RETRIES) for chunk in chunks]
         try:
             for future in as_completed(futures, loop=client.loop):
                 try:
@@ -61,7 +62,7 @@ def fly_on_cluster(tasks: list[Task], address: str) -> Iterator[tuple[str, list[
             client.cancel(futures, force=True)
 
 
-def _check_workers(client: Any, address: str) -> None:
+def _check_workers(client: Any, work: Work, address: str) -> None:
     try:
         client.wait_for_workers(1, timeout=PATIENCE_S)
     except TimeoutError as error:
@@ -69,14 +70,11 @@ def _check_workers(client: Any, address: str) -> None:
             "cluster", address, f"a scheduler with workers (none came within {PATIENCE_S:g} s)"
         ) from error
     try:
-        codes = set(client.run(fingerprint).values())
+        codes = set(client.run(work.code).values())
     except Exception as error:
         reason = " ".join(str(error).split())
         raise ConfigError("cluster", address, f"workers that can import dtsa_bench ({reason})") from error
-    if codes != {fingerprint()}:
-        raise ConfigError(
-            "cluster",
-            address,
-            f"workers that run the same code as here ({fingerprint()}, not "
-            f"{', '.join(sorted(codes - {fingerprint()}))})",
-        )
+    here = work.code()
+    if codes != {here}:
+        others = ", ".join(sorted(codes - {here}))
+        raise ConfigError("cluster", address, f"workers that run the same code as here ({here}, not {others})")

@@ -1,7 +1,4 @@
-"""Flies the runs of a sweep:
-
-in this process, on all cores, or on a Dask cluster. Finished rows are kept at once.
-"""
+"""Does the runs of a plan: in this process, on all cores, or on a Dask cluster. Finished rows are kept at once."""
 
 from __future__ import annotations
 
@@ -14,22 +11,31 @@ from typing import Any
 
 from dtsa_agent.core.errors import DtsaError
 
-from .journal import Journal, Row
-from .spec import Task
-from .work import fly_chunk, live_with_the_parent
+from .cluster import run_on_cluster
+from .journal import Journal
+from .task import Plan, Row, Task, Work
+from .worker import live_with_the_parent, run_chunk
 
 Chunk = list[Task]
 Progress = Callable[[int, float], None]  # runs and cost done since the last call
 CHUNK_COST = 250_000.0  # about a quarter of a second of one core
-RESTARTS = 3  # how often dead worker processes are replaced before a sweep gives up
+RESTARTS = 3  # how often dead worker processes are replaced before a batch gives up
 
 
-def fly_all(
-    journal: Journal, *, jobs: int = 1, cluster: str | None = None, progress: Progress | None = None
+def run_all(
+    plan: Plan,
+    work: Work,
+    journal: Journal | None = None,
+    *,
+    jobs: int = 1,
+    cluster: str | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Row]:
-    """Flies whatever the journal does not have yet.
+    """Does the runs that the journal does not have yet.
 
-    :param journal: of the sweep; gets every row as soon as it is there.
+    :param plan: all runs.
+    :param work: how a run is done.
+    :param journal: of the plan; gets every row as soon as it is there. None: rows are kept in memory alone.
     :param jobs: processes on this machine.
     :param cluster: address of a Dask scheduler (``tcp://HOST:PORT``) instead.
     :param progress: called after every chunk.
@@ -37,19 +43,21 @@ def fly_all(
     :raises ConfigError: if the cluster cannot be used.
     :raises DtsaError: if worker processes keep dying, or the code changes meanwhile.
     """
-    rows = journal.rows()
-    tasks = [task for task in journal.sweep.tasks() if task.key not in rows]
-    tasks.sort(key=lambda task: task.seed)  # all settings with few seeds before few settings with all seeds
+    rows = {} if journal is None else journal.rows()
+    known = work.code() if journal is None else journal.code
+    tasks = [task for task in plan.tasks() if task.key not in rows]
+    # All settings with few seeds before few settings with all seeds; the longest runs of a seed first.
+    tasks.sort(key=lambda task: (task.seed, -task.cost))
     costs = {task.key: task.cost for task in tasks}
-    with contextlib.closing(_results(tasks, jobs, cluster)) as results:
+    with contextlib.closing(_results(tasks, work, jobs, cluster)) as results:
         for code, chunk in results:
-            if code != journal.code:
-                where = "on the cluster" if cluster else "on this machine while the sweep ran"
+            if code != known:
+                where = "on the cluster" if cluster else "on this machine while the batch ran"
                 raise DtsaError(
-                    f"the code is another one {where} ({code}, not {journal.code}): nothing is mixed; "
-                    "finished runs are saved"
+                    f"the code is another one {where} ({code}, not {known}): nothing is mixed; finished runs are saved"
                 )
-            journal.append(chunk)
+            if journal is not None:
+                journal.append(chunk)
             rows.update((row["key"], row) for row in chunk)
             if progress is not None:
                 progress(len(chunk), sum(costs[row["key"]] for row in chunk))
@@ -79,21 +87,19 @@ def chunks_of(tasks: Sequence[Task], workers: int, largest: float | None = None)
 Results = Iterator[tuple[str, list[Row]]]
 
 
-def _results(tasks: list[Task], jobs: int, cluster: str | None) -> Any:
+def _results(tasks: list[Task], work: Work, jobs: int, cluster: str | None) -> Any:
     if cluster is not None:
-        from .cluster import fly_on_cluster
-
-        return fly_on_cluster(tasks, cluster)
-    return _on_cores(tasks, jobs) if jobs > 1 and len(tasks) > 1 else _here(tasks)
+        return run_on_cluster(tasks, work, cluster, chunks_of)
+    return _on_cores(tasks, work, jobs) if jobs > 1 and len(tasks) > 1 else _here(tasks, work)
 
 
-def _here(tasks: list[Task]) -> Results:
+def _here(tasks: list[Task], work: Work) -> Results:
     for chunk in chunks_of(tasks, 1):
-        yield fly_chunk(chunk)
+        yield run_chunk(work, chunk)
 
 
-def _on_cores(tasks: list[Task], jobs: int) -> Results:
-    """In worker processes; a worker that dies costs its chunk, which is flown again."""
+def _on_cores(tasks: list[Task], work: Work, jobs: int) -> Results:
+    """In worker processes; a worker that dies costs its chunk, which is done again."""
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
@@ -111,7 +117,7 @@ def _on_cores(tasks: list[Task], jobs: int) -> Results:
                 initializer=live_with_the_parent,
                 initargs=(os.getpid(),),
             )
-            with contextlib.closing(parallel(map(delayed(fly_chunk), chunks))) as results:
+            with contextlib.closing(parallel(delayed(run_chunk)(work, chunk) for chunk in chunks)) as results:
                 try:
                     for result in results:
                         for row in result[1]:
@@ -130,7 +136,7 @@ def _on_cores(tasks: list[Task], jobs: int) -> Results:
 
 @contextlib.contextmanager
 def _worker_processes() -> Iterator[None]:
-    """Ends joblib's workers at the end, and keeps it quiet when an interrupted sweep gives up what is under way.
+    """Ends joblib's workers at the end, and keeps it quiet when an interrupted batch gives up what is under way.
 
     It would warn of the runs given up, and its own thread may stumble over work that has been withdrawn.
     """

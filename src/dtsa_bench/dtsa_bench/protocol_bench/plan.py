@@ -1,0 +1,98 @@
+"""The runs of the protocol's table as a plan, and how one of them is done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..batch.task import Row, Task, Work, attempt, code_digest, key_of
+from .cases import PROTOCOLS, Case, Result, cases, run_case
+
+NAME = "protocol"
+SEEDS, SLOTS, FIRST_SEED = 8, 20_000, 1001
+TITLE = "The slot protocols alone: ages, waking, joins, deaths, jams, partitions"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One case with one protocol."""
+
+    labels: dict[str, str]  # case and protocol
+
+
+class ProtocolPlan:
+    """Every case with each of its protocols and every seed.
+
+    :param rows: the cases.
+    :param seeds: seeds of the runs.
+    :param slots: length of steady and stop-and-go runs.
+    """
+
+    name = NAME
+
+    def __init__(self, rows: Sequence[Case], seeds: Sequence[int], slots: int) -> None:
+        self._rows, self._seeds, self._slots = rows, seeds, slots
+        self.cells = [Cell({"case": case.name, "protocol": protocol}) for case in rows for protocol in case.protocols]
+        self.source: dict[str, Any] = {
+            "title": TITLE, "seeds": list(seeds), "slots": slots, "cases": [case.name for case in rows]
+        }  # fmt: skip
+
+    def tasks(self) -> Iterator[Task]:
+        """All runs, cell by cell."""
+        index = 0
+        for case in self._rows:
+            for protocol in case.protocols:
+                many = 20 if protocol == "dtsa" and case.loss else 1
+                cost = float(case.agents * case.slots(protocol, self._slots) * many)
+                for seed in self._seeds:
+                    settings = {"case": case.name, "protocol": protocol, "seed": seed, "slots": self._slots}
+                    yield Task(key_of(settings), index, seed, settings, cost)
+                index += 1
+
+
+@cache
+def _cases() -> dict[str, Case]:
+    return {case.name: case for case in cases()}
+
+
+def run_one(task: Task) -> Row:
+    """Does one run.
+
+    :param task: the run.
+    :returns: its row; what goes wrong becomes the reason in it.
+    """
+    return attempt(task, _run)
+
+
+def _run(task: Task) -> tuple[str, Row]:
+    wanted = task.settings
+    result = run_case(_cases()[wanted["case"]], wanted["protocol"], task.seed, wanted["slots"])
+    return "completed", asdict(result)
+
+
+def result_of(row: Row) -> Result:
+    """What a run gave, from its row in the journal."""
+    values = row["summary"]
+    return Result(**{name: tuple(v) if isinstance(v, list) else v for name, v in values.items()})
+
+
+@cache
+def fingerprint() -> str:
+    """A digest of the code that runs."""
+    return code_digest(sorted(Path(__file__).resolve().parent.glob("*.py")))
+
+
+WORK = Work(run_one, fingerprint)
+
+
+def as_yaml() -> str:
+    """What the preset runs, for `sweep --show`."""
+    rows = [{name: list(v) if isinstance(v, tuple) else v for name, v in asdict(case).items()} for case in cases()]
+    content = {"title": TITLE, "seeds": SEEDS, "slots": SLOTS, "protocols": PROTOCOLS, "cases": rows}
+    head = "# Runs without flight: for `tools/dtsa sweep --preset protocol`, not for --file.\n"
+    return head + yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
