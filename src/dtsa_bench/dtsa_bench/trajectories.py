@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
+from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.run_config import RunConfig
 
 Array = NDArray[np.float64]
@@ -122,8 +123,8 @@ def subtitle(summary: dict[str, Any]) -> str:
 
 def heading(summary: dict[str, Any]) -> str:
     """What flew, e.g. ``DTSA, linear``."""
-    policy = summary["policy"]
-    return f"{policy.upper() if policy in ('tdma', 'dtsa') else policy}, {summary['estimator']}"
+    built_in = POLICIES.rows.get(summary["policy"])  # a plug-in need not be installed where its flight is shown
+    return f"{built_in.label if built_in else summary['policy']}, {summary['estimator']}"
 
 
 def view_extent(scenario: Scenario, positions: Sequence[Array]) -> float:

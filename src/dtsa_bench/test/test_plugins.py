@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core import REASONS, Agent, ConfigError, LocalProtocolError, SwarmConfig, plugins
+from dtsa_agent.core.flight_models import flight_model
+from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.simulate import simulate
 from dtsa_bench.sweep import spec, work
 
@@ -64,7 +66,7 @@ def test_an_estimator_of_ones_own_feeds_avoider_and_metrics() -> None:
 def test_an_avoider_of_ones_own_flies() -> None:
     result = flight(avoider="give-way", timeout_s=20.0)
     assert result.summary()["end"] == "completed"
-    assert plugins.avoider_model("give-way").vehicle.tau == 0.1
+    assert flight_model("give-way").vehicle.tau == 0.1
     speed = np.linalg.norm(np.diff(result.trace.positions(), axis=0), axis=1) / 0.01
     assert 0.9 < speed.max() <= 1.0 + 1e-9
     straight = flight(
@@ -135,7 +137,7 @@ def test_what_does_not_exist_or_does_not_import_is_named(monkeypatch: pytest.Mon
         with pytest.raises(ConfigError, match=f"^{kind}: got 'nothing'.*{near}"):
             SwarmConfig(**{kind: "nothing"})
     broken = importlib.metadata.EntryPoint("broken", "no_such_module:Thing", "dtsa.policies")
-    monkeypatch.setattr(plugins, "available", lambda kind: {"broken": broken})
+    monkeypatch.setattr(POLICIES, "plug_ins", lambda: {"broken": broken})
     with pytest.raises(ConfigError, match="no_such_module"):
         SwarmConfig(policy="broken")
 

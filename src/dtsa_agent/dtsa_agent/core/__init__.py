@@ -7,8 +7,9 @@ from .errors import ConfigError, DtsaError, LocalProtocolError, RemoteProtocolEr
 from .frame import Frame, decode_frame, encode_frame
 from .outcome import SlotOutcome
 from .priority import priority, select
+from .registry import REASONS
 from .scenario import Scenario, make_scenario
-from .swarm import REASONS, Swarm
+from .swarm import Swarm
 
 __all__ = [
     "REASONS", "AbstractSwarm", "Agent", "AgentGroup", "ConfigError", "Decision", "DtsaError", "Frame",

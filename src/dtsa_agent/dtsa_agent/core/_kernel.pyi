@@ -7,7 +7,13 @@ Array: TypeAlias = Any  # whatever offers the buffer protocol
 Vector: TypeAlias = tuple[float, float, float]
 FrameFields: TypeAlias = tuple[int, int, int, int, Vector, Vector, Vector]
 
+NAMES: dict[str, tuple[str, ...]]
 FRAME_MAX: int
+EXTENDED_LENGTH: int
+EXTENDED_HEAD: int
+EXTENDED_SENDER_MAX: int
+LEASE_OPEN: int
+PRESENT_LEAVING: int
 METRICS_CRASHED: int
 METRICS_ARRIVED: int
 

@@ -22,8 +22,8 @@ Slots = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 Hashes = NDArray[np.uint32]
 
-FRAME_MAX: int = _kernel.FRAME_MAX
-PRESENT_LEAVING = 2  # in ``present``: will be switched off after a last frame
+FRAME_MAX = _kernel.FRAME_MAX  # bytes
+PRESENT_LEAVING = _kernel.PRESENT_LEAVING  # in ``present``: will be switched off after a last frame
 
 
 class SwarmState:
@@ -211,7 +211,7 @@ class AbstractSwarm(SwarmState, ABC):
 
     @abstractmethod
     def leave(self, local_index: int) -> None:
-        """A local agent leaves: policy ``lease`` says so in its next own turn, with others it is off at once.
+        """A local agent leaves: with a policy that says so, after its next own turn; with others at once.
 
         :param local_index: position in ``ids``.
         """

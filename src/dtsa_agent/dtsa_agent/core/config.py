@@ -6,18 +6,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from . import _kernel
 from .errors import ConfigError
+from .flight_models import AVOIDERS, flight_model
+from .registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow
 from .settings import Settings, check, setting
 
-POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")
-ESTIMATORS = ("hold", "linear", "intent", "oracle")
-AVOIDERS = ("orca", "crazyflie", "potential", "jerky", "bvc", "bvc-firmware", "none")
-SELECTIONS = ("candidates", "pairwise")
 FRAMES = ("auto", "paper", "extended")
 SHAPES = ("circle", "ellipse", "ellipsoid")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
 MAX_AGENTS = 1024
-MAX_LEASE_AGENTS = 254
+MAX_EXTENDED_AGENTS = _kernel.EXTENDED_SENDER_MAX  # ids have 8 bits in extended frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +30,11 @@ class SwarmConfig(Settings):
     moving: int | None = setting(
         None, "how many of them move, an even number (antipodal pairs); default: all", minimum=0, maximum=MAX_AGENTS
     )
-    policy: str = setting("dtsa", "who sends next", choices=POLICIES, open_choices=True)
-    estimator: str = setting("linear", "where the others are by now", choices=ESTIMATORS, open_choices=True)
-    avoider: str = setting("orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS, open_choices=True)
+    policy: str = setting("dtsa", "who sends next", choices=POLICIES.names, open_choices=True)
+    estimator: str = setting("linear", "where the others are by now", choices=ESTIMATORS.names, open_choices=True)
+    avoider: str = setting(
+        "orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS.names, open_choices=True
+    )
     slot_ms: float = setting(10.0, "length of a time slot, t_s", unit="ms", minimum=0.5, maximum=1000)
     seed: int = setting(1, "seed of the whole run", minimum=0, maximum=2**63 - 1)
 
@@ -126,20 +127,36 @@ class SwarmConfig(Settings):
             raise ConfigError("moving", self.moving, f"0 to {self.agents}, the number of agents")
         if self.movers % 2:
             raise ConfigError("moving", self.moving, "an even number: agents exchange places in pairs")
-        if self.policy == "lease" and self.frame == "paper":
-            raise ConfigError("frame", self.frame, "auto or extended with policy lease")
-        if self.extended and self.agents > MAX_LEASE_AGENTS:
-            raise ConfigError("agents", self.agents, f"1 to {MAX_LEASE_AGENTS} with extended frames")
-        self._check_options()
-
-    def _check_options(self) -> None:
-        from .flight_models import flight_model
-
+        POLICIES.row(self.policy)
+        ESTIMATORS.row(self.estimator)
         flight_model(self.avoider, self.options)
-        if self.policy not in POLICIES or self.estimator not in ESTIMATORS:
-            from .plugins import check
+        if self.policy_row.extended and self.frame == "paper":
+            raise ConfigError("frame", self.frame, f"auto or extended with policy {self.policy}")
+        self._check_agents()
 
-            check(self)
+    def _check_agents(self) -> None:
+        """Whether ids fit into frames and into the policy.
+
+        :raises ConfigError: with the number that is possible.
+        """
+        most = self.policy_row.most_agents
+        if most is not None and self.agents > most:
+            raise ConfigError("agents", self.agents, f"1 to {most} with policy {self.policy}")
+        if self.extended and self.agents > MAX_EXTENDED_AGENTS:
+            allowed = f"1 to {MAX_EXTENDED_AGENTS} with extended frames, whose ids have 8 bits"
+            others = [row.name for row in POLICIES.rows.values() if not row.extended]
+            instead = f"policy {', '.join(others)}" if self.policy_row.extended else "frame: paper"
+            raise ConfigError("agents", self.agents, f"{allowed}; up to {MAX_AGENTS} with {instead}")
+
+    @property
+    def policy_row(self) -> PolicyRow:
+        """What is known about the policy."""
+        return POLICIES.row(self.policy)
+
+    @property
+    def estimator_row(self) -> EstimatorRow:
+        """What is known about the estimator."""
+        return ESTIMATORS.row(self.estimator)
 
     @property
     def movers(self) -> int:
@@ -149,7 +166,7 @@ class SwarmConfig(Settings):
     @property
     def extended(self) -> bool:
         """Whether frames on the air have profile ``extended``."""
-        return self.frame == "extended" or (self.frame == "auto" and self.policy == "lease")
+        return self.frame == "extended" or (self.frame == "auto" and self.policy_row.extended)
 
     @property
     def open_period(self) -> int:

@@ -8,19 +8,21 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import _kernel
 from .errors import ConfigError
+from .registry import Registry, check_kernel
 from .settings import REQUIRED, Settings, check, setting, settings_of
 
 Array = NDArray[np.float64]
 
 # Numbers of the avoiders in the compiled kernel (avoider.h).
 KINDS = ("orca", "potential", "bvc", "none")
+check_kernel("avoiders", KINDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +82,6 @@ class VehicleParams(Settings):
         :param velocity: same shape, m/s.
         :param command: commanded velocity, same shape, m/s.
         """
-        from . import _kernel
-
         _kernel.vehicle_step(self.tau, self.a_max, dt, position, velocity, command)
 
 
@@ -128,8 +128,6 @@ class FlightModel(Settings):
         :param others_velocity: their velocities, (3, N), m/s.
         :param age_s: age of each one's news, (N,), s; None: no margins.
         """
-        from . import _kernel
-
         result = np.empty(3)
         given = (position, velocity, goal, others_position, others_velocity)
         p, v, target, others_p, others_v = (np.ascontiguousarray(a, dtype=np.float64) for a in given)
@@ -147,36 +145,40 @@ _JERKY = AvoiderParams(v_max=1.0, influence=0.43, strength=0.541, core=0.2, tang
 _BVC = AvoiderParams(v_max=1.5, radius=0.163, horizon=1.0, sidestep=0.25)
 _BVC_FIRMWARE = AvoiderParams(v_max=0.5, radius=0.3, horizon=1.0, sidestep=0.25, stretch_z=3.0)
 
-FLIGHT_MODELS: Mapping[str, FlightModel] = MappingProxyType(
-    {
-        model.name: model
-        for model in (
-            FlightModel("orca", "orca", _ORCA, VehicleParams(0.25, 2.0), 0.9, 2.2),
-            FlightModel("crazyflie", "orca", _CRAZYFLIE, VehicleParams(0.25, 2.0), 0.9, 2.2),
-            FlightModel("potential", "potential", _POTENTIAL, VehicleParams(0.1, 2.0), 0.55, 1.8),
-            FlightModel("jerky", "potential", _JERKY, VehicleParams(0.05, 15.0), 0.55, 1.8),
-            FlightModel("bvc", "bvc", _BVC, VehicleParams(0.25, 2.0), 0.9, 2.2),
-            FlightModel("bvc-firmware", "bvc", _BVC_FIRMWARE, VehicleParams(0.25, 2.0), 0.9, 2.2),
-            FlightModel("none", "none", AvoiderParams(v_max=1.5), VehicleParams(0.25, 2.0), 0.9, 2.2),
-        )
-    }
+_MODELS = (
+    FlightModel("orca", "orca", _ORCA, VehicleParams(0.25, 2.0), 0.9, 2.2),
+    FlightModel("crazyflie", "orca", _CRAZYFLIE, VehicleParams(0.25, 2.0), 0.9, 2.2),
+    FlightModel("potential", "potential", _POTENTIAL, VehicleParams(0.1, 2.0), 0.55, 1.8),
+    FlightModel("jerky", "potential", _JERKY, VehicleParams(0.05, 15.0), 0.55, 1.8),
+    FlightModel("bvc", "bvc", _BVC, VehicleParams(0.25, 2.0), 0.9, 2.2),
+    FlightModel("bvc-firmware", "bvc", _BVC_FIRMWARE, VehicleParams(0.25, 2.0), 0.9, 2.2),
+    FlightModel("none", "none", AvoiderParams(v_max=1.5), VehicleParams(0.25, 2.0), 0.9, 2.2),
 )
+
+
+def _avoider_plug_in(name: str, factory: Any) -> FlightModel:
+    """The flight model of an avoider plug-in: vehicle and spacing of the built-in model that it names."""
+    base = getattr(factory, "model", "orca")
+    if base not in AVOIDERS.rows:
+        raise ConfigError(f"{name}.model", base, ", ".join(AVOIDERS.names))
+    model = AVOIDERS.rows[base]
+    return FlightModel(name, "none", model.avoider, model.vehicle, model.spacing, model.min_radius)
+
+
+AVOIDERS = Registry("avoider", "dtsa.avoiders", _MODELS, _avoider_plug_in)
+FLIGHT_MODELS: Mapping[str, FlightModel] = AVOIDERS.rows
 
 
 def flight_model(name: str, options: Mapping[str, float] | None = None) -> FlightModel:
     """A named flight model, possibly with some values replaced.
 
-    :param name: a key of :data:`FLIGHT_MODELS`.
+    :param name: a name of :data:`AVOIDERS`, or of an avoider plug-in.
     :param options: values by the names of the fields of :class:`AvoiderParams` and :class:`VehicleParams`, or
         ``spacing`` and ``min_radius``.
         Names with a dot belong to plug-ins and are not looked at.
     :raises ConfigError: for unknown names and values outside their range.
     """
-    model = FLIGHT_MODELS.get(name)
-    if model is None:
-        from .plugins import avoider_model
-
-        model = avoider_model(name)
+    model = AVOIDERS.row(name)
     groups: dict[str, dict[str, Any]] = {"avoider": {}, "vehicle": {}, "room": {}}
     owners = {spec.name: "avoider" for spec in settings_of(AvoiderParams)}
     owners |= {spec.name: "vehicle" for spec in settings_of(VehicleParams)}

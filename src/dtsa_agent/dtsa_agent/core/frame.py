@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 from . import _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
+from .registry import PROFILES
 
-PROFILE_PAPER = 0  # id, c_r, slot, position, velocity: 19 bytes
-PROFILE_PAPER_INTENT = 1  # the same and the commanded velocity: 23 bytes
-PROFILE_EXTENDED = 2  # policy lease, at most 60 bytes
+PROFILE_PAPER = PROFILES.index("paper")  # id, c_r, slot, position, velocity: 19 bytes
+PROFILE_PAPER_INTENT = PROFILES.index("paper-intent")  # the same and the commanded velocity: 23 bytes
+PROFILE_EXTENDED = PROFILES.index("extended")  # 56 bytes
 
 Vector = tuple[float, float, float]
 

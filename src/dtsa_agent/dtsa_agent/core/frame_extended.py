@@ -8,10 +8,11 @@ from . import _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
 from .frame import _FAULTS, Frame, Vector
 
-EXTENDED_LENGTH = 56  # bytes, and 4 more for the tag of an authenticated frame
-HEAD_LENGTH = 23  # bytes that hold the sender's own state: enough for who hears only the beginning of a frame
-OPEN = 255  # lessee of a turn that is open to all who wake
-LEAVING_BYTE = 255
+EXTENDED_LENGTH = _kernel.EXTENDED_LENGTH  # bytes, and 4 more for the tag of an authenticated frame
+HEAD_LENGTH = (
+    _kernel.EXTENDED_HEAD
+)  # bytes that hold the sender's own state: enough for who hears only the beginning of a frame
+OPEN = _kernel.LEASE_OPEN  # lessee of a turn that is open to all who wake
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 from .abstract_swarm import AbstractSwarm
 from .config import SwarmConfig
 from .errors import ConfigError
+from .registry import POLICIES
 from .timebase import LISTENING, TimeBase
-
-# Who sends next depends on the slot's number there, or on what the sender itself has been told; never on a table that
-# all must have equal, which nobody can have who was not there from the start.
-JOINABLE = ("tdma", "aloha", "lease")
 
 
 def check_joinable(policy: str) -> None:
@@ -23,8 +20,9 @@ def check_joinable(policy: str) -> None:
 
     :raises ConfigError: if they never could agree with the others.
     """
-    if policy not in JOINABLE:
-        raise ConfigError("policy", policy, f"{', '.join(JOINABLE)}, to come into a flight that is under way")
+    if not POLICIES.row(policy).may_join:
+        joinable = [row.name for row in POLICIES.rows.values() if row.may_join]
+        raise ConfigError("policy", policy, f"{', '.join(joinable)}, to come into a flight that is under way")
 
 
 class Listeners:
@@ -77,7 +75,7 @@ class Listeners:
 class Newcomers:
     """Local agents that hover because they are new: nobody knows where they are, and they do not know the others.
 
-    An agent flies from when it has spoken in a turn of its own and, with policy ``lease``, is no longer in probation:
+    An agent flies from when it has spoken in a turn of its own and, where the policy has probation, is through with it:
     then it has been heard; and after a whole round, in which it has heard everybody else where nothing is lost.
 
     :param count: number of local agents L.
@@ -119,4 +117,4 @@ class Newcomers:
         since = self._since[index]
         if slot < since + config.agents or swarm.sent_slot[index, swarm.local[index]] < since:
             return False
-        return config.policy != "lease" or not swarm.lease_status(index)["probation"]
+        return not config.policy_row.probation or not swarm.lease_status(index)["probation"]

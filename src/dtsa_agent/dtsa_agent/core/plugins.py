@@ -13,23 +13,21 @@ that hear everything).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
-from .config import AVOIDERS, ESTIMATORS, POLICIES, SwarmConfig
-from .errors import ConfigError, LocalProtocolError
-from .flight_models import FLIGHT_MODELS, FlightModel
+from .config import SwarmConfig
+from .errors import LocalProtocolError
+from .flight_models import AVOIDERS
+from .registry import ESTIMATORS, POLICIES, REASONS, Registry
 from .scenario import Scenario
-from .swarm import REASONS, Swarm
+from .swarm import Swarm
 
 Array = NDArray[np.float64]
 
-GROUPS = {"policy": "dtsa.policies", "estimator": "dtsa.estimators", "avoider": "dtsa.avoiders"}
-BUILT_IN = {"policy": POLICIES, "estimator": ESTIMATORS, "avoider": AVOIDERS}
 _PLUGIN_REASON = REASONS.index("plugin")
 
 
@@ -99,61 +97,12 @@ class Avoider(Protocol):
         """Commanded velocity, (3,), m/s, frame map; the estimates in ``view`` are those of this instant."""
 
 
-def available(kind: str) -> dict[str, EntryPoint]:
-    """The plug-ins installed on this machine, by name.
-
-    :param kind: ``policy``, ``estimator`` or ``avoider``.
-    """
-    return {point.name: point for point in entry_points(group=GROUPS[kind]) if point.name not in BUILT_IN[kind]}
-
-
-def find(kind: str, name: str) -> Any:
-    """The factory of a plug-in.
-
-    :param kind: ``policy``, ``estimator`` or ``avoider``.
-    :param name: the name it was announced by.
-    :raises ConfigError: if there is none, or it does not import.
-    """
-    points = available(kind)
-    if name not in points:
-        raise ConfigError(kind, name, ", ".join((*BUILT_IN[kind], *sorted(points))))
-    try:
-        return points[name].load()
-    except Exception as error:
-        source = f"{points[name].value} ({type(error).__name__}: {error})"
-        raise ConfigError(kind, name, f"a plug-in that can be imported, unlike {source}") from error
-
-
-def check(config: SwarmConfig) -> None:
-    """Looks for the plug-ins that a configuration names.
-
-    :raises ConfigError: if one of them does not exist.
-    """
-    for kind, names in BUILT_IN.items():
-        if getattr(config, kind) not in names:
-            find(kind, getattr(config, kind))
-
-
-def avoider_model(name: str) -> FlightModel:
-    """The flight model of an avoider plug-in: vehicle and spacing of the built-in model that it names.
-
-    :param name: name of the plug-in.
-    :raises ConfigError: if there is none, or its model is unknown.
-    """
-    base = getattr(find("avoider", name), "model", "orca")
-    if base not in FLIGHT_MODELS:
-        raise ConfigError(f"{name}.model", base, ", ".join(FLIGHT_MODELS))
-    model = FLIGHT_MODELS[base]
-    return FlightModel(name, "none", model.avoider, model.vehicle, model.spacing, model.min_radius)
+_REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
 
 
 def uses_plugins(config: SwarmConfig) -> bool:
     """Whether a configuration names anything that is not built in."""
-    return any(getattr(config, kind) not in names for kind, names in BUILT_IN.items())
-
-
-# Policies by which all agents decide the same as long as they have heard the same.
-SHAREABLE = ("tdma", "dtsa", "age")
+    return any(getattr(config, registry.kind) not in registry.rows for registry in _REGISTRIES)
 
 
 def shareable(config: SwarmConfig) -> bool:
@@ -161,7 +110,7 @@ def shareable(config: SwarmConfig) -> bool:
 
     :param config: the swarm's settings.
     """
-    return config.policy in SHAREABLE and not uses_plugins(config)
+    return config.policy_row.may_share and not uses_plugins(config)
 
 
 def make_swarm(
@@ -179,14 +128,7 @@ def make_swarm(
     """
     if not uses_plugins(config):
         return Swarm(config, scenario, local, shared_view, observers)
-    return PluginSwarm(Swarm(config, scenario, local, False, observers, _intent(config)))
-
-
-def _intent(config: SwarmConfig) -> bool | None:
-    """Whether an estimator plug-in makes frames carry the commanded velocity; None: it is not a plug-in."""
-    if config.estimator in ESTIMATORS:
-        return None
-    return bool(getattr(find("estimator", config.estimator), "needs_intent", False))
+    return PluginSwarm(Swarm(config, scenario, local, False, observers))
 
 
 class PluginSwarm(SwarmWrapper):
@@ -199,15 +141,13 @@ class PluginSwarm(SwarmWrapper):
         super().__init__(inner)
         ids = [int(index) + 1 for index in self.observer]
         self._views = [View(self, view) for view in range(len(ids))]
-        self._policies = self._instances("policy", ids)
-        self._estimators = self._instances("estimator", ids)
-        self._avoiders = self._instances("avoider", ids)
+        self._policies, self._estimators, self._avoiders = (self._instances(r, ids) for r in _REGISTRIES)
 
-    def _instances(self, kind: str, ids: list[int]) -> list[Any]:
-        name = getattr(self.config, kind)
-        if name in BUILT_IN[kind]:
+    def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Any]:
+        name = getattr(self.config, registry.kind)
+        if name in registry.rows:
             return []
-        factory = find(kind, name)
+        factory = registry.factory(name)
         return [factory(self.config, agent) for agent in ids]
 
     def decide(self, slot: int) -> None:

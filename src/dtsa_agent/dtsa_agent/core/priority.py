@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _kernel
-from .config import SELECTIONS
 from .errors import ConfigError
+from .registry import SELECTIONS
 
 
 def priority(position: ArrayLike, velocity: ArrayLike, slot_s: float) -> NDArray[np.float64]:

@@ -10,31 +10,12 @@ from numpy.typing import NDArray
 
 from . import _kernel
 from .abstract_swarm import PRESENT_LEAVING, AbstractSwarm, Bytes
-from .config import ESTIMATORS, POLICIES, SELECTIONS, SwarmConfig
+from .config import SwarmConfig
 from .errors import ConfigError
 from .flight_models import flight_model
 from .frame import PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT
+from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
 from .scenario import STREAM_POLICY, Scenario, generator, make_scenario
-
-REASONS = (
-    "nobody",
-    "tdma",
-    "boot",
-    "age-cap",
-    "priority",
-    "tie",
-    "oldest",
-    "return",
-    "random",
-    "plugin",
-    "own",
-    "anchor",
-    "leased",
-    "adopted",
-    "open",
-    "absent",
-    "probation",
-)
 
 DECAY_STEPS = 4096  # intent: beyond this many control periods a vehicle has settled at its command
 
@@ -50,7 +31,6 @@ class Swarm(AbstractSwarm):
     :param local: ids of the agents that live here, ascending; default: all.
     :param shared_view: one table serves all local agents. Right only where all hear the same, i.e. without loss.
     :param observers: with ``local=[]``: ids of the observers whose tables are kept (0: one that hears everything).
-    :param intent: whether paper frames carry the commanded velocity; default: if the estimator needs it.
     :raises ConfigError: for ids that do not exist, or settings that need agents that are not here.
     """
 
@@ -61,7 +41,6 @@ class Swarm(AbstractSwarm):
         local: Sequence[int] | None = None,
         shared_view: bool = False,
         observers: Sequence[int] | None = None,
-        intent: bool | None = None,
     ) -> None:
         self.config = config
         self.scenario = make_scenario(config) if scenario is None else scenario
@@ -74,15 +53,19 @@ class Swarm(AbstractSwarm):
         self.observer = np.array(seen, dtype=np.int32) - 1
         self.shared = bool(shared_view)
         self.rows = np.arange(count)
-        if config.estimator == "oracle" and 0 < count < agents:
-            raise ConfigError("estimator", "oracle", "hold, linear or intent: it needs all agents in one process")
-        if shared_view and config.policy == "lease":
-            raise ConfigError("shared_view", True, "False: with policy lease every agent knows something of its own")
-        lease = _kernel.lease_state_bytes(agents, config.anchor_every) if config.policy == "lease" else 0
+        if config.estimator_row.needs_everybody and 0 < count < agents:
+            others = ", ".join(row.name for row in ESTIMATORS.rows.values() if not row.needs_everybody)
+            allowed = f"{others}: it needs all agents in one process"
+            raise ConfigError("estimator", config.estimator, allowed)
+        row = config.policy_row
+        if shared_view and row.agent_state:
+            why = f"False: with policy {row.name} every agent knows something of its own"
+            raise ConfigError("shared_view", True, why)
+        lease = _kernel.lease_state_bytes(agents, config.anchor_every) if row.agent_state else 0
         self._make_tables(len(self.observer), agents)
         self._make_agents(count, config.steps, lease)
         self.course = self.scenario.course(self.local)
-        parameters = self._parameters(count, config.estimator == "intent" if intent is None else intent)
+        parameters = self._parameters(count)
         self._arrays = self._shared_arrays()
         self.kernel = _kernel.Swarm(parameters, self._arrays)
 
@@ -90,15 +73,15 @@ class Swarm(AbstractSwarm):
         if list(ids) != sorted(set(ids)) or (ids and not 1 <= ids[0] <= ids[-1] <= self.config.agents):
             raise ConfigError(name, ids, f"ascending ids from 1 to {self.config.agents}")
 
-    def _parameters(self, count: int, intent: bool) -> dict[str, Any]:
+    def _parameters(self, count: int) -> dict[str, Any]:
         config, model = self.config, flight_model(self.config.avoider, self.config.options)
         key = int(generator(config.seed, STREAM_POLICY).integers(0, 2**63))
-        profile = PROFILE_PAPER_INTENT if intent else PROFILE_PAPER
+        profile = PROFILE_PAPER_INTENT if config.estimator_row.needs_intent else PROFILE_PAPER
         self._decay = decay_table(model.vehicle.tau, config.slot_s / config.steps)
         return {
             "agents": config.agents, "local_count": count, "view_count": len(self.observer), "steps": config.steps,
-            "shared": int(self.shared), "slot_s": config.slot_s, "policy": _index(POLICIES, config.policy),
-            "estimator": _index(ESTIMATORS, config.estimator), "avoider": model.kind,
+            "shared": int(self.shared), "slot_s": config.slot_s, "policy": POLICIES.number(config.policy),
+            "estimator": ESTIMATORS.number(config.estimator), "avoider": model.kind,
             "selection": SELECTIONS.index(config.selection), "epsilon": float(config.epsilon),
             "age_cap": float(config.age_cap), "boot_round": int(config.boot_round), "return_every": config.return_every,
             "r_min": float(config.r_min), "c_r": config.c_r,
@@ -174,7 +157,7 @@ class Swarm(AbstractSwarm):
 
     def leave(self, local_index: int) -> None:
         if self.present[local_index]:
-            self.present[local_index] = PRESENT_LEAVING if self.config.policy == "lease" else 0
+            self.present[local_index] = PRESENT_LEAVING if self.config.policy_row.says_leaving else 0
 
     def with_own_tables(self, slot: int) -> Swarm:
         swarm = Swarm(self.config, self.scenario, local=self.ids)
@@ -192,10 +175,6 @@ class Swarm(AbstractSwarm):
 
     def reason_name(self, local_index: int) -> str:
         return REASONS[self.reason[local_index]]
-
-
-def _index(names: tuple[str, ...], name: str) -> int:
-    return names.index(name) if name in names else len(names)
 
 
 def decay_table(tau: float, dt: float) -> NDArray[np.float64]:

@@ -140,7 +140,7 @@ class RealtimeNode(SwarmNode):
             return False
         swarm = self.swarm
         if self._leaves_by is None:
-            if self.config.policy != "lease" or self.slot < self._first:
+            if not self.config.policy_row.says_leaving or self.slot < self._first:
                 return True
             self._signals = stop.count
             self._leaves_by = self.slot + (self.config.anchor_every + 1) * self.config.agents
@@ -204,7 +204,7 @@ class RealtimeNode(SwarmNode):
         while (message := self.loop.take()) is not None:
             if not self._take(message):
                 return False
-        if -remaining > self._too_long_ns and self.config.policy == "lease":
+        if -remaining > self._too_long_ns and self.config.policy_row.probation:
             self._begin_anew(time.monotonic_ns() - self._zero)
         else:
             self._open(self.slot + 1)

@@ -98,7 +98,7 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
     agents = run.swarm.agents
     if options.processes is not None and not 1 <= options.processes <= agents:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
-    if run.swarm.estimator == "oracle" and (options.processes or agents) > 1:
+    if run.swarm.estimator_row.needs_everybody and (options.processes or agents) > 1:
         raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
     late = dict(options.late_s)
     for name, value in (("respawn", options.respawn_s), ("late", late or None)):

@@ -30,7 +30,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         self.begin_s = self.end_s = 0.0  # wall clock: slot 0 answered by all, flight over; 0: not yet
         self._tables = metrics_tables(run, scenario, everyone=True)
         self._agents = run.swarm.agents
-        self._oracle = run.swarm.estimator == "oracle"
+        self._oracle = run.swarm.estimator_row.needs_everybody
         self._outcome = 0
         self._compared = self._tables.digest, self._tables.chosen  # of the slot that is being flown
 

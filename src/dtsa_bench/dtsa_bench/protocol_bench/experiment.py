@@ -129,7 +129,7 @@ class Experiment:
         self._events: dict[int, list[Event]] = {}
         for event in events:
             self._events.setdefault(event.slot, []).append(event)
-        if config.policy == "lease":
+        if config.policy_row.agent_state:
             self.outcome.ledger = Ledger(config.agents, config.anchor_every)
         self.swarm.active[:] = 0
         self.swarm.final[:] = final

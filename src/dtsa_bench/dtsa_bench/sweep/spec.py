@@ -16,6 +16,7 @@ import yaml
 
 from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import POLICIES
 from dtsa_channel_sim import ChannelConfig
 
 from ..batch.task import Task, key_of
@@ -76,9 +77,9 @@ def cost_of(settings: Mapping[str, Any]) -> float:
     slot_ms = float(settings.get("slot_ms", 10.0))
     slots = min(float(settings.get("timeout_s", 60.0)), 3.0 + agents / 5) * 1000.0 / slot_ms
     lossy = any(settings.get(name) for name in ("loss", "burst_length", "range_m", "loss_matrix", "schedule"))
-    own = lossy or settings.get("policy") in ("aloha", "lease")
-    tables = agents if own else 1.0
-    priority = 0.05 if settings.get("policy", "dtsa") == "dtsa" else 0.002
+    policy = POLICIES.row(settings.get("policy", "dtsa"))
+    tables = 1.0 if policy.may_share and not lossy else agents
+    priority = 0.05 if policy.weighs_all else 0.002
     return slots * (4.0 + 0.3 * agents + 0.006 * agents * agents + tables * priority * agents * (agents + 4) / 10)
 
 

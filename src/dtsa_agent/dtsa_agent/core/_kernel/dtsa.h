@@ -23,9 +23,9 @@ enum { FRAME_MAX = 60 };          /* bytes, Crazyflie peer-to-peer payload */
 
 enum { POLICY_TDMA, POLICY_DTSA, POLICY_AGE, POLICY_ALOHA, POLICY_LEASE, POLICY_EXTERNAL };
 enum { ESTIMATE_HOLD, ESTIMATE_LINEAR, ESTIMATE_INTENT, ESTIMATE_ORACLE, ESTIMATE_EXTERNAL };
-enum { SELECT_CANDIDATES, SELECT_PAIRWISE };
+enum { SELECT_CANDIDATES, SELECT_PAIRWISE, SELECT_COUNT };
 
-/* Why a sender was chosen; keep in step with REASONS in core/swarm.py. */
+/* Why a sender was chosen. Names of all these: names.c. */
 enum {
     REASON_NOBODY,        /* A_p is empty and nobody else has a claim */
     REASON_TDMA,          /* slot modulo N */
@@ -44,12 +44,13 @@ enum {
     REASON_LEASE_ADOPTED, /* given away by the next one alive, because its owner is thought dead */
     REASON_LEASE_OPEN,    /* given to whoever has just woken or joined */
     REASON_LEASE_ABSENT,  /* its owner is thought dead */
-    REASON_LEASE_PROBATION        /* its owner may not use it yet */
+    REASON_LEASE_PROBATION, /* its owner may not use it yet */
+    REASON_COUNT
 };
 
 /* ---- frame.c: the radio frame, the only codec ---- */
 
-enum { PROFILE_PAPER = 0, PROFILE_PAPER_INTENT = 1, PROFILE_EXTENDED = 2 };
+enum { PROFILE_PAPER = 0, PROFILE_PAPER_INTENT = 1, PROFILE_EXTENDED = 2, PROFILE_COUNT };
 enum { FRAME_VERSION = 1 };
 enum { SECTIONS = 3, SECTION_BYTES = 11, EXTENDED_HEAD = 23, EXTENDED_LENGTH = EXTENDED_HEAD + SECTIONS * SECTION_BYTES };
 enum { RELAY_IDS = 8, RELAY_REACH = 24, GOSSIP_AGE_MAX = 127, LEASE_ROOM = 2 * SECTION_BYTES, EXTENDED_SENDER_MAX = 254 };

@@ -2,6 +2,8 @@
  * Python and C look at the same memory; core/swarm.py creates and documents them. */
 #include "module.h"
 
+#include "lease.h"
+
 int borrow(PyObject *object, const char *name, Py_ssize_t count, Py_ssize_t itemsize, int writable, Py_buffer *out)
 {
     const int flags = PyBUF_C_CONTIGUOUS | (writable ? PyBUF_WRITABLE : 0);
@@ -111,6 +113,30 @@ static struct PyModuleDef MODULE = {
     .m_methods = METHODS,
 };
 
+static const struct {
+    const char *name;
+    int value;
+} CONSTANTS[] = {
+    {"METRICS_CRASHED", METRICS_CRASHED},
+    {"METRICS_ARRIVED", METRICS_ARRIVED},
+    {"FRAME_MAX", FRAME_MAX},
+    {"EXTENDED_LENGTH", EXTENDED_LENGTH},
+    {"EXTENDED_HEAD", EXTENDED_HEAD},
+    {"EXTENDED_SENDER_MAX", EXTENDED_SENDER_MAX},
+    {"LEASE_OPEN", LEASE_OPEN},
+    {"PRESENT_LEAVING", PRESENT_LEAVING},
+};
+
+static int add_constants(PyObject *module)
+{
+    for (size_t i = 0; i < sizeof CONSTANTS / sizeof *CONSTANTS; i++)
+        if (PyModule_AddIntConstant(module, CONSTANTS[i].name, CONSTANTS[i].value) < 0) return -1;
+    PyObject *names = names_dict();
+    const int status = names ? PyModule_AddObjectRef(module, "NAMES", names) : -1;
+    Py_XDECREF(names);
+    return status;
+}
+
 PyMODINIT_FUNC PyInit__kernel(void)
 {
     if (PyType_Ready(&SwarmType) < 0 || PyType_Ready(&MetricsType) < 0) return NULL;
@@ -118,10 +144,7 @@ PyMODINIT_FUNC PyInit__kernel(void)
     if (!module) return NULL;
     if (PyModule_AddFunctions(module, avoider_methods) < 0 || PyModule_AddFunctions(module, lease_methods) < 0 ||
         PyModule_AddObjectRef(module, "Swarm", (PyObject *)&SwarmType) < 0 ||
-        PyModule_AddObjectRef(module, "Metrics", (PyObject *)&MetricsType) < 0 ||
-        PyModule_AddIntConstant(module, "METRICS_CRASHED", METRICS_CRASHED) < 0 ||
-        PyModule_AddIntConstant(module, "METRICS_ARRIVED", METRICS_ARRIVED) < 0 ||
-        PyModule_AddIntConstant(module, "FRAME_MAX", FRAME_MAX) < 0) {
+        PyModule_AddObjectRef(module, "Metrics", (PyObject *)&MetricsType) < 0 || add_constants(module) < 0) {
         Py_DECREF(module);
         return NULL;
     }

@@ -21,6 +21,9 @@ enum { METRICS_CRASHED = 1, METRICS_ARRIVED = 2 };
 extern PyTypeObject SwarmType, MetricsType;
 extern PyMethodDef avoider_methods[], lease_methods[];
 
+/* names.c: tuples of names by kind of list; on failure sets an exception and returns NULL. */
+PyObject *names_dict(void);
+
 /* A C-contiguous buffer of exactly `count` items of `itemsize` bytes; on failure sets an exception and returns -1. */
 int borrow(PyObject *object, const char *name, Py_ssize_t count, Py_ssize_t itemsize, int writable, Py_buffer *out);
 /* A slot's number; on failure sets an exception and returns -1. */

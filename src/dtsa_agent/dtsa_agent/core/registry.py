@@ -1,0 +1,239 @@
+"""Policies and estimators: one row each. Whatever depends on the nature of one asks its row.
+
+Avoiders and their vehicles are rows as well: :data:`dtsa_agent.core.flight_models.AVOIDERS`. Rows are in the order of
+the kernel's numbers, which is checked when this module is imported. Plug-ins get their rows from what they declare.
+
+A built-in policy is a row here, a C function in ``_kernel`` and its name in ``_kernel/names.c``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from types import MappingProxyType
+from typing import Any, Generic, Protocol, TypeVar
+
+from . import _kernel
+from .errors import ConfigError
+
+PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/protocol.md
+OUTCOME = ("received", "busy")  # what the outcome of a slot is derived from
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Row = TypeVar("Row", bound=_Named)
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyRow:
+    """Who sends next: what the rest of the software has to know about a policy.
+
+    :param name: what the setting ``policy`` calls it.
+    :param label: what figures call it.
+    :param decides: who sends in a slot, in a few words.
+    :param under_loss: what becomes of it on a channel that loses frames.
+    :param may_share: agents that have heard the same decide the same: one table may serve all of them.
+    :param may_join: agents may come late or come back, because nobody needs a table that all have equal.
+    :param says_leaving: an agent that leaves says so in a last frame.
+    :param probation: an agent that is new or stood still for long may not use all of its turns yet.
+    :param extended: its frames are extended ones.
+    :param agent_state: it keeps state of its own for each agent (``lease_state`` of a swarm).
+    :param weighs_all: it computes the priorities of all agents in every slot.
+    :param most_agents: largest number of agents; None: as many as a swarm may have.
+    :param port: what it uses of the air, of :data:`PORT`.
+    :param own_bytes: bytes of its own that a plug-in appends to frames.
+    """
+
+    name: str
+    label: str
+    decides: str
+    under_loss: str
+    may_share: bool = False
+    may_join: bool = False
+    says_leaving: bool = False
+    probation: bool = False
+    extended: bool = False
+    agent_state: bool = False
+    weighs_all: bool = False
+    most_agents: int | None = None
+    port: tuple[str, ...] = ("send", "received")
+    own_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorRow:
+    """Where the others are by now.
+
+    :param name: what the setting ``estimator`` calls it.
+    :param text: what it supposes, in a few words.
+    :param needs_intent: frames carry the commanded velocity.
+    :param needs_everybody: it knows the truth: all agents must be in one process.
+    """
+
+    name: str
+    text: str
+    needs_intent: bool = False
+    needs_everybody: bool = False
+
+
+class Registry(Generic[Row]):
+    """Rows by name: the built-in ones, in the order of the kernel's numbers, and those of plug-ins.
+
+    :param kind: the setting that names a row.
+    :param group: the group of entry points in which packages announce plug-ins.
+    :param rows: the built-in rows.
+    :param plug_in_row: makes the row of a plug-in from its name and its factory.
+    """
+
+    def __init__(self, kind: str, group: str, rows: Iterable[Row], plug_in_row: Callable[[str, Any], Row]) -> None:
+        self.kind, self.group = kind, group
+        self.rows: Mapping[str, Row] = MappingProxyType({row.name: row for row in rows})
+        self._plug_in_row = plug_in_row
+        self._plug_ins: dict[str, tuple[Any, Row]] = {}  # looking for them takes milliseconds
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the built-in rows."""
+        return tuple(self.rows)
+
+    def number(self, name: str) -> int:
+        """The kernel's number of a row; plug-ins have the one after the last.
+
+        :param name: the name.
+        """
+        return self.names.index(name) if name in self.rows else len(self.rows)
+
+    def row(self, name: str) -> Row:
+        """The row of a name.
+
+        :param name: the name.
+        :raises ConfigError: if there is none, or it is a plug-in that cannot be used.
+        """
+        return self.rows[name] if name in self.rows else self._plug_in(name)[1]
+
+    def factory(self, name: str) -> Any:
+        """The factory of a plug-in.
+
+        :param name: the name it was announced by.
+        :raises ConfigError: if there is none, or it cannot be used.
+        """
+        return self._plug_in(name)[0]
+
+    def plug_ins(self) -> dict[str, EntryPoint]:
+        """The plug-ins installed on this machine, by name.
+
+        :raises ConfigError: if one has the name of a built-in row.
+        """
+        points = {point.name: point for point in entry_points(group=self.group)}
+        for name in self.rows:
+            if name in points:
+                allowed = f"another name for {points[name].value}: {', '.join(self.rows)} are built in"
+                raise ConfigError(self.group, name, allowed)
+        return points
+
+    def _plug_in(self, name: str) -> tuple[Any, Row]:
+        if name not in self._plug_ins:
+            points = self.plug_ins()
+            if name not in points:
+                raise ConfigError(self.kind, name, ", ".join((*self.rows, *sorted(points))))
+            try:
+                factory = points[name].load()
+            except Exception as error:
+                source = f"{points[name].value} ({type(error).__name__}: {error})"
+                raise ConfigError(self.kind, name, f"a plug-in that can be imported, unlike {source}") from error
+            self._plug_ins[name] = factory, self._plug_in_row(name, factory)
+        return self._plug_ins[name]
+
+
+MAX_OWN_BYTES = 16  # of a plug-in; 23 bytes of a frame with intent, these and a tag fit into 60
+
+
+def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
+    own, port = getattr(factory, "own_bytes", 0), tuple(getattr(factory, "port", ("send", "received")))
+    if isinstance(own, bool) or not isinstance(own, int) or not 0 <= own <= MAX_OWN_BYTES:
+        raise ConfigError(f"{name}.own_bytes", own, f"0 to {MAX_OWN_BYTES}")
+    if not set(port) <= set(PORT):
+        raise ConfigError(f"{name}.port", port, "some of " + ", ".join(PORT))
+    may_join = bool(getattr(factory, "may_join", False))
+    return PolicyRow(name, name, "plug-in", "as it was written", may_join=may_join, port=port, own_bytes=own)
+
+
+def _estimator_plug_in(name: str, factory: Any) -> EstimatorRow:
+    return EstimatorRow(name, "plug-in", needs_intent=bool(getattr(factory, "needs_intent", False)))
+
+
+POLICIES = Registry(
+    "policy",
+    "dtsa.policies",
+    (
+        PolicyRow("tdma", "TDMA", "slot modulo N", "works", may_share=True, may_join=True, port=("send",)),
+        PolicyRow(
+            "dtsa",
+            "DTSA",
+            "the agent whose state is most urgent, as in the paper",
+            "tables diverge, slots collide, for good",
+            may_share=True,
+            weighs_all=True,
+        ),
+        PolicyRow("age", "age", "the longest silent of those that have not arrived", "the same", may_share=True),
+        PolicyRow("aloha", "aloha", "everybody with probability 1/N_p", "collides by design", may_join=True),
+        PolicyRow(
+            "lease",
+            "lease",
+            "the owner; who has nothing to say lends its turn, in its own frame, to who has",
+            "works; no two senders by construction",
+            may_join=True,
+            says_leaving=True,
+            probation=True,
+            extended=True,
+            agent_state=True,
+        ),
+    ),
+    _policy_plug_in,
+)
+
+ESTIMATORS = Registry(
+    "estimator",
+    "dtsa.estimators",
+    (
+        EstimatorRow("hold", "where last heard"),
+        EstimatorRow("linear", "on with the velocity last heard (eq:estimate)"),
+        EstimatorRow("intent", "towards the commanded velocity, which the frame carries", needs_intent=True),
+        EstimatorRow("oracle", "the truth, for comparison", needs_everybody=True),
+    ),
+    _estimator_plug_in,
+)
+
+SELECTIONS = ("candidates", "pairwise")  # readings of the selection function
+PROFILES = ("paper", "paper-intent", "extended")  # of frames
+REASONS = (
+    "nobody", "tdma", "boot", "age-cap", "priority", "tie", "oldest", "return", "random", "plugin",
+    "own", "anchor", "leased", "adopted", "open", "absent", "probation",
+)  # fmt: skip
+
+
+def check_kernel(kind: str, names: tuple[str, ...]) -> None:
+    """Compares a list of names with the compiled kernel's, whose numbers are places in it.
+
+    :param kind: the list's name in the kernel.
+    :param names: the list as Python has it.
+    :raises ImportError: if they differ: kernel and Python are not of the same version.
+    """
+    compiled = _kernel.NAMES[kind]
+    if compiled != names:
+        raise ImportError(f"{kind}: Python has {names}, the compiled kernel has {compiled}; build dtsa_agent again")
+
+
+for _kind, _names in (
+    ("policies", POLICIES.names),
+    ("estimators", ESTIMATORS.names),
+    ("selections", SELECTIONS),
+    ("profiles", PROFILES),
+    ("reasons", REASONS),
+):
+    check_kernel(_kind, _names)
