@@ -10,11 +10,9 @@ from typing import Any
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import Setting, Settings, settings_of
-from dtsa_bench.run_config import RunConfig, RunLimits
+from dtsa_bench.run_config import FROM_SWARM, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
-# Settings of the channel that follow from the swarm's.
-FROM_SWARM = ("agents", "slot_ns", "seed")
 _SECTIONS: tuple[tuple[str, type[Settings], tuple[str, ...]], ...] = (
     ("swarm", SwarmConfig, ()),
     ("channel", ChannelConfig, FROM_SWARM),
@@ -111,7 +109,7 @@ def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
     """
     values = {section: given(args, cls, section) for section, cls, _ in _SECTIONS}
     swarm = SwarmConfig.from_dict({**values["swarm"], **fixed})
-    derived = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed}
+    derived = from_swarm(swarm)
     if getattr(args, "channel", None):
         channel = ChannelConfig.from_yaml(args.channel, **values["channel"], **derived)
     else:

@@ -9,6 +9,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import Settings, check, nested, setting
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
+FROM_SWARM = ("agents", "slot_ns", "seed")  # settings of the channel that follow from the swarm's
 LOCKSTEP, REALTIME = MODES = ("lockstep", "realtime")
 
 
@@ -48,8 +49,7 @@ class RunConfig(Settings):
     def __post_init__(self) -> None:
         check(self)
         if self.channel is None:
-            channel = ChannelConfig(agents=self.swarm.agents, slot_ns=self.swarm.slot_ns, seed=self.swarm.seed)
-            object.__setattr__(self, "channel", channel)
+            object.__setattr__(self, "channel", ChannelConfig(**from_swarm(self.swarm)))
         for name, there, here in (
             ("agents", self.air.agents, self.swarm.agents),
             ("slot_ns", self.air.slot_ns, self.swarm.slot_ns),
@@ -62,3 +62,11 @@ class RunConfig(Settings):
         """The channel's settings."""
         assert self.channel is not None
         return self.channel
+
+
+def from_swarm(swarm: SwarmConfig) -> dict[str, int]:
+    """Settings of the channel that follow from the swarm's.
+
+    :param swarm: the swarm's settings.
+    """
+    return {name: getattr(swarm, name) for name in FROM_SWARM}

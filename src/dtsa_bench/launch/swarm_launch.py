@@ -16,8 +16,7 @@ from launch_ros.actions import Node
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import settings_of
-from dtsa_bench.options import FROM_SWARM
-from dtsa_bench.run_config import RunLimits
+from dtsa_bench.run_config import FROM_SWARM, RunLimits
 from dtsa_channel_sim import ChannelConfig
 
 UNSET = ""  # the node's own default

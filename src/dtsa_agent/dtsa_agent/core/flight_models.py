@@ -45,11 +45,9 @@ class AvoiderParams(Settings):
     strength: float = setting(0.33, "potential: k, strength of the field", unit="m^2/s", minimum=0, maximum=100)
     core: float = setting(0.1, "potential: d_c, distance of infinite repulsion", unit="m", minimum=0, maximum=100)
     tangential: float = setting(
-        0.3, "potential: share of the force that acts sideways", unit="1", minimum=-2, maximum=2
+        0.3, "potential: c_t, share of the force that acts sideways", unit="1", minimum=-2, maximum=2
     )
-    margin_rate: float = setting(
-        0.0, "growth of a safety margin with the age of the news", unit="m/s", minimum=0, maximum=10
-    )
+    margin_rate: float = setting(0.0, "growth of a safety margin with age", unit="m/s", minimum=0, maximum=10)
     margin_max: float = setting(0.3, "largest such margin", unit="m", minimum=0, maximum=10)
     sidestep: float = setting(
         0.25, "bvc: closer to the wall than this, step to the right", unit="m", minimum=1e-6, maximum=10

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.config import AVOIDERS
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.flight_models import flight_model
+from dtsa_agent.core.flight_models import AVOIDERS, flight_model
 from dtsa_agent.core.settings import Settings, check, setting
 from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import check_fault
@@ -52,7 +51,7 @@ class FleetConfig(Settings):
     seed: int = setting(1, "seed of noise and loss", minimum=0, maximum=2**63 - 1)
     protocol: int = setting(12, "version of the protocol told to the host", choices=PROTOCOLS)
     noise: bool = setting(True, "sensors have noise")
-    model: str = setting("orca", "flight model whose vehicle they are", choices=AVOIDERS, open_choices=True)
+    model: str = setting("orca", "flight model whose vehicle they are", choices=AVOIDERS.names, open_choices=True)
     collision_m: float = setting(
         0.2, "the record notes two flying vehicles closer than this", unit="m", minimum=0, maximum=10
     )

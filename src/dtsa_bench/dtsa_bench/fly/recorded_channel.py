@@ -18,8 +18,8 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.process import run_node
-from dtsa_bench.options import FROM_SWARM, new_directory
-from dtsa_bench.run_config import LOCKSTEP, RunConfig, RunLimits
+from dtsa_bench.options import new_directory
+from dtsa_bench.run_config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.ros.channel_node import declare_limits, follow_parameters
 from dtsa_channel_sim.ros.diagnostics import Diagnostics
@@ -113,7 +113,7 @@ def declare_run(node: Node) -> RunConfig:
     channel = declare_settings(node, ChannelConfig, skip=FROM_SWARM, changeable=True)
     described = ParameterDescriptor(description="YAML file with further settings of the channel", read_only=True)
     file = node.declare_parameter("channel_file", "", described).value
-    derived = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed}
+    derived = from_swarm(swarm)
     if file:
         defaults = {spec.name: spec.default for spec in settings_of(ChannelConfig)}
         given = {name: value for name, value in channel.items() if value != defaults[name]}

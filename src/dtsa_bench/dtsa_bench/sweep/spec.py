@@ -1,7 +1,4 @@
-"""What a sweep flies:
-
-a base, axes that are combined with each other, and seeds. Read from YAML; see docs/bench.md.
-"""
+"""What a sweep flies: a base, axes that are combined with each other, and seeds. Read from YAML; see docs/bench.md."""
 
 from __future__ import annotations
 
@@ -12,15 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
+from dtsa_agent.core.settings import Settings, check, setting, settings_of
+from dtsa_agent.yaml_file import read_yaml
 from dtsa_channel_sim import ChannelConfig
 
 from ..batch.task import Task, key_of
-from ..run_config import RunConfig, RunLimits
+from ..run_config import FROM_SWARM, RunConfig, RunLimits, from_swarm
 from .columns import RESERVED
 
 PRESETS = Path(__file__).resolve().parent.parent / "presets"
@@ -28,11 +25,40 @@ FIGURE_KINDS = ("bars", "lines", "matrix", "trajectories", "estimate")
 #: Seeds of reports start here; those below are for tuning and tests.
 FIRST_SEED = 1001
 
-_SWARM = tuple(spec.name for spec in dataclasses.fields(SwarmConfig))
-_LIMITS = tuple(spec.name for spec in dataclasses.fields(RunLimits))
-_CHANNEL = tuple(
-    spec.name for spec in dataclasses.fields(ChannelConfig) if spec.name not in ("agents", "seed", "slot_ns")
-)
+# Settings by section. Those of the channel that follow from the swarm's are left out.
+_SECTIONS = {
+    "swarm": tuple(spec.name for spec in settings_of(SwarmConfig)),
+    "channel": tuple(spec.name for spec in settings_of(ChannelConfig) if spec.name not in FROM_SWARM),
+    "limits": tuple(spec.name for spec in settings_of(RunLimits)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SweepSpec(Settings):
+    """What a sweep's YAML file says.
+
+    :raises ConfigError: naming what is not usable.
+    """
+
+    title: str = setting("", "heading of the report; empty: the sweep's name")
+    text: str = setting("", "what the report says before its tables")
+    seeds: int | list[int] = setting(30, "a number of seeds, or a list of whole numbers", kind="structure", custom=True)
+    base: Mapping[str, Any] = setting({}, "settings of all flights, by name", kind="structure", custom=True)
+    axes: Mapping[str, Any] = setting(
+        {}, "lists of values by the name of a setting, or settings by names by an axis", kind="structure", custom=True
+    )
+    figures: tuple[Mapping[str, Any], ...] = setting((), "figures of the report", kind="structure", custom=True)
+
+    def __post_init__(self) -> None:
+        check(self)
+        object.__setattr__(self, "base", _mapping(self.base, "base"))
+        axes = {axis: _levels(axis, values) for axis, values in _mapping(self.axes, "axes").items()}
+        object.__setattr__(self, "axes", axes)
+        if not isinstance(self.figures, (list, tuple)):
+            raise ConfigError("figures", self.figures, "a list")
+        figures = tuple(_figure(entry, index, list(axes)) for index, entry in enumerate(self.figures))
+        object.__setattr__(self, "figures", figures)
+        _seeds(self.seeds, None, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +86,13 @@ class Sweep:
     cells: tuple[Cell, ...]
     seeds: tuple[int, ...]
     axes: tuple[str, ...]
-    figures: tuple[dict[str, Any], ...] = ()
-    source: dict[str, Any] = field(default_factory=dict)  # as it was read, with what the command line changed
+    figures: tuple[Mapping[str, Any], ...] = ()
+    spec: SweepSpec = field(default_factory=SweepSpec)  # as it was read, with what the command line changed
+
+    @property
+    def source(self) -> dict[str, Any]:
+        """The sweep's file as plain values, with what the command line changed."""
+        return self.spec.to_dict()
 
     def tasks(self) -> Iterator[Task]:
         """All runs, cell by cell."""
@@ -93,19 +124,16 @@ def run_config(settings: Mapping[str, Any]) -> RunConfig:
     for name, value in settings.items():
         section = section_of(name)
         if section is None:
-            raise ConfigError(name, value, "one of the settings " + ", ".join((*_SWARM, *_CHANNEL, *_LIMITS)))
+            raise ConfigError(name, value, "one of the settings " + ", ".join(sum(_SECTIONS.values(), ())))
         parts[section][name] = value
     swarm = SwarmConfig.from_dict(parts["swarm"])
-    channel = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": swarm.seed, **parts["channel"]}
+    channel = {**from_swarm(swarm), **parts["channel"]}
     return RunConfig(swarm, ChannelConfig.from_dict(channel), RunLimits(**parts["limits"]))
 
 
 def section_of(name: str) -> str | None:
     """The section of a flat name: swarm, channel or limits; None if there is no such setting."""
-    for section, names in (("swarm", _SWARM), ("channel", _CHANNEL), ("limits", _LIMITS)):
-        if name in names:
-            return section
-    return None
+    return next((section for section, names in _SECTIONS.items() if name in names), None)
 
 
 def preset_names() -> list[str]:
@@ -132,14 +160,7 @@ def load_file(path: str | Path, **changes: Any) -> Sweep:
     :param changes: as for :func:`make_sweep`.
     :raises ConfigError: if it cannot be read, or does not describe a sweep.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError("file", str(path), f"a readable YAML file ({error})") from error
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError("file", str(path), f"YAML ({' '.join(str(error).split())})") from error
+    content = read_yaml(path, "file")
     if not isinstance(content, dict):
         raise ConfigError("file", str(path), "a mapping with axes, and base, seeds, title, text, figures as you like")
     return make_sweep(content, Path(path).stem, **changes)
@@ -162,31 +183,14 @@ def make_sweep(
     :param base: settings that win over the file's base.
     :raises ConfigError: naming what is not usable.
     """
-    known = ("title", "text", "seeds", "base", "axes", "figures")
-    for key in content:
-        if key not in known:
-            raise ConfigError(str(key), content[key], "one of " + ", ".join(known))
-    common = {**_mapping(content.get("base", {}), "base"), **(base or {})}
-    axes = _mapping(content.get("axes", {}), "axes")
-    levels = [_levels(axis, values) for axis, values in axes.items()]
-    chosen = _seeds(content.get("seeds", 30), seeds, first_seed)
-    cells = tuple(_cells(common, list(axes), levels))
+    spec = SweepSpec.from_dict(content)
+    chosen = _seeds(spec.seeds, seeds, first_seed)
+    spec = dataclasses.replace(spec, base={**spec.base, **(base or {})}, seeds=list(chosen))
+    levels = [_settings_of_levels(axis, values) for axis, values in spec.axes.items()]
+    cells = tuple(_cells(spec.base, list(spec.axes), levels))
     for cell in cells:
         cell.run(chosen[0])
-    figures = content.get("figures", [])
-    if not isinstance(figures, list):
-        raise ConfigError("figures", figures, "a list")
-    source = {**content, "base": common, "seeds": list(chosen)}
-    return Sweep(
-        name,
-        str(content.get("title", name)),
-        str(content.get("text", "")).strip(),
-        cells,
-        chosen,
-        tuple(axes),
-        tuple(_figure(entry, index, list(axes)) for index, entry in enumerate(figures)),
-        source,
-    )
+    return Sweep(name, spec.title or name, spec.text.strip(), cells, chosen, tuple(spec.axes), spec.figures, spec)
 
 
 def _cells(
@@ -199,7 +203,7 @@ def _cells(
         yield Cell({axis: label for axis, (label, _) in zip(axes, combination, strict=True)}, settings)
 
 
-def _levels(axis: str, values: object) -> dict[Any, dict[str, Any]]:
+def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
     """Levels of an axis: a list of values of the setting it is named after, or names with settings each."""
     if axis in RESERVED:
         raise ConfigError(f"axes.{axis}", values, "another name: results have one of this name")
@@ -208,8 +212,13 @@ def _levels(axis: str, values: object) -> dict[Any, dict[str, Any]]:
     if isinstance(values, list) and values:
         if section_of(axis) is None:
             raise ConfigError(f"axes.{axis}", values, "names with settings, or an axis named after a setting")
-        return {value: {axis: value} for value in values}
+        return list(values)
     raise ConfigError(f"axes.{axis}", values, "a list of values, or names with settings each")
+
+
+def _settings_of_levels(axis: str, levels: list[Any] | dict[str, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
+    """What each level of an axis sets."""
+    return levels if isinstance(levels, dict) else {value: {axis: value} for value in levels}
 
 
 def _seeds(value: object, count: int | None, first: int | None) -> tuple[int, ...]:

@@ -178,6 +178,11 @@ class Change:
     values: tuple[tuple[str, Any], ...]
     until: int | None = None
 
+    def __post_init__(self) -> None:
+        # In one order, so that equal changes are equal objects.
+        in_order = sorted(self.values, key=lambda pair: CHANGEABLE.index(pair[0]))
+        object.__setattr__(self, "values", tuple(in_order))
+
     @classmethod
     def from_dict(cls, entry: object, config: ChannelConfig, name: str) -> Change:
         """Return an entry ``{slot | at_s: ..., until | until_s: ..., loss: ..., jam: ...}``, validated.
