@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.config import SwarmConfig
-from dtsa_agent.core.plugins import View
+from dtsa_agent.core.plugins import Table
 
 Array = NDArray[np.float64]
 
@@ -24,32 +24,29 @@ class LeastKnown:
         self.agents = config.agents
         self.every = 10  # each tenth slot is TDMA's, so that nobody is forgotten
 
-    def choose(self, view: View, slot: int) -> int:
+    def choose(self, table: Table, slot: int) -> int:
         """Id of the sender of a slot, 0: nobody."""
-        if slot < self.agents or slot % self.every == 0 or not view.in_ap.any():
+        if slot < self.agents or slot % self.every == 0 or not table.in_ap.any():
             return slot // (1 if slot < self.agents else self.every) % self.agents + 1
-        speed = np.sqrt((view.sent_velocity**2).sum(axis=0)) + 0.1
-        stray = np.where(view.in_ap == 1, (slot - view.sent_slot) * speed, -1.0)
+        speed = np.sqrt((table.sent_velocity**2).sum(axis=0)) + 0.1
+        stray = np.where(table.in_ap == 1, (slot - table.sent_slot) * speed, -1.0)
         return int(np.argmax(stray)) + 1
 
 
 class Damped:
-    """Estimator:
-
-    an agent keeps its velocity at first and is believed to have come to rest after about a second.
-    """
+    """Estimator: an agent keeps its velocity at first and is believed to have come to rest after about a second."""
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         self.slot_s = config.slot_s
         self.control_s = config.slot_s / config.steps
         self.rest_s = config.options.get("damped.rest_s", 1.0)
 
-    def estimate(self, view: View, slot: int, step: int, position: Array, velocity: Array) -> None:
+    def estimate(self, table: Table, slot: int, step: int, position: Array, velocity: Array) -> None:
         """Writes positions (m) and velocities (m/s), (3, N)."""
-        age = np.where(view.sent_slot < 0, 0.0, (slot - view.sent_slot) * self.slot_s + step * self.control_s)
+        age = np.where(table.sent_slot < 0, 0.0, (slot - table.sent_slot) * self.slot_s + step * self.control_s)
         left = 1.0 / (1.0 + age / self.rest_s)  # no exp: its last bit depends on the machine
-        velocity[:] = view.sent_velocity * left
-        position[:] = view.sent_position + view.sent_velocity * age * (1.0 + left) / 2.0
+        velocity[:] = table.sent_velocity * left
+        position[:] = table.sent_position + table.sent_velocity * age * (1.0 + left) / 2.0
 
 
 class GiveWay:
@@ -64,12 +61,12 @@ class GiveWay:
         self.index = agent - 1
         self.reach = 1.2  # m
 
-    def command(self, view: View, slot: int, step: int) -> tuple[float, float, float]:
+    def command(self, table: Table, slot: int, step: int) -> tuple[float, float, float]:
         """Commanded velocity, m/s, frame map."""
-        away = view.goal - view.own_position
+        away = table.goal - table.own_position
         distance = math.sqrt(float(away @ away))
         wish = away * min(2.0, 1.0 / max(distance, 1e-9))
-        gap = view.own_position[:, None] - view.estimate_position
+        gap = table.own_position[:, None] - table.estimate_position
         length = np.sqrt((gap * gap).sum(axis=0))
         near = (length < self.reach) & (np.arange(len(length)) != self.index)
         for k in np.flatnonzero(near):

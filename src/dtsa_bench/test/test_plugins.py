@@ -144,10 +144,10 @@ def test_what_does_not_exist_or_does_not_import_is_named(monkeypatch: pytest.Mon
 
 def test_what_a_plugin_sees_it_cannot_change() -> None:
     swarm = plugins.make_swarm(SwarmConfig(agents=3, moving=2, policy="least-known"))
-    view = plugins.View(swarm, 0)
+    table = plugins.Table(swarm, 0)
     for name in ("sent_position", "in_ap", "last_turn", "own_position", "goal"):
         with pytest.raises(ValueError, match="read-only"):
-            getattr(view, name)[...] = 0
+            getattr(table, name)[...] = 0
 
 
 def test_built_in_names_never_make_a_plugin_swarm() -> None:

@@ -11,12 +11,11 @@ from __future__ import annotations
 import hashlib
 import hmac
 
-from .abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
+from .abstract_swarm import FRAME_MAX, AbstractSwarm, Bytes, SwarmWrapper
 from .errors import ConfigError, LocalProtocolError
+from .frame import TAG_LENGTH
 
-TAG_LENGTH = 4  # bytes
 MIN_KEY, MAX_KEY = 16, 32  # bytes
-_MAX_FRAME = 60  # bytes on the air
 
 
 class Authenticator:
@@ -72,8 +71,8 @@ class Authenticator:
         :param slot: the slot it is sent in.
         :raises LocalProtocolError: if frame and tag do not fit on the air.
         """
-        if not 0 < len(data) <= _MAX_FRAME - TAG_LENGTH:
-            raise LocalProtocolError(f"a frame of {len(data)} bytes cannot be sealed: 1 to {_MAX_FRAME - TAG_LENGTH}")
+        if not 0 < len(data) <= FRAME_MAX - TAG_LENGTH:
+            raise LocalProtocolError(f"a frame of {len(data)} bytes cannot be sealed: 1 to {FRAME_MAX - TAG_LENGTH}")
         return data + self._tag(data, slot)
 
     def open(self, data: bytes, slot: int, late: int = 0) -> bytes | None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from . import _kernel
 from .errors import ConfigError
 from .flight_models import AVOIDERS, flight_model
+from .frame import PROFILE_EXTENDED, PROFILE_PAPER_INTENT, TAG_LENGTH
 from .registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow
 from .settings import Settings, check, setting
 
@@ -133,6 +134,7 @@ class SwarmConfig(Settings):
         if self.policy_row.extended and self.frame == "paper":
             raise ConfigError("frame", self.frame, f"auto or extended with policy {self.policy}")
         self._check_agents()
+        self._check_own_bytes()
 
     def _check_agents(self) -> None:
         """Whether ids fit into frames and into the policy.
@@ -147,6 +149,22 @@ class SwarmConfig(Settings):
             others = [row.name for row in POLICIES.rows.values() if not row.extended]
             instead = f"policy {', '.join(others)}" if self.policy_row.extended else "frame: paper"
             raise ConfigError("agents", self.agents, f"{allowed}; up to {MAX_AGENTS} with {instead}")
+
+    def _check_own_bytes(self) -> None:
+        """Whether frames with what plug-ins append to them fit into a packet.
+
+        :raises ConfigError: with the number of bytes that would fit.
+        """
+        profile = PROFILE_EXTENDED if self.extended else PROFILE_PAPER_INTENT
+        room = _kernel.FRAME_MAX - _kernel.frame_length(profile) - (TAG_LENGTH if self.auth else 0)
+        if self.own_bytes > room:
+            names = " and ".join(row.name for row in (self.policy_row, self.estimator_row) if row.own_bytes)
+            raise ConfigError(f"own_bytes of {names}", self.own_bytes, f"0 to {room} with these frames")
+
+    @property
+    def own_bytes(self) -> int:
+        """Bytes that plug-ins append to each frame."""
+        return self.policy_row.own_bytes + self.estimator_row.own_bytes
 
     @property
     def policy_row(self) -> PolicyRow:

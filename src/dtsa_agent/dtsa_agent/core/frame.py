@@ -12,6 +12,8 @@ PROFILE_PAPER = PROFILES.index("paper")  # id, c_r, slot, position, velocity: 19
 PROFILE_PAPER_INTENT = PROFILES.index("paper-intent")  # the same and the commanded velocity: 23 bytes
 PROFILE_EXTENDED = PROFILES.index("extended")  # 56 bytes
 
+TAG_LENGTH = 4  # bytes of authentication after a frame, and after what plug-ins append to it
+
 Vector = tuple[float, float, float]
 
 _FAULTS = {-1: "wrong length", -2: "unknown version or profile", -3: "field out of range"}

@@ -12,7 +12,7 @@ that hear everything).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -22,6 +22,8 @@ from .abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
 from .config import SwarmConfig
 from .errors import LocalProtocolError
 from .flight_models import AVOIDERS
+from .frame import decode_frame
+from .outcome import SlotOutcome
 from .registry import ESTIMATORS, POLICIES, REASONS, Registry
 from .scenario import Scenario
 from .swarm import Swarm
@@ -31,7 +33,7 @@ Array = NDArray[np.float64]
 _PLUGIN_REASON = REASONS.index("plugin")
 
 
-class View:
+class Table:
     """What one observer knows; arrays are read-only windows on its table and are always up to date.
 
     Positions are m, velocities m/s, frame map, with shape (3, N); agent ``id`` is column ``id - 1``.
@@ -54,37 +56,71 @@ class View:
         "sent_velocity",
     )
 
-    def __init__(self, swarm: AbstractSwarm, view: int) -> None:
-        self.agent = int(swarm.observer[view]) + 1  # id of the observer, 0: one that hears everything
+    def __init__(self, swarm: AbstractSwarm, row: int) -> None:
+        self.agent = int(swarm.observer[row]) + 1  # id of the observer, 0: one that hears everything
         self.config = swarm.config
         self.scenario = swarm.scenario
-        self.sent_position = _window(swarm.sent_position[view])  # last heard (own: last sent) state
-        self.sent_velocity = _window(swarm.sent_velocity[view])
-        self.sent_intent = _window(swarm.sent_intent[view])  # commanded velocity, zero unless frames carry it
-        self.sent_slot = _window(swarm.sent_slot[view])  # (N,) slot of that state, -1: never heard
-        self.last_turn = _window(swarm.last_turn[view])  # (N,) slot of the last turn; h = slot - 1 - last_turn
-        self.in_ap = _window(swarm.in_ap[view])  # (N,) A_p
-        self.estimate_position = _window(swarm.estimate_position[view])  # as the estimator last filled them
-        self.estimate_velocity = _window(swarm.estimate_velocity[view])
-        here = view < len(swarm.ids)
-        self.own_position = _window(swarm.position[:, view]) if here else None  # (3,) own true state
-        self.own_velocity = _window(swarm.velocity[:, view]) if here else None
-        self.goal = _window(swarm.goal[:, view]) if here else None
+        self.sent_position = _window(swarm.sent_position[row])  # last heard (own: last sent) state
+        self.sent_velocity = _window(swarm.sent_velocity[row])
+        self.sent_intent = _window(swarm.sent_intent[row])  # commanded velocity, zero unless frames carry it
+        self.sent_slot = _window(swarm.sent_slot[row])  # (N,) slot of that state, -1: never heard
+        self.last_turn = _window(swarm.last_turn[row])  # (N,) slot of the last turn; h = slot - 1 - last_turn
+        self.in_ap = _window(swarm.in_ap[row])  # (N,) A_p
+        self.estimate_position = _window(swarm.estimate_position[row])  # as the estimator last filled them
+        self.estimate_velocity = _window(swarm.estimate_velocity[row])
+        here = row < len(swarm.ids)
+        self.own_position = _window(swarm.position[:, row]) if here else None  # (3,) own true state
+        self.own_velocity = _window(swarm.velocity[:, row]) if here else None
+        self.goal = _window(swarm.goal[:, row]) if here else None
+
+
+class Speaks(Protocol):
+    """What policies and estimators may have besides: bytes of their own in frames, and the outcome of each slot.
+
+    All of it may be left out. ``own_bytes``, a class attribute, is the number of bytes, 0 to ``MAX_OWN_BYTES``.
+    """
+
+    own_bytes: ClassVar[int] = 0
+
+    def say(self, table: Table, slot: int) -> bytes:
+        """The bytes for the frame that this agent sends in a slot: exactly ``own_bytes`` of them."""
+
+    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
+        """Takes in what the same part of another agent has said.
+
+        :param table: what this observer knows, with the frame's state in it.
+        :param slot: the slot in which the frame is heard.
+        :param sender: id of who sent it.
+        :param data: its bytes: not to be trusted more than its sender.
+        """
+
+    def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
+        """A slot is over for this observer.
+
+        :param outcome: what it could tell; collisions are silence to receivers that cannot tell.
+        """
 
 
 class Policy(Protocol):
-    """Who sends next."""
+    """Who sends next. It may have what :class:`Speaks` has.
 
-    def choose(self, view: View, slot: int) -> int:
+    ``port``, a class attribute, says what it uses of the air (``dtsa_agent.core.registry.PORT``); ``may_join = True``:
+    agents may come late, because nobody needs a table that all have equal.
+    """
+
+    def choose(self, table: Table, slot: int) -> int:
         """The id that this observer takes for the sender of a slot, 0: nobody. It sends if that is its own."""
 
 
 class Estimator(Protocol):
-    """Where the others are by now. ``needs_intent = True`` makes frames carry the commanded velocity."""
+    """Where the others are by now. It may have what :class:`Speaks` has.
+
+    ``needs_intent = True`` makes frames carry the commanded velocity.
+    """
 
     needs_intent: ClassVar[bool] = False
 
-    def estimate(self, view: View, slot: int, step: int, position: Array, velocity: Array) -> None:
+    def estimate(self, table: Table, slot: int, step: int, position: Array, velocity: Array) -> None:
         """Writes the estimates for control instant ``step`` of a slot into (3, N) arrays, m and m/s."""
 
 
@@ -93,8 +129,8 @@ class Avoider(Protocol):
 
     model: ClassVar[str] = "orca"
 
-    def command(self, view: View, slot: int, step: int) -> Sequence[float]:
-        """Commanded velocity, (3,), m/s, frame map; the estimates in ``view`` are those of this instant."""
+    def command(self, table: Table, slot: int, step: int) -> Sequence[float]:
+        """Commanded velocity, (3,), m/s, frame map; the estimates in ``table`` are those of this instant."""
 
 
 _REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
@@ -139,9 +175,16 @@ class PluginSwarm(SwarmWrapper):
 
     def __init__(self, inner: AbstractSwarm) -> None:
         super().__init__(inner)
-        ids = [int(index) + 1 for index in self.observer]
-        self._views = [View(self, view) for view in range(len(ids))]
-        self._policies, self._estimators, self._avoiders = (self._instances(r, ids) for r in _REGISTRIES)
+        self._ids = [int(index) + 1 for index in self.observer]
+        self._tables = [Table(self, row) for row in range(len(self._ids))]
+        self._outcome = np.zeros(len(self._ids), dtype=np.uint8)  # SlotOutcome of the open slot, collisions apart
+        self._said: dict[int, bytes] = {}  # in this slot, by position in ids
+        self._own_bytes = self.config.own_bytes
+        self._make_parts()
+
+    def _make_parts(self) -> None:
+        self._policies, self._estimators, self._avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
+        self._list_speakers()
 
     def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Any]:
         name = getattr(self.config, registry.kind)
@@ -150,12 +193,19 @@ class PluginSwarm(SwarmWrapper):
         factory = registry.factory(name)
         return [factory(self.config, agent) for agent in ids]
 
+    def _list_speakers(self) -> None:
+        """Notes the parts of each observer that may say something, with the size of it, in the frame's order."""
+        policy, estimator = self.config.policy_row, self.config.estimator_row
+        parts = ((self._policies, policy.own_bytes), (self._estimators, estimator.own_bytes))
+        self._speakers = [[(made[row], size) for made, size in parts if made] for row in range(len(self._ids))]
+        self._listen_to_outcome = any(hasattr(part, "slot_over") for row in self._speakers for part, _ in row)
+
     def decide(self, slot: int) -> None:
         if not self._policies:
             self.inner.decide(slot)
             return
         for index, agent in enumerate(self.ids):
-            chosen = self._policies[index].choose(self._views[index], slot)
+            chosen = self._policies[index].choose(self._tables[index], slot)
             if not 0 <= chosen <= self.config.agents:
                 raise LocalProtocolError(
                     f"policy {self.config.policy}: chose agent {chosen} in slot {slot}; "
@@ -169,20 +219,79 @@ class PluginSwarm(SwarmWrapper):
 
     def begin(self, slot: int) -> tuple[int, ...]:
         self.decide(slot)
-        return self.inner.emit(slot)
+        return self.emit(slot)
+
+    def emit(self, slot: int) -> tuple[int, ...]:
+        senders = self.inner.emit(slot)
+        if self._own_bytes:
+            self._said = {index: b"".join(self._say(index, slot)) for index in senders}
+        return senders
+
+    def _say(self, index: int, slot: int) -> Iterator[bytes]:
+        for part, size in self._speakers[index]:
+            data = bytes(part.say(self._tables[index], slot)) if size else b""
+            if len(data) != size:
+                raise LocalProtocolError(f"{type(part).__name__}.say: gave {len(data)} bytes, declared {size}")
+            yield data
+
+    def frame(self, local_index: int) -> bytes:
+        data = self.inner.frame(local_index)
+        return data + self._said[local_index] if data and self._own_bytes else data
+
+    def hear(self, slot: int, data: bytes, mask: Bytes | None = None) -> bool:
+        end = max(0, len(data) - self._own_bytes)
+        if not self.inner.hear(slot, data[:end], mask):
+            return False
+        if not (self._own_bytes or self._listen_to_outcome):
+            return True
+        sender = decode_frame(data[:end]).sender
+        for row, agent in enumerate(self._ids):
+            if agent == sender or (mask is not None and not mask[row]):
+                continue
+            self._outcome[row] = SlotOutcome.FRAME
+            at = end
+            for part, size in self._speakers[row]:
+                if size:
+                    part.heard(self._tables[row], slot, sender, data[at : at + size])
+                at += size
+        return True
 
     def estimate(self, slot: int, step: int = 0) -> None:
         if not self._estimators:
             self.inner.estimate(slot, step)
             return
-        for index, view in enumerate(self._views):
+        for index, table in enumerate(self._tables):
             position, velocity = self.estimate_position[index], self.estimate_velocity[index]
-            self._estimators[index].estimate(view, slot, step, position, velocity)
+            self._estimators[index].estimate(table, slot, step, position, velocity)
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
         self.inner.end(slot, collided)
+        if self._listen_to_outcome:
+            self._tell_outcome(slot, collided)
         if self._estimators:
             self.estimate(slot + 1)  # what the metrics compare with the truth
+
+    def _tell_outcome(self, slot: int, collided: Bytes | None) -> None:
+        self._outcome[: len(self.ids)][(self.sends != 0) & (self.frame_length > 0)] = SlotOutcome.FRAME
+        for row, table in enumerate(self._tables):
+            outcome = SlotOutcome(int(self._outcome[row]))
+            if collided is not None and collided[row] and outcome == SlotOutcome.SILENCE:
+                outcome = SlotOutcome.COLLISION
+            for part, _ in self._speakers[row]:
+                if hasattr(part, "slot_over"):
+                    part.slot_over(table, slot, outcome)
+        self._outcome[:] = SlotOutcome.SILENCE
+
+    def reset(self) -> None:
+        self.inner.reset()
+        self._outcome[:] = SlotOutcome.SILENCE
+        self._make_parts()
+
+    def restart(self, local_index: int) -> None:
+        self.inner.restart(local_index)
+        for registry, parts in zip(_REGISTRIES, (self._policies, self._estimators, self._avoiders), strict=True):
+            parts[local_index : local_index + 1] = self._instances(registry, [self.ids[local_index]])
+        self._list_speakers()
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
         if estimate and self._estimators:
@@ -190,7 +299,7 @@ class PluginSwarm(SwarmWrapper):
         self.inner.steer(slot, step, estimate and not self._estimators)
         for index, avoider in enumerate(self._avoiders):
             if index < len(self.ids) and self.active[index] and self.present[index]:
-                self.command[:, index] = avoider.command(self._views[index], slot, step)
+                self.command[:, index] = avoider.command(self._tables[index], slot, step)
 
     def fly(self, slot: int) -> None:
         if not (self._estimators or self._avoiders):

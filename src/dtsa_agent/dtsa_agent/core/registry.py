@@ -18,7 +18,6 @@ from . import _kernel
 from .errors import ConfigError
 
 PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/protocol.md
-OUTCOME = ("received", "busy")  # what the outcome of a slot is derived from
 
 
 class _Named(Protocol):
@@ -73,12 +72,14 @@ class EstimatorRow:
     :param text: what it supposes, in a few words.
     :param needs_intent: frames carry the commanded velocity.
     :param needs_everybody: it knows the truth: all agents must be in one process.
+    :param own_bytes: bytes of its own that a plug-in appends to frames.
     """
 
     name: str
     text: str
     needs_intent: bool = False
     needs_everybody: bool = False
+    own_bytes: int = 0
 
 
 class Registry(Generic[Row]):
@@ -150,21 +151,34 @@ class Registry(Generic[Row]):
         return self._plug_ins[name]
 
 
-MAX_OWN_BYTES = 16  # of a plug-in; 23 bytes of a frame with intent, these and a tag fit into 60
+MAX_OWN_BYTES = 16  # of one plug-in
+
+
+def _own_bytes(name: str, factory: Any) -> int:
+    own = getattr(factory, "own_bytes", 0)
+    if isinstance(own, bool) or not isinstance(own, int) or not 0 <= own <= MAX_OWN_BYTES:
+        raise ConfigError(f"{name}.own_bytes", own, f"0 to {MAX_OWN_BYTES}")
+    return own
 
 
 def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
-    own, port = getattr(factory, "own_bytes", 0), tuple(getattr(factory, "port", ("send", "received")))
-    if isinstance(own, bool) or not isinstance(own, int) or not 0 <= own <= MAX_OWN_BYTES:
-        raise ConfigError(f"{name}.own_bytes", own, f"0 to {MAX_OWN_BYTES}")
+    port = tuple(getattr(factory, "port", ("send", "received")))
     if not set(port) <= set(PORT):
         raise ConfigError(f"{name}.port", port, "some of " + ", ".join(PORT))
-    may_join = bool(getattr(factory, "may_join", False))
-    return PolicyRow(name, name, "plug-in", "as it was written", may_join=may_join, port=port, own_bytes=own)
+    return PolicyRow(
+        name,
+        name,
+        "plug-in",
+        "as it was written",
+        may_join=bool(getattr(factory, "may_join", False)),
+        port=port,
+        own_bytes=_own_bytes(name, factory),
+    )
 
 
 def _estimator_plug_in(name: str, factory: Any) -> EstimatorRow:
-    return EstimatorRow(name, "plug-in", needs_intent=bool(getattr(factory, "needs_intent", False)))
+    needs_intent = bool(getattr(factory, "needs_intent", False))
+    return EstimatorRow(name, "plug-in", needs_intent, own_bytes=_own_bytes(name, factory))
 
 
 POLICIES = Registry(

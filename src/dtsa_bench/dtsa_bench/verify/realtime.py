@@ -192,6 +192,7 @@ class RealtimeCheck:
         position, velocity, command = (tuple(vector.tolist()) for vector in state)
         if self.run.swarm.auth:
             data = self._opened(data, slot)
+        data = data[: len(data) - self.run.swarm.own_bytes]
         if self.run.swarm.extended:
             found = decode_extended(data).own
             right = Frame(agent, slot & _SLOT_MASK, found.c_r, position, velocity, command if found.intent else None)

@@ -100,10 +100,19 @@ static PyObject *py_decode(PyObject *module, PyObject *arg)
                          f.v[2], f.c[0], f.c[1], f.c[2]);
 }
 
+static PyObject *py_frame_length(PyObject *module, PyObject *arg)
+{
+    const long profile = PyLong_AsLong(arg);
+    (void)module;
+    if (profile == -1 && PyErr_Occurred()) return NULL;
+    return PyLong_FromLong(frame_length((int)profile));
+}
+
 static PyMethodDef METHODS[] = {
     {"priority", (PyCFunction)(void (*)(void))py_priority, METH_FASTCALL, "priority(position, velocity, slot_s, out, scratch)"},
     {"select", py_select, METH_VARARGS, "select(g, counter, in_ap, epsilon, selection, candidates) -> (index, reason)"},
     {"encode", py_encode, METH_VARARGS, "encode(profile, sender, slot, c_r, p, v, c) -> bytes, empty if not encodable"},
+    {"frame_length", py_frame_length, METH_O, "frame_length(profile) -> bytes, 0 for an unknown profile"},
     {"decode", py_decode, METH_O, "decode(data) -> (profile, sender, slot, c_r, p, v, c), or a negative error"},
     {NULL, NULL, 0, NULL},
 };
