@@ -15,11 +15,12 @@ from node_helpers import Graph, end_of, ros_graph
 pytest.importorskip("dtsa_msgs.msg")
 
 from builtin_interfaces.msg import Time
-from dtsa_msgs.msg import Slot, Transmission
+from dtsa_msgs.msg import Decision, Slot, Transmission
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, GetParameters
+from std_msgs.msg import Header
 
-from dtsa_agent.core import Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
+from dtsa_agent.core import REASONS, Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import format_values, parse_values, settings_of
 from dtsa_agent.ros.common import names
@@ -84,7 +85,7 @@ def test_odometry_is_sent_to_who_listens_reliably_like_rviz(tmp_path: Path) -> N
         graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3", "-p", "moving:=2", "-p", "seed:=5")
         answers: list[Transmission] = []
         while not heard:
-            answers.append(channel.ask(len(answers), stamp=Time(sec=len(answers))))
+            answers.append(channel.ask(len(answers), header=Header(stamp=Time(sec=len(answers)))))
         first = heard[0]
         slot = first.header.stamp.sec
         assert (first.header.frame_id, first.child_frame_id) == ("map", "cf2/base_link")
@@ -266,3 +267,8 @@ def test_a_scenario_is_handed_through() -> None:
     other = Scenario(plain.start, plain.start.copy(), plain.moving)
     swarm = Swarm(config, other)
     assert np.array_equal(swarm.goal, plain.start)
+
+
+def test_reasons_in_the_message_are_those_of_the_core() -> None:
+    named = {name: getattr(Decision, name) for name in dir(Decision) if name.startswith("REASON_")}
+    assert named == {f"REASON_{name.upper().replace('-', '_')}": code for code, name in enumerate(REASONS)}

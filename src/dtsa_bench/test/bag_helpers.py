@@ -17,6 +17,7 @@ from dtsa_bench.bag.errors import BagError
 from dtsa_bench.bag.writer import BagWriter
 
 MESSAGES = Path(__file__).parents[2] / "dtsa_msgs" / "msg"
+RUN = 0x1234  # id of all synthetic runs
 SECOND = 1_000_000_000
 
 
@@ -58,6 +59,11 @@ def cdr(kind: str, **fields: Any) -> bytes:
 def stamp(time_ns: int) -> Any:
     """`builtin_interfaces/Time` for rosbags' serialiser."""
     return typestore().types["builtin_interfaces/msg/Time"](time_ns // SECOND, time_ns % SECOND)
+
+
+def header(time_ns: int) -> Any:
+    """`std_msgs/Header` in frame `map` for rosbags' serialiser."""
+    return typestore().types["std_msgs/msg/Header"](stamp(time_ns), "map")
 
 
 def positions(agents: int, time_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +118,7 @@ class SyntheticRun:
         self._write(
             "/swarm/slot",
             cdr(
-                "dtsa_msgs/msg/Slot", stamp=stamp(start), slot=slot, phase=0, heard_slot=max(0, slot - 1),
+                "dtsa_msgs/msg/Slot", header=header(start), run=RUN, slot=slot, phase=0, heard_slot=max(0, slot - 1),
                 sender=u16((slot - 1) % n + 1) if slot else u16(), length=u8(23) if slot else u8(),
                 data=frame if slot else u8(), received=heard if slot else u8(),
             ),
@@ -121,7 +127,7 @@ class SyntheticRun:
         self._write(
             "/swarm/transmission",
             cdr(
-                "dtsa_msgs/msg/Transmission", stamp=stamp(start), slot=slot, agent=ids,
+                "dtsa_msgs/msg/Transmission", header=header(start), run=RUN, slot=slot, agent=ids,
                 length=np.where(ids == sender, 23, 0).astype(np.uint8), data=frame,
                 offset_ns=np.zeros(0, np.int64), chosen=np.full(n, sender, np.uint16), reason=np.zeros(n, np.uint8),
                 digest=np.full(n, slot, np.uint32), score=np.zeros(n), steps=1,
@@ -133,7 +139,7 @@ class SyntheticRun:
         self._write(
             "/swarm/reception",
             cdr(
-                "dtsa_msgs/msg/Reception", stamp=stamp(end), slot=slot, outcome=1, sender=u16(sender),
+                "dtsa_msgs/msg/Reception", header=header(end), run=RUN, slot=slot, outcome=1, sender=u16(sender),
                 received=heard, lost=u16(0), collided=u16(0),
             ),
             end, end,
@@ -141,7 +147,7 @@ class SyntheticRun:
         self._write(
             "/swarm/decision",
             cdr(
-                "dtsa_msgs/msg/Decision", stamp=stamp(start), slot=slot, agent=ids,
+                "dtsa_msgs/msg/Decision", header=header(start), run=RUN, slot=slot, agent=ids,
                 chosen=np.full(n, sender, np.uint16), reason_name=["tdma"], reason_index=np.zeros(n, np.uint8),
                 reason=np.zeros(n, np.uint8), digest=np.full(n, slot, np.uint32), score=np.zeros(n),
             ),

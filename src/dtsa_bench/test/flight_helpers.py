@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bag_helpers import SECOND, cdr, definition, stamp
+from bag_helpers import RUN, SECOND, cdr, definition, header
 
 from dtsa_agent.core import REASONS, Swarm
 from dtsa_agent.core.config import SwarmConfig
@@ -43,7 +43,8 @@ def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings:
             """Record what the agents say at the start of a slot."""
             message = cdr(
                 "dtsa_msgs/msg/Transmission",
-                stamp=stamp(start),
+                header=header(start),
+                run=RUN,
                 slot=slot,
                 agent=ids,
                 length=swarm.frame_length if len(data) else np.zeros(n, np.uint8),
@@ -71,7 +72,7 @@ def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings:
             answer(slot, start, data)
             names = [REASONS[code] for code in sorted(set(swarm.reason.tolist()))]
             decision = cdr(
-                "dtsa_msgs/msg/Decision", stamp=stamp(start), slot=slot, agent=ids, chosen=swarm.chosen,
+                "dtsa_msgs/msg/Decision", header=header(start), run=RUN, slot=slot, agent=ids, chosen=swarm.chosen,
                 reason_name=names, reason_index=np.array([names.index(REASONS[c]) for c in swarm.reason], np.uint8),
                 reason=swarm.reason, digest=swarm.digest, score=swarm.score,
             )  # fmt: skip
@@ -86,7 +87,7 @@ def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings:
             writer.write(
                 channels["reception"],
                 cdr(
-                    "dtsa_msgs/msg/Reception", stamp=stamp(end), slot=slot, outcome=min(2, len(senders)),
+                    "dtsa_msgs/msg/Reception", header=header(end), run=RUN, slot=slot, outcome=min(2, len(senders)),
                     sender=np.array([k + 1 for k in senders], np.uint16),
                     received=np.packbits(heard, axis=1, bitorder="little").ravel(),
                     lost=np.array([n - 1 - heard[0].sum()] if alone else [0] * len(senders), np.uint16),

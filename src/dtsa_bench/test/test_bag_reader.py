@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_helpers import SECOND, SyntheticRun, cdr, definition, stamp, synthetic_bag, typestore
+from bag_helpers import RUN, SECOND, SyntheticRun, cdr, definition, header, synthetic_bag, typestore
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
@@ -157,7 +157,7 @@ def test_columns_of_changing_lengths(rows: list[tuple[list[int], list[str], list
     table = Table(store, DECISION)
     for slot, (ids, texts, scores, reasons) in enumerate(rows):
         data = cdr(
-            DECISION, stamp=stamp(SECOND), slot=slot, agent=np.array(ids, np.uint16),
+            DECISION, header=header(SECOND), run=RUN, slot=slot, agent=np.array(ids, np.uint16),
             chosen=np.array(ids[::-1], np.uint16), reason_name=texts, reason_index=np.array(reasons, np.uint8),
             reason=np.array([], np.uint8), digest=np.array(reasons, np.uint32), score=np.array(scores),
         )  # fmt: skip

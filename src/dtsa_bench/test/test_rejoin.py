@@ -242,7 +242,7 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
         options = ("agents:=3", "policy:=dtsa", "mode:=realtime")
         late = graph.start("dtsa_agent.ros.agent_node", *(word for option in options for word in ("-p", option)))
         start = Slot(phase=Slot.START)
-        start.stamp.sec = 1
+        start.header.stamp.sec = 1
         deadline = time.monotonic() + PATIENCE_S
         while late.poll() is None and time.monotonic() < deadline:
             channel.publish(start)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from dtsa_msgs.msg import Slot
 from numpy.typing import NDArray
 from rclpy.duration import Duration
@@ -21,6 +20,7 @@ from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 
 from .common import names
 from .common.loop import Stop
+from .common.stamps import header_of, ns_of
 from .common.wire import split_frames, unpack_received
 from .swarm_node import SwarmNode
 
@@ -155,9 +155,11 @@ class RealtimeNode(SwarmNode):
         """Answers the channel's call, or takes the start time; False when the run is over."""
         if message.phase == Slot.PREPARE:
             self._called = True
-            self._answer(0, message.stamp, ())
+            self.run_id = message.run
+            self._answer(0, message.header, ())
         elif message.phase == Slot.START:
-            self._zero = message.stamp.sec * _PPB + message.stamp.nanosec
+            self.run_id = message.run
+            self._zero = ns_of(message.header.stamp)
             if not self._called:
                 now = self.local_ns(time.monotonic_ns() - self._zero)
                 self._listeners = Listeners(self.config, self.swarm.ids, now.tolist())
@@ -259,7 +261,7 @@ class RealtimeNode(SwarmNode):
 
     def _began_ns(self, message: Slot) -> int:
         """When the transmission of a frame began, by its arrival and length: ns on the channel's time line."""
-        arrival = int(message.stamp.sec) * _PPB + int(message.stamp.nanosec) - names.TIME_ZERO_NS
+        arrival = ns_of(message.header.stamp) - names.TIME_ZERO_NS
         return arrival - self._fixed_ns - self._per_byte_ns * int(message.length[0])
 
     def _lateness(self, message: Slot) -> NDArray[np.int64]:
@@ -290,12 +292,11 @@ class RealtimeNode(SwarmNode):
                 frame = swarm.frames[index, : swarm.frame_length[index]].tobytes()
                 self._gone[index] = decode_extended(frame).leaving
         self._message.offset_ns = array("q", offsets.tobytes())
-        seconds, nanoseconds = divmod(names.slot_time_ns(slot, self.slot_ns), _PPB)
+        header = header_of(names.slot_time_ns(slot, self.slot_ns))
         self.slot = slot
-        stamp = Time(sec=seconds, nanosec=nanoseconds)
-        self._answer(slot, stamp, [index for index in senders if swarm.frame_length[index]])
+        self._answer(slot, header, [index for index in senders if swarm.frame_length[index]])
         if self._watched:
-            self._publish_odometry(stamp)
+            self._publish_odometry(header.stamp)
         swarm.fly(slot)
         early, self._early = self._early, []
         for message in early:

@@ -14,6 +14,7 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from std_msgs.msg import Header
 
 from dtsa_agent.core import AbstractSwarm, AgentGroup
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
@@ -42,6 +43,7 @@ class SwarmNode:
         self.node = node
         self.config = config = swarm.config
         self.agents = AgentGroup(swarm)
+        self.run_id = 0  # as the channel says
         self.slot = -1  # the slot that has been answered
         self._goal = b""  # as last told
         self._nothing = np.zeros((0, config.agents), dtype=np.uint8)  # heard by whom, in a slot without frames
@@ -94,6 +96,7 @@ class SwarmNode:
         """
         if message.phase == Slot.END:
             return False
+        self.run_id = message.run
         slot = message.slot
         if slot != self.slot + 1:
             if slot == self.slot:  # asked again: the answer was given before the channel could hear it
@@ -104,10 +107,10 @@ class SwarmNode:
         if slot:
             self._hear(message, slot - 1)
             self.agents.on_slot_end()
-        self._answer(slot, message.stamp, self.agents.on_slot(slot))
+        self._answer(slot, message.header, self.agents.on_slot(slot))
         self.slot = slot
         if self._watched:
-            self._publish_odometry(message.stamp)
+            self._publish_odometry(message.header.stamp)
         self.swarm.fly(slot)
         return True
 
@@ -129,9 +132,10 @@ class SwarmNode:
             raise RemoteProtocolError(f"the channel's message for slot {message.slot} is unusable: {error}") from None
         return self.agents.on_frames(slot, message.sender, frames, heard)
 
-    def _answer(self, slot: int, stamp: Time, senders: Sequence[int]) -> None:
+    def _answer(self, slot: int, header: Header, senders: Sequence[int]) -> None:
         swarm, message = self.swarm, self._message
-        message.stamp = stamp
+        message.header = header
+        message.run = self.run_id
         message.slot = slot
         frames = [swarm.frame(index) for index in senders]
         message.length = array("B", bytes(len(swarm.ids)))

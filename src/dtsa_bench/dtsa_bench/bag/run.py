@@ -25,7 +25,7 @@ OUTCOMES = ("idle", "success", "collision")
 _PLACE = tuple(f"pose.pose.position.{axis}" for axis in "xyz")
 _SPEED = tuple(f"twist.twist.linear.{axis}" for axis in "xyz")
 _FIELD_NAMES = """slot outcome sender received lost collided agent chosen reason_name reason_index score digest
-    length data steps track velocity stamp.sec stamp.nanosec"""
+    length data steps track velocity header.stamp.sec header.stamp.nanosec"""
 _FIELDS = frozenset((*_FIELD_NAMES.split(), *_PLACE, *_SPEED))
 _OFFSET_NS = 1_000_000_000  # simulated time of slot 0, where a bag has no slot messages
 
@@ -156,7 +156,7 @@ def _agents(config: Mapping[str, Any]) -> int:
 def _start_ns(reception: Columns, slot_ns: int) -> int:
     if not len(reception.get("slot", ())):
         return _OFFSET_NS
-    end = int(reception["stamp.sec"][0]) * 1_000_000_000 + int(reception["stamp.nanosec"][0])
+    end = int(reception["header.stamp.sec"][0]) * 1_000_000_000 + int(reception["header.stamp.nanosec"][0])
     return end - (int(reception["slot"][0]) + 1) * slot_ns
 
 

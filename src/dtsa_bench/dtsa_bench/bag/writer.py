@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 from mcap.writer import CompressionType, Writer
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros.common.wire import RUN_MESSAGES
 from dtsa_bench import __version__
 from dtsa_bench.bag import metadata, schema
 from dtsa_bench.bag.digest import KEY, BagDigest
@@ -75,6 +76,7 @@ class BagWriter:
         self._schemas: dict[str, int] = {}
         self._counts = [0]  # messages by channel id; ids start at 1
         self._names = [b""]  # topics by channel id
+        self._runs = [False]  # by channel id: whether its messages carry the run's id
         self._digest = BagDigest()
         self._start_ns = 1 << 63
         self._end_ns = 0
@@ -143,6 +145,7 @@ class BagWriter:
         self._topics[topic] = (channel, definition, profiles)
         self._counts.append(0)
         self._names.append(topic.encode())
+        self._runs.append(type_name in RUN_MESSAGES)
         return channel
 
     def write(
@@ -170,7 +173,7 @@ class BagWriter:
             self._mcap.add_message(channel, log_time_ns, data, publish_time_ns, sequence)
         except OSError as error:
             self._fail(error)
-        self._digest.add(self._names[channel], log_time_ns, publish_time_ns, sequence, data)
+        self._digest.add(self._names[channel], log_time_ns, publish_time_ns, sequence, data, self._runs[channel])
         self._counts[channel] += 1
         if log_time_ns < self._start_ns:
             self._start_ns = log_time_ns

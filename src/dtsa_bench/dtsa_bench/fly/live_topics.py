@@ -25,10 +25,11 @@ class LiveTopics(ChannelObserver):
     :param node: the channel's node.
     :param scenario: the scenario.
     :param slot_ns: ns, length of a slot.
+    :param run_id: the run's id.
     """
 
-    def __init__(self, node: Node, scenario: Scenario, slot_ns: int) -> None:
-        self._messages = SlotMessages(scenario, slot_ns)
+    def __init__(self, node: Node, scenario: Scenario, slot_ns: int, run_id: int) -> None:
+        self._messages = SlotMessages(scenario, slot_ns, run_id)
         self._decision, self._reception, self._markers = self._publishers = tuple(
             node.create_publisher(kind, f"{names.SWARM}/{topic}", 10)
             for kind, topic in ((Decision, names.DECISION), (Reception, names.RECEPTION), (MarkerArray, names.MARKERS))

@@ -25,6 +25,7 @@ from dtsa_channel_sim.ros.channel_node import declare_limits, follow_parameters
 from dtsa_channel_sim.ros.diagnostics import Diagnostics
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+from dtsa_channel_sim.ros.ros_channel import new_run_id
 
 from .clock_statistics import ClockStatistics
 from .live_topics import LiveTopics
@@ -52,18 +53,18 @@ class RecordedFlight:
         self.scenario = make_scenario(run.swarm)
         self.measurement = FlightMeasurement(run, self.scenario)
         model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
+        self.run_id = new_run_id()
+        limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run_id": self.run_id}
         self.channel: LockstepChannel | RealtimeChannel
         if run.mode == LOCKSTEP:
-            self.channel = LockstepChannel(
-                node, model, steps, answer_s, referee=referee, startup_s=startup_s, end_s=end_s
-            )
+            self.channel = LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
         else:
-            self.channel = RealtimeChannel(node, model, steps, referee=referee, startup_s=startup_s, end_s=end_s)
+            self.channel = RealtimeChannel(node, model, steps, referee=referee, **limits)
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
-            FlightRecorder(directory / BAG, run, self.scenario),
+            FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
             self.measurement,
-            LiveTopics(node, self.scenario, run.swarm.slot_ns),
+            LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id),
             Diagnostics(node),
         )
         self._clocks = ClockStatistics(run.swarm.agents)

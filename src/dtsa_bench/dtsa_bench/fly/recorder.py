@@ -9,6 +9,7 @@ from rcl_interfaces.msg import ParameterType
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common import names
 from dtsa_bench.bag.cdr import HEADER, SECOND, CdrBuilder, OdometryPacker
+from dtsa_bench.bag.metadata import RUN_ID
 from dtsa_bench.bag.writer import BagWriter
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim import Change
@@ -30,14 +31,17 @@ class FlightRecorder(ChannelObserver):
     :param directory: the bag's directory.
     :param run: the run.
     :param scenario: its scenario.
+    :param run_id: its id.
     """
 
-    def __init__(self, directory: Path, run: RunConfig, scenario: Scenario) -> None:
+    def __init__(self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int) -> None:
         self._slot_ns = run.swarm.slot_ns
         self._marker_slots = max(1, round(_MARKER_RECORD_NS / self._slot_ns))
-        self._packed = SlotMessages(scenario, self._slot_ns)
+        self._packed = SlotMessages(scenario, self._slot_ns, run_id)
         agents = run.swarm.agents
-        self.bag = BagWriter(directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed)})
+        self.bag = BagWriter(
+            directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed), RUN_ID: f"{run_id:016x}"}
+        )
         add = self.bag.add_topic
         self._slot = add(f"{names.SWARM}/{names.SLOT}", "dtsa_msgs/msg/Slot")
         self._transmission = add(f"{names.SWARM}/{names.TRANSMISSION}", "dtsa_msgs/msg/Transmission")

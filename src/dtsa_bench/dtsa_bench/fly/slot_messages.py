@@ -5,17 +5,17 @@ from __future__ import annotations
 from array import array
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from dtsa_msgs.msg import Decision, Reception
 from rclpy.serialization import serialize_message
+from std_msgs.msg import Header
 
 from dtsa_agent.core import REASONS, Scenario
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.stamps import header_of
 from dtsa_agent.ros.common.wire import pack_received
 from dtsa_bench.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
 from dtsa_channel_sim.ros.answers import Answers
-from dtsa_channel_sim.ros.ros_channel import slot_stamp
 
 
 class SlotMessages:
@@ -23,16 +23,17 @@ class SlotMessages:
 
     :param scenario: the scenario.
     :param slot_ns: ns, length of a slot.
+    :param run_id: the run's id.
     """
 
-    def __init__(self, scenario: Scenario, slot_ns: int) -> None:
-        self._scenario, self._slot_ns = scenario, slot_ns
+    def __init__(self, scenario: Scenario, slot_ns: int, run_id: int) -> None:
+        self._scenario, self._slot_ns, self._run_id = scenario, slot_ns, run_id
         self._agents = scenario.start.shape[1]
         self._reasons: dict[bytes, tuple[list[str], array[int]]] = {}
         self._markers = MarkerPacker([f"cf{agent}" for agent in range(1, self._agents + 1)])
 
-    def _stamp(self, slot: int) -> Time:
-        return slot_stamp(names.slot_time_ns(slot, self._slot_ns))
+    def _header(self, slot: int) -> Header:
+        return header_of(names.slot_time_ns(slot, self._slot_ns))
 
     def decision(self, slot: int, answers: Answers) -> bytes:
         """A dtsa_msgs/Decision as CDR.
@@ -48,7 +49,8 @@ class SlotMessages:
             known = labels, array("B", np.searchsorted(used, answers.reason).astype(np.uint8).tobytes())
             self._reasons[key] = known
         message = Decision(
-            stamp=self._stamp(slot),
+            header=self._header(slot),
+            run=self._run_id,
             slot=slot,
             agent=array("H", range(1, self._agents + 1)),
             chosen=array("H", answers.chosen.tobytes()),
@@ -69,7 +71,8 @@ class SlotMessages:
         nothing = (0,) * len(verdict.senders)
         received = pack_received(verdict.mask(self._agents)) if verdict.senders else b""
         message = Reception(
-            stamp=self._stamp(slot + 1),
+            header=self._header(slot + 1),
+            run=self._run_id,
             slot=slot,
             outcome=verdict.outcome,
             sender=array("H", verdict.senders),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dtsa_bench.bag.metadata import RUN_ID
 from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.metrics import FlightMetrics
 from dtsa_bench.run_config import RunConfig
@@ -51,7 +52,8 @@ class LockstepCheck:
             tuple(int(i) for i in self.bag.decode(m).agent) for m in self.streams.first(names.TRANSMISSION, begin)
         ]
         self._check_groups(groups)
-        self.rebuild = Rebuild(self.run, self.bag.typestore, sorted(groups))
+        run_id = int(self.bag.custom_data.get(RUN_ID, "0"), 16)
+        self.rebuild = Rebuild(self.run, self.bag.typestore, sorted(groups), run_id)
         self.metrics = FlightMetrics(self.run, self.rebuild.swarm.scenario)
         while self._slot():
             if self._progress and self.rebuild.slot % 100 == 0:

@@ -152,7 +152,9 @@ class RealtimeCheck:
                 raise ValueError(f"{len(offsets)} offsets, {len(frames)} lengths, {count} agents")
         except ValueError as error:
             self._fail("transmission", "fields that fit together", str(error), "one entry an agent", slot, ids[0])
-        self._equal_time("transmission.stamp", names.slot_time_ns(slot, self.slot_ns), stamp_ns(said.stamp), slot)
+        self._equal_time(
+            "transmission.stamp", names.slot_time_ns(slot, self.slot_ns), stamp_ns(said.header.stamp), slot
+        )
         decided = self._decided.setdefault(slot, {})
         starts = self._starts.setdefault(slot, {})
         for k, agent in enumerate(ids):
@@ -221,7 +223,7 @@ class RealtimeCheck:
         """A slot message: what it delivers has been sent, and its sender is not among the receivers."""
         said = self.bag.decode(message)
         slot, count = int(said.heard_slot), len(said.sender)
-        stamp = stamp_ns(said.stamp)
+        stamp = stamp_ns(said.header.stamp)
         if self.own_clocks and message.log_time_ns < self._last_stamp:
             later = f"at {self._last_stamp} ns or later"
             self._fail("slot messages", later, message.log_time_ns, "in order of time", slot)
@@ -259,7 +261,9 @@ class RealtimeCheck:
         """The channel's verdict: the same receivers as in the slot messages, and numbers that add up."""
         said = self.bag.decode(message)
         slot, count = int(said.slot), len(said.sender)
-        self._equal_time("reception.stamp", names.slot_time_ns(slot + 1, self.slot_ns), stamp_ns(said.stamp), slot)
+        self._equal_time(
+            "reception.stamp", names.slot_time_ns(slot + 1, self.slot_ns), stamp_ns(said.header.stamp), slot
+        )
         outcome = IDLE if not count else COLLISION if said.collided.any() else SUCCESS
         if outcome != int(said.outcome):
             self._fail("reception.outcome", outcome, int(said.outcome), "who sent and what collided decide", slot)

@@ -13,7 +13,7 @@ from dtsa_agent.core import REASONS, make_scenario
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.wire import pack_received
+from dtsa_agent.ros.common.wire import RUN_BYTES, pack_received
 from dtsa_bench.bag.cdr import OdometryPacker
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim import Channel
@@ -43,11 +43,12 @@ class Expected(NamedTuple):
 def first_agent(data: bytes) -> int:
     """Id of the first agent of a Transmission message, 0 if it has none.
 
-    :param data: the message as CDR: header 4, stamp 8, slot 4, number of agents 4, ids 2 each.
+    :param data: the message as CDR: representation 4, header 16, run 8, slot 4, number of agents 4, ids 2 each.
     """
-    if len(data) < 22 or _IDS.unpack_from(data, 16)[0] == 0:
+    at = RUN_BYTES.stop + 4
+    if len(data) < at + 6 or _IDS.unpack_from(data, at)[0] == 0:
         return 0
-    return data[20] | data[21] << 8
+    return data[at + 4] | data[at + 5] << 8
 
 
 class Rebuild:
@@ -58,13 +59,15 @@ class Rebuild:
     :param run: the run, as recorded.
     :param typestore: message types of the bag, from rosbags.
     :param groups: ids of the agents of each process, as answered to slot 0.
+    :param run_id: the run's id.
     """
 
-    def __init__(self, run: RunConfig, typestore: Any, groups: Sequence[tuple[int, ...]]) -> None:
+    def __init__(self, run: RunConfig, typestore: Any, groups: Sequence[tuple[int, ...]], run_id: int) -> None:
         self.run, self.groups = run, list(groups)
         self.swarm = with_key(make_swarm(run.swarm, make_scenario(run.swarm)))
         self.channel = Channel(run.air)
         self.slot = -1
+        self._run_id = run_id
         self._store = typestore
         self._goal = np.full_like(self.swarm.goal, np.nan)
         self._columns = [np.array(group, dtype=np.intp) - 1 for group in self.groups]
@@ -97,11 +100,13 @@ class Rebuild:
         if layout is None:
             name, types = f"dtsa_msgs/msg/{kind}", self._store.types
             first = {key: v[0] if isinstance(v, np.ndarray) and v.ndim == 2 else v for key, v in fields.items()}
-            example = types[name](stamp=types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), **first)
+            time = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+            header = types["std_msgs/msg/Header"](stamp=time, frame_id=names.FRAME)
+            example = types[name](header=header, run=self._run_id, **first)
             layout = self._layouts[shape] = Layout(self._store, name, example, rows)
         seconds, nanoseconds = divmod(self.time_ns(at), 1_000_000_000)
-        layout.fill("stamp.sec", seconds)
-        layout.fill("stamp.nanosec", nanoseconds)
+        layout.fill("header.stamp.sec", seconds)
+        layout.fill("header.stamp.nanosec", nanoseconds)
         for name, value in fields.items():
             if not isinstance(value, list):
                 layout.fill(name, value)

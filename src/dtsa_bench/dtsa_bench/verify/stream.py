@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
+from dtsa_agent.ros.common.wire import RUN_MESSAGES
 from dtsa_bench.bag.digest import KEY, BagDigest
 from dtsa_bench.bag.reader import Bag, Message
 
@@ -24,6 +25,7 @@ class Streams:
         self._digest = BagDigest()
         self._recorded = bag.custom_data.get(KEY)
         self._names = {name: name.encode() for name in bag.topics}
+        self._runs = {name for name, info in bag.topics.items() if info.type in RUN_MESSAGES}
         self._ended = False
 
     def _pull(self) -> bool:
@@ -38,6 +40,7 @@ class Streams:
             message.publish_time_ns,
             message.sequence,
             message.data,
+            message.topic in self._runs,
         )
         queue = self._queues.get(message.topic)
         if queue is not None:

@@ -12,11 +12,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.stamps import header_of
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import named
-from .ros_channel import RosChannel, put_frames, slot_stamp
+from .ros_channel import RosChannel, put_frames
 
 _REPEAT_S = 0.1  # until all agents have answered slot 0, it is sent again and again
 _GARBAGE_PATIENCE_S = 0.5
@@ -72,7 +73,8 @@ class LockstepChannel(RosChannel):
     def _open(self, slot: int, frames: dict[int, bytes], verdict: Verdict | None) -> None:
         """Publishes the message that opens a slot."""
         time_ns = names.slot_time_ns(slot, self.slot_ns)
-        message = Slot(stamp=slot_stamp(time_ns), slot=slot, phase=Slot.RUN, heard_slot=max(slot - 1, 0))
+        header = header_of(time_ns)
+        message = Slot(header=header, run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=max(slot - 1, 0))
         if verdict is not None and verdict.senders:
             mask = verdict.mask(self.agents)
             heard = np.flatnonzero(mask.any(axis=1))
@@ -81,7 +83,7 @@ class LockstepChannel(RosChannel):
         self.slot, self._complaint = slot, ""
         self._bytes = serialize_message(message)
         self._publisher.publish(self._bytes)
-        self._tell_time(message.stamp)
+        self._tell_time(header.stamp)
         self._observers.slot_published(slot, self._bytes, time_ns)
 
     def _collect(self, slot: int, stop: object) -> bool:

@@ -13,13 +13,14 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.stamps import header_of, time_of
 from dtsa_channel_sim.model.airtime import LONGEST_FRAME
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.realtime import FrameVerdict, RealtimeArbiter
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 from .answers import Answers, named
-from .ros_channel import RosChannel, put_frames, slot_stamp
+from .ros_channel import RosChannel, put_frames
 
 _NS = 1_000_000_000
 _TICK_NS = 500_000
@@ -121,7 +122,7 @@ class RealtimeChannel(RosChannel):
             now = time.monotonic()
             if now - repeat > _REPEAT_S:
                 repeat = now
-                self._publisher.publish(Slot(phase=Slot.PREPARE))
+                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE))
             data = self.loop.wait()
             if data is not None:
                 message = self._decoded(data)
@@ -138,7 +139,7 @@ class RealtimeChannel(RosChannel):
 
     def _tell_start(self) -> None:
         self._told = time.monotonic()
-        self._publisher.publish(Slot(phase=Slot.START, stamp=slot_stamp(self._zero)))
+        self._publisher.publish(Slot(header=header_of(self._zero), run=self.run_id, phase=Slot.START))
 
     def _fly(self, stop: object) -> None:
         tick = now = 0
@@ -218,7 +219,7 @@ class RealtimeChannel(RosChannel):
             return
         frame = self._frames[(slot, sender)]
         time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
-        message = Slot(stamp=slot_stamp(time_ns), slot=slot, phase=Slot.RUN, heard_slot=slot)
+        message = Slot(header=header_of(time_ns), run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=slot)
         put_frames(message, [sender], [frame], verdict.received[None])
         data = bytes(serialize_message(message))
         self._publisher.publish(data)
@@ -243,7 +244,7 @@ class RealtimeChannel(RosChannel):
         self.answers = book
         frames, verdict = self._verdict(slot)
         self._observers.judged(slot, book, frames, verdict)
-        self._tell_time(slot_stamp(names.slot_time_ns(slot, self.slot_ns)))
+        self._tell_time(time_of(names.slot_time_ns(slot, self.slot_ns)))
         self._observers.slot_over(slot, book, verdict)
         self.slot = slot
         self._lag_ns = int(np.median(self._offset_ns[[k for k in range(self.agents) if k + 1 not in self.lost] or [0]]))

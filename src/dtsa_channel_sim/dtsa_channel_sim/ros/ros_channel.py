@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from array import array
 from typing import Any
@@ -37,6 +38,7 @@ class RosChannel:
     :param swarm_namespace: namespace of the swarm's topics.
     :param startup_s: s of wall time that all agents have to answer for the first time.
     :param end_s: s of wall time that the nodes have to hear of the end.
+    :param run_id: the run's id in all its messages, 64 bits; None: a random one.
     """
 
     def __init__(
@@ -49,9 +51,11 @@ class RosChannel:
         swarm_namespace: str = names.SWARM,
         startup_s: float = 60.0,
         end_s: float = 4.0,
+        run_id: int | None = None,
     ) -> None:
         self.node, self.model = node, channel
         self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
+        self.run_id = new_run_id() if run_id is None else run_id
         self.slot = -1
         self.answers = Answers(self.agents, steps)
         self.unusable = 0  # messages that could not be read, or came from agents that do not exist
@@ -104,7 +108,7 @@ class RosChannel:
     def _publish_end(self) -> None:
         """Tells all nodes that the run is over."""
         if self.node.context.ok():
-            self._publisher.publish(Slot(slot=max(0, self.slot + 1), phase=Slot.END))
+            self._publisher.publish(Slot(run=self.run_id, slot=max(0, self.slot + 1), phase=Slot.END))
 
     def close(self) -> None:
         """Closes the observers first, waits until all nodes know that the run is over or have left, frees the handles.
@@ -127,13 +131,9 @@ class RosChannel:
             self._publish_end()
 
 
-def slot_stamp(time_ns: int) -> Time:
-    """A message's time.
-
-    :param time_ns: ns.
-    """
-    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
-    return Time(sec=seconds, nanosec=nanoseconds)
+def new_run_id() -> int:
+    """A random id for a run, 1 to 2^64 - 1: no two runs share one."""
+    return secrets.randbelow(2**64 - 1) + 1
 
 
 def put_frames(message: Slot, senders: list[int], frames: list[bytes], received: Any) -> None:

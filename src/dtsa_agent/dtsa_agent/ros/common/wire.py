@@ -7,6 +7,19 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+# Where the run's id lies in the messages that carry one, as CDR: after 4 bytes of representation and a header in frame
+# "map". It is random, and so outside all that is compared between flights.
+RUN_BYTES = slice(20, 28)
+RUN_MESSAGES = frozenset(f"dtsa_msgs/msg/{name}" for name in ("Slot", "Transmission", "Reception", "Decision"))
+
+
+def without_run(data: bytes | memoryview) -> bytes:
+    """A message of :data:`RUN_MESSAGES` with the run's id blanked.
+
+    :param data: the message as CDR.
+    """
+    return b"".join((data[: RUN_BYTES.start], bytes(8), data[RUN_BYTES.stop :]))
+
 
 def pack_received(mask: NDArray[np.bool_]) -> bytes:
     """The field ``received``: one bit an agent and frame.
