@@ -55,8 +55,9 @@ class RealtimeCheck:
 
     def __init__(self, bag: Bag, result: Result) -> None:
         self.bag, self.result = bag, result
-        self.run = RunConfig.from_dict(bag.config)
         self.own_clocks = result.mode == REALTIME
+        # Missions say what they fly with instead of a mode of runs.
+        self.run = RunConfig.from_dict({**bag.config, "mode": REALTIME})
         self.agents, self.slot_ns = self.run.swarm.agents, self.run.swarm.slot_ns
         kept = {SLOT, TRANSMISSION, DECISION, RECEPTION, EVENTS}
         self.streams = Streams(bag, kept.__contains__)
