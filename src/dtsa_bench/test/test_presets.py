@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from dtsa_bench import cli
+from dtsa_bench.report.sweep import write_report
 from dtsa_bench.sweep import spec
 from dtsa_bench.sweep.aggregate import Table, collected
 from dtsa_bench.sweep.claims import FAILS, HOLDS, OPEN, PARTLY, claims_of, clean_up_to
-from dtsa_bench.sweep.report import write_report
 from dtsa_bench.sweep.work import fly_one
 
 NAMED = (

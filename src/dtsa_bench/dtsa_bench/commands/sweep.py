@@ -146,7 +146,7 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     if claims := claims_text(table):
         print(f"\n{claims}\n")
     if not args.no_report:
-        from dtsa_bench.sweep.report import write_report
+        from dtsa_bench.report.sweep import write_report
 
         path = write_report(table, directory, WORK.code(), f"tools/dtsa {shlex.join(sys.argv[1:])}")
         print(f"report: {path}")

@@ -13,6 +13,7 @@ from dtsa_agent.core.settings import REQUIRED, Setting, Settings, build, check, 
 
 from .airtime import Airtime
 from .gilbert import GilbertElliott
+from .timeline import check as check_timeline
 from .topology import LinkLoss, format_partition, parse_matrix, parse_partition
 
 _NS_PER_S = 1_000_000_000
@@ -114,8 +115,6 @@ class ChannelConfig(Settings):
         )
         if self.schedule:
             # Entries may be fine one by one and wrong together: try every state that the channel will be in.
-            from .timeline import check as check_timeline
-
             check_timeline(self)
 
     @property

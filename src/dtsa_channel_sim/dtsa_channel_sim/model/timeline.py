@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from dtsa_agent.core.errors import ConfigError
 
-from .config import Change, ChannelConfig
+if TYPE_CHECKING:  # the settings check themselves with what is here
+    from .config import Change, ChannelConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,7 @@ def _flattened(config: ChannelConfig) -> Iterable[Change]:
         values = tuple((name, now[name]) for name in sorted(named) if now[name] != before[name])
         before = now
         if values:
-            yield Change(edge, values)
+            yield replace(config.schedule[0], slot=edge, values=values, until=None)
 
 
 def check(config: ChannelConfig) -> None:

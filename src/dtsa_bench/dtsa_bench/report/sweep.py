@@ -14,8 +14,8 @@ from ..figures import charts, flights
 from ..figures.charts import label_of
 from ..figures.style import save, style
 from ..statistics import LEVEL, Mean, Share
-from .aggregate import MEASURES, Group, Table
-from .claims import Claim, claims_of
+from ..sweep.aggregate import MEASURES, Group, Table
+from ..sweep.claims import Claim, claims_of
 
 _DRAW: dict[str, Callable[[Table, Any], Figure]] = {
     "bars": charts.bars, "lines": charts.lines, "matrix": charts.matrix, "trajectories": flights.trajectories,
@@ -51,7 +51,7 @@ def write_report(table: Table, directory: Path, code: str, command: str = "") ->
         _left_out(table),
         _NOTES,
     ]
-    css = (_HERE / "report.css").read_text(encoding="utf-8")
+    css = (_HERE / "assets" / "sweep.css").read_text(encoding="utf-8")
     page = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>\n{css}</style></head>\n'
