@@ -230,7 +230,7 @@ def test_a_bag_without_a_usable_configuration_still_gives_a_page(tmp_path: Path,
         for message in bag.messages():
             writer.write(channels[message.topic], message.data, message.log_time_ns, message.publish_time_ns)
     found = run_data(tmp_path / "strange")
-    assert found["news"] is None
+    assert found["ages"] is None
     assert "of tomorrow" in found["notes"][0]
     assert found["summary"]["slots"]["total"] == SLOTS
     assert found["summary"]["min_distance_m"] > 0
@@ -297,7 +297,7 @@ def test_chromium_draws_every_part(data: dict[str, Any], tmp_path: Path, names: 
     assert "data-ready" in result.stdout, result.stderr
     assert complaints(result.stderr) == []
     headings = re.findall(r"<h2>([^<]+)</h2>", result.stdout)
-    expected = ["Flight", "Distances", "Slots", "Channel use", "Decisions", "Age of news", "Estimate error", "Agents"]
+    expected = ["Flight", "Distances", "Slots", "Channel use", "Decisions", "Age", "Estimate error", "Agents"]
     assert [heading for heading in headings if heading in expected] == expected
     assert headings[-1] == "Configuration"
     # distances, channel, decisions, twice age, twice error; scene and two canvases for the slots

@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario, make_scenario
-from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core import Scenario
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.run import OUTCOMES, RecordedRun, load_run, swarm_section
-from dtsa_bench.metrics import FlightMetrics, metrics_tables
-from dtsa_bench.report.news import News, follow
-from dtsa_bench.run_config import RunConfig
+from dtsa_bench.report.ages import Ages, follow_run
 
 BINS = 400  # steps of the charts over time
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
@@ -51,8 +48,10 @@ def run_data(path: str | Path) -> dict[str, Any]:
         recovered = "recovered_from" in bag.custom_data
     notes = ["This bag was recovered: its recorder was killed or its file was damaged."] if recovered else []
     distances = pair_distances(run)
-    scenario, news, summary = _follow(run, notes)
-    summary |= _counts(run)
+    followed = follow_run(run)
+    scenario, ages = followed.scenario, followed.ages
+    notes += followed.notes
+    summary = followed.summary | _counts(run)
     if distances is not None and summary.get("min_distance_m") is None and len(distances.least):
         summary["min_distance_m"] = float(np.nanmin(distances.least))
     return {
@@ -70,8 +69,8 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "channel": _channel(run),
         "decisions": _reasons(run),
         "distances": _distances(distances, run),
-        "news": _news(news, run),
-        "table": _table(run, news, distances, scenario),
+        "ages": _ages(ages, run),
+        "table": _table(run, ages, distances, scenario),
     }
 
 
@@ -111,31 +110,6 @@ def pair_distances(run: RecordedRun) -> Distances | None:
         series.append(np.sqrt((gap**2).sum(axis=1)))
     pairs = [(int(motion.ids[first[k]]), int(motion.ids[second[k]])) for k in chosen]
     return Distances((motion.time_ns - run.start_ns) / 1e9, least, pairs, series)
-
-
-def _follow(run: RecordedRun, notes: list[str]) -> tuple[Scenario | None, News | None, dict[str, Any]]:
-    """What the agents knew of each other, and the results, by the one definition of `FlightMetrics`."""
-    try:
-        config = RunConfig.from_dict(run.config if "swarm" in run.config else {"swarm": run.config})
-        scenario = make_scenario(config.swarm)
-    except (DtsaError, TypeError, ValueError) as error:
-        notes.append(f"Ages, estimates and results are left out: the configuration cannot be used ({error}).")
-        return None, None, {}
-    complete = len(run.slots) and np.array_equal(run.slots, np.arange(len(run.slots)))
-    everyone = np.array_equal(run.motion.ids, np.arange(1, run.agents + 1))
-    if not complete or not everyone or run.agents != config.swarm.agents:
-        notes.append("Ages, estimates and results are left out: slots or agents are missing in the bag.")
-        return scenario, None, {}
-    if not any(run.frames.data):
-        notes.append("Ages and estimates are left out: the bag holds no frames.")
-        return scenario, None, {}
-    heard_by_all = run.frames.lost.sum() == 0 and run.frames.collided.sum() == 0
-    tables = metrics_tables(config, scenario, everyone=not heard_by_all)
-    metrics = FlightMetrics(config, scenario)
-    news = follow(run, tables, metrics, scenario.moving)
-    if config.swarm.steps > 1 and len(run.motion.time_ns) < config.swarm.steps * len(run.slots):
-        notes.append("Distances are those at the ends of slots; within a slot agents may have been closer.")
-    return scenario, news, metrics.summary()
 
 
 def _duration_s(run: RecordedRun) -> float:
@@ -277,8 +251,8 @@ def _distances(distances: Distances | None, run: RecordedRun) -> dict[str, Any] 
     }
 
 
-def _news(news: News | None, run: RecordedRun) -> dict[str, Any] | None:
-    if news is None or not len(news.slot):
+def _ages(ages: Ages | None, run: RecordedRun) -> dict[str, Any] | None:
+    if ages is None or not len(ages.slot):
         return None
 
     def chart(values: Array, digits: int) -> dict[str, Any]:
@@ -296,16 +270,16 @@ def _news(news: News | None, run: RecordedRun) -> dict[str, Any] | None:
             "top": round(top, digits),
         }
 
-    time_s = run.time_s(news.slot + 1)
+    time_s = run.time_s(ages.slot + 1)
     return {
         "time": thin(reduce_bins(time_s, np.mean)),
-        "age": chart(news.age, 2),
-        "error": chart(news.error, 4),
+        "age": chart(ages.age, 2),
+        "error": chart(ages.error, 4),
     }
 
 
 def _table(
-    run: RecordedRun, news: News | None, distances: Distances | None, scenario: Scenario | None
+    run: RecordedRun, ages: Ages | None, distances: Distances | None, scenario: Scenario | None
 ) -> list[dict[str, Any]]:
     """One row an agent."""
     frames, motion = run.frames, run.motion
@@ -320,9 +294,9 @@ def _table(
             "heard": round(float(frames.received[mine].sum()) / (sent * max(1, run.agents - 1)), 4) if sent else None,
             "collided": int((frames.collided[mine] > 0).sum()),
         }
-        if news is not None:
-            column = slice(min(run.agents, len(news.slot)), None), agent - 1
-            for name, values, digits in (("age", news.age, 2), ("error", news.error, 4)):
+        if ages is not None:
+            column = slice(min(run.agents, len(ages.slot)), None), agent - 1
+            for name, values, digits in (("age", ages.age, 2), ("error", ages.error, 4)):
                 known = values[column][np.isfinite(values[column])]
                 row[f"{name}_mean"] = round(float(known.mean()), digits) if len(known) else None
                 row[f"{name}_max"] = round(float(known.max()), digits) if len(known) else None

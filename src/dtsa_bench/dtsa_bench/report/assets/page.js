@@ -31,7 +31,7 @@ const FIGURES = [
   ["Collided slots", run => whole(run.summary.slots.collision), run => percent(run.summary.slots.total ? run.summary.slots.collision / run.summary.slots.total : null), run => run.summary.slots.collision ? "bad" : ""],
   ["Idle slots", run => whole(run.summary.slots.idle), run => percent(run.summary.slots.total ? run.summary.slots.idle / run.summary.slots.total : null)],
   ["Lost to noise", run => percent(run.summary.lost_fraction, 2), () => "of all receptions"],
-  ["Age of news", run => num(run.summary.age_mean_slots, 1, "slots"), run => `at most ${whole(run.summary.age_max_slots)}`],
+  ["Age", run => num(run.summary.age_mean_slots, 1, "slots"), run => `at most ${whole(run.summary.age_max_slots)}`],
   ["Estimate error", run => length(run.summary.estimate_error_mean_m), run => `at most ${length(run.summary.estimate_error_max_m)}`],
 ];
 function lede(run) {
@@ -127,17 +127,17 @@ section("Decisions", "Why agents took whom they took for the sender: of all agen
   },
 }, "half");
 for (const [key, title, what, unit, digits, suffix, axis] of [
-  ["age", "Age of news", "How many slots ago the others last heard each moving agent: mean over its observers that still expect it to move.", "age (slots)", 1, "slots", "mean and most of all agents"],
+  ["age", "Age", "How many slots ago the others last heard each moving agent: mean over its observers that still expect it to move.", "age (slots)", 1, "slots", "mean and most of all agents"],
   ["error", "Estimate error", "How far from each moving agent the others take it to be: mean over the same observers.", "error (m)", 4, "m", ""],
 ]) {
   section(title, what, {
-    has: run => run.news,
+    has: run => run.ages,
     draw: run => {
-      const data = run.news[key];
+      const data = run.ages[key];
       return el("div", {},
-        lineChart({time: run.news.time, unit, label: title + " over time", height: 190, digits, suffix, scale: key,
+        lineChart({time: run.ages.time, unit, label: title + " over time", height: 190, digits, suffix, scale: key,
           series: [{name: "mean of agents", values: data.mean, color: LINES[0], width: 1.9}, {name: "worst agent", values: data.most, color: LINES[1], width: 1.2}]}),
-        heatChart({time: run.news.time, level: new Uint8Array(bytes(data.heat)), agents: run.agents, top: data.top, unit: "agent", label: title + " by agent", digits, suffix, scale: `${key} by agent`}));
+        heatChart({time: run.ages.time, level: new Uint8Array(bytes(data.heat)), agents: run.agents, top: data.top, unit: "agent", label: title + " by agent", digits, suffix, scale: `${key} by agent`}));
     },
   }, "half");
 }
