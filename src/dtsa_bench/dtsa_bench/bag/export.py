@@ -119,6 +119,15 @@ def describe() -> str:
     return "".join(parts)
 
 
+def arrow_table(run: RecordedRun, name: str) -> pa.Table:
+    """One table of a run in memory.
+
+    :param run: the run.
+    :param name: from `COLUMNS`.
+    """
+    return pa.concat_tables([pa.table(batch) for batch in _TABLES[name](run)])
+
+
 def _write(file: Path, kind: str, name: str, batches: Iterator[dict[str, Any]]) -> int:
     notes = {column: {"unit": unit, "meaning": meaning} for column, unit, meaning in COLUMNS[name]}
     writer: Any = None

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -37,21 +38,7 @@ def trajectories(table: Table, spec: Spec) -> Figure:
     figure, axes = panels(len(flights), width=3.3, height=3.6)
     for axis, (name, flight) in zip(axes, flights, strict=True):
         assert flight.trace is not None
-        path = flight.trace.positions()
-        hovering = np.flatnonzero(~flight.scenario.moving)
-        axis.plot(
-            *flight.scenario.start[:2, hovering],
-            "o",
-            color=QUIET,
-            alpha=0.45,
-            markersize=6,
-            markeredgewidth=0,
-        )
-        for number, k in enumerate(_movers(flight)):
-            shade = CYCLE[number % len(CYCLE)]
-            axis.plot(path[:, 0, k], path[:, 1, k], color=shade)
-            axis.plot(*path[0, :2, k], "o", color=shade, markersize=6)
-            axis.plot(*path[-1, :2, k], "x", color=shade, markersize=7, markeredgewidth=2)
+        draw_paths(axis, flight.trace.positions(), flight.scenario.moving, flight.scenario.start)
         summary = flight.summary()
         time = summary["completion_time_s"]
         axis.set_title(name)
@@ -59,9 +46,26 @@ def trajectories(table: Table, spec: Spec) -> Figure:
             f"x [m]\n{summary['min_distance_m']:.2f} m apart at least"
             + (f", {time:.2f} s" if time is not None else f", {summary['end']}")
         )
-        axis.set_aspect("equal", "datalim")
     axes[0].set_ylabel("y [m]")
     return figure
+
+
+def draw_paths(axis: Axes, path: NDArray[np.float64], moving: NDArray[np.bool_], start: NDArray[np.float64]) -> None:
+    """Paths of the movers from above; who hovers is a grey dot.
+
+    :param axis: where.
+    :param path: (T, 3, N) m, frame map; not a number where a position is not known.
+    :param moving: (N,) who moves.
+    :param start: (3, N) m, frame map.
+    """
+    hovering = np.flatnonzero(~moving)
+    axis.plot(*start[:2, hovering], "o", color=QUIET, alpha=0.45, markersize=6, markeredgewidth=0)
+    for number, k in enumerate(np.flatnonzero(moving)):
+        shade = CYCLE[number % len(CYCLE)]
+        axis.plot(path[:, 0, k], path[:, 1, k], color=shade)
+        axis.plot(*path[0, :2, k], "o", color=shade, markersize=6)
+        axis.plot(*path[-1, :2, k], "x", color=shade, markersize=7, markeredgewidth=2)
+    axis.set_aspect("equal", "datalim")
 
 
 def estimate(table: Table, spec: Spec) -> Figure:

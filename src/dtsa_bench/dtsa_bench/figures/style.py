@@ -10,9 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-
-mpl.use("agg")
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 

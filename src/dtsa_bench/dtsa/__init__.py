@@ -1,0 +1,103 @@
+"""Channel access in quadcopter swarms: simulate, sweep, read and verify recorded runs.
+
+This is the public interface; everything else in `dtsa_agent`, `dtsa_channel_sim` and `dtsa_bench` may change. Importing
+it costs next to nothing: what a name needs is loaded when the name is first used. Units are SI, positions are in frame
+`map` (the room's centre, ENU). Figures need Matplotlib, data frames need pandas. See docs/library.md.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from dtsa_bench import __version__
+
+if TYPE_CHECKING:
+    from dtsa_agent.core import (
+        Agent,
+        ConfigError,
+        Decision,
+        DtsaError,
+        LocalProtocolError,
+        RemoteProtocolError,
+        SlotOutcome,
+        SwarmConfig,
+    )
+    from dtsa_bench.bag.errors import BagError, UnusableBag
+    from dtsa_bench.run_config import RunConfig, RunLimits
+    from dtsa_bench.verify import Difference
+    from dtsa_bench.verify import Result as Verification
+    from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig, Verdict
+
+    from ._flight import Flight, run_config, simulate
+    from ._plots import plot_ages, plot_bars, plot_distances, plot_lines, plot_matrix, plot_trajectories
+    from ._recording import Recording, read_bag, verify
+    from ._sweep import SweepResult, sweep
+
+__all__ = [
+    "Agent",
+    "BagError",
+    "Channel",
+    "ChannelConfig",
+    "ClockConfig",
+    "ConfigError",
+    "Decision",
+    "Difference",
+    "DtsaError",
+    "Flight",
+    "LocalProtocolError",
+    "Recording",
+    "RemoteProtocolError",
+    "RunConfig",
+    "RunLimits",
+    "SlotOutcome",
+    "SwarmConfig",
+    "SweepResult",
+    "UnusableBag",
+    "Verdict",
+    "Verification",
+    "__version__",
+    "plot_ages",
+    "plot_bars",
+    "plot_distances",
+    "plot_lines",
+    "plot_matrix",
+    "plot_trajectories",
+    "read_bag",
+    "run_config",
+    "simulate",
+    "sweep",
+    "verify",
+]  # fmt: skip
+
+_HOMES = {
+    "dtsa._flight": ("Flight", "run_config", "simulate"),
+    "dtsa._plots": ("plot_ages", "plot_bars", "plot_distances", "plot_lines", "plot_matrix", "plot_trajectories"),
+    "dtsa._recording": ("Recording", "read_bag", "verify"),
+    "dtsa._sweep": ("SweepResult", "sweep"),
+    "dtsa_agent.core": (
+        "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "RemoteProtocolError", "SlotOutcome",
+        "SwarmConfig",
+    ),
+    "dtsa_bench.bag.errors": ("BagError", "UnusableBag"),
+    "dtsa_bench.run_config": ("RunConfig", "RunLimits"),
+    "dtsa_bench.verify": ("Difference", "Verification"),
+    "dtsa_channel_sim": ("Channel", "ChannelConfig", "ClockConfig", "Verdict"),
+}  # fmt: skip
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+_OTHER_NAMES = {"Verification": "Result"}
+
+if not TYPE_CHECKING:  # a type checker takes the names from above, and knows no others
+
+    def __getattr__(name: str) -> object:
+        """Load what a name needs when it is first used."""
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(import_module(_HOME[name]), _OTHER_NAMES.get(name, name))
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """The public names."""
+    return sorted(__all__)

@@ -1,0 +1,125 @@
+"""One simulated flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.run_config import RunConfig
+from dtsa_bench.simulate import Flight as _Flight
+from dtsa_bench.simulate import Trace
+from dtsa_bench.simulate import simulate as _simulate
+from dtsa_bench.sweep.spec import run_config as _run_config
+from dtsa_channel_sim import OUTCOMES
+
+from ._frames import data_frame
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A simulated flight and what came of it."""
+
+    config: RunConfig
+    summary: dict[str, Any]  # the results, with the keys of summary.json; units are in the names
+    _flight: _Flight
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """(N,) which agents move; the others hover."""
+        return self._flight.scenario.moving
+
+    @property
+    def start(self) -> NDArray[np.float64]:
+        """(3, N) m, frame map: where the agents start."""
+        return self._flight.scenario.start
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(T,) s from the start of slot 0: the control instants of `path`, the last of each slot at its end."""
+        swarm = self.config.swarm
+        instants = np.arange(1, len(self.path) + 1, dtype=np.float64)
+        return np.asarray(instants * (swarm.slot_s / swarm.steps))
+
+    @cached_property
+    def path(self) -> NDArray[np.float64]:
+        """(T, 3, N) m, frame map: true positions at all control instants.
+
+        :raises ConfigError: if the flight was simulated without its trace.
+        """
+        return self._trace.positions()
+
+    @property
+    def slots(self) -> pd.DataFrame:
+        """A row a slot: slot, time_s (start), outcome, senders (how many), sender (id of the first, 0: nobody).
+
+        :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
+        """
+        trace = self._trace
+        slot = np.arange(len(trace.senders))
+        return data_frame(
+            {
+                "slot": slot,
+                "time_s": slot * self.config.swarm.slot_s,
+                "outcome": [OUTCOMES[outcome] for outcome in trace.outcomes],
+                "senders": [len(senders) for senders in trace.senders],
+                "sender": [senders[0] if senders else 0 for senders in trace.senders],
+            }
+        )
+
+    @property
+    def positions(self) -> pd.DataFrame:
+        """A row an agent and control instant: time_s, agent (id), position_{x,y,z}_m in frame map.
+
+        :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
+        """
+        path, agents = self.path, self.config.swarm.agents
+        columns: dict[str, Any] = {
+            "time_s": np.repeat(self.time_s, agents),
+            "agent": np.tile(np.arange(1, agents + 1), len(path)),
+        }
+        columns |= {f"position_{axis}_m": path[:, number].ravel() for number, axis in enumerate("xyz")}
+        return data_frame(columns)
+
+    @property
+    def _trace(self) -> Trace:
+        if self._flight.trace is None:
+            raise ConfigError("trace", False, "True in simulate(): this flight did not keep what happened in its slots")
+        return self._flight.trace
+
+
+def run_config(**settings: Any) -> RunConfig:
+    """The configuration of a run from settings by name.
+
+    :param settings: settings of the swarm, of the channel and of the end of a run side by side, such as
+        `agents=12, loss=0.1, timeout_s=20`, with the units and ranges of :class:`SwarmConfig`, :class:`ChannelConfig`
+        and :class:`RunLimits`. `seed` is that of the swarm and of the channel.
+    :raises ConfigError: for a name that does not exist or a value that is not allowed.
+    """
+    return _run_config(settings)
+
+
+def simulate(config: RunConfig | None = None, *, trace: bool = True, observer: int = 1, **settings: Any) -> Flight:
+    """Flies one run without ROS; equal configurations give equal flights, bit for bit.
+
+    :param config: the run; None: made from the settings.
+    :param trace: keep what happened in every slot, which `path`, data frames and figures need: about 24 bytes an agent
+        and control instant.
+    :param observer: id of the agent whose table the trace follows.
+    :param settings: as for :func:`run_config`, if there is no config.
+    :raises ConfigError: for a setting that is not usable, or both a config and settings.
+    """
+    if config is not None and settings:
+        raise ConfigError("settings", sorted(settings), "none beside a config")
+    run = run_config(**settings) if config is None else config
+    if not 1 <= observer <= run.swarm.agents:
+        raise ConfigError("observer", observer, f"1 to {run.swarm.agents}")
+    flight = _simulate(run, trace=trace, observer=observer)
+    return Flight(run, flight.summary(), flight)

@@ -1,0 +1,149 @@
+"""Figures. Each function returns a new `matplotlib.figure.Figure`; nothing is shown or saved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.figures import charts
+from dtsa_bench.figures.flights import draw_paths
+from dtsa_bench.figures.style import QUIET, colours, panels, style
+from dtsa_bench.sweep.aggregate import CRASHED, MEASURES
+
+from ._flight import Flight
+from ._recording import Recording
+from ._sweep import SweepResult
+
+Flown = Flight | Recording
+
+
+def plot_trajectories(*flights: Flown, titles: Sequence[str] | None = None) -> Figure:
+    """Paths of the movers from above: a panel a flight, circles where they start and crosses where they end.
+
+    :param flights: simulated or recorded flights.
+    :param titles: one a flight; None: policy and estimator.
+    :raises ConfigError: without a flight, or for a number of titles that does not fit.
+    """
+    names = _titles(flights, titles)
+    with style():
+        figure, axes = panels(len(flights), width=3.3, height=3.6)
+        for axis, flight, name in zip(axes, flights, names, strict=True):
+            draw_paths(axis, flight.path, flight.moving, flight.start)
+            axis.set_title(name)
+            axis.set_xlabel("x [m]")
+        axes[0].set_ylabel("y [m]")
+    return figure
+
+
+def plot_distances(*flights: Flown, titles: Sequence[str] | None = None) -> Figure:
+    """Smallest distance between any two agents over time, m over s; the dotted line is where two have crashed.
+
+    :param flights: simulated or recorded flights, a line each.
+    :param titles: one a flight; None: policy and estimator.
+    :raises ConfigError: without a flight, or for a number of titles that does not fit.
+    """
+    names = _titles(flights, titles)
+    with style():
+        figure, (axis,) = panels(1, width=5.6, height=3.6)
+        for flight, name, shade in zip(flights, names, colours(list(range(len(flights)))), strict=True):
+            axis.plot(flight.time_s, _closest(flight.path), color=shade, label=name)
+        axis.axhline(flights[0].config.limits.collision_m, color=QUIET, linewidth=1, linestyle=":")
+        axis.set(title="smallest distance [m]", xlabel="time [s]", ylim=(0, None))
+        if len(flights) > 1:
+            axis.legend()
+    return figure
+
+
+def plot_ages(*recordings: Recording, titles: Sequence[str] | None = None) -> Figure:
+    """Mean age of what the agents know of each other over time, slots over s.
+
+    :param recordings: recorded runs, a line each.
+    :param titles: one a run; None: policy and estimator.
+    :raises ConfigError: without a run, for a number of titles that does not fit, or if pandas is missing.
+    """
+    names = _titles(recordings, titles)
+    with style():
+        figure, (axis,) = panels(1, width=5.6, height=3.6)
+        for recording, name, shade in zip(recordings, names, colours(list(range(len(recordings)))), strict=True):
+            mean = recording.ages.groupby("time_s")["age_slots"].mean()
+            axis.plot(mean.index, mean.to_numpy(), color=shade, label=name)
+        axis.set(title="mean age [slots]", xlabel="time [s]", ylim=(0, None))
+        if len(recordings) > 1:
+            axis.legend()
+    return figure
+
+
+def plot_bars(result: SweepResult, *, x: str, y: str | Sequence[str], series: str | None = None) -> Figure:
+    """Grouped bars of a sweep with 95 % intervals: a panel a measure.
+
+    :param result: the sweep.
+    :param x: axis whose levels are the groups.
+    :param y: measures: `crashed` or a measure of `SweepResult.table`.
+    :param series: axis whose levels are the bars of a group.
+    :raises ConfigError: for an axis or a measure that does not exist.
+    """
+    return _chart(result, charts.bars, y, x=x, series=series)
+
+
+def plot_lines(
+    result: SweepResult, *, x: str, y: str | Sequence[str], series: str | None = None, facets: str | None = None
+) -> Figure:
+    """Lines over the numbers of an axis of a sweep, with 95 % intervals.
+
+    :param result: the sweep.
+    :param x: axis whose levels are numbers.
+    :param y: measures: `crashed` or a measure of `SweepResult.table`.
+    :param series: axis whose levels are the lines.
+    :param facets: axis whose levels have a panel each.
+    :raises ConfigError: for an axis or a measure that does not exist.
+    """
+    return _chart(result, charts.lines, y, x=x, series=series, facets=facets)
+
+
+def plot_matrix(result: SweepResult, *, rows: str, columns: str, y: str | Sequence[str]) -> Figure:
+    """A coloured table of a sweep: a panel a measure.
+
+    :param result: the sweep.
+    :param rows: axis whose levels are the rows.
+    :param columns: axis whose levels are the columns.
+    :param y: measures: `crashed` or a measure of `SweepResult.table`.
+    :raises ConfigError: for an axis or a measure that does not exist.
+    """
+    return _chart(result, charts.matrix, y, rows=rows, columns=columns)
+
+
+def _chart(result: SweepResult, draw: Any, y: str | Sequence[str], **roles: str | None) -> Figure:
+    spec: dict[str, Any] = {role: axis for role, axis in roles.items() if axis is not None}
+    for role, axis in spec.items():
+        if axis not in result.axes:
+            raise ConfigError(role, axis, f"one of the axes {', '.join(result.axes)}")
+    spec["y"] = [y] if isinstance(y, str) else list(y)
+    for measure in spec["y"]:
+        if measure != CRASHED and measure not in MEASURES:
+            raise ConfigError("y", measure, ", ".join((CRASHED, *MEASURES)))
+    with style():
+        figure: Figure = draw(result._table, spec)
+    return figure
+
+
+def _titles(flights: Sequence[Flown], titles: Sequence[str] | None) -> list[str]:
+    if not flights:
+        raise ConfigError("flights", 0, "at least one")
+    if titles is not None:
+        if len(titles) != len(flights):
+            raise ConfigError("titles", list(titles), f"{len(flights)}, one a flight")
+        return list(titles)
+    return [f"{flight.config.swarm.policy}, {flight.config.swarm.estimator}" for flight in flights]
+
+
+def _closest(path: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """(T,) m, smallest distance of any two at each instant."""
+    closest = np.full(len(path), np.inf)
+    for k in range(path.shape[2] - 1):
+        between = np.linalg.norm(path[:, :, k + 1 :] - path[:, :, k : k + 1], axis=1)
+        closest = np.fmin(closest, np.nanmin(between, axis=1, initial=np.inf))
+    return closest

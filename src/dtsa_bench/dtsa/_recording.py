@@ -1,0 +1,147 @@
+"""Recorded runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_bench.bag.export import arrow_table
+from dtsa_bench.bag.place import find_file
+from dtsa_bench.bag.run import RecordedRun, load_run
+from dtsa_bench.report.ages import Followed, follow_run
+from dtsa_bench.run_config import RunConfig
+from dtsa_bench.verify import Result, verify_bag
+
+from ._frames import data_frame, from_arrow
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Recording:
+    """A recorded run. Tables are made when they are first asked for; all but `ages` have the columns of `dtsa export`.
+
+    :param path: run directory, bag directory or .mcap file.
+    :raises UnusableBag: if it is no bag of this project, or is damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.file: Path = find_file(path)  # the .mcap file
+        self._run: RecordedRun = load_run(path)
+
+    @property
+    def name(self) -> str:
+        """Name of the run, from that of its directory."""
+        return self._run.name
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The recorded configuration as plain values."""
+        return self._run.config
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """The recorded configuration.
+
+        :raises ConfigError: if it cannot be used, for example because another version wrote it.
+        """
+        values = self._run.config
+        return RunConfig.from_dict(values if "swarm" in values else {"swarm": values})
+
+    @cached_property
+    def _followed(self) -> Followed:
+        return follow_run(self._run)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The results, with the keys of summary.json; empty where the bag does not hold enough."""
+        return self._followed.summary
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """(N,) which agents move; all, where the configuration cannot be used."""
+        scenario = self._followed.scenario
+        return np.ones(len(self._run.motion.ids), np.bool_) if scenario is None else scenario.moving
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(T,) s from the start of slot 0: the instants of `path`."""
+        return np.asarray((self._run.motion.time_ns - self._run.start_ns) / 1e9)
+
+    @property
+    def path(self) -> NDArray[np.float64]:
+        """(T, 3, N) m, frame map: true positions; not a number where an agent was not recorded yet."""
+        return self._run.motion.position
+
+    @property
+    def start(self) -> NDArray[np.float64]:
+        """(3, N) m, frame map: the first recorded positions."""
+        return np.asarray(self._run.motion.position[0])
+
+    @cached_property
+    def slots(self) -> pd.DataFrame:
+        """A row a slot: slot, time_s (start), outcome, senders (how many).
+
+        :raises ConfigError: if pandas is missing; likewise below.
+        """
+        return from_arrow(arrow_table(self._run, "slots"))
+
+    @cached_property
+    def receptions(self) -> pd.DataFrame:
+        """A row a frame: slot, time_s, sender, received, lost, collided (receivers), length, data, and what it said."""
+        return from_arrow(arrow_table(self._run, "frames"))
+
+    @cached_property
+    def decisions(self) -> pd.DataFrame:
+        """A row an agent and slot: slot, time_s, agent, chosen (id, 0: nobody), reason, score, digest of its table."""
+        return from_arrow(arrow_table(self._run, "decisions"))
+
+    @cached_property
+    def positions(self) -> pd.DataFrame:
+        """A row an agent and instant: time_s, agent, position_{x,y,z}_m, velocity_{x,y,z}_mps, frame map."""
+        return from_arrow(arrow_table(self._run, "states"))
+
+    @cached_property
+    def ages(self) -> pd.DataFrame:
+        """A row a slot and agent: slot, time_s (end), agent, age_slots, error_m: means over the agent's observers.
+
+        Not a number where nobody still expects the agent to move; no rows where the bag does not hold enough.
+        """
+        ages, agents = self._followed.ages, self._run.agents
+        if ages is None:
+            return data_frame({name: np.zeros(0) for name in ("slot", "time_s", "agent", "age_slots", "error_m")})
+        slot = np.repeat(ages.slot, agents)
+        return data_frame(
+            {
+                "slot": slot,
+                "time_s": self._run.time_s(slot + 1),
+                "agent": np.tile(np.arange(1, agents + 1), len(ages.slot)),
+                "age_slots": ages.age.ravel(),
+                "error_m": ages.error.ravel(),
+            }
+        )
+
+
+def read_bag(path: str | Path) -> Recording:
+    """Reads a recorded run, without ROS.
+
+    :param path: run directory, bag directory or .mcap file.
+    :raises UnusableBag: if it is no bag of this project, or is damaged.
+    """
+    return Recording(path)
+
+
+def verify(path: str | Path, *, progress: Callable[[int], None] | None = None) -> Result:
+    """Checks whether every message of a recorded run is what the protocol gives.
+
+    :param path: run directory, bag directory or .mcap file.
+    :param progress: is called with the slot now and then.
+    :returns: what was checked, and the first difference if there is one.
+    :raises UnusableBag: if it cannot be read as a bag of this project at all.
+    """
+    return verify_bag(path, progress)
