@@ -134,7 +134,7 @@ def foxglove(agents: int = AGENTS) -> dict[str, Any]:
                 "lichtblickPanelTitle": slots,
             },
             "Plot!senders": plot("Who sends", senders, "agent", minYValue=0),
-            "Plot!ages": plot("Age of news", ages, "age (slots)", minYValue=0),
+            "Plot!ages": plot("Age", ages, "age (slots)", minYValue=0),
             "Plot!distances": plot("Smallest distance", distances, "distance (m)", minYValue=0),
             "Plot!heights": plot("Odometry: height", heights, "z (m)", sidebarDimension=90),
             "RawMessages!decision": {
@@ -210,7 +210,7 @@ def plotjuggler(agents: int = AGENTS) -> str:
     slots: list[Panel] = [
         ("Slots: 0 idle, 1 success, 2 collision", [(outcome, COLOURS[0])], "StepsInv", {"min": "-0.1", "max": "2.1"}),
         ("Who sends (first of the senders)", [(sender, COLOURS[1])], "Dots", {"min": "0"}),
-        ("Age of news (s)", ages, "Lines", {"min": "0"}),
+        ("Age (s)", ages, "Lines", {"min": "0"}),
     ]
     _rows(_tab(tabs, "slots"), slots, [0.2, 0.3, 0.5])
     others = range(2, min(agents, PAIRS + 1) + 1)

@@ -126,7 +126,7 @@ class FlightMetrics:
     def regain(self, agent: int) -> None:
         """An agent that fell out takes part again: distances to it count, and it has to arrive.
 
-        Its way stays unknown, and news of it stay out of the ages.
+        Its way stays unknown, and its state stays out of the ages.
 
         :param agent: its id.
         """

@@ -223,9 +223,9 @@ def test_sigterm_lets_an_agent_say_farewell_and_a_second_one_does_not_wait(tmp_p
     assert "started again" not in flight.said
     assert summary["lost_agents"] == [2, 3]
     sent = [report for report in reports(flight.out, 2) if report.frame]
-    farewell = sent[-1]
-    assert decode_extended(farewell.frame).leaving
-    assert farewell.heard > 0
+    last = sent[-1]
+    assert decode_extended(last.frame).leaving
+    assert last.heard > 0
     assert not any(decode_extended(report.frame).leaving for report in sent[:-1])
 
 

@@ -278,7 +278,7 @@ def test_a_wrong_frame_is_shown_in_words(tmp_path: Path, monkeypatch: pytest.Mon
     assert difference is not None
     for text in (difference.expected, difference.recorded):
         assert "no frame" not in text
-        assert "news of cf" in text
+        assert "state of cf" in text
         assert ("sealed" in text) == sealed
 
 

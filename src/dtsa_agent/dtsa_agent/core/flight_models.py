@@ -124,7 +124,7 @@ class FlightModel(Settings):
         :param goal: where it wants to go, (3,), m.
         :param others_position: where it believes everybody is, (3, N), m; whoever is not finite is ignored.
         :param others_velocity: their velocities, (3, N), m/s.
-        :param age_s: age of each one's news, (N,), s; None: no margins.
+        :param age_s: age of each one's state, (N,), s; None: no margins.
         """
         result = np.empty(3)
         given = (position, velocity, goal, others_position, others_velocity)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -253,12 +253,3 @@ def _half_sphere(count: int) -> Array:
     turn = index * math.pi * (3.0 - math.sqrt(5.0))
     r = np.sqrt(1.0 - z * z)
     return np.stack((r * np.cos(turn), r * np.sin(turn), z))
-
-
-def scenario_fields(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as plain lists, for recording."""
-    return {
-        "start": scenario.start.tolist(),
-        "target": scenario.target.tolist(),
-        "moving": scenario.moving.tolist(),
-    }

@@ -133,9 +133,9 @@ class SafetyMonitor:
         found += self._distance(vehicles)
         found += self._heartbeat(vehicles, heartbeat_age)
         keys = {(v.name, v.rule + v.action.value) for v in found}
-        news = [v for v in found if (v.name, v.rule + v.action.value) not in self._active]
+        fresh = [v for v in found if (v.name, v.rule + v.action.value) not in self._active]
         self._active = keys
-        return news
+        return fresh
 
     def _fence(self, v: Watched) -> list[Verdict]:
         s = self.settings

@@ -17,7 +17,7 @@ ROOT = "rosbag2_bagfile_information"
 FILE_NAME = "metadata.yaml"
 RECORD_NAME = "rosbag2"  # name of the metadata record inside the .mcap
 RECORD_KEY = "serialized_metadata"
-RUN_ID = "run"  # name of the run's id in custom data, 16 hexadecimal digits
+RUN_ID = "run"  # name of the run's id in custom data, 8 hexadecimal digits
 
 
 @dataclass(frozen=True, slots=True)

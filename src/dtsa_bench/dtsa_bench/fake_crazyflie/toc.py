@@ -91,7 +91,6 @@ PARAM_ENTRIES: tuple[Entry, ...] = (
     Entry("deck", "bcLighthouse4", "uint8_t", 1, read_only=True),
 )
 
-LOG_BY_NAME = {entry.full_name: entry for entry in LOG_ENTRIES}
 PARAM_ID = {entry.full_name: index for index, entry in enumerate(PARAM_ENTRIES)}
 
 

@@ -40,7 +40,7 @@ class FlightRecorder(ChannelObserver):
         self._packed = SlotMessages(scenario, self._slot_ns, run_id)
         agents = run.swarm.agents
         self.bag = BagWriter(
-            directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed), RUN_ID: f"{run_id:016x}"}
+            directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}"}
         )
         add = self.bag.add_topic
         self._slot = add(f"{names.SWARM}/{names.SLOT}", "dtsa_msgs/msg/Slot")

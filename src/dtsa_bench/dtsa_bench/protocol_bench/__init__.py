@@ -1,1 +1,1 @@
-"""Experiments with the slot protocols alone: who sends when, how old news is, what faults do. No flight."""
+"""Experiments with the slot protocols alone: who sends when, ages, what faults do. No flight."""

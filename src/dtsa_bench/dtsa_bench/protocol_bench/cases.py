@@ -85,7 +85,7 @@ def cases() -> list[Case]:
     ):
         for name, loss, burst in channels:
             protocols = tuple(p for p in PROTOCOLS if agents < 200 or not loss or p != "dtsa")
-            asked = 1.0 if burst else factor  # who hears nothing for ten slots has old news whatever the protocol
+            asked = 1.0 if burst else factor  # who hears nothing for ten slots has old states whatever the protocol
             warmup = 10 * agents if agents > 12 else 600
             rows.append(
                 Case(

@@ -61,14 +61,14 @@ class Outcome:
     collision_slots: list[int] = field(default_factory=list)
     age_sum: int = 0  # over pairs (observer, agent that it takes for a mover), every slot after the warm-up
     age_count: int = 0
-    true_sum: int = 0  # over pairs (observer, agent that does move); news counts from its waking on
+    true_sum: int = 0  # over pairs (observer, agent that does move); ages count from its waking on
     true_count: int = 0
     waits: list[Wait] = field(default_factory=list)
     ledger: Ledger | None = None
 
     @property
     def age(self) -> float:
-        """Mean age of the movers' news, slots, over agents that their observers take for movers."""
+        """Mean age of the movers' states, slots, over agents that their observers take for movers."""
         return self.age_sum / self.age_count if self.age_count else float("nan")
 
     @property
@@ -232,8 +232,8 @@ class Experiment:
         believed = heard & (swarm.in_ap[:, movers] > 0)
         out.age_sum += int((self.slot - sent)[believed].sum())
         out.age_count += int(np.count_nonzero(believed))
-        news = np.maximum(sent, self.moving_since[movers])
-        out.true_sum += int((self.slot - news)[heard].sum())
+        since = np.maximum(sent, self.moving_since[movers])
+        out.true_sum += int((self.slot - since)[heard].sum())
         out.true_count += int(np.count_nonzero(heard))
 
     def _look_at_waiting(self, ids: tuple[int, ...]) -> None:

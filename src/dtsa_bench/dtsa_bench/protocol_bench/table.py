@@ -98,7 +98,7 @@ def as_text(table: Sequence[dict[str, Any]]) -> str:
             faults.append([row["case"], *cells, row["target"], _mark(row)])
     return "\n".join(
         (
-            "Mean age of the movers' news, slots (collided slots per 1000)\n",
+            "Mean age of the movers' states, slots (collided slots per 1000)\n",
             markdown(["case", "warm-up", *names, "lease / TDMA", "asked", ""], ages),
             "\nFaults and changes, slots: median / largest\n",
             markdown(["case", *LEASE, "asked", ""], faults),

@@ -34,7 +34,7 @@ MEASURES = {
         Measure("min_distance_m", "minimum distance", "m", 3, True, 1),
         Measure("efficiency_mean", "trajectory efficiency", "", 3, True, 1),
         Measure("completion_time_s", "completion time", "s", 2, True, -1),
-        Measure("age_mean_slots", "age of news", "slots", 2, False, -1),
+        Measure("age_mean_slots", "age", "slots", 2, False, -1),
         Measure("estimate_error_mean_m", "error of estimates", "m", 4, False, -1),
         Measure("wasted_share", "slots without a frame", "", 3, False, -1),
     )

@@ -182,7 +182,7 @@ def _idle(table: Table) -> list[Claim]:
         claims.append(
             Claim(
                 f"{moving} of 200 moving: N_p t_s instead of N t_s until an update (eq:update_time_NA)",
-                f"news is {b.value:.1f} slots old with DTSA, {a.value:.1f} with TDMA; "
+                f"the age is {b.value:.1f} slots with DTSA, {a.value:.1f} with TDMA; "
                 + _signed(gain, "age_mean_slots"),
                 _verdict(gain, -1),
                 "Here the scheduler does it: both extrapolate. "

@@ -163,7 +163,7 @@ def _more(frame: ExtendedFrame) -> str:
     words = [f"c_s {frame.c_s}"] if frame.c_s else []
     words += ["leaving"] if frame.leaving else []
     words += ["on probation"] if frame.probation else []
-    words += [f"news of cf{item.agent}, {item.age} slots old" for item in frame.gossip]
+    words += [f"state of cf{item.agent}, {item.age} slots old" for item in frame.gossip]
     words += [f"leases {frame.leases.hex(' ')}"] if any(frame.leases) else []
     words += [f"relays {', '.join(f'+{ahead}: {lessee}' for ahead, lessee in frame.relay)}"] if frame.relay else []
     return "".join(f", {word}" for word in words)

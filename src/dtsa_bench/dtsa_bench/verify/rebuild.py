@@ -43,7 +43,7 @@ class Expected(NamedTuple):
 def first_agent(data: bytes) -> int:
     """Id of the first agent of a Transmission message, 0 if it has none.
 
-    :param data: the message as CDR: representation 4, header 16, run 8, slot 4, number of agents 4, ids 2 each.
+    :param data: the message as CDR: representation 4, header 16, run 4, slot 4, number of agents 4, ids 2 each.
     """
     at = RUN_BYTES.stop + 4
     if len(data) < at + 6 or _IDS.unpack_from(data, at)[0] == 0:

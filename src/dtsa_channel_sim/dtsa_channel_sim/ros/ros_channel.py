@@ -38,7 +38,7 @@ class RosChannel:
     :param swarm_namespace: namespace of the swarm's topics.
     :param startup_s: s of wall time that all agents have to answer for the first time.
     :param end_s: s of wall time that the nodes have to hear of the end.
-    :param run_id: the run's id in all its messages, 64 bits; None: a random one.
+    :param run_id: the run's id in all its messages, 32 bits; None: a random one.
     """
 
     def __init__(
@@ -132,8 +132,8 @@ class RosChannel:
 
 
 def new_run_id() -> int:
-    """A random id for a run, 1 to 2^64 - 1: no two runs share one."""
-    return secrets.randbelow(2**64 - 1) + 1
+    """A random id for a run, 1 to 2^32 - 1; 64 bits would be more than some viewers can show."""
+    return secrets.randbelow(2**32 - 1) + 1
 
 
 def put_frames(message: Slot, senders: list[int], frames: list[bytes], received: Any) -> None:

@@ -21,7 +21,7 @@ typedef struct {
     double strength;    /* m^2/s, potential: k */
     double core;        /* m, potential: d_c */
     double tangential;  /* 1, potential: share of the sideways force */
-    double margin_rate; /* m/s, how fast the safety margin of a neighbour grows with the age of its news (0: not at all) */
+    double margin_rate; /* m/s, how fast the safety margin of a neighbour grows with the age of its state (0: not at all) */
     double margin_max;  /* m, largest such margin */
     double sidestep;    /* m, bvc: nearer than this to its cell's wall an agent steps to its right */
     double stretch_z;   /* 1, bvc: height of an agent's ellipsoid over its width (downwash) */
@@ -36,7 +36,7 @@ int avoid_scratch_doubles(int n);
  * position, velocity, goal: own true state and goal, 3 each (m, m/s, frame map).
  * others_p, others_v: (3, n) planes, what this agent believes about everybody now; entry `self` is ignored, and so is
  * whoever's believed position is not finite.
- * age_s: (n) seconds since each one's news was sampled, or NULL (no margins).
+ * age_s: (n) seconds since each one's state was sampled, or NULL (no margins).
  * scratch: avoid_scratch_doubles(n) doubles, contents undefined.
  * command: 3, output. */
 void avoid_command(int kind, const avoid_params *params, int n, int self,

@@ -37,7 +37,7 @@ static inline double *avoid_plane(const avoid_query *query, int plane)
     return query->scratch + (long)plane * avoid_plane_length(query->n);
 }
 
-/* Extra safety distance towards a neighbour whose news is `age` seconds old. */
+/* Extra safety distance towards a neighbour whose state is `age` seconds old. */
 static inline double avoid_margin(const avoid_params *params, double age)
 {
     double margin = params->margin_rate * age;

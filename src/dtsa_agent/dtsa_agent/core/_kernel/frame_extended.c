@@ -1,4 +1,4 @@
-/* The extended frame: the paper's state, and three sections of news about others. Layout in docs/protocol.md.
+/* The extended frame: the paper's state, and three sections about others. Layout in docs/protocol.md.
  *
  *   0      version (high nibble), profile 2 (low nibble)
  *   1      sender's id, 1..254

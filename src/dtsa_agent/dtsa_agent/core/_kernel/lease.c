@@ -169,7 +169,7 @@ int lease_decide(swarm *s, int l, int64_t slot, int *reason)
     if (!a->started) start(&v, slot);
     roll(&v, slot);
     watch_goal(s, l, &v, slot);
-    a->heard_now = a->sent_now = 0;
+    a->heard_now = 0;
     a->expected = -1;
     const int owner = (int)(slot % v.n), given = v.lessee[slot % v.window], anchor = lease_is_anchor(&v, slot);
     if (given == LEASE_OPEN) {
@@ -277,6 +277,6 @@ void lease_end(swarm *s, int64_t slot)
             note_silence(&v, slot);
         }
         end_probation(s, &v, s->local[l], slot);
-        if (a->farewell) s->present[l] = 0;
+        if (a->leaving) s->present[l] = 0;
     }
 }

@@ -21,7 +21,7 @@ typedef struct lease_agent {
     double wakers;        /* agents that woke lately: about so many in the last n slots */
     int32_t expected;     /* 0-based agent expected in this slot, -1: nobody in particular */
     int32_t deaf;         /* silent slots in a row */
-    uint8_t started, heard_now, sent_now, probation, anchored, attempts, moving, farewell;
+    uint8_t started, heard_now, probation, anchored, attempts, moving, leaving;
 } lease_agent;
 
 typedef struct {

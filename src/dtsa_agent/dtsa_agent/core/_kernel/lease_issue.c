@@ -123,7 +123,7 @@ void lease_fill(swarm *s, int l, int64_t slot, extended_frame *e)
     const int own_turn = slot % v.n == self;
     e->probation = v.a->probation;
     e->leaving = own_turn && s->present[l] == PRESENT_LEAVING;
-    v.a->farewell = (uint8_t)e->leaving;
+    v.a->leaving = (uint8_t)e->leaving;
     e->c_s = s->lease.adoption && !v.a->probation && !e->leaving ? count_absent_before(&v, self, slot) : 0;
     if (own_turn) issue(s, l, &v, slot, e);
     relay(&v, self, slot, e);

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 # Where the run's id lies in the messages that carry one, as CDR: after 4 bytes of representation and a header in frame
 # "map". It is random, and so outside all that is compared between flights.
-RUN_BYTES = slice(20, 28)
+RUN_BYTES = slice(20, 24)
 RUN_MESSAGES = frozenset(f"dtsa_msgs/msg/{name}" for name in ("Slot", "Transmission", "Reception", "Decision"))
 
 
@@ -18,7 +18,7 @@ def without_run(data: bytes | memoryview) -> bytes:
 
     :param data: the message as CDR.
     """
-    return b"".join((data[: RUN_BYTES.start], bytes(8), data[RUN_BYTES.stop :]))
+    return b"".join((data[: RUN_BYTES.start], bytes(4), data[RUN_BYTES.stop :]))
 
 
 def pack_received(mask: NDArray[np.bool_]) -> bytes:
