@@ -97,7 +97,8 @@ def test_nodes_find_plugins_too_and_agree_with_the_simulator(
     installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("rclpy")
-    from dtsa_bench.fly.flight import FlightOptions, fly
+    from dtsa_bench.fly.flight import fly
+    from dtsa_bench.fly.options import FlightOptions
 
     # Its processes inherit the way to the package.
     before = os.environ.get("PYTHONPATH", "")

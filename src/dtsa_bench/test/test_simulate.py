@@ -165,8 +165,8 @@ def test_dtsa_chooses_for_the_reasons_that_it_has() -> None:
 def test_simulate_and_fly_agree_bit_for_bit(tmp_path: Path, agents: int, processes: int | None, loss: float) -> None:
     pytest.importorskip("rclpy")
     from dtsa_bench.bag.reader import Bag
-    from dtsa_bench.fly.flight import FlightOptions
     from dtsa_bench.fly.flight import fly as fly_nodes
+    from dtsa_bench.fly.options import FlightOptions
 
     moving = 2 if agents == 12 else agents
     config = run(agents=agents, moving=moving, loss=loss, timeout_s=1.5, stop_on_crash=False, seed=agents)

@@ -11,24 +11,27 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from dtsa_msgs.msg import Slot, VelocityWorld
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dtsa_agent.core import AbstractSwarm
 from dtsa_agent.core.plugins import make_swarm
+from dtsa_agent.core.settings import Settings, setting
 from dtsa_agent.crazyflie.external_vehicles import ExternalVehicles
 from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_agent.crazyflie.units import rotate
 from dtsa_agent.keys import with_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.process import run_node
 from dtsa_agent.ros.hosting import declare_swarm
 from dtsa_agent.ros.realtime import RealtimeNode
@@ -108,25 +111,32 @@ class StationNode(RealtimeNode):
         super()._open(slot)
 
 
+@dataclass(frozen=True, slots=True)
+class StationNodeSettings(Settings):
+    """What the node needs beside what the whole swarm agrees on.
+
+    :raises ConfigError: for values that are not allowed.
+    """
+
+    swarm_namespace: str = setting(names.SWARM, "namespace of what the whole swarm shares")
+    command_hz: float = setting(50.0, "rate of the commands", unit="Hz", minimum=1, maximum=100)
+    priority: int = setting(0, "real-time priority; 0: none", minimum=0, maximum=90)
+
+
 def _body(stop: Stop, supervised: bool) -> None:
     plain = {"start_parameter_services": False, "enable_rosout": False} if supervised else {}
     node = Node("crazyflie_agents", namespace=names.SWARM, **plain)
     try:
         config = declare_swarm(node)
-        shared = ParameterDescriptor(description="namespace of what the whole swarm shares", read_only=True)
-        space = str(node.declare_parameter("swarm_namespace", names.SWARM, shared).value).rstrip("/")
         listed = ParameterDescriptor(description="ids of the agents in this process; [0]: all", read_only=True)
         ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
-        span = FloatingPointRange(from_value=1.0, to_value=100.0, step=0.0)
-        rate = ParameterDescriptor(description="rate of the commands (Hz)", read_only=True, floating_point_range=[span])
-        command_hz = float(node.declare_parameter("command_hz", 50.0, rate).value)
-        levels = IntegerRange(from_value=0, to_value=90, step=1)
-        level = ParameterDescriptor(description="real-time priority", read_only=True, integer_range=[levels])
-        take_priority(int(node.declare_parameter("priority", 0, level).value))
+        station = StationNodeSettings(**declare_settings(node, StationNodeSettings))
+        take_priority(station.priority)
         ids = parse_ids(ids, config.agents)
         zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
         swarm = with_key(make_swarm(config, local=ids))
-        agents = StationNode(node, swarm, space, command_hz=command_hz, offset_ns=zero, drift_ppb=zero, align=False)
+        space, rate = station.swarm_namespace.rstrip("/"), station.command_hz
+        agents = StationNode(node, swarm, space, command_hz=rate, offset_ns=zero, drift_ppb=zero, align=False)
         try:
             agents.run(stop)
         finally:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
 from dtsa_agent.core.config import MAX_AGENTS
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings import Setting
 
 from .common import names
 from .common.loop import Stop
+from .common.parameters import declare_setting
 from .common.process import node_options, run_node
 from .hosting import declare_swarm, host_agents
 
@@ -34,17 +35,8 @@ def _make_node(supervised: bool) -> tuple[Node, int]:
 
 
 def _own_id(node: Node, default: int) -> int:
-    span = IntegerRange(from_value=1, to_value=MAX_AGENTS, step=1)
-    info = ParameterDescriptor(
-        description="id of this agent, 1 .. agents; default: the number in the namespace",
-        read_only=True,
-        integer_range=[span],
-    )
-    try:
-        return int(node.declare_parameter("id", default, info).value)
-    except Exception as error:  # rclpy has no common base for wrong types and values out of range
-        value = node._parameter_overrides["id"].value
-        raise ConfigError("id", value, f"a whole number, 1 to {MAX_AGENTS}") from error
+    text = "id of this agent, 1 .. agents; default: the number in the namespace"
+    return int(declare_setting(node, Setting("id", "int", default, text, minimum=1, maximum=MAX_AGENTS)))
 
 
 def _body(stop: Stop, supervised: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
@@ -12,6 +13,7 @@ from rclpy.node import Node
 from dtsa_agent.core import AbstractSwarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.plugins import make_swarm, shareable
+from dtsa_agent.core.settings import Settings, setting
 from dtsa_agent.keys import with_key
 
 from .common import names
@@ -22,7 +24,34 @@ from .swarm_node import SwarmNode
 MODES = ("lockstep", "realtime")
 
 
-def _declare(node: Node, name: str, default: Any, text: str, kind: int = ParameterType.PARAMETER_NOT_SET) -> Any:
+@dataclass(frozen=True, slots=True)
+class HostSettings(Settings):
+    """How agents live in a process, beside what the whole swarm agrees on.
+
+    :raises ConfigError: for values that are not allowed.
+    """
+
+    swarm_namespace: str = setting(names.SWARM, "namespace of what the whole swarm shares")
+    odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
+    mode: str = setting(
+        MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own", choices=MODES
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OwnClocks(Settings):
+    """What the clocks of all agents of a process have in common.
+
+    :raises ConfigError: for values that are not allowed.
+    """
+
+    clock_jitter_ns: float = setting(
+        0.0, "standard deviation of the time of one transmission", unit="ns", minimum=0, maximum=1e9
+    )
+    align: bool = setting(True, "agents move their slots towards what they hear")
+
+
+def _declare(node: Node, name: str, default: Any, text: str, kind: int) -> Any:
     info = ParameterDescriptor(description=text, read_only=True, type=kind)
     return node.declare_parameter(name, default, info).value
 
@@ -56,17 +85,14 @@ def host_agents(
     """
     if shared and not shareable(config):
         raise ConfigError("shared_view", True, f"false with policy {config.policy}")
-    space = str(_declare(node, "swarm_namespace", names.SWARM, "namespace of what the whole swarm shares")).rstrip("/")
-    odometry = _declare(node, "odometry", True, "offer each agent's true motion as <agent>/odom")
-    mode = _declare(node, "mode", MODES[0], "lockstep: all wait for each other; realtime: each agent has its own clock")
-    if mode not in MODES:
-        raise ConfigError("mode", mode, ", ".join(MODES))
-    swarm = with_key(make_swarm(config, local=sorted(ids), shared_view=shared and mode == "lockstep"))
-    if mode == "lockstep":
+    host = HostSettings(**declare_settings(node, HostSettings))
+    space = host.swarm_namespace.rstrip("/")
+    swarm = with_key(make_swarm(config, local=sorted(ids), shared_view=shared and host.mode == "lockstep"))
+    if host.mode == "lockstep":
         agents: SwarmNode = SwarmNode(node, swarm, space)
     else:
         agents = _realtime(node, swarm, space)
-    if odometry:
+    if host.odometry:
         agents.offer_odometry(spaces)
     try:
         agents.run(stop)
@@ -83,8 +109,7 @@ def _realtime(node: Node, swarm: AbstractSwarm, space: str) -> SwarmNode:
     drift = _whole_numbers(
         node, "clock_drift_ppb", [0], count, "by how much each agent's clock runs fast (parts per billion)"
     )
-    jitter = float(_declare(node, "clock_jitter_ns", 0.0, "standard deviation of the time of one transmission (ns)"))
-    align = bool(_declare(node, "align", True, "agents move their slots towards what they hear"))
+    clocks = OwnClocks(**declare_settings(node, OwnClocks))
     fixed, per_byte = _whole_numbers(
         node,
         "flight_time_ns",
@@ -102,8 +127,8 @@ def _realtime(node: Node, swarm: AbstractSwarm, space: str) -> SwarmNode:
         space,
         offset_ns=offset,
         drift_ppb=drift,
-        jitter_ns=jitter,
-        align=align,
+        jitter_ns=clocks.clock_jitter_ns,
+        align=clocks.align,
         flight_time_ns=(fixed, per_byte),
         resume_at=places if len(places) > 1 else (),
     )

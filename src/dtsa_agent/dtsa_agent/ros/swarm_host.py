@@ -8,11 +8,22 @@ from collections.abc import Sequence
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
+from dtsa_agent.core.settings import Setting
+
 from .common import names
 from .common.loop import Stop
+from .common.parameters import declare_setting
 from .common.process import node_options, run_node
 from .hosting import declare_swarm, host_agents
 from .swarm_node import parse_ids
+
+SHARED = Setting(
+    "shared_view",
+    "bool",
+    False,
+    "one table serves all agents here, for as long as all hear the same; policies tdma, dtsa and age; only faster, "
+    "changes no flight",
+)
 
 
 def _body(stop: Stop, supervised: bool) -> None:
@@ -26,12 +37,7 @@ def _body(stop: Stop, supervised: bool) -> None:
             type=ParameterType.PARAMETER_INTEGER_ARRAY,
         )
         ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
-        share = ParameterDescriptor(
-            read_only=True,
-            description="one table serves all agents here, for as long as all "
-            "hear the same; policies tdma, dtsa and age; only faster, changes no flight",
-        )
-        shared = node.declare_parameter("shared_view", False, share).value
+        shared = declare_setting(node, SHARED)
         host_agents(node, parse_ids(ids, config.agents), config, stop, shared)
     finally:
         node.destroy_node()

@@ -198,7 +198,8 @@ def nodes() -> Iterator[Row]:
     try:
         import rclpy  # noqa: F401
 
-        from ..fly.flight import FlightOptions, fly
+        from ..fly.flight import fly
+        from ..fly.options import FlightOptions
         from .bare_round import rounds_per_s
     except ImportError as error:
         yield {"what": NODES, "left_out": f"{error}"}

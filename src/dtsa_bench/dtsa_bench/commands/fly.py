@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from dtsa_bench.options import add_mode_options, add_run_options, run_config, whole_number
+from dtsa_bench.fly.options import FlightOptions
+from dtsa_bench.options import add_mode_options, add_options, add_run_options, given, run_config, whole_number
 
 INTERRUPTED = 130
 
@@ -39,20 +40,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--config", metavar="FILE", default=None, help="swarm.yaml of the Crazyflies, for --backend cflib"
     )
-    parser.add_argument(
-        "--answer-s",
-        metavar="X",
-        type=float,
-        default=10.0,
-        help="wall time in which every node must answer a slot, s [10]",
-    )
-    parser.add_argument(
-        "--respawn",
-        metavar="S",
-        type=float,
-        default=None,
-        help="real time: a process that died is started again after S seconds, and its agents come back [off]",
-    )
+    add_options(parser, FlightOptions, "flight", skip=("startup_s", "processes", "domain", "pictures"))
     parser.add_argument(
         "--late",
         metavar="cfK=S,...",
@@ -88,15 +76,14 @@ def run(args: argparse.Namespace) -> int:
     directory = Path(args.out)
 
     from dtsa_agent.ros.common.loop import Stop
-    from dtsa_bench.fly.flight import FlightOptions, fly
+    from dtsa_bench.fly.flight import fly
 
     options = FlightOptions(
         processes=processes,
         domain=domain,
-        answer_s=args.answer_s,
         pictures=args.picture,
-        respawn_s=args.respawn,
-        late_s=late_agents(args.late),
+        late=late_agents(args.late),
+        **given(args, FlightOptions, "flight"),
     )
     with Stop() as stop:
         flight = fly(config, directory, options, stop)
@@ -134,21 +121,20 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     from dtsa_agent.core.errors import ConfigError
     from dtsa_agent.crazyflie.config import load_swarm
 
-    for name in ("respawn", "late"):
-        if getattr(args, name) is not None:
-            raise ConfigError(name, getattr(args, name), "only with --backend sim")
+    for name, value in {"late": args.late, **given(args, FlightOptions, "flight")}.items():
+        if value is not None and name != "answer_s":
+            raise ConfigError(name, value, "only with --backend sim")
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     path = Path(args.config)
     settings = load_swarm(path)
     from dtsa_agent.ros.common.loop import Stop
     from dtsa_bench.fly.crazyflie import fly_crazyflies, mission_defaults
-    from dtsa_bench.fly.flight import FlightOptions
 
     if getattr(args, "run.mode") is None:
         setattr(args, "run.mode", "realtime")
-    given = {key.partition(".")[2]: value for key, value in vars(args).items() if key.startswith("swarm.")}
-    config = run_config(args, **mission_defaults(settings, given))
+    chosen = {key.partition(".")[2]: value for key, value in vars(args).items() if key.startswith("swarm.")}
+    config = run_config(args, **mission_defaults(settings, chosen))
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     options = FlightOptions(domain=domain, pictures=args.picture)
     with Stop() as stop:

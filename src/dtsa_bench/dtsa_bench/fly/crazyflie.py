@@ -43,7 +43,8 @@ from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .children import Child, Children, describe_end
 from .domain import ros_domain
-from .flight import END_S, Flight, FlightOptions, run_environment
+from .flight import END_S, Flight, run_environment
+from .options import FlightOptions
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import RealtimeSupervisor, Supervisor

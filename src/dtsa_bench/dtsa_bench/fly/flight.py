@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .children import Children
 from .domain import ros_domain
+from .options import FlightOptions
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import LateStart, RealtimeSupervisor, Supervisor
@@ -60,19 +61,6 @@ def run_environment(domain: int, logs: Path) -> dict[str, str]:
 
 
 @dataclass(frozen=True, slots=True)
-class FlightOptions:
-    """How a flight is carried out; none of it changes what happens in it."""
-
-    processes: int | None = None  # None: one an agent
-    domain: int | None = None  # None: any that is free
-    startup_s: float = 60.0
-    answer_s: float = 10.0
-    respawn_s: float | None = None  # real time: a process that died is started again after so long; None: it is not
-    late_s: Mapping[int, float] = field(default_factory=dict)  # real time: agents that start so long after slot 0
-    pictures: bool = True
-
-
-@dataclass(frozen=True, slots=True)
 class Flight:
     """What is left of a flight."""
 
@@ -96,20 +84,18 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
     :raises ConfigError: for options that do not fit the run.
     """
     agents = run.swarm.agents
-    if options.processes is not None and not 1 <= options.processes <= agents:
+    if options.processes is not None and options.processes > agents:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
     if run.swarm.estimator_row.needs_everybody and (options.processes or agents) > 1:
         raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
-    late = dict(options.late_s)
-    for name, value in (("respawn", options.respawn_s), ("late", late or None)):
+    late = dict(options.late)
+    for name, value in (("respawn", options.respawn), ("late", late or None)):
         if value is not None and run.mode == LOCKSTEP:
             raise ConfigError(name, value, "only with --mode realtime: in lockstep all wait for all")
         if value is not None:
             check_joinable(run.swarm.policy)
-    if options.respawn_s is not None and not 0.0 <= options.respawn_s <= 3600.0:
-        raise ConfigError("respawn", options.respawn_s, "0 to 3600 s")
-    if late and (not set(late) < set(range(1, agents + 1)) or not all(0.0 <= s <= 86400.0 for s in late.values())):
-        raise ConfigError("late", late, f"some, not all, of the agents 1 to {agents}, and 0 to 86400 s")
+    if late and not set(late) < set(range(1, agents + 1)):
+        raise ConfigError("late", late, f"some, not all, of the agents 1 to {agents}")
     if late and options.processes is not None:
         raise ConfigError("late", late, "only with --processes per-agent")
 
@@ -172,7 +158,7 @@ def _fly(
         channel, measurement = flight.channel, flight.measurement
         shown = FlightProgress(progress, measurement, run.swarm.agents, run.swarm.slot_ns)
         if isinstance(channel, RealtimeChannel):
-            again = options.respawn_s
+            again = options.respawn
             channel.observe(RealtimeSupervisor(children, channel, measurement, progress.say, again, late))
         else:
             channel.observe(Supervisor(children))
@@ -203,8 +189,8 @@ def _start_agents(children: Children, run: RunConfig, options: FlightOptions, di
         for agent in range(1, swarm.agents + 1):
             place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_parameters(run, [agent])]
             start = partial(children.start, f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
-            if agent in options.late_s:
-                late.append(LateStart(options.late_s[agent], agent, start))
+            if agent in options.late:
+                late.append(LateStart(options.late[agent], agent, start))
             else:
                 start()
         return late

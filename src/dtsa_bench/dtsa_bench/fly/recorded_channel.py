@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig, make_scenario
-from dtsa_agent.core.settings import settings_of
+from dtsa_agent.core.settings import Setting, settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
-from dtsa_agent.ros.common.parameters import declare_settings
+from dtsa_agent.ros.common.parameters import declare_setting, declare_settings
 from dtsa_agent.ros.common.process import run_node
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.ros.channel_node import declare_limits, follow_parameters
+from dtsa_channel_sim.ros.answer_limits import AnswerLimits
+from dtsa_channel_sim.ros.channel_node import follow_parameters
 from dtsa_channel_sim.ros.diagnostics import Diagnostics
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
@@ -112,8 +112,7 @@ def declare_run(node: Node) -> RunConfig:
     """
     swarm = SwarmConfig.from_dict(declare_settings(node, SwarmConfig))
     channel = declare_settings(node, ChannelConfig, skip=FROM_SWARM, changeable=True)
-    described = ParameterDescriptor(description="YAML file with further settings of the channel", read_only=True)
-    file = node.declare_parameter("channel_file", "", described).value
+    file = declare_setting(node, Setting("channel_file", "text", "", "YAML file with further settings of the channel"))
     derived = from_swarm(swarm)
     if file:
         defaults = {spec.name: spec.default for spec in settings_of(ChannelConfig)}
@@ -128,10 +127,9 @@ def _body(stop: Stop, supervised: bool) -> None:
     node = Node("channel", namespace=names.SWARM)
     try:
         run = declare_run(node)
-        where = ParameterDescriptor(description="directory for the bag and the results", read_only=True)
-        directory = new_directory(node.declare_parameter("out", "flight", where).value)
-        startup_s, answer_s = declare_limits(node)
-        flight = RecordedFlight(node, run, directory, startup_s, answer_s)
+        directory = new_directory(declare_setting(node, Setting("out", "text", "flight", "directory for the results")))
+        wait = AnswerLimits(**declare_settings(node, AnswerLimits))
+        flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s)
         try:
             flight.channel.run(stop)
         finally:

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 
 from .airtime import LONGEST_FRAME
-from .config import Change, ChannelConfig
+from .config import ChannelConfig
 from .losses import Losses, NoiseSource
 from .medium import Medium, OnAir
+from .schedule import Change
 from .timeline import Epoch, Timeline
 from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 

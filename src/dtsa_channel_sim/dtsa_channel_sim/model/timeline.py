@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dtsa_agent.core.errors import ConfigError
 
-if TYPE_CHECKING:  # the settings check themselves with what is here
-    from .config import Change, ChannelConfig
+from .schedule import Change
+
+if TYPE_CHECKING:
+    from .config import ChannelConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +99,15 @@ def _flattened(config: ChannelConfig) -> Iterable[Change]:
         values = tuple((name, now[name]) for name in sorted(named) if now[name] != before[name])
         before = now
         if values:
-            yield replace(config.schedule[0], slot=edge, values=values, until=None)
+            yield Change(edge, values)
 
 
-def check(config: ChannelConfig) -> None:
-    """Raise :class:`ConfigError` when the schedule leads to settings that do not go together."""
+def check_schedule(config: ChannelConfig) -> None:
+    """Tries every state that the channel will be in.
+
+    :param config: the settings with their schedule.
+    :raises ConfigError: if it leads to settings that do not go together.
+    """
     try:
         Timeline(config)
     except ConfigError as error:

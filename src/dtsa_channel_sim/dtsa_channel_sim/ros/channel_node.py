@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import settings_of
+from dtsa_agent.core.settings import setting, settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import declare_settings, from_parameter
 from dtsa_agent.ros.common.process import run_node
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.config import CHANGEABLE, Change, ChannelConfig
+from dtsa_channel_sim.model.config import CHANGEABLE, ChannelConfig
+from dtsa_channel_sim.model.schedule import Change
 
+from .answer_limits import AnswerLimits
 from .diagnostics import Diagnostics
 from .lockstep import LockstepChannel
 from .observer import SlotLimit
@@ -62,38 +65,25 @@ def follow_parameters(node: Node, channel: Channel, changed: Callable[[Change], 
     node.add_on_set_parameters_callback(apply)
 
 
-def declare_limits(node: Node) -> tuple[float, float]:
-    """Declares how long the channel waits for its agents; s of wall time for slot 0 and for later ones."""
-    values = []
-    for name, default, text in (
-        ("startup_s", 60.0, "wall time that all agents have to answer slot 0"),
-        ("answer_s", 10.0, "wall time that all agents have to answer any later slot"),
-    ):
-        span = FloatingPointRange(from_value=0.1, to_value=86400.0, step=0.0)
-        info = ParameterDescriptor(description=text + " (s)", floating_point_range=[span], read_only=True)
-        values.append(float(node.declare_parameter(name, default, info).value))
-    return values[0], values[1]
+@dataclass(frozen=True, slots=True)
+class ChannelNodeSettings(AnswerLimits):
+    """What the channel's node needs beside the channel's settings.
+
+    :raises ConfigError: for values that are not allowed.
+    """
+
+    slots: int = setting(0, "the run ends after so many slots; 0: by a signal only", minimum=0, maximum=2**31)
+    steps: int = setting(1, "control instants in a slot, as the agents have", minimum=1, maximum=255)
 
 
 def _body(stop: Stop, supervised: bool) -> None:
     node = Node("channel", namespace=names.SWARM)
     try:
         values = declare_channel(node, ChannelConfig(agents=12))
-        count = ParameterDescriptor(
-            description="the run ends after so many slots; 0: by a signal only",
-            read_only=True,
-            integer_range=[IntegerRange(from_value=0, to_value=2**31, step=1)],
-        )
-        slots = node.declare_parameter("slots", 0, count).value
-        control = ParameterDescriptor(
-            description="control instants in a slot, as the agents have",
-            read_only=True,
-            integer_range=[IntegerRange(from_value=1, to_value=255, step=1)],
-        )
-        steps = node.declare_parameter("steps", 1, control).value
-        startup_s, answer_s = declare_limits(node)
+        run = ChannelNodeSettings(**declare_settings(node, ChannelNodeSettings))
         medium = Channel(ChannelConfig.from_dict(values))
-        channel = LockstepChannel(node, medium, steps, answer_s, referee=SlotLimit(slots), startup_s=startup_s)
+        referee = SlotLimit(run.slots)
+        channel = LockstepChannel(node, medium, run.steps, run.answer_s, referee=referee, startup_s=run.startup_s)
         channel.observe(Diagnostics(node))
         follow_parameters(node, medium, channel.change_settings)
         try:

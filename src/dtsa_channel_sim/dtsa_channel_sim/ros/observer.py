@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_channel_sim.model.config import Change
+from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Answers

@@ -17,7 +17,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Loop
 from dtsa_agent.ros.common.wire import pack_received
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.config import Change
+from dtsa_channel_sim.model.schedule import Change
 
 from .answers import Answers
 from .observer import ChannelObserver, ChannelStatus, Observers, Referee, SlotLimit

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import Setting, Settings, format_values, settings_of
@@ -64,22 +64,29 @@ def declare_settings(
     for setting in settings_of(cls):
         if setting.kind == "structure" or setting.name in skip:
             continue
-        default = (defaults or {}).get(setting.name, setting.default)
-        parameter = _declare(node, setting, prefix, default, not (changeable and setting.changeable))
-        values[setting.name] = from_parameter(setting, parameter.value)
+        own = dataclasses.replace(setting, default=(defaults or {}).get(setting.name, setting.default))
+        values[setting.name] = declare_setting(node, own, prefix, not (changeable and setting.changeable))
     return values
 
 
-def _declare(node: Node, setting: Setting, prefix: str, default: Any, read_only: bool) -> Parameter:
+def declare_setting(node: Node, setting: Setting, prefix: str = "", read_only: bool = True) -> Any:
+    """Declares one parameter and gives the value that the node was started with.
+
+    :param node: the node.
+    :param setting: name, default, description and range.
+    :param prefix: stands before the setting's name in the parameter's.
+    :param read_only: whether it is fixed once the node runs.
+    :raises ConfigError: for a value of the wrong type or out of range.
+    """
     name = prefix + setting.name
-    if default is None:
-        default = _NOTHING
+    default = _NOTHING if setting.default is None else to_parameter(setting, setting.default)
     try:
-        return node.declare_parameter(name, to_parameter(setting, default), descriptor(setting, read_only))
+        parameter = node.declare_parameter(name, default, descriptor(setting, read_only))
     except Exception as error:  # rclpy has no common base for wrong types and values out of range
         given = node._parameter_overrides.get(name)
         value = given.value if given is not None else default
         raise ConfigError(name, value, setting.allowed) from error
+    return from_parameter(setting, parameter.value)
 
 
 def from_parameter(setting: Setting, value: Any) -> Any:
