@@ -20,6 +20,8 @@ COMMANDS = {
     "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
 }
 
+RECORDED_RUN = "run directory, bag directory or .mcap file"  # what commands take that read one
+
 
 def module_name(command: str) -> str:
     """Name of the module of a command inside `dtsa_bench.commands`."""

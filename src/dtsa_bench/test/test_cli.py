@@ -111,3 +111,13 @@ def test_the_list_of_commands_imports_nothing_heavy() -> None:
     )
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_help_of_commands_that_read_runs_imports_nothing_heavy() -> None:
+    script = (
+        "import sys; from dtsa_bench.cli import build_parser; "
+        "[build_parser(name) for name in ('verify', 'report', 'replay', 'recover', 'export', 'sweep')]; "
+        "print(sorted({'numpy', 'rclpy', 'matplotlib', 'pandas', 'rosbags'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

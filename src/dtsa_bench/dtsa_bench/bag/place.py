@@ -6,7 +6,6 @@ from pathlib import Path
 
 from dtsa_bench.bag.errors import UnusableBag
 
-GIVEN = "run directory, bag directory or .mcap file"  # for the help of the commands
 SQLITE = "an sqlite3 bag; `ros2 bag convert` makes an mcap bag of it"
 PACKED = "its file is compressed as a whole; `ros2 bag convert` makes a plain bag of it"
 

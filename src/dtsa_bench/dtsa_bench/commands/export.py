@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from dtsa_bench.bag.place import GIVEN, bag_of
+from dtsa_bench.registry import RECORDED_RUN
 
 DESCRIPTION = """\
 Writes a recorded run as tables for pandas and polars: slots, frames, decisions and states, one file each, and
@@ -14,7 +14,7 @@ columns.md, which says what each column holds and in which unit."""
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
     parser = subparsers.add_parser("export", help="tables of a recorded run: Parquet or CSV", description=DESCRIPTION)
-    parser.add_argument("bag", help=GIVEN)
+    parser.add_argument("bag", help=RECORDED_RUN)
     parser.add_argument("--to", default="parquet", metavar="FORMAT", help="parquet (default) or csv")
     parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_tables beside the bag)")
     parser.add_argument("--tables", nargs="+", metavar="TABLE", help="only these: slots frames decisions states")
@@ -23,6 +23,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Export the bag."""
     from dtsa_bench.bag.export import export
+    from dtsa_bench.bag.place import bag_of
 
     bag = bag_of(args.bag).resolve()
     target = args.out or bag.with_name(f"{bag.name if bag.is_dir() else bag.stem}_tables")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from dtsa_bench.bag.place import GIVEN
+from dtsa_bench.registry import RECORDED_RUN
 
 DESCRIPTION = """\
 Makes a full bag of what a killed recorder, a full disk or a damaged file left, and says what was saved.
@@ -15,7 +15,7 @@ The original is only read."""
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
     parser = subparsers.add_parser("recover", help="make a full bag of a damaged one", description=DESCRIPTION)
-    parser.add_argument("bag", help=GIVEN)
+    parser.add_argument("bag", help=RECORDED_RUN)
     parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_recovered beside the old one)")
     parser.add_argument(
         "--keep-damaged",

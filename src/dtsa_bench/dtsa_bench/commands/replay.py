@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from dtsa_bench.bag.place import GIVEN
+from dtsa_bench.registry import RECORDED_RUN
 
 if TYPE_CHECKING:
     from dtsa_bench.bag.reader import Bag
@@ -32,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bag", help=GIVEN)
+    parser.add_argument("bag", help=RECORDED_RUN)
     parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed, 1 is real time (default 1)")
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="begin S seconds into the run")
     parser.add_argument("--loop", action="store_true", help="begin again at the end, until q or Ctrl-C")

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from dtsa_bench.bag.place import GIVEN, bag_of
+from dtsa_bench.registry import RECORDED_RUN
 
 DESCRIPTION = """\
 Writes one self-contained HTML page about one recorded run, or several side by side: the flight in 3D, the
@@ -23,12 +23,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{GIVEN}; up to 6")
+    parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{RECORDED_RUN}; up to 6")
     parser.add_argument("--out", metavar="FILE", help="the page (default: report.html beside the first bag)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the report."""
+    from dtsa_bench.bag.place import bag_of
     from dtsa_bench.report.page import write_report
 
     first = bag_of(args.bags[0]).resolve()

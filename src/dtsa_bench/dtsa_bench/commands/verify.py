@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from dtsa_bench.bag.place import GIVEN
+from dtsa_bench.registry import RECORDED_RUN
 
 DESCRIPTION = """\
 Rebuilds every agent and the channel from the recorded configuration, feeds them what they heard, and compares
@@ -21,7 +21,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bag", nargs="+", help=GIVEN)
+    parser.add_argument("bag", nargs="+", help=RECORDED_RUN)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
