@@ -24,9 +24,9 @@ from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.bag.writer import BagWriter
 from dtsa_bench.fly.clock_statistics import ClockStatistics
 from dtsa_bench.verify import Result, verify_bag
-from dtsa_bench.verify.air import Air
+from dtsa_bench.verify.frames import SentFrames
 from dtsa_bench.verify.result import Mismatch
-from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig, RealtimeArbiter, make_clocks
+from dtsa_channel_sim import Air, Channel, ChannelConfig, ClockConfig, make_clocks
 
 MS = 1_000_000
 DRIFT_PPM = 1000.0  # much more than a crystal's, to see in seconds what else takes minutes
@@ -330,53 +330,72 @@ FRAME = st.tuples(st.integers(1, 5), st.integers(0, 12 * MS), st.integers(1, 60)
 FRAMES = st.lists(FRAME, min_size=2, max_size=12, unique_by=lambda frame: frame[:2])
 
 
-def on_air(config: ChannelConfig, frames: list[tuple[int, int, int]], flip: tuple[int, int] | None = None) -> Air:
+def on_air(
+    config: ChannelConfig, frames: list[tuple[int, int, int]], flip: tuple[int, int] | None = None
+) -> SentFrames:
     """Frames with the channel's verdicts on them, one receiver's bit turned round in deliveries and verdicts alike."""
-    arbiter, air = RealtimeArbiter(Channel(config)), Air(config, own_clocks=True)
+    line, sent = Air(Channel(config)), SentFrames(config, own_clocks=True)
     ordered = sorted(frames, key=lambda f: f[1])
     for number, (sender, start, length) in enumerate(ordered):
-        arbiter.push(number, sender, start, length)
-        air.send(number, sender, start, bytes(length))
-    verdicts = sorted(arbiter.settle(100 * MS), key=lambda v: v.frame_id)
+        line.begin(number, sender, start, length)
+        sent.send(number, sender, start, bytes(length))
+    verdicts = sorted(line.settle(100 * MS), key=lambda v: v.frame_id)
     for v in verdicts:
         received = v.received.copy()
         if flip and v.frame_id == flip[0] % len(ordered):
             received[flip[1]] ^= True
         if received.any():
-            air.deliver(v.frame_id, v.sender, bytes(ordered[v.frame_id][2]), received)
-        air.judged(v.slot, v.sender, received, v.lost, v.collided)
-    return air
+            sent.deliver(v.frame_id, v.sender, bytes(ordered[v.frame_id][2]), received)
+        sent.judged(v.slot, v.sender, received, v.lost, v.collided)
+    return sent
 
 
 @given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
 @settings(max_examples=60, deadline=None)
 def test_the_channels_own_verdicts_always_pass(frames: list[tuple[int, int, int]], loss: float, seed: int) -> None:
-    air = on_air(ChannelConfig(agents=5, loss=loss, seed=seed), frames)
-    air.check_overlaps()
-    assert air.check_verdicts([], only_alone=False) == len(frames)
+    sent = on_air(ChannelConfig(agents=5, loss=loss, seed=seed), frames)
+    sent.check_overlaps()
+    assert sent.check_verdicts([]) == len(frames)
 
 
 @given(FRAMES, st.integers(0, 99), st.integers(0, 4))
 @settings(max_examples=60, deadline=None)
 def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], frame: int, receiver: int) -> None:
     def check() -> None:
-        air = on_air(ChannelConfig(agents=5), frames, flip=(frame, receiver))
-        air.check_overlaps()
-        air.check_verdicts([], only_alone=False)
+        sent = on_air(ChannelConfig(agents=5), frames, flip=(frame, receiver))
+        sent.check_overlaps()
+        sent.check_verdicts([])
 
     with pytest.raises(Mismatch):
         check()
 
 
-def both_heard(gap_ns: int, second: int) -> Air:
+def test_a_dropped_frame_has_disturbed_nobody() -> None:
+    """Agent 1's frame met that of agent 2 in time, but came too late to be on the air: all heard agent 2."""
+    sent = SentFrames(ChannelConfig(agents=3), own_clocks=True)
+    nobody, others = np.zeros(3, dtype=bool), np.array([True, False, True])
+    for sender, received in ((1, nobody), (2, others)):
+        sent.send(0, sender, 0, bytes(24))
+        sent.judged(0, sender, received, 0, 0)
+    sent.deliver(0, 2, bytes(24), others)
+    with pytest.raises(Mismatch, match="who sends does not hear"):
+        sent.check_overlaps()
+    sent.check_overlaps(late=1)
+    assert sent.dropped == 1
+    assert sent.check_verdicts([], late=1) == 1
+    with pytest.raises(Mismatch):
+        sent.check_verdicts([])
+
+
+def both_heard(gap_ns: int, second: int) -> SentFrames:
     """A frame of agent 1 and one of agent 2 that starts ``gap_ns`` later; agent 3 has heard both or not."""
-    air = Air(ChannelConfig(agents=3), own_clocks=True)
+    sent = SentFrames(ChannelConfig(agents=3), own_clocks=True)
     for sender, start, heard in ((1, 0, True), (2, gap_ns, second > 0)):
-        air.send(0, sender, start, bytes(24))
+        sent.send(0, sender, start, bytes(24))
         received = np.array([False, False, heard])
-        air.deliver(0, sender, bytes(24), received)
-        air.judged(0, sender, received, 0, 0)
-    return air
+        sent.deliver(0, sender, bytes(24), received)
+        sent.judged(0, sender, received, 0, 0)
+    return sent
 
 
 def test_two_frames_at_one_time_are_never_both_heard() -> None:
@@ -384,9 +403,9 @@ def test_two_frames_at_one_time_are_never_both_heard() -> None:
     with pytest.raises(Mismatch, match="both at cf3"):
         both_heard(length_ns // 2, second=1).check_overlaps()
     both_heard(length_ns, second=1).check_overlaps()
-    air = both_heard(length_ns // 2, second=0)
-    air.check_overlaps()
-    assert air.safety()["overlapping_pairs"] == 1
+    sent = both_heard(length_ns // 2, second=0)
+    sent.check_overlaps()
+    assert sent.safety()["overlapping_pairs"] == 1
 
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:

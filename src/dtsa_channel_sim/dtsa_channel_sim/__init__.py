@@ -1,11 +1,11 @@
 """The radio channel that a swarm shares: slots, collisions, losses, ranges and clocks."""
 
+from .model.air import Air, FrameVerdict
 from .model.airtime import Airtime
 from .model.channel import Channel
 from .model.clocks import AgentClock, ClockConfig, make_clocks
 from .model.config import CHANGEABLE, Change, ChannelConfig
-from .model.medium import OnAir
-from .model.realtime import FrameVerdict, RealtimeArbiter
+from .model.medium import Medium, OnAir, Reception
 from .model.topology import LinkLoss
 from .model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
 
@@ -16,6 +16,7 @@ __all__ = [
     "OUTCOMES",
     "SUCCESS",
     "AgentClock",
+    "Air",
     "Airtime",
     "Change",
     "Channel",
@@ -23,8 +24,9 @@ __all__ = [
     "ClockConfig",
     "FrameVerdict",
     "LinkLoss",
+    "Medium",
     "OnAir",
-    "RealtimeArbiter",
+    "Reception",
     "Verdict",
     "make_clocks",
 ]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.alignment import ClockAligner
 from dtsa_agent.core.errors import ConfigError
-from dtsa_channel_sim import AgentClock, Channel, ChannelConfig, ClockConfig, RealtimeArbiter, make_clocks
+from dtsa_channel_sim import AgentClock, Air, Channel, ChannelConfig, ClockConfig, make_clocks
 
 MS = 1_000_000
 TIMES = st.integers(-(10**15), 10**18)
@@ -115,7 +115,7 @@ def ten_minutes(*, loss, align, jitter_ns=5000, agents=18, slots=60_000, burst_l
     drifts = np.random.default_rng(seed).permutation(np.linspace(-50_000, 50_000, agents)).astype(int)
     clocks = [dataclasses.replace(c, drift_ppb=d) for c, d in zip(clocks, drifts.tolist(), strict=True)]
     channel = Channel(ChannelConfig(agents=agents, loss=loss, burst_length=burst_length, seed=seed))
-    line = RealtimeArbiter(channel)
+    line = Air(channel)
     config = channel.config
     travel = config.airtime.total_ns(length)
     # Local time at which each agent's slot 0 starts; a frame goes out a quarter of a slot later.
@@ -126,7 +126,7 @@ def ten_minutes(*, loss, align, jitter_ns=5000, agents=18, slots=60_000, burst_l
     for slot in range(slots):
         owner = slot % agents
         start = clocks[owner].to_channel(zero[owner] + slot * slot_ns + guard) + clocks[owner].jitter(slot)
-        line.push(slot, owner + 1, start, length)
+        line.begin(slot, owner + 1, start, length)
         for verdict in line.settle((slot - 4) * slot_ns):
             collided += verdict.collided > 0
             if not align:

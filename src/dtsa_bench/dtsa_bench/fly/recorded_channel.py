@@ -79,7 +79,7 @@ class RecordedFlight:
         if isinstance(channel, RealtimeChannel):
             result |= {
                 "mode": self.run_config.mode,
-                "late_frames": channel.arbiter.late,
+                "late_frames": channel.air.late,
                 "missed_reports": channel.missed,
                 "returned_agents": sorted(channel.returned),
                 **self._clocks.summary(),

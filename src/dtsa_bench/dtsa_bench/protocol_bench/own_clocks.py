@@ -1,6 +1,6 @@
 """A swarm without a common clock: every agent has its own and finds out by itself which slot it is.
 
-An event simulation on the channel's real-time arbiter: exact to the nanosecond, and the same for the same seeds.
+An event simulation on the channel's time line: exact to the nanosecond, and the same for the same seeds.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 
 from dtsa_agent.core import Swarm, SwarmConfig, decode_frame
 from dtsa_agent.core.timebase import LISTENING, RESTARTED, TimeBase
-from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim import Air, Channel, ChannelConfig
 from dtsa_channel_sim.model.clocks import AgentClock
-from dtsa_channel_sim.model.realtime import RealtimeArbiter
 
 from .experiment import FAR, still_scenario
 
@@ -80,7 +79,7 @@ class OwnClocks:
         align: bool = True,
     ) -> None:
         self.config, self.seen = config, Seen()
-        self._arbiter = RealtimeArbiter(Channel(channel))
+        self._air: Air[tuple[int, int]] = Air(Channel(channel))
         self._delay_ns = 2 * channel.link_delay_ns
         self._airtime = channel.airtime
         self.agents = [_Agent(config, k + 1, clock, align) for k, clock in enumerate(clocks)]
@@ -119,7 +118,7 @@ class OwnClocks:
         if slot is not None and slot != agent.open:
             data = agent.take_slot(slot)
             if data:
-                self._arbiter.push((k, slot), k + 1, now, len(data))
+                self._air.begin((k, slot), k + 1, now, len(data))
                 self._data[k, slot] = data
                 self.seen.frames += 1
         if slot is not None:
@@ -129,8 +128,8 @@ class OwnClocks:
         heapq.heappush(self._events, (self.agents[k].clock.to_channel(local_ns), k, False))
 
     def _deliver(self, now: int) -> None:
-        for verdict in self._arbiter.settle(now):
-            sender, slot = verdict.frame_id  # type: ignore[misc]
+        for verdict in self._air.settle(now):
+            sender, slot = verdict.frame_id
             data = self._data.pop((sender, slot))
             if verdict.collided:
                 self.seen.destroyed.append(verdict.start_ns)

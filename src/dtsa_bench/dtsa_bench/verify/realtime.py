@@ -26,7 +26,7 @@ from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
-from .air import Air
+from .frames import SentFrames
 from .lockstep import parameter_value
 from .rebuild import DECISION, RECEPTION, SLOT, TRANSMISSION
 from .result import Difference, Mismatch, Result
@@ -67,7 +67,7 @@ class RealtimeCheck:
                 self._authenticator = Authenticator.from_hex(key, self.run.swarm.auth_session)
             else:
                 result.skipped["tags of frames"] = f"no key in {VARIABLE}"
-        self.air = Air(self.run.air, self.own_clocks)
+        self.frames = SentFrames(self.run.air, self.own_clocks)
         self.position = np.full((3, self.agents), np.nan)  # m, true, as last reported
         self._slots = np.full(self.agents, -1, dtype=np.int64)  # last slot that each has answered
         self._places: list[list[tuple[int, NDArray[np.float64], float]]] = [[] for _ in range(self.agents)]
@@ -99,25 +99,25 @@ class RealtimeCheck:
         self._finish()
 
     def _finish(self) -> None:
-        result, air = self.result, self.air
-        for what, times in air.check_overlaps().items():
-            result.count(what, times)
+        result, frames = self.result, self.frames
         summary = self._summary()
         late = summary.get("late_frames", 0)
+        for what, times in frames.check_overlaps(late).items():
+            result.count(what, times)
         missed = summary.get("missed_reports", len(self._carried))
         if len(self._carried) > missed:
             why = "only who reported too late is missing from its slot's account"
             self._fail("decision", f"{missed} late reports", len(self._carried), why, None)
         if self._carried:
             result.skipped["decisions of agents that reported too late"] = f"{len(self._carried)} in all"
-        if late:
+        if late and frames.dropped != late:
             result.skipped["verdicts on frames that met another"] = (
-                f"{late} frames were handed in after others had been settled, and could not destroy them any more"
+                f"{late} frames came too late to be on the air, {frames.dropped} are known"
             )
         if self.own_clocks and (self.run.air.range_m or self.run.air.capture_db):
             result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
         else:
-            result.count("verdicts made again", air.check_verdicts(self._events, only_alone=late > 0))
+            result.count("verdicts made again", frames.check_verdicts(self._events, late))
         self._odometry()
         self.streams.check_digest(result)
         result.skipped["decisions and motion"] = (
@@ -126,7 +126,7 @@ class RealtimeCheck:
         for topic in self.bag.topics:
             if topic not in (SLOT, TRANSMISSION, DECISION, RECEPTION, EVENTS) and not topic.endswith("/odom"):
                 result.skipped[topic] = "carries nothing that is not in other topics; covered by the digest"
-        result.safety |= air.safety()
+        result.safety |= frames.safety()
         if self.own_clocks:
             spread = [max(s.values()) - min(s.values()) for s in self._starts.values() if len(s) > 1]
             result.safety["clock_spread_max_ms"] = max(spread, default=0) / 1e6
@@ -171,9 +171,9 @@ class RealtimeCheck:
             self._places[agent - 1].append((slot, track[-1, :, k].copy(), float(np.linalg.norm(velocity[:, k]))))
             if frames[k]:
                 self._frame(slot, agent, frames[k], track[-1, :, k], velocity[:, k], command[:, k])
-                self.air.send(slot, agent, slot * self.slot_ns + int(offsets[k]), frames[k])
+                self.frames.send(slot, agent, slot * self.slot_ns + int(offsets[k]), frames[k])
         if not self.own_clocks:
-            self.air.place(slot, self.position)
+            self.frames.place(slot, self.position)
         self.result.count("transmission")
 
     def _frame(self, slot: int, agent: int, data: bytes, *state: NDArray[np.float64]) -> None:
@@ -243,7 +243,7 @@ class RealtimeCheck:
         for sender, frame, mask in zip(said.sender.tolist(), frames, masks, strict=True):
             if self.own_clocks:
                 self._catch_up(slot, sender)
-            sent = self.air.deliver(slot, sender, frame, mask)
+            sent = self.frames.deliver(slot, sender, frame, mask)
             if self.own_clocks:
                 arrival = names.TIME_ZERO_NS + max(0, sent.on_air.end_ns + self.run.air.link_delay_ns)
                 self._equal_time("slot.stamp", arrival, stamp, slot, sender)
@@ -255,7 +255,7 @@ class RealtimeCheck:
 
         Reports lie in the bag where the channel's slots start. Whoever has a fast clock is heard before that.
         """
-        while not self.air.knows(slot, sender) and (message := self.streams.take(TRANSMISSION)) is not None:
+        while not self.frames.knows(slot, sender) and (message := self.streams.take(TRANSMISSION)) is not None:
             self._transmission(message)
 
     def _reception(self, message: Message) -> None:
@@ -274,7 +274,7 @@ class RealtimeCheck:
             if int(masks[k].sum()) + verdict[1] + verdict[2] > self.agents - 1:
                 limit = f"at most {self.agents - 1} receivers"
                 self._fail("reception", limit, "more", "each counts once", slot, sender)
-            self.air.judged(slot, sender, *verdict)
+            self.frames.judged(slot, sender, *verdict)
         self.result.count("reception")
 
     def _decision(self, message: Message) -> None:

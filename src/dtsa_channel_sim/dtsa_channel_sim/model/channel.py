@@ -5,7 +5,7 @@ Pure code: no clock, no I/O. The node, the Monte Carlo engine and the verifier u
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 
+from .air import Air
 from .airtime import LONGEST_FRAME
 from .config import ChannelConfig
-from .losses import Losses, NoiseSource
+from .losses import NoiseSource
 from .medium import Medium, OnAir
 from .schedule import Change
 from .timeline import Epoch, Timeline
 from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 Positions = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 _FOREVER = 2**63
 
 
@@ -36,8 +36,8 @@ class Channel:
     """
 
     __slots__ = (
-        "_airtime", "_alone", "_changes", "_end", "_epoch", "_first", "_idle", "_last", "_losses", "_medium",
-        "_plain", "_shared", "_simple", "_source", "_spills", "_tail", "_timeline", "config",
+        "_air", "_airtime", "_alone", "_changes", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near",
+        "_plain", "_shared", "_simple", "_source", "_spills", "_timeline", "config",
     )  # fmt: skip
 
     def __init__(self, config: ChannelConfig) -> None:
@@ -46,7 +46,8 @@ class Channel:
         self._source = NoiseSource(config.seed, config.agents)
         self._airtime = config.airtime
         self._changes: list[Change] = []
-        self._tail: list[OnAir] = []
+        self._air: Air[int] = Air(self)  # carries from slot to slot what outlasts its own
+        self._near = self._air.near
         self._last = -1
         # A frame sent at the slot's start may be longer than the slot.
         self._spills = self._airtime.total_ns(LONGEST_FRAME) > config.slot_ns
@@ -90,7 +91,7 @@ class Channel:
         return change
 
     def advance(self, slot: int) -> None:
-        """Note that a slot has been dealt with (with :meth:`judge`): later changes begin after it.
+        """Note that a slot has been dealt with (on an :class:`Air`): later changes of settings begin after it.
 
         :param slot: number of the slot.
         """
@@ -112,15 +113,14 @@ class Channel:
         :param positions: (3, N), m, frame map; needed with a limited range or capture.
         :param offsets_ns: ns, start of each transmission from the slot's start by the channel's clock; None:
             all start with the slot and any two overlap. Needs ``lengths``. What is still on air when its slot
-            ends disturbs the next slot's frames; its own verdict has been given by then (settle frames in
-            real time with
-            :class:`~dtsa_channel_sim.model.realtime.RealtimeArbiter` where that matters).
+            ends disturbs the next slot's frames; its own verdict has been given by then (an
+            :class:`~dtsa_channel_sim.model.air.Air` waits with it).
         :raises LocalProtocolError: when the arguments do not go together.
         """
         if not self._first <= slot < self._end:
             self._use(slot)
         last, self._last = self._last, slot
-        if self._simple and offsets_ns is None and not self._tail:
+        if self._simple and offsets_ns is None and not self._near:
             if len(senders) == 1:
                 alone = self._alone.get(senders[0])
                 if alone is not None:
@@ -129,36 +129,20 @@ class Channel:
                 return self._idle
         return self._many(slot, slot > last, self._checked(senders), lengths, positions, offsets_ns)
 
-    def judge(
-        self, slot: int, frame: OnAir, others: Iterable[OnAir], positions: Positions | None = None
-    ) -> tuple[Mask, int, int]:
-        """Return (received (N,), lost, collided) of one transmission among others, on a time line of its own.
-
-        :param slot: slot whose settings and random numbers count.
-        :param frame: the transmission.
-        :param others: transmissions that may overlap it.
-        :param positions: (3, N), m, frame map; needed with a limited range or capture.
-        """
+    def medium(self, slot: int) -> Medium:
+        """Return the medium of a slot, with the settings that hold in it."""
         if not self._first <= slot < self._end:
             self._use(slot)
-        reach, collided = self._medium.judge(frame, others, positions)
-        clear = reach & ~collided
-        received = self._noisy(slot, frame.sender, clear)
-        return (
-            received,
-            int(np.count_nonzero(clear) - np.count_nonzero(received)),
-            int(np.count_nonzero(collided)),
-        )
+        return self._medium
 
     def _use(self, slot: int) -> None:
         """Make the settings of a slot the present ones."""
         if slot < 0:
             raise LocalProtocolError(f"slot {slot}: slots count from 0")
         epoch: Epoch = self._timeline.at(slot)
-        self._epoch = epoch
         self._first, self._end = epoch.first, _FOREVER if epoch.end is None else epoch.end
-        self._losses = Losses(epoch.config, self._source)
-        self._medium = Medium(epoch.config)
+        self._medium = Medium(epoch.config, self._source)
+        self._losses = self._medium.losses
         # Frames that start with their slot and do not outlast it, everybody in reach: no look at times and
         # places.
         self._shared = self._medium.everywhere and not self._spills
@@ -175,12 +159,6 @@ class Channel:
             return alone
         return Verdict(SUCCESS, alone.senders, received, (missing,), (0,))
 
-    def _noisy(self, slot: int, sender: int, clear: Mask) -> Mask:
-        """Return who receives a frame of those where nothing else disturbs it, (N,)."""
-        if self._epoch.config.jam:
-            return np.zeros_like(clear)
-        return clear if self._losses.none else clear & ~self._losses.lost(slot, sender)[0]
-
     def _many(
         self,
         slot: int,
@@ -191,27 +169,21 @@ class Channel:
         offsets_ns: Sequence[int] | None,
     ) -> Verdict:
         """Return the verdict on any number of frames, in full generality."""
-        tail = self._tail if follows else []
-        self._tail = []
+        if not follows:
+            self._near.clear()
         agents = len(self._alone)
-        if self._shared and offsets_ns is None and not tail and len(senders) > 1:
+        if self._shared and offsets_ns is None and not self._near and len(senders) > 1:
             others = (agents - 1,) * len(senders)
             return Verdict(COLLISION, senders, np.zeros((len(senders), agents), np.bool_), (0,) * len(senders), others)
         frames = self._laid(slot, senders, lengths, offsets_ns)
-        end_ns = (slot + 1) * self.config.slot_ns
-        # A frame of the next slot may begin before that slot does, so keep what ends shortly before it, too.
-        self._tail = [f for f in (*tail, *frames) if f.end_ns > end_ns or (offsets_ns is not None and f in frames)]
+        # A frame of the next slot may begin before that slot does, so what ends shortly before it is kept, too.
+        receptions = self._air.judge_slot(slot, frames, positions, keep=offsets_ns is not None)
         if not senders:
             return self._idle
-        received = np.zeros((len(senders), agents), dtype=np.bool_)
-        lost, collided = [], []
-        for row, frame in enumerate(frames):
-            others_on_air = [*tail, *(f for f in frames if f is not frame)]
-            received[row], missing, destroyed = self.judge(slot, frame, others_on_air, positions)
-            lost.append(missing)
-            collided.append(destroyed)
-        outcome = COLLISION if any(collided) else SUCCESS
-        return Verdict(outcome, senders, received, tuple(lost), tuple(collided))
+        received = np.array([reception.received for reception in receptions])
+        lost = tuple(reception.lost for reception in receptions)
+        collided = tuple(reception.collided for reception in receptions)
+        return Verdict(COLLISION if any(collided) else SUCCESS, senders, received, lost, collided)
 
     def _laid(
         self,
@@ -230,12 +202,10 @@ class Channel:
                 raise LocalProtocolError("offsets_ns: the lengths of the frames are needed with them")
             return [OnAir(sender, start, start, start + self.config.slot_ns) for sender in senders]
         offsets = offsets_ns if offsets_ns is not None else (0,) * len(senders)
-        airtime = self._airtime
-        frames = []
-        for sender, length, offset in zip(senders, lengths, offsets, strict=True):
-            begin = start + int(offset)
-            frames.append(OnAir(sender, begin, begin + airtime.ramp_up_ns, begin + airtime.total_ns(int(length))))
-        return frames
+        return [
+            OnAir.of(self._airtime, sender, start + int(offset), int(length))
+            for sender, length, offset in zip(senders, lengths, offsets, strict=True)
+        ]
 
     def _checked(self, senders: Sequence[int]) -> tuple[int, ...]:
         ids = tuple(int(sender) for sender in senders)

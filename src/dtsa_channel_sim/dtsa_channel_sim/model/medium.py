@@ -1,4 +1,8 @@
-"""What frames do to each other at each receiver: reach, overlap, capture, a sender's own deafness."""
+"""The medium: what transmissions do to each other at each receiver, at any instant.
+
+This is the one place that says how long a frame is on air, who is in reach, what overlap does, when the stronger of two
+frames survives, that who sends does not hear, when a radio finds the air busy, and what noise takes away.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,13 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import LocalProtocolError
 
+from .airtime import Airtime
 from .config import ChannelConfig
+from .losses import Losses, NoiseSource
 from .topology import group_numbers, parse_partition, squared_distances
 
 Mask = NDArray[np.bool_]
+Positions = NDArray[np.float64]
 #: Distances below this are taken as this when powers are compared, m.
 _NEAREST_M = 0.01
 
@@ -30,6 +37,17 @@ class OnAir(NamedTuple):
     end_ns: int
     """The last bit has left; the sender hears again."""
 
+    @classmethod
+    def of(cls, airtime: Airtime, sender: int, start_ns: int, length: int) -> OnAir:
+        """The transmission of a frame.
+
+        :param airtime: times of the radio.
+        :param sender: id of the sender.
+        :param start_ns: ns, when the sender turns to sending.
+        :param length: bytes of the frame.
+        """
+        return cls(sender, start_ns, start_ns + airtime.ramp_up_ns, start_ns + airtime.total_ns(length))
+
     def overlaps(self, other: OnAir) -> bool:
         """True when both are on air at one time."""
         return self.air_ns < other.end_ns and other.air_ns < self.end_ns
@@ -39,45 +57,81 @@ class OnAir(NamedTuple):
         return self.start_ns < other.end_ns and other.air_ns < self.end_ns
 
 
+class Reception(NamedTuple):
+    """What became of one transmission at all receivers."""
+
+    received: Mask
+    """(N,): agent with id index + 1 received it."""
+    lost: int
+    """Receivers in reach that lost it to noise or jamming."""
+    collided: int
+    """Receivers in reach where it collided, or that were sending themselves."""
+
+
 class Medium:
-    """Who reaches and who disturbs whom, under one set of settings.
+    """Who receives what, under one set of settings.
 
     :param config: the settings.
+    :param source: the random numbers of the channel; None: those of the settings' seed.
     """
 
     __slots__ = (
-        "_agents",
-        "_capture",
-        "_disturb2",
-        "_exponent",
-        "_groups",
-        "_range2",
-        "everywhere",
+        "_agents", "_capture", "_disturb2", "_exponent", "_groups", "_jam", "_range2", "everywhere", "losses",
         "needs_positions",
-    )
+    )  # fmt: skip
 
-    def __init__(self, config: ChannelConfig) -> None:
+    def __init__(self, config: ChannelConfig, source: NoiseSource | None = None) -> None:
         self._agents = config.agents
         self._range2 = config.range_m**2
         self._disturb2 = (config.range_m * config.interference_factor) ** 2
         self._capture = 10.0 ** (config.capture_db / 10.0) if config.capture_db else 0.0
         self._exponent = config.path_loss_exponent
+        self._jam = config.jam
         groups = parse_partition(config.partition, config.agents)
         self._groups = group_numbers(groups, config.agents) if groups else None
+        #: Which receivers lose a frame to noise.
+        self.losses = Losses(config, source or NoiseSource(config.seed, config.agents))
         self.needs_positions = bool(config.range_m or config.capture_db)
         #: True when everybody hears and disturbs everybody: two frames at one time destroy each other
         #: everywhere.
         self.everywhere = not self.needs_positions and self._groups is None
 
-    def judge(self, frame: OnAir, others: Iterable[OnAir], positions: NDArray[np.float64] | None) -> tuple[Mask, Mask]:
-        """Return (reach, collided), (N,) each: who would hear it alone, and who of these does not.
+    def judge(self, slot: int, frame: OnAir, others: Iterable[OnAir], positions: Positions | None = None) -> Reception:
+        """Return what became of one transmission among others.
 
+        :param slot: slot whose random numbers count.
         :param frame: the transmission in question.
         :param others: transmissions that may overlap it.
         :param positions: (3, N), m, frame map; needed for range and capture only.
+        :raises LocalProtocolError: when positions are needed and missing.
         """
-        if self.needs_positions and positions is None:
-            raise LocalProtocolError("a limited range and capture need the agents' positions")
+        reach, collided = self._undisturbed(frame, others, positions)
+        clear = reach & ~collided
+        if self._jam:
+            received = np.zeros_like(clear)
+        else:
+            received = clear if self.losses.none else clear & ~self.losses.lost(slot, frame.sender)[0]
+        lost = int(np.count_nonzero(clear) - np.count_nonzero(received))
+        return Reception(received, lost, int(np.count_nonzero(collided)))
+
+    def senses(self, receiver: int, when_ns: int, frame: OnAir, positions: Positions | None = None) -> bool:
+        """Return whether a radio that listens finds the air busy with a transmission.
+
+        A radio that sends itself, or turns to sending, cannot listen: its air is busy.
+
+        :param receiver: id of the agent that listens.
+        :param when_ns: ns, when.
+        :param frame: the transmission.
+        :param positions: (3, N), m, frame map; needed for range and capture only.
+        """
+        if frame.sender == receiver:
+            return frame.start_ns <= when_ns < frame.end_ns
+        if not frame.air_ns <= when_ns < frame.end_ns:
+            return False
+        return self.everywhere or bool(self._heard(frame.sender, positions, self._disturb2)[0][receiver - 1])
+
+    def _undisturbed(self, frame: OnAir, others: Iterable[OnAir], positions: Positions | None) -> tuple[Mask, Mask]:
+        """Return (reach, collided), (N,) each: who would hear it alone, and who of these does not."""
         reach, power = self._heard(frame.sender, positions, self._range2)
         disturbed = np.zeros(self._agents, dtype=np.bool_)
         noise = np.zeros(self._agents)
@@ -94,15 +148,15 @@ class Medium:
             disturbed &= power < self._capture * noise
         return reach, reach & (disturbed | deaf)
 
-    def _heard(
-        self, sender: int, positions: NDArray[np.float64] | None, range2: float
-    ) -> tuple[Mask, NDArray[np.float64]]:
+    def _heard(self, sender: int, positions: Positions | None, range2: float) -> tuple[Mask, NDArray[np.float64]]:
         """Return who is near enough to a sender, (N,), and the power there, relative to that at 1 m."""
         heard = np.ones(self._agents, dtype=np.bool_)
         power = heard.astype(np.float64) if not self._capture else np.zeros(0)
         if self._groups is not None:
             heard &= self._groups == self._groups[sender - 1]
-        if self.needs_positions and positions is not None:
+        if self.needs_positions:
+            if positions is None:
+                raise LocalProtocolError("a limited range and capture need the agents' positions")
             distance2 = squared_distances(positions, sender)
             if range2:
                 heard &= distance2 <= range2

@@ -14,9 +14,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.stamps import header_of, time_of
+from dtsa_channel_sim.model.air import Air, FrameVerdict
 from dtsa_channel_sim.model.airtime import LONGEST_FRAME
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.realtime import FrameVerdict, RealtimeArbiter
+from dtsa_channel_sim.model.medium import OnAir
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 from .answers import Answers, named
@@ -33,6 +34,8 @@ _PATIENCE = 10  # slots that a slot is kept open for agents that have not report
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _AHEAD = 100  # slots: a report from farther in the future is none
 _AFTERLIFE = 10  # slots: a report for a later one was made after its agent had been given up
+
+_Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
 
 
 class RealtimeChannel(RosChannel):
@@ -52,14 +55,14 @@ class RealtimeChannel(RosChannel):
         self.missed = 0  # reports of agents that came too late to count
         self.lost: set[int] = set()  # ids of agents that have fallen silent
         self.returned: set[int] = set()  # ids of those that were, and report again
-        self.arbiter = RealtimeArbiter(channel)
+        self.air: Air[_Sent] = Air(channel)
         self._steps = steps
         self._zero = 0
         self._told = 0.0  # time.monotonic() of the last start message
         self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
         self._book: dict[int, Answers] = {}
-        self._frames: dict[tuple[int, int], bytes] = {}
-        self._settled: dict[int, list[FrameVerdict]] = {}
+        self._frames: dict[_Sent, bytes] = {}
+        self._settled: dict[int, list[FrameVerdict[_Sent]]] = {}
         self._heard_ns = np.zeros(self.agents, dtype=np.int64)
         self._offset_ns = np.zeros(self.agents, dtype=np.int64)  # of each agent's slots, as last reported
         self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
@@ -153,7 +156,7 @@ class RealtimeChannel(RosChannel):
             now = min(time.monotonic_ns() - self._zero, now + self._stride_ns)
             if now >= tick:
                 tick = now + _TICK_NS
-                for verdict in self.arbiter.settle(now - self._grace_ns, self.answers.position):
+                for verdict in self.air.settle(now - self._grace_ns, self.answers.position):
                     self._deliver(verdict)
             while self._due(now):
                 if not self._close_slot():
@@ -185,7 +188,7 @@ class RealtimeChannel(RosChannel):
             return
         if slot > self.slot:
             book = self._entry(slot)
-        else:  # too late for the slot's account; what it sends is on the air nevertheless
+        else:  # too late for the slot's account; what it sends may still be on the air
             self.missed += len(message.agent)
             book = Answers(self.agents, self._steps)
         try:
@@ -203,7 +206,9 @@ class RealtimeChannel(RosChannel):
             key = (slot, agent)
             if length and key not in self._frames:
                 self._frames[key] = book.frames[agent]
-                self.arbiter.push(key, agent, slot * self.slot_ns + offset, length)
+                start_ns = slot * self.slot_ns + offset
+                if not self.air.begin(key, agent, start_ns, length):
+                    self._drop(key, start_ns, length)
 
     def _entry(self, slot: int) -> Answers:
         book = self._book.get(slot)
@@ -211,9 +216,17 @@ class RealtimeChannel(RosChannel):
             book = self._book[slot] = Answers(self.agents, self._steps)
         return book
 
-    def _deliver(self, verdict: FrameVerdict) -> None:
+    def _drop(self, key: _Sent, start_ns: int, length: int) -> None:
+        """Takes a frame into its slot's account that came too late to be on the air: nobody hears it."""
+        frame = OnAir.of(self.model.config.airtime, key[1], start_ns, length)
+        nobody = np.zeros(self.agents, dtype=np.bool_)
+        slot = max(0, start_ns // self.slot_ns)
+        verdict = FrameVerdict(key, key[1], slot, start_ns, frame.end_ns, frame.end_ns, nobody, 0, 0)
+        self._settled.setdefault(max(key[0], self.slot + 1), []).append(verdict)
+
+    def _deliver(self, verdict: FrameVerdict[_Sent]) -> None:
         """Sends a frame that has left the air to those that received it."""
-        slot, sender = verdict.frame_id  # type: ignore[misc]
+        slot, sender = verdict.frame_id
         self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
         if not verdict.received.any():
             return
@@ -270,8 +283,7 @@ class RealtimeChannel(RosChannel):
         settled = self._settled.pop(slot, [])
         frames = {}
         for verdict in settled:
-            key = verdict.frame_id
-            frames[verdict.sender] = self._frames.pop(key)  # type: ignore[arg-type]
+            frames[verdict.sender] = self._frames.pop(verdict.frame_id)
         if not settled:
             return frames, Verdict(IDLE, (), None, None, None)
         outcome = COLLISION if any(verdict.collided for verdict in settled) else SUCCESS

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.model.medium import OnAir
-from dtsa_channel_sim.model.realtime import RealtimeArbiter
+from dtsa_channel_sim import Air, Channel, ChannelConfig, OnAir
 
 from .result import Difference, Mismatch
 
@@ -34,8 +32,13 @@ class Sent:
         """Its id."""
         return self.on_air.sender
 
+    @property
+    def dropped(self) -> bool:
+        """Whether nobody was in reach of it, as of a frame that the channel got too late to put it on the air."""
+        return self.verdict is not None and not self.verdict[1].any() and self.verdict[2:] == (0, 0)
 
-class Air:
+
+class SentFrames:
     """Frames as they were sent, delivered and judged.
 
     :param config: the channel's settings.
@@ -55,9 +58,7 @@ class Air:
         :param slot: as its sender counts.
         :param start_ns: ns from the start of slot 0 by the channel's clock.
         """
-        airtime = self.config.airtime
-        end_ns = start_ns + airtime.total_ns(len(data))
-        sent = Sent(slot, OnAir(sender, start_ns, start_ns + airtime.ramp_up_ns, end_ns), data)
+        sent = Sent(slot, OnAir.of(self.config.airtime, sender, start_ns, len(data)), data)
         self._sent[(slot, sender)] = sent
         self._unjudged.setdefault(sender, deque()).append(sent)
 
@@ -100,9 +101,10 @@ class Air:
             raise Mismatch(Difference("reception.sender", "agents that sent", f"cf{sender}", why, slot))
         waiting.popleft().verdict = slot, received, lost, collided
 
-    def check_overlaps(self) -> dict[str, int]:
+    def check_overlaps(self, late: int = 0) -> dict[str, int]:
         """Whether deliveries and verdicts agree, and nobody has heard two frames at one time, or while it sent.
 
+        :param late: frames that the channel dropped; they were not on the air.
         :returns: how often what was found right.
         :raises Mismatch: at the first frame for which that is not so.
         """
@@ -115,6 +117,8 @@ class Air:
                 if (given != sent.verdict[1]).any():
                     raise Mismatch(Difference("reception.received", _ids(given), _ids(sent.verdict[1]),
                                               "as delivered to the agents", sent.slot, sent.sender))  # fmt: skip
+            if late and sent.dropped:
+                continue
             active = [other for other in active if other.on_air.end_ns > sent.on_air.start_ns]
             for other in active:
                 self._pair(other, sent)
@@ -137,18 +141,26 @@ class Air:
             raise Mismatch(Difference("slot.received", f"without cf{one.sender}", _ids(other.received),
                                       "who sends does not hear", other.slot, other.sender))  # fmt: skip
 
-    def check_verdicts(self, changes: list[tuple[int, dict[str, Any]]], only_alone: bool) -> int:
+    @property
+    def dropped(self) -> int:
+        """Frames whose verdict is that of a dropped one."""
+        return sum(1 for sent in self._sent.values() if sent.dropped)
+
+    def check_verdicts(self, changes: list[tuple[int, dict[str, Any]]], late: int = 0) -> int:
         """Makes all verdicts again from the frames, their times and the channel's seed; after :meth:`check_overlaps`.
 
         :param changes: first slot and values of each change of the channel's settings.
-        :param only_alone: leaves out frames that met another one.
+        :param late: frames that the channel dropped. If the recording does not show just as many, it is not known
+            which frames were on the air: those that met another one are left out.
         :returns: how many are equal.
         :raises Mismatch: at the first that is not.
         """
         channel = Channel(self.config)
         for slot, values in changes:
             channel.set(slot=slot, **values)
-        again = self._arbitrated(channel) if self.own_clocks else self._by_slots(channel)
+        left_out = {key for key, sent in self._sent.items() if late and sent.dropped}
+        only_alone = len(left_out) != late
+        again = self._on_one_time_line(channel, left_out) if self.own_clocks else self._by_slots(channel)
         equal = 0
         for key, right in again.items():
             sent = self._sent[key]
@@ -162,18 +174,21 @@ class Air:
             equal += 1
         return equal
 
-    def _arbitrated(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
-        arbiter = RealtimeArbiter(channel)
-        waiting = deque(sorted(self._sent.items(), key=lambda item: item[1].on_air.start_ns))
+    def _on_one_time_line(
+        self, channel: Channel, left_out: set[tuple[int, int]]
+    ) -> dict[tuple[int, int], tuple[Mask, int, int]]:
+        air: Air[tuple[int, int]] = Air(channel)
+        frames = [item for item in self._sent.items() if item[0] not in left_out]
+        waiting = deque(sorted(frames, key=lambda item: item[1].on_air.start_ns))
         last = max((sent.on_air.end_ns for sent in self._sent.values()), default=0)
         result = {}
         for at in range(0, last + 2 * self.config.slot_ns, self.config.slot_ns):
             while waiting and waiting[0][1].on_air.start_ns < at:
                 key, sent = waiting.popleft()
-                arbiter.push(key, sent.sender, sent.on_air.start_ns, len(sent.data))
-            for verdict in arbiter.settle(at):
+                air.begin(key, sent.sender, sent.on_air.start_ns, len(sent.data))
+            for verdict in air.settle(at):
                 result[verdict.frame_id] = verdict.received, verdict.lost, verdict.collided
-        return result  # type: ignore[return-value]
+        return result
 
     def _by_slots(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
         slots: dict[int, list[Sent]] = {}
