@@ -6,6 +6,7 @@ from .model.channel import Channel
 from .model.clocks import AgentClock, ClockConfig, make_clocks
 from .model.config import CHANGEABLE, Change, ChannelConfig
 from .model.medium import Medium, OnAir, Reception
+from .model.simulated_air import SimulatedAir, SimulatedPort
 from .model.topology import LinkLoss
 from .model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
 
@@ -27,6 +28,8 @@ __all__ = [
     "Medium",
     "OnAir",
     "Reception",
+    "SimulatedAir",
+    "SimulatedPort",
     "Verdict",
     "make_clocks",
 ]
