@@ -10,15 +10,16 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from tool_helpers import checkout
 
 import dtsa_bench
-from machine import checks, cmake_paths, layout, main, prepare, processes, progress, ros2, wheels, workspace
+from machine import checks, cmake_paths, layout, main, prepare, progress, wheels, workspace
 
+__all__ = ["checkout"]  # a fixture
 DTSA = layout.ROOT / "tools" / "dtsa"
 
 
@@ -30,23 +31,6 @@ def call(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str
         env={**os.environ, **environment},
         check=False,
     )
-
-
-@pytest.fixture
-def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty place that stands for the checkout: sources are copied, nothing is built."""
-    for package in workspace.PACKAGES:
-        ignore = shutil.ignore_patterns("__pycache__", "*.so", "*.egg-info", "test")
-        shutil.copytree(layout.SOURCES / package, tmp_path / "src" / package, ignore=ignore)
-    shutil.copytree(layout.REQUIREMENTS, tmp_path / "requirements")
-    places = {
-        "ROOT": ".", "SOURCES": "src", "REQUIREMENTS": "requirements", "BUILD": "build", "INSTALL": "install",
-        "VENV": ".venv", "PYTHON": ".venv/bin/python", "VENV_STAMPS": ".venv/.dtsa",
-        "STATE": ".dtsa", "STEP_LOGS": ".dtsa/log",
-    }  # fmt: skip
-    for name, place in places.items():
-        monkeypatch.setattr(layout, name, tmp_path / place)
-    return tmp_path
 
 
 def pretend_built(package: str) -> None:
@@ -121,94 +105,6 @@ def test_a_moved_checkout_gets_a_new_environment(checkout: Path, monkeypatch: py
     assert wheels.has_venv()
     monkeypatch.setattr(layout, "ROOT", checkout / "elsewhere")
     assert not wheels.has_venv()
-
-
-def pretend_environment(directory: Path, stamp: str) -> None:
-    """Make the files by which a virtual environment is recognised.
-
-    :param stamp: version of Python and kind.
-    """
-    python = directory / "bin" / "python"
-    python.parent.mkdir(parents=True)
-    python.symlink_to(sys.executable)
-    layout.write(directory / ".dtsa" / "venv", f"{stamp} {directory.parent}")
-
-
-def test_each_kind_of_machine_has_an_environment_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    here = layout.python_version()
-    monkeypatch.delenv("ROS_DISTRO", raising=False)
-    assert layout.suffix(tmp_path) == ""
-    pretend_environment(tmp_path / ".venv", f"{here} wheels")
-    assert layout.suffix(tmp_path) == ""
-    monkeypatch.setenv("ROS_DISTRO", "jazzy")
-    assert layout.suffix(tmp_path) == "-jazzy"
-    pretend_environment(tmp_path / ".venv-jazzy", "3.9 system")
-    assert layout.suffix(tmp_path) == f"-jazzy-{here}"
-
-
-@pytest.mark.parametrize("stamp", ["3.9 wheels", f"{layout.python_version()} system"])
-def test_an_environment_of_another_kind_is_left_alone(
-    stamp: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("ROS_DISTRO", raising=False)
-    pretend_environment(tmp_path / ".venv", stamp)
-    assert layout.suffix(tmp_path) == f"-{layout.python_version()}"
-    (tmp_path / ".venv" / "bin" / "python").unlink()  # the interpreter is gone: of no use to anybody
-    assert layout.suffix(tmp_path) == ""
-
-
-def test_an_environment_that_somebody_else_made_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("ROS_DISTRO", raising=False)
-    pretend_environment(tmp_path / ".venv", "")
-    configuration = tmp_path / ".venv" / "pyvenv.cfg"
-    configuration.write_text(f"home = /usr/bin\nversion = {layout.python_version()}.1\n")
-    assert layout.suffix(tmp_path) == ""
-    configuration.write_text("home = /usr/bin\nversion_info = 3.9.2.final.0\n")
-    assert layout.suffix(tmp_path) == f"-{layout.python_version()}"
-
-
-@pytest.fixture
-def running(checkout: Path) -> Iterator[int]:
-    """Id of a process that runs from the checkout's virtual environment."""
-    layout.PYTHON.parent.mkdir(parents=True)
-    layout.PYTHON.symlink_to(sys.executable)
-    program = [str(layout.PYTHON), "-c", "print(flush=True); input()"]
-    process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert process.stdout is not None
-    process.stdout.readline()
-    yield process.pid
-    process.communicate(b"\n", timeout=30)
-
-
-@pytest.mark.parametrize("remove", [wheels.make_venv, lambda: main.run_clean(["--all"])])
-def test_an_environment_in_use_is_never_removed(running: int, remove: Callable[[], object]) -> None:
-    with pytest.raises(layout.SetupError, match=rf"in use by process {running}; .*nothing was removed") as raised:
-        remove()
-    assert raised.value.code == 2
-    assert layout.PYTHON.exists()
-
-
-def test_a_waiting_set_up_does_not_use_the_environment(checkout: Path) -> None:
-    layout.PYTHON.parent.mkdir(parents=True)
-    layout.PYTHON.symlink_to(sys.executable)
-    command = [str(layout.PYTHON), "-I", "-S", "-c", "print(flush=True); input()"]  # as tools/dtsa starts itself
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        assert processes.users_of([layout.VENV]) == []
-        process.communicate(b"\n", timeout=30)
-
-
-def test_what_is_missing_is_said_before_anything_is_removed(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DISTRO", "jazzy")
-    monkeypatch.setattr(checks, "check", lambda: None)
-    monkeypatch.setattr(wheels, "system_distributions", lambda python: {"numpy", "pyyaml"})
-    kept = layout.VENV / "kept"
-    kept.parent.mkdir()
-    kept.touch()
-    with pytest.raises(layout.SetupError, match=r"sudo apt install python3-matplotlib$"):
-        prepare.prepare(set())
-    assert kept.exists()
 
 
 @pytest.mark.parametrize(
@@ -440,84 +336,6 @@ def test_wrong_words_are_one_line_and_exit_2(words: list[str]) -> None:
     assert result.returncode == 2
     assert "got 'nonsense'; allowed: " in result.stderr
     assert result.stderr.count("\n") == 1
-
-
-@pytest.fixture
-def prefix(tmp_path: Path) -> dict[str, str]:
-    """Two small prefixes with packages as an ament index has them; the first hides part of the second."""
-    for name, package in (("first", "one"), ("second", "one"), ("second", "two")):
-        root = tmp_path / name
-        index = root / ros2.INDEX
-        (index / "packages").mkdir(parents=True, exist_ok=True)
-        (index / "packages" / package).touch()
-        library = root / "lib" / package
-        library.mkdir(parents=True)
-        script = library / f"{package}_of_{name}"
-        script.write_text('#!/bin/sh\necho "$0" "$@"\n')
-        script.chmod(0o755)
-        (library / "notes.txt").touch()
-    (tmp_path / "second" / ros2.INDEX / "rosidl_interfaces").mkdir()
-    (tmp_path / "second" / ros2.INDEX / "rosidl_interfaces" / "two").write_text(
-        "msg/Outer.idl\nmsg/Outer.msg\nmsg/Inner.msg\n"
-    )
-    messages = tmp_path / "second" / "share" / "two" / "msg"
-    messages.mkdir(parents=True)
-    (messages / "Outer.msg").write_text("# Head\nuint8 LIMIT=3\nInner[<=LIMIT] parts # m\nstring name\n")
-    (messages / "Inner.msg").write_text("# Not shown\nfloat64 x\n")
-    return {"AMENT_PREFIX_PATH": f"{tmp_path / 'first'}{os.pathsep}{tmp_path / 'second'}"}
-
-
-def test_stand_in_lists_executables(prefix: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert ros2.main(["pkg", "executables"], prefix) == 0
-    assert capsys.readouterr().out == "one one_of_first\ntwo two_of_second\n"
-    assert ros2.main(["pkg", "executables", "two"], prefix) == 0
-    assert capsys.readouterr().out == "two two_of_second\n"
-
-
-def test_stand_in_shows_nested_interfaces(prefix: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert ros2.main(["interface", "list"], prefix) == 0
-    assert capsys.readouterr().out == "two/msg/Inner\ntwo/msg/Outer\n"
-    assert ros2.main(["interface", "show", "two/msg/Outer"], prefix) == 0
-    assert capsys.readouterr().out == ("# Head\nuint8 LIMIT=3\nInner[<=LIMIT] parts # m\n\tfloat64 x\nstring name\n")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["run", "three", "x"], "package: got 'three'"),
-        (["run", "two", "x"], "executable: got 'x'; allowed: two_of_second"),
-        (["interface", "show", "two/msg/None"], "interface: got 'two/msg/None'"),
-        (["launch", "dtsa_bench", "swarm_launch.py"], "ros2: got 'launch dtsa_bench swarm_launch.py'"),
-    ],
-)
-def test_stand_in_says_what_is_wrong(words: list[str], message: str, prefix: dict[str, str]) -> None:
-    with pytest.raises(layout.SetupError) as raised:
-        ros2.main(words, prefix)
-    assert str(raised.value).startswith(message)
-    assert raised.value.code == 2
-
-
-@pytest.mark.parametrize("distribution", ["", "humble", "jazzy"])
-def test_stand_in_makes_way_for_the_command_of_jazzy_only(
-    distribution: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ROS_DISTRO", distribution)
-    assert not main.has_ros2({"PATH": str(tmp_path)})
-    (tmp_path / "ros2").write_text("#!/bin/sh\n")
-    (tmp_path / "ros2").chmod(0o755)
-    assert main.has_ros2({"PATH": str(tmp_path)}) == (distribution == "jazzy")
-
-
-def test_stand_in_agrees_with_the_ament_index() -> None:
-    index = pytest.importorskip("ament_index_python.packages")
-    if not os.environ.get("AMENT_PREFIX_PATH"):
-        pytest.skip("the workspace is not sourced")
-    assert {name: str(path) for name, path in ros2.packages(os.environ).items()} == dict(
-        index.get_packages_with_prefixes()
-    )
-    assert [path.name for path in ros2.executables("dtsa_agent", os.environ)] == [
-        "agent", "crazyflie_agents", "crazyflie_bridge", "swarm_host"
-    ]  # fmt: skip
 
 
 def test_built_executables_start() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,121 +65,67 @@ class Case:
         return protocol == "dtsa" and not self.loss
 
 
+LOSSES = (("no loss", 0.0), ("10 %", 0.1))
+
+
 def cases() -> list[Case]:
     """All rows of the table."""
-    rows: list[Case] = []
-    channels = [
-        ("no loss", 0.0, 0.0),
-        ("5 %", 0.05, 0.0),
-        ("10 %", 0.1, 0.0),
-        ("30 %", 0.3, 0.0),
-        ("10 % in bursts of 10", 0.1, 10.0),
-    ]
-    for agents, movers, factor in (
-        (12, 12, 1.0),
-        (12, 6, 0.64),
-        (12, 2, 0.2),
-        (70, 70, 1.0),
-        (70, 35, 0.64),
-        (200, 10, 0.0805),
-    ):
-        for name, loss, burst in channels:
+    return [*_steady_cases(), *_stop_and_go_cases(), *_start_cases(), *_newcomer_cases(), *_fault_cases()]
+
+
+def _steady_cases() -> Iterator[Case]:
+    channels = (*LOSSES[:1], ("5 %", 0.05), *LOSSES[1:], ("30 %", 0.3), ("10 % in bursts of 10", 0.1))
+    sizes = ((12, 12, 1.0), (12, 6, 0.64), (12, 2, 0.2), (70, 70, 1.0), (70, 35, 0.64), (200, 10, 0.0805))
+    for agents, movers, factor in sizes:
+        for name, loss in channels:
+            burst = 10.0 if "bursts" in name else 0.0
             protocols = tuple(p for p in PROTOCOLS if agents < 200 or not loss or p != "dtsa")
-            asked = 1.0 if burst else factor  # who hears nothing for ten slots has old states whatever the protocol
+            asked = 1.0 if burst else factor  # who hears nothing for ten slots knows old states whatever the protocol
             warmup = 10 * agents if agents > 12 else 600
-            rows.append(
-                Case(
-                    f"{agents}/{movers} moving, {name}",
-                    "steady",
-                    agents,
-                    movers,
-                    protocols,
-                    loss,
-                    burst,
-                    warmup,
-                    target=f"lease at most {asked:g} x TDMA",
-                    limits=dict.fromkeys(LEASE, asked + 1e-09),
-                )
-            )
+            yield Case(
+                f"{agents}/{movers} moving, {name}", "steady", agents, movers, protocols, loss, burst, warmup,
+                target=f"lease at most {asked:g} x TDMA", limits=dict.fromkeys(LEASE, asked + 1e-09),
+            )  # fmt: skip
+
+
+def _stop_and_go_cases() -> Iterator[Case]:
     for pause, factor in ((300, 1.02), (1000, 1.02), (3000, 0.8)):
-        for name, loss in (("no loss", 0.0), ("10 %", 0.1)):
-            rows.append(
-                Case(
-                    f"70 stop and go, pauses of {pause}, {name}",
-                    "stop-and-go",
-                    70,
-                    0,
-                    tuple(PROTOCOLS),
-                    loss,
-                    warmup=2000,
-                    pause=pause,
-                    target=f"lease at most {factor:g} x TDMA",
-                    limits={"lease": factor},
-                )
-            )
+        for name, loss in LOSSES:
+            yield Case(
+                f"70 stop and go, pauses of {pause}, {name}", "stop-and-go", 70, 0, loss=loss, warmup=2000, pause=pause,
+                target=f"lease at most {factor:g} x TDMA", limits={"lease": factor},
+            )  # fmt: skip
+
+
+def _start_cases() -> Iterator[Case]:
     for agents, movers in ((12, 6), (18, 8), (70, 34)):
-        rows.append(
-            Case(
-                f"{agents}/{movers}, hoverers final, from the first slot on",
-                "start",
-                agents,
-                movers,
-                target="lease below TDMA",
-                limits={"lease": 1.0 - 1e-9},
-            )
-        )
+        name = f"{agents}/{movers}, hoverers final, from the first slot on"
+        yield Case(name, "start", agents, movers, target="lease below TDMA", limits={"lease": 1.0 - 1e-9})
+
+
+def _newcomer_cases() -> Iterator[Case]:
+    """Agents that wake, and agents that join."""
     for agents, movers, wakers in ((12, 2, 1), (70, 35, 1), (70, 35, 10)):
-        rows.append(Case(f"{wakers} of {agents} wake, {movers} moving", "wake", agents, movers, LEASE, wakers=wakers))
+        yield Case(f"{wakers} of {agents} wake, {movers} moving", "wake", agents, movers, LEASE, wakers=wakers)
     for agents, movers in ((12, 12), (12, 6), (70, 70)):
-        for name, loss in (("no loss", 0.0), ("10 %", 0.1), ("30 %", 0.3)):
-            rows.append(
-                Case(
-                    f"join of 1 of {agents}, {movers} moving, {name}",
-                    "join",
-                    agents,
-                    movers,
-                    LEASE,
-                    loss,
-                    target=f"first frame within {7 * agents} slots",
-                )
-            )
+        for name, loss in (*LOSSES, ("30 %", 0.3)):
+            target = f"first frame within {7 * agents} slots"
+            title = f"join of 1 of {agents}, {movers} moving, {name}"
+            yield Case(title, "join", agents, movers, LEASE, loss, target=target)
+
+
+def _fault_cases() -> Iterator[Case]:
+    """Deaths, jams and merged partitions."""
     for agents, movers in ((12, 12), (12, 6), (70, 35)):
-        rows.append(
-            Case(
-                f"death of 1 of {agents}, {movers} moving, 10 %",
-                "death",
-                agents,
-                movers,
-                ("lease",),
-                0.1,
-                target=f"turns used again within {max(1000, 30 * agents) + 10 * agents} slots",
-            )
-        )
+        target = f"turns used again within {max(1000, 30 * agents) + 10 * agents} slots"
+        title = f"death of 1 of {agents}, {movers} moving, 10 %"
+        yield Case(title, "death", agents, movers, ("lease",), 0.1, target=target)
     for agents, movers in ((12, 6), (70, 35)):
-        rows.append(
-            Case(
-                f"jam of 300 slots, {agents}/{movers}, 5 %",
-                "jam",
-                agents,
-                movers,
-                LEASE,
-                0.05,
-                target="no collision afterwards",
-            )
-        )
+        title = f"jam of 300 slots, {agents}/{movers}, 5 %"
+        yield Case(title, "jam", agents, movers, LEASE, 0.05, target="no collision afterwards")
     for agents, movers in ((12, 12), (12, 6), (70, 35)):
-        rows.append(
-            Case(
-                f"merge of two halves, {agents}/{movers}, 10 %",
-                "merge",
-                agents,
-                movers,
-                ("lease",),
-                0.1,
-                target="at most 10 collisions afterwards",
-            )
-        )
-    return rows
+        title = f"merge of two halves, {agents}/{movers}, 10 %"
+        yield Case(title, "merge", agents, movers, ("lease",), 0.1, target="at most 10 collisions afterwards")
 
 
 @dataclass(frozen=True, slots=True)
