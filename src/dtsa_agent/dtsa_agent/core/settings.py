@@ -210,6 +210,8 @@ def setting(
     :param kind: one of :data:`KINDS`; empty: what the field's annotation says.
     :param group: heading in the documentation, for this field and those that follow.
     """
+    if not isinstance(choices, tuple) and not callable(choices):
+        raise TypeError(f"choices: a tuple or a function, not {choices!r}")
     metadata = {
         "help": help,
         "unit": unit,
