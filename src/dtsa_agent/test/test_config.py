@@ -28,7 +28,7 @@ def test_all_but_one_of_an_odd_swarm_move_by_default() -> None:
         ("agents", 2.5, "whole number"),
         ("agents", True, "whole number"),
         ("moving", 13, "the number of agents"),
-        ("moving", 3, "even"),
+        ("extent_m", 0.5, "1 to 10000 m"),
         ("policy", 7, "tdma, dtsa"),
         ("selection", "first", "candidates, pairwise"),
         ("slot_ms", -10, "0.5 to 1000 ms"),

@@ -66,3 +66,38 @@ def test_ids_are_dealt_out_at_random_unless_told_otherwise() -> None:
     assert (np.diff(angle) > 0).all()
     shuffled = make_scenario(SwarmConfig(agents=12, jitter_m=0)).start
     assert not np.array_equal(ordered, shuffled)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 41), st.data())
+def test_a_mover_without_a_partner_has_a_far_point_of_its_own(agents: int, data: st.DataObject) -> None:
+    moving = 2 * data.draw(st.integers(0, (agents - 1) // 2)) + 1
+    shape, seed = data.draw(st.sampled_from(["circle", "ellipse", "ellipsoid"])), data.draw(st.integers(0, 999))
+    config = SwarmConfig(agents=agents, moving=moving, seed=seed, shape=shape, permute=data.draw(st.booleans()))
+    scenario = make_scenario(config)
+    assert scenario.moving.sum() == moving
+    start, target = scenario.start.T, scenario.target.T
+    alone = [k for k in np.flatnonzero(scenario.moving) if not (target[k] == start).all(axis=1).any()]
+    assert len(alone) == 1
+    (k,) = alone
+    way = target[k] - start[k]
+    assert np.linalg.norm(way) == pytest.approx(2 * np.linalg.norm(start[k]) + 0.9, abs=1e-5)
+    others = np.delete(target, k, axis=0)
+    assert not len(others) or np.linalg.norm(others - target[k], axis=1).min() > 0.6
+    pairs = make_scenario(SwarmConfig(**{**config.to_dict(), "moving": moving - 1}))
+    assert np.array_equal(pairs.start, scenario.start)
+    assert np.array_equal(np.delete(pairs.target, k, axis=1), np.delete(scenario.target, k, axis=1))
+
+
+@pytest.mark.parametrize("kind", ["exchange", "staggered", "waypoints", "streams", "stop-and-go"])
+@pytest.mark.parametrize(("agents", "moving"), [(7, 7), (7, 5), (6, 3), (1, 1)])
+def test_odd_numbers_of_movers_fly_in_every_scenario(kind: str, agents: int, moving: int) -> None:
+    scenario = make_scenario(SwarmConfig(agents=agents, moving=moving, scenario=kind, seed=4))
+    movers = scenario.moving
+    assert movers.sum() == moving
+    last = scenario.target if scenario.plan is None else scenario.plan.goals[0]
+    assert (np.linalg.norm(last - scenario.start, axis=0)[movers] > 0.5).all()
+    assert np.array_equal(scenario.target[:, ~movers], scenario.start[:, ~movers])
+    for places in (scenario.start, scenario.target):
+        gaps = np.linalg.norm(places[:, :, None] - places[:, None], axis=0) + 9 * np.eye(agents)
+        assert gaps.min() > 0.5

@@ -229,7 +229,7 @@ def test_the_oracle_knows_the_truth_and_needs_everyone_here() -> None:
 
 
 def test_aloha_sends_with_probability_one_over_n_p() -> None:
-    config = SwarmConfig(agents=10, policy="aloha", avoider="none", axis_x_m=100, seed=5)
+    config = SwarmConfig(agents=10, policy="aloha", avoider="none", axis_x_m=100, extent_m=110, seed=5)
     swarm, counts = Swarm(config), np.zeros(4, dtype=int)
     for slot in range(4000):
         counts[min(len(one_slot(swarm, slot)), 3)] += 1

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from . import _kernel
 from .errors import ConfigError
 from .flight_models import AVOIDERS, flight_model
-from .frame import PROFILE_EXTENDED, PROFILE_PAPER_INTENT, TAG_LENGTH
+from .frame import EXTENT_M, PROFILE_EXTENDED, PROFILE_PAPER_INTENT, TAG_LENGTH
 from .registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow
 from .settings import Settings, check, setting
 
@@ -29,7 +29,10 @@ class SwarmConfig(Settings):
 
     agents: int = setting(12, "number of agents, N = |A|", minimum=1, maximum=MAX_AGENTS, group="The swarm")
     moving: int | None = setting(
-        None, "how many of them move, an even number (antipodal pairs); default: all", minimum=0, maximum=MAX_AGENTS
+        None,
+        "how many of them move, in antipodal pairs, an odd one to a far point of its own; default: all in pairs",
+        minimum=0,
+        maximum=MAX_AGENTS,
     )
     policy: str = setting("dtsa", "who sends next", choices=POLICIES.names, open_choices=True)
     estimator: str = setting("linear", "where the others are by now", choices=ESTIMATORS.names, open_choices=True)
@@ -72,6 +75,13 @@ class SwarmConfig(Settings):
         "frames on the air; auto: extended with policy lease, else paper",
         choices=FRAMES,
         group="Frames and leases",
+    )
+    extent_m: float = setting(
+        EXTENT_M,
+        "largest coordinate that frames can say, half of it in gossip; scales the steps of positions: 2 mm by default",
+        unit="m",
+        minimum=1,
+        maximum=10000,
     )
     gossip: bool = setting(True, "extended frames carry what their sender last heard of others")
     anchor_every: int = setting(
@@ -126,8 +136,6 @@ class SwarmConfig(Settings):
             object.__setattr__(self, "moving", self.agents - self.agents % 2)
         if self.movers > self.agents:
             raise ConfigError("moving", self.moving, f"0 to {self.agents}, the number of agents")
-        if self.movers % 2:
-            raise ConfigError("moving", self.moving, "an even number: agents exchange places in pairs")
         POLICIES.row(self.policy)
         ESTIMATORS.row(self.estimator)
         flight_model(self.avoider, self.options)

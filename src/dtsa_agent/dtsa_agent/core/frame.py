@@ -14,6 +14,9 @@ PROFILE_EXTENDED = PROFILES.index("extended")  # 56 bytes
 
 TAG_LENGTH = 4  # bytes of authentication after a frame, and after what plug-ins append to it
 
+POSITION_STEP = 0.002  # m, one step of a coordinate at the default extent
+EXTENT_M = 65.534  # m, default extent: 32767 steps, the largest coordinate that a frame can say
+
 Vector = tuple[float, float, float]
 
 _FAULTS = {-1: "wrong length", -2: "unknown version or profile", -3: "field out of range"}
@@ -34,10 +37,19 @@ class Frame:
     intent: Vector | None = None  # m/s, commanded velocity; None: not carried
 
 
-def encode_frame(frame: Frame) -> bytes:
+def position_step(extent_m: float) -> float:
+    """One step of a coordinate in frames, m; gossip has twice that.
+
+    :param extent_m: the swarm's setting ``extent_m``, m.
+    """
+    return POSITION_STEP * (extent_m / EXTENT_M)
+
+
+def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
     """The bytes of a frame.
 
-    :param frame: its fields; positions beyond +-65.5 m and velocities beyond +-20.4 m/s saturate.
+    :param frame: its fields; positions beyond the extent and velocities beyond +-20.4 m/s saturate.
+    :param extent_m: largest coordinate that fits, m, as the swarm has agreed.
     :returns: 19 bytes, 23 with intent.
     :raises LocalProtocolError: if a field is not a number or an id is out of range.
     """
@@ -50,19 +62,21 @@ def encode_frame(frame: Frame) -> bytes:
         frame.position,
         frame.velocity,
         frame.intent or (0.0, 0.0, 0.0),
+        position_step(extent_m),
     )
     if not data:
         raise LocalProtocolError(f"not encodable: {frame}")
     return data
 
 
-def decode_frame(data: bytes) -> Frame:
+def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
     """The fields of a frame that all profiles have.
 
     :param data: the bytes heard.
+    :param extent_m: largest coordinate that fits, m, as the swarm has agreed.
     :raises RemoteProtocolError: if they are no frame: sealed ones are opened first.
     """
-    fields = _kernel.decode(data)
+    fields = _kernel.decode(data, position_step(extent_m))
     if isinstance(fields, int):
         raise RemoteProtocolError(f"{_FAULTS[fields]} ({len(data)} bytes)")
     profile, sender, slot, c_r, position, velocity, intent = fields

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .config import SwarmConfig
 from .course import Course, Plan
+from .errors import ConfigError
 from .flight_models import flight_model
 
 Array = NDArray[np.float64]
@@ -95,6 +96,7 @@ def make_scenario(config: SwarmConfig) -> Scenario:
 
     :param config: scenario, number of agents and movers, shape, jitter, seed.
     :returns: the same arrays for the same configuration, in every process.
+    :raises ConfigError: if it does not fit into the extent that frames can say.
     """
     random = generator(config.seed, STREAM_SCENARIO)
     places, partner = (_streams if config.scenario == "streams" else _places)(config)
@@ -102,20 +104,54 @@ def make_scenario(config: SwarmConfig) -> Scenario:
     order = random.permutation(count) if config.permute else np.arange(count)
     places = places + random.uniform(-config.jitter_m, config.jitter_m, (3, count))
     pairs = [(a, int(b)) for a, b in enumerate(partner) if a < b]
-    chosen = random.permutation(len(pairs))[: config.movers // 2]
+    chosen = random.permutation(len(pairs))
     target, moving = places.copy(), np.zeros(count, dtype=np.bool_)
     if config.scenario == "streams":
         moving[: config.movers] = True
         target[:, : config.movers] += _stream_way(config)
     else:
-        for index in chosen:
+        for index in chosen[: config.movers // 2]:
             a, b = pairs[index]
             target[:, a], target[:, b] = places[:, b], places[:, a]
             moving[a] = moving[b] = True
+        if config.movers % 2:
+            # Without a partner: whoever has none anyway, else the first of the next pair.
+            single = count - 1 if count % 2 else pairs[chosen[config.movers // 2]][0]
+            target[:, single] = _far_point(config, places[:, single])
+            moving[single] = True
     # Micrometres: whatever the last bit of a cosine is on some machine, all agents start from the same
     # numbers.
     start, target = (np.ascontiguousarray(np.round(planes, 6)[:, order]) for planes in (places, target))
-    return _planned(config, Scenario(start, target, moving[order]), random)
+    plain = Scenario(start, target, moving[order])
+    check_extent(config, plain)  # waypoints lie between the starts
+    return _planned(config, plain, random)
+
+
+def _far_point(config: SwarmConfig, place: Array) -> Array:
+    """Goal of a mover without a partner, (3,), m: opposite, one spacing further out, where nobody else has a place."""
+    spacing = flight_model(config.avoider, config.options).spacing
+    far: Array = -place * (1.0 + spacing / math.sqrt(float(place @ place)))
+    return far
+
+
+FIELD_MARGIN_M = 2.0  # m, room to avoid each other beyond the outermost start or goal
+
+
+def check_extent(config: SwarmConfig, scenario: Scenario) -> None:
+    """Whether frames can say where everybody will be.
+
+    :param config: its extent.
+    :param scenario: starts and goals.
+    :raises ConfigError: naming the extent that would do.
+    """
+    points = [scenario.start, scenario.target, *([] if scenario.plan is None else scenario.plan.goals)]
+    reach = max(float(np.abs(planes).max(initial=0.0)) for planes in points)
+    if not all(np.isfinite(planes).all() for planes in points):
+        raise ConfigError("scenario", "places that are not", "finite starts and goals")
+    if not reach + FIELD_MARGIN_M <= config.extent_m:
+        enough = math.ceil(10.0 * (reach + FIELD_MARGIN_M)) / 10.0
+        text = f"{enough:g} m or more: starts and goals are up to {reach:.2f} m from the centre"
+        raise ConfigError("extent_m", config.extent_m, f"{text}, and agents avoid each other")
 
 
 def _planned(config: SwarmConfig, plain: Scenario, random: np.random.Generator) -> Scenario:
@@ -129,8 +165,8 @@ def _planned(config: SwarmConfig, plain: Scenario, random: np.random.Generator) 
     if config.scenario == "staggered":
         # Partners start together: pairs one after the other, in the order of their lower ids.
         partner = {tuple(plain.start[:, k]): k for k in range(count)}
-        mates = [(k, partner[tuple(plain.target[:, k])]) for k in np.flatnonzero(moving)]
-        for turn, (a, b) in enumerate(pair for pair in mates if pair[0] < pair[1]):
+        mates = [(int(k), partner.get(tuple(plain.target[:, k]), int(k))) for k in np.flatnonzero(moving)]
+        for turn, (a, b) in enumerate(pair for pair in mates if pair[0] <= pair[1]):
             begin[a] = begin[b] = turn * config.stagger_slots
     elif config.scenario == "waypoints":
         goals = np.concatenate((_waypoints(config, plain, random), goals))
@@ -175,7 +211,7 @@ def _waypoints(config: SwarmConfig, plain: Scenario, random: np.random.Generator
 
 def _stream_size(config: SwarmConfig) -> tuple[int, float]:
     """Agents in a row of a stream, and the distance between them, m."""
-    half = max(1, config.movers // 2)
+    half = max(1, (config.movers + 1) // 2)
     return math.ceil(math.sqrt(half)), max(1.0, flight_model(config.avoider, config.options).spacing)
 
 
@@ -193,17 +229,18 @@ def _streams(config: SwarmConfig) -> tuple[Array, NDArray[np.int64]]:
     """Places of two blocks that will cross, movers first, and of those that hover around them."""
     rows, gap = _stream_size(config)
     length = 2 * ((rows + 1) * gap + 2.0)
-    half = config.movers // 2
-    index = np.arange(half)
+    half, movers = config.movers // 2, config.movers
+    index = np.arange(movers - half)  # the second stream has the odd one
     depth, lane = index // rows * gap, (index % rows - (rows - 1) / 2) * gap
     places = np.zeros((3, config.agents))
-    places[0, :half], places[1, :half] = -length / 2 - depth + (rows - 1) * gap / 2, lane
-    places[0, half : 2 * half], places[1, half : 2 * half] = lane, -length / 2 - depth + (rows - 1) * gap / 2
-    rest = config.agents - 2 * half
+    along = -length / 2 - depth + (rows - 1) * gap / 2
+    places[0, :half], places[1, :half] = along[:half], lane[:half]
+    places[0, half:movers], places[1, half:movers] = lane, along
+    rest = config.agents - movers
     if rest:
         radius = max(length / 2 + rows * gap + 1.0, gap * rest / (2 * math.pi))
         angle = 2 * np.pi * np.arange(rest) / rest
-        places[0, 2 * half :], places[1, 2 * half :] = radius * np.cos(angle), radius * np.sin(angle)
+        places[0, movers:], places[1, movers:] = radius * np.cos(angle), radius * np.sin(angle)
     return places, np.full(config.agents, -1, dtype=np.int64)
 
 

@@ -13,9 +13,9 @@ from .abstract_swarm import PRESENT_LEAVING, AbstractSwarm, Bytes
 from .config import SwarmConfig
 from .errors import ConfigError
 from .flight_models import flight_model
-from .frame import PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT
+from .frame import PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, position_step
 from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
-from .scenario import STREAM_POLICY, Scenario, generator, make_scenario
+from .scenario import STREAM_POLICY, Scenario, check_extent, generator, make_scenario
 
 DECAY_STEPS = 4096  # intent: beyond this many control periods a vehicle has settled at its command
 
@@ -44,6 +44,7 @@ class Swarm(AbstractSwarm):
     ) -> None:
         self.config = config
         self.scenario = make_scenario(config) if scenario is None else scenario
+        check_extent(config, self.scenario)
         self.ids = tuple(range(1, config.agents + 1) if local is None else local)
         self._check_ids("local", self.ids)
         count, agents = len(self.ids), config.agents
@@ -88,7 +89,8 @@ class Swarm(AbstractSwarm):
             "targets_known": int(config.targets_known and self.scenario.goals_known),
             "profile": PROFILE_EXTENDED if config.extended else profile, "key": key,
             "decay_len": self._decay.shape[1], "tau": model.vehicle.tau, "a_max": model.vehicle.a_max,
-            "avoid": model.avoider.to_dict(), "gossip": int(config.gossip), "anchor_every": config.anchor_every,
+            "avoid": model.avoider.to_dict(), "gossip": int(config.gossip),
+            "position_step": position_step(config.extent_m), "anchor_every": config.anchor_every,
             "open_every": config.open_period, "adoption": int(config.adoption), "depth_rate": float(config.depth_rate),
             "share": float(config.lease_share),
         }  # fmt: skip

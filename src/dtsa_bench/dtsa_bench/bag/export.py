@@ -15,7 +15,7 @@ import pyarrow.parquet
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_frame
 from dtsa_bench.bag.errors import BagError
-from dtsa_bench.bag.run import OUTCOMES, RecordedRun, load_run
+from dtsa_bench.bag.run import OUTCOMES, RecordedRun, extent_of, load_run
 
 FORMATS = ("parquet", "csv")
 ROWS = 65536  # rows that are in memory as a table at once
@@ -173,9 +173,9 @@ def _slots(run: RecordedRun) -> Iterator[dict[str, Any]]:
 
 
 def _frames(run: RecordedRun) -> Iterator[dict[str, Any]]:
-    frames = run.frames
+    frames, extent = run.frames, extent_of(run.config)
     for piece in _pieces(len(frames.slot)):
-        decoded = [_decode(data) for data in frames.data[piece]]
+        decoded = [_decode(data, extent) for data in frames.data[piece]]
         batch: dict[str, Any] = {
             "slot": frames.slot[piece],
             "time_s": run.time_s(frames.slot[piece]),
@@ -193,9 +193,9 @@ def _frames(run: RecordedRun) -> Iterator[dict[str, Any]]:
         yield batch
 
 
-def _decode(data: bytes) -> tuple[Any, ...]:
+def _decode(data: bytes, extent_m: float) -> tuple[Any, ...]:
     try:
-        frame = decode_frame(data)
+        frame = decode_frame(data, extent_m)
     except RemoteProtocolError:
         return (None,) * 7
     return (frame.c_r, *frame.position, *frame.velocity)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.core.frame import EXTENT_M
 from dtsa_bench.bag.errors import UnusableBag
 from dtsa_bench.bag.reader import Bag
 
@@ -141,6 +142,12 @@ def swarm_section(config: Mapping[str, Any]) -> Mapping[str, Any]:
     """The swarm's settings in a recorded configuration, whether it has sections or not."""
     section = config.get("swarm", config)
     return section if isinstance(section, Mapping) else {}
+
+
+def extent_of(config: Mapping[str, Any]) -> float:
+    """Largest coordinate that the frames of a recorded run can say, m."""
+    value = swarm_section(config).get("extent_m", EXTENT_M)
+    return float(value) if isinstance(value, (int, float)) and 0 < value < float("inf") else EXTENT_M
 
 
 def _slot_ns(config: Mapping[str, Any]) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dtsa_agent.core import _kernel
+from dtsa_agent.core.frame import POSITION_STEP
 
 OPEN = 255
 
@@ -84,7 +85,7 @@ class Ledger:
             self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(lessees)}")
 
     def _read(self, slot: int, sender: int, data: bytes) -> None:
-        fields = _kernel.decode_extended(data)
+        fields = _kernel.decode_extended(data, POSITION_STEP)
         if isinstance(fields, int):
             self.broken.append(f"slot {slot}: agent {sender} sent a frame that is none ({fields})")
             return

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.core import REASONS, RemoteProtocolError, decode_frame
-from dtsa_agent.core.authentication import TAG_LENGTH
+from dtsa_agent.core import REASONS, RemoteProtocolError, _kernel, decode_frame
+from dtsa_agent.core.frame import EXTENT_M, TAG_LENGTH
 from dtsa_agent.core.frame_extended import EXTENDED_LENGTH, ExtendedFrame, decode_extended
 from dtsa_bench.bag.errors import BagError
 from dtsa_bench.bag.reader import Bag, Message
+from dtsa_bench.bag.run import extent_of
 
 from .result import Difference
 
@@ -68,7 +69,7 @@ def differing(bag: Bag, recorded: Message, expected: bytes, slot: int) -> Differ
         if same(a, b):
             continue
         if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-            return _in_array(f"{kind}.{name}", name, a, b, right, slot)
+            return _in_array(f"{kind}.{name}", name, a, b, right, slot, extent_of(bag.config))
         return Difference(
             f"{kind}.{name}",
             short(_plain(a)),
@@ -110,10 +111,12 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _in_array(what: str, name: str, a: np.ndarray, b: np.ndarray, message: Any, slot: int) -> Difference:
+def _in_array(
+    what: str, name: str, a: np.ndarray, b: np.ndarray, message: Any, slot: int, extent_m: float
+) -> Difference:
     why = WHY.get(name, "rebuilt from the run")
     if name == "data":
-        return _in_frames(what, a, b, message, slot, why)
+        return _in_frames(what, a, b, message, slot, why, extent_m)
     if a.shape != b.shape:
         return Difference(what, short(a), short(b), why, slot)
     index = int(np.flatnonzero(a.view(np.uint8).reshape(a.size, -1) != b.view(np.uint8).reshape(b.size, -1))[0])
@@ -132,24 +135,27 @@ def _in_array(what: str, name: str, a: np.ndarray, b: np.ndarray, message: Any, 
     return Difference(what, short(a[index].item()), short(b[index].item()), why, slot, agent)
 
 
-def _in_frames(what: str, a: np.ndarray, b: np.ndarray, message: Any, slot: int, why: str) -> Difference:
+def _in_frames(
+    what: str, a: np.ndarray, b: np.ndarray, message: Any, slot: int, why: str, extent_m: float
+) -> Difference:
     ids = message.agent if hasattr(message, "agent") else message.sender
     at = 0
     for agent, length in zip(ids, message.length, strict=False):
         right, wrong = a[at : at + length].tobytes(), b[at : at + length].tobytes()
         at += int(length)
         if right != wrong:
-            return Difference(what, _frame(right), _frame(wrong), why, slot, int(agent))
+            return Difference(what, _frame(right, extent_m), _frame(wrong, extent_m), why, slot, int(agent))
     return Difference(what, f"{a.size} bytes", f"{b.size} bytes", why, slot)
 
 
-def _frame(data: bytes) -> str:
+def _frame(data: bytes, extent_m: float = EXTENT_M) -> str:
     """A frame in words, sealed or not."""
     why = ""
-    for length, seal in ((len(data), ""), (len(data) - TAG_LENGTH, ", sealed")):
+    whole = _kernel.frame_length(data[0] & 15) if data else 0
+    for length, seal in ((len(data), ""), (len(data) - TAG_LENGTH, ", sealed"), (whole, ", and more")):
         try:
-            frame = decode_frame(data[:length])
-            more = _more(decode_extended(data[:length])) if length == EXTENDED_LENGTH else ""
+            frame = decode_frame(data[:length], extent_m)
+            more = _more(decode_extended(data[:length], extent_m)) if length == EXTENDED_LENGTH else ""
         except RemoteProtocolError as error:
             why = why or str(error)
             continue

@@ -196,13 +196,14 @@ class RealtimeCheck:
         if self.run.swarm.auth:
             data = self._opened(data, slot)
         data = data[: len(data) - self.run.swarm.own_bytes]
+        extent = self.run.swarm.extent_m
         if self.run.swarm.extended:
-            found = decode_extended(data).own
+            found = decode_extended(data, extent).own
             right = Frame(agent, slot & _SLOT_MASK, found.c_r, position, velocity, command if found.intent else None)
-            return found, decode_extended(encode_extended(ExtendedFrame(right))).own
-        found = decode_frame(data)
+            return found, decode_extended(encode_extended(ExtendedFrame(right), extent), extent).own
+        found = decode_frame(data, extent)
         right = Frame(agent, slot & _SLOT_MASK, found.c_r, position, velocity, command if found.intent else None)
-        return found, decode_frame(encode_frame(right))
+        return found, decode_frame(encode_frame(right, extent), extent)
 
     def _opened(self, data: bytes, slot: int) -> bytes:
         """A sealed frame without its tag, which is checked where the key is at hand."""

@@ -66,8 +66,9 @@ typedef struct {
 } dtsa_frame;
 
 int frame_length(int profile);
-int frame_encode(const dtsa_frame *frame, uint8_t *out);   /* -> length, 0 if a field is not a number */
-int frame_decode(const uint8_t *data, long length, dtsa_frame *frame);
+/* position_step: m, agreed on by the whole swarm; the largest coordinate that fits is 32767 steps. */
+int frame_encode(const dtsa_frame *frame, double position_step, uint8_t *out);   /* -> length, 0 if a field is not a number */
+int frame_decode(const uint8_t *data, long length, double position_step, dtsa_frame *frame);
 /* Quantised fields, shared by all profiles; saturate, never wrap. */
 int64_t quantise(double value, double step, int bits);
 
@@ -75,7 +76,7 @@ int64_t quantise(double value, double step, int bits);
 
 typedef struct {
     int id, age, c_r;     /* 1..254; slots since it was sampled, 1..127; 0 or 1 */
-    double p[3], v[3];    /* m, m/s, frame map; 4 mm, 2 cm/s on the air */
+    double p[3], v[3];    /* m, m/s, frame map; 4 mm (2 position steps), 2 cm/s on the air */
 } gossip_entry;
 
 typedef struct {
@@ -89,8 +90,10 @@ typedef struct {
     uint8_t relay_ids[RELAY_IDS];
 } extended_frame;
 
-int extended_encode(const extended_frame *frame, uint8_t *out);     /* -> length, 0 if not encodable */
-int extended_decode(const uint8_t *data, long length, extended_frame *frame);
+int extended_encode(const extended_frame *frame, double position_step, uint8_t *out);     /* -> length, 0 if not encodable */
+int extended_decode(const uint8_t *data, long length, double position_step, extended_frame *frame);
+/* Whether gossip can say a state without saturating. */
+int gossip_fits(const double p[3], const double v[3], double position_step);
 
 /* ---- priority.c ---- */
 
@@ -121,6 +124,7 @@ typedef struct swarm {
     int c_r;
     int targets_known;
     int profile, gossip;
+    double position_step;       /* m, of positions in frames */
     uint64_t key;
     avoid_params avoid;
     vehicle_params vehicle;

@@ -4,7 +4,7 @@
  *   1-2    sender's id
  *   3      c_r
  *   4-7    slot in which the state was sampled
- *   8-13   position, 3 x 16 bits, 2 mm
+ *   8-13   position, 3 x 16 bits, in steps that the swarm agrees on (2 mm)
  *   14-18  velocity, 3 x 12 bits, 1 cm/s, 4 bits zero          (profile paper, 19 bytes)
  *   14-22  velocity and intended velocity, 6 x 12 bits, 1 cm/s (profile paper with intent, 23 bytes)
  *
@@ -15,7 +15,7 @@
 
 #include "dtsa.h"
 
-static const double POSITION_STEP = 0.002, VELOCITY_STEP = 0.01;
+static const double VELOCITY_STEP = 0.01;
 
 int64_t quantise(double value, double step, int bits)
 {
@@ -64,7 +64,7 @@ static double get12(const uint8_t *in, int index)
     return (double)((int)(u ^ 0x800u) - 0x800) * VELOCITY_STEP;
 }
 
-int frame_encode(const dtsa_frame *f, uint8_t *out)
+int frame_encode(const dtsa_frame *f, double position_step, uint8_t *out)
 {
     const int length = frame_length(f->profile), extended = f->profile == PROFILE_EXTENDED;
     if (!length || f->sender < 1 || f->sender > 65535 || f->c_r < 0 || f->c_r > 255) return 0;
@@ -77,7 +77,7 @@ int frame_encode(const dtsa_frame *f, uint8_t *out)
     out[3] = (uint8_t)(extended ? f->c_r != 0 : f->c_r);
     for (int i = 0; i < 4; i++) out[4 + i] = (uint8_t)(f->slot >> 8 * i);
     for (int i = 0; i < 3; i++) {
-        const int64_t q = quantise(f->p[i], POSITION_STEP, 16);
+        const int64_t q = quantise(f->p[i], position_step, 16);
         out[8 + 2 * i] = (uint8_t)q;
         out[9 + 2 * i] = (uint8_t)((uint64_t)q >> 8);
         put12(out + 14, i, quantise(f->v[i], VELOCITY_STEP, 12));
@@ -87,7 +87,7 @@ int frame_encode(const dtsa_frame *f, uint8_t *out)
     return length;
 }
 
-int frame_decode(const uint8_t *data, long length, dtsa_frame *f)
+int frame_decode(const uint8_t *data, long length, double position_step, dtsa_frame *f)
 {
     if (length < 1) return FRAME_BAD_LENGTH;
     if (data[0] >> 4 != FRAME_VERSION) return FRAME_BAD_HEADER;
@@ -102,7 +102,7 @@ int frame_decode(const uint8_t *data, long length, dtsa_frame *f)
     f->slot = 0;
     for (int i = 0; i < 4; i++) f->slot |= (uint32_t)data[4 + i] << 8 * i;
     for (int i = 0; i < 3; i++) {
-        f->p[i] = (double)(int16_t)(data[8 + 2 * i] | data[9 + 2 * i] << 8) * POSITION_STEP;
+        f->p[i] = (double)(int16_t)(data[8 + 2 * i] | data[9 + 2 * i] << 8) * position_step;
         f->v[i] = get12(data + 14, i);
         f->c[i] = f->profile != PROFILE_PAPER ? get12(data + 14, 3 + i) : 0.0;
     }

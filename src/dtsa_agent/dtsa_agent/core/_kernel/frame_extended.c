@@ -6,17 +6,30 @@
  *   3      bit 0: c_r is not 0; bit 1: in probation; bits 2-3, 4-5, 6-7: kinds of the three sections
  *   4-22   slot, position, velocity, intended velocity as in profile paper with intent
  *   23-33, 34-44, 45-55   sections:
- *     kind 0, gossip: id (0: empty), age << 1 | c_r is not 0, position 3 x 14 bits at 4 mm, velocity 3 x 10 bits at 2 cm/s
+ *     kind 0, gossip: id (0: empty), age << 1 | c_r is not 0, position 3 x 14 bits at twice the frame's step (4 mm),
+ *       velocity 3 x 10 bits at 2 cm/s
  *     kind 1, leases: a byte a turn (0: none, id of the lessee, 255: open)
  *     kind 2, relay: 24 bits, bit d - 1: turn slot + d is leased; then at most 8 lessees
  */
+#include <math.h>
 #include <string.h>
 
 #include "dtsa.h"
 
 enum { KIND_GOSSIP, KIND_LEASES, KIND_RELAY };
 
-static const double POSITION_STEP = 0.004, VELOCITY_STEP = 0.02;
+static const double VELOCITY_STEP = 0.02;
+
+/* Gossip has two bits less for a coordinate than the sender's own state: twice the step, half the extent. */
+static double gossip_step(double position_step) { return 2.0 * position_step; }
+
+int gossip_fits(const double p[3], const double v[3], double position_step)
+{
+    const double far = ((1 << 13) - 2) * gossip_step(position_step), fast = ((1 << 9) - 2) * VELOCITY_STEP;
+    for (int i = 0; i < 3; i++)
+        if (!(fabs(p[i]) <= far && fabs(v[i]) <= fast)) return 0;
+    return 1;
+}
 
 static void put_bits(uint8_t *out, int at, int bits, uint64_t value)
 {
@@ -34,17 +47,17 @@ static int64_t get_signed(const uint8_t *in, int at, int bits)
     return (int64_t)(word ^ top) - (int64_t)top;
 }
 
-static void put_gossip(const gossip_entry *g, uint8_t *out)
+static void put_gossip(const gossip_entry *g, double step, uint8_t *out)
 {
     out[0] = (uint8_t)g->id;
     out[1] = (uint8_t)(g->age << 1 | (g->c_r != 0));
     for (int i = 0; i < 3; i++) {
-        put_bits(out + 2, 14 * i, 14, (uint64_t)quantise(g->p[i], POSITION_STEP, 14));
+        put_bits(out + 2, 14 * i, 14, (uint64_t)quantise(g->p[i], step, 14));
         put_bits(out + 2, 42 + 10 * i, 10, (uint64_t)quantise(g->v[i], VELOCITY_STEP, 10));
     }
 }
 
-static int get_gossip(const uint8_t *in, gossip_entry *g)
+static int get_gossip(const uint8_t *in, double step, gossip_entry *g)
 {
     g->id = in[0];
     if (!g->id) {
@@ -56,7 +69,7 @@ static int get_gossip(const uint8_t *in, gossip_entry *g)
     g->c_r = in[1] & 1;
     if (g->id > EXTENDED_SENDER_MAX || g->age == 0) return FRAME_BAD_FIELD;
     for (int i = 0; i < 3; i++) {
-        g->p[i] = (double)get_signed(in + 2, 14 * i, 14) * POSITION_STEP;
+        g->p[i] = (double)get_signed(in + 2, 14 * i, 14) * step;
         g->v[i] = (double)get_signed(in + 2, 42 + 10 * i, 10) * VELOCITY_STEP;
     }
     return FRAME_OK;
@@ -75,11 +88,11 @@ static int get_relay(const uint8_t *in, extended_frame *e)
     return FRAME_OK;
 }
 
-int extended_encode(const extended_frame *e, uint8_t *out)
+int extended_encode(const extended_frame *e, double position_step, uint8_t *out)
 {
     uint8_t kinds[SECTIONS];
     int section = 0;
-    if (!frame_encode(&e->own, out)) return 0;
+    if (!frame_encode(&e->own, position_step, out)) return 0;
     uint8_t *at = out + EXTENDED_HEAD;
     out[2] = e->leaving ? 255 : (uint8_t)e->c_s;
     for (int i = 0; i < e->lease_count; i += SECTION_BYTES, at += SECTION_BYTES) {
@@ -98,16 +111,16 @@ int extended_encode(const extended_frame *e, uint8_t *out)
     for (int i = 0; i < e->gossip_count; i++, at += SECTION_BYTES) {
         if (section == SECTIONS) return 0;
         kinds[section++] = KIND_GOSSIP;
-        put_gossip(&e->gossip[i], at);
+        put_gossip(&e->gossip[i], gossip_step(position_step), at);
     }
     while (section < SECTIONS) kinds[section++] = KIND_GOSSIP;
     out[3] = (uint8_t)(out[3] | (e->probation != 0) << 1 | kinds[0] << 2 | kinds[1] << 4 | kinds[2] << 6);
     return EXTENDED_LENGTH;
 }
 
-int extended_decode(const uint8_t *data, long length, extended_frame *e)
+int extended_decode(const uint8_t *data, long length, double position_step, extended_frame *e)
 {
-    const int status = frame_decode(data, length, &e->own);
+    const int status = frame_decode(data, length, position_step, &e->own);
     if (status != FRAME_OK) return status;
     if (e->own.profile != PROFILE_EXTENDED) return FRAME_BAD_HEADER;
     e->leaving = data[2] == 255;
@@ -122,7 +135,7 @@ int extended_decode(const uint8_t *data, long length, extended_frame *e)
         int bad = FRAME_OK;
         switch (data[3] >> (2 + 2 * i) & 3) {
         case KIND_GOSSIP:
-            bad = get_gossip(at, &e->gossip[e->gossip_count]);
+            bad = get_gossip(at, gossip_step(position_step), &e->gossip[e->gossip_count]);
             e->gossip_count += bad == FRAME_OK && at[0];
             break;
         case KIND_LEASES:

@@ -4,16 +4,29 @@
 #include "dtsa.h"
 #include "lease.h"
 
-/* The newest state of somebody not yet chosen that is `age` slots old or older; -1: none. */
-static int newest_of_age(const swarm *s, const int64_t *sent, int self, int64_t slot, int age, const int *chosen, int count)
+/* What a table holds of an agent, and whether gossip can say it. */
+static int sayable(const swarm *s, int view, int k)
 {
+    const long plane = (long)view * 3 * s->n + k;
+    double p[3], v[3];
+    for (int i = 0; i < 3; i++) {
+        p[i] = s->sent_p[plane + (long)i * s->n];
+        v[i] = s->sent_v[plane + (long)i * s->n];
+    }
+    return gossip_fits(p, v, s->position_step);
+}
+
+/* The newest state of somebody not yet chosen that is `age` slots old or older and can be said; -1: none. */
+static int newest_of_age(const swarm *s, int view, int self, int64_t slot, int age, const int *chosen, int count)
+{
+    const int64_t *sent = s->sent_slot + (long)view * s->n;
     int best = -1;
     for (int k = 0; k < s->n; k++) {
         const int64_t old = slot - sent[k];
         if (k == self || sent[k] < 0 || old < age || old > GOSSIP_AGE_MAX) continue;
         int taken = 0;
         for (int i = 0; i < count; i++) taken |= chosen[i] == k;
-        if (!taken && (best < 0 || sent[k] > sent[best])) best = k;
+        if (!taken && (best < 0 || sent[k] > sent[best]) && sayable(s, view, k)) best = k;
     }
     return best;
 }
@@ -26,7 +39,7 @@ int gossip_collect(const swarm *s, int view, int self, int64_t slot, int room, g
     const int later = 2 + s->n / 16, ages[2 * SECTIONS] = {1, later, 2 * later, 1, 1, 1};
     int best[SECTIONS], count = 0;
     for (int i = 0; i < 2 * SECTIONS && count < room; i++) {
-        const int k = newest_of_age(s, sent, self, slot, ages[i], best, count);
+        const int k = newest_of_age(s, view, self, slot, ages[i], best, count);
         if (k >= 0) best[count++] = k;
     }
     for (int i = 0; i < count; i++) {
@@ -43,11 +56,11 @@ int gossip_collect(const swarm *s, int view, int self, int64_t slot, int room, g
     return count;
 }
 
-/* A state that somebody else heard replaces an older one only. */
+/* A state that somebody else heard replaces an older one only; one at the codec's limit may be a wrong one. */
 static void learn_gossip(swarm *s, int view, int64_t sampled, const gossip_entry *g)
 {
     if (sampled < 0 || s->observer[view] == g->id - 1) return;
-    if (s->sent_slot[(long)view * s->n + g->id - 1] >= sampled) return;
+    if (s->sent_slot[(long)view * s->n + g->id - 1] >= sampled || !gossip_fits(g->p, g->v, s->position_step)) return;
     dtsa_frame f = {.sender = g->id, .c_r = g->c_r};
     for (int i = 0; i < 3; i++) {
         f.p[i] = g->p[i];
@@ -76,13 +89,13 @@ int extended_emit(swarm *s, int l, int64_t slot, const dtsa_frame *own, uint8_t 
     const int used = (e.lease_count + SECTION_BYTES - 1) / SECTION_BYTES + (e.relay_mask != 0);
     if (s->gossip)
         e.gossip_count = gossip_collect(s, s->shared ? 0 : l, s->local[l], slot, SECTIONS - used, e.gossip);
-    return extended_encode(&e, out);
+    return extended_encode(&e, s->position_step, out);
 }
 
 int extended_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const uint8_t *mask)
 {
     extended_frame e;
-    if (extended_decode(data, length, &e) != FRAME_OK) {
+    if (extended_decode(data, length, s->position_step, &e) != FRAME_OK) {
         s->malformed++;
         return 0;
     }

@@ -75,25 +75,39 @@ static PyObject *py_select(PyObject *module, PyObject *args)
     return result;
 }
 
+int step_arg(PyObject *object, double *step)
+{
+    *step = PyFloat_AsDouble(object);
+    if (*step == -1.0 && PyErr_Occurred()) return -1;
+    if (*step > 0.0) return 0;
+    PyErr_SetString(PyExc_ValueError, "position_step: allowed: more than 0 m");
+    return -1;
+}
+
 static PyObject *py_encode(PyObject *module, PyObject *args)
 {
     dtsa_frame f;
+    double step;
+    PyObject *step_object;
     uint8_t out[FRAME_MAX];
     (void)module;
-    if (!PyArg_ParseTuple(args, "iiIi(ddd)(ddd)(ddd)", &f.profile, &f.sender, &f.slot, &f.c_r, &f.p[0], &f.p[1], &f.p[2],
-                          &f.v[0], &f.v[1], &f.v[2], &f.c[0], &f.c[1], &f.c[2]))
+    if (!PyArg_ParseTuple(args, "iiIi(ddd)(ddd)(ddd)O", &f.profile, &f.sender, &f.slot, &f.c_r, &f.p[0], &f.p[1], &f.p[2],
+                          &f.v[0], &f.v[1], &f.v[2], &f.c[0], &f.c[1], &f.c[2], &step_object) ||
+        step_arg(step_object, &step) < 0)
         return NULL;
-    const int length = frame_encode(&f, out);
+    const int length = frame_encode(&f, step, out);
     return PyBytes_FromStringAndSize((const char *)out, length);
 }
 
-static PyObject *py_decode(PyObject *module, PyObject *arg)
+static PyObject *py_decode(PyObject *module, PyObject *const *args, Py_ssize_t count)
 {
     Py_buffer data;
+    double step;
     dtsa_frame f;
     (void)module;
-    if (PyObject_GetBuffer(arg, &data, PyBUF_SIMPLE) < 0) return NULL;
-    const int status = frame_decode(data.buf, data.len, &f);
+    if (count != 2) return PyErr_Format(PyExc_TypeError, "decode(data, position_step)");
+    if (step_arg(args[1], &step) < 0 || PyObject_GetBuffer(args[0], &data, PyBUF_SIMPLE) < 0) return NULL;
+    const int status = frame_decode(data.buf, data.len, step, &f);
     PyBuffer_Release(&data);
     if (status != FRAME_OK) return PyLong_FromLong(status);
     return Py_BuildValue("(iiIi(ddd)(ddd)(ddd))", f.profile, f.sender, f.slot, f.c_r, f.p[0], f.p[1], f.p[2], f.v[0], f.v[1],
@@ -111,9 +125,11 @@ static PyObject *py_frame_length(PyObject *module, PyObject *arg)
 static PyMethodDef METHODS[] = {
     {"priority", (PyCFunction)(void (*)(void))py_priority, METH_FASTCALL, "priority(position, velocity, slot_s, out, scratch)"},
     {"select", py_select, METH_VARARGS, "select(g, counter, in_ap, epsilon, selection, candidates) -> (index, reason)"},
-    {"encode", py_encode, METH_VARARGS, "encode(profile, sender, slot, c_r, p, v, c) -> bytes, empty if not encodable"},
+    {"encode", py_encode, METH_VARARGS,
+     "encode(profile, sender, slot, c_r, p, v, c, position_step) -> bytes, empty if not encodable"},
     {"frame_length", py_frame_length, METH_O, "frame_length(profile) -> bytes, 0 for an unknown profile"},
-    {"decode", py_decode, METH_O, "decode(data) -> (profile, sender, slot, c_r, p, v, c), or a negative error"},
+    {"decode", (PyCFunction)(void (*)(void))py_decode, METH_FASTCALL,
+     "decode(data, position_step) -> (profile, sender, slot, c_r, p, v, c), or a negative error"},
     {NULL, NULL, 0, NULL},
 };
 

@@ -21,6 +21,8 @@ enum { METRICS_CRASHED = 1, METRICS_ARRIVED = 2 };
 extern PyTypeObject SwarmType, MetricsType;
 extern PyMethodDef avoider_methods[], lease_methods[];
 
+/* Metres of one step of a coordinate; on failure sets an exception and returns -1. */
+int step_arg(PyObject *object, double *step);
 /* names.c: tuples of names by kind of list; on failure sets an exception and returns NULL. */
 PyObject *names_dict(void);
 

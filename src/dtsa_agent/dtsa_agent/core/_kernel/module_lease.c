@@ -1,9 +1,8 @@
 /* Python's door to the extended frame; core/frame_extended.py documents it. */
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "module.h"
+
 #include <string.h>
 
-#include "dtsa.h"
 #include "lease.h"
 
 static PyObject *gossip_tuple(const extended_frame *e)
@@ -31,13 +30,15 @@ static PyObject *relay_list(const extended_frame *e)
     return list;
 }
 
-static PyObject *py_decode_extended(PyObject *module, PyObject *arg)
+static PyObject *py_decode_extended(PyObject *module, PyObject *const *args, Py_ssize_t count)
 {
     Py_buffer data;
+    double step;
     extended_frame e;
     (void)module;
-    if (PyObject_GetBuffer(arg, &data, PyBUF_SIMPLE) < 0) return NULL;
-    const int status = extended_decode(data.buf, data.len, &e);
+    if (count != 2) return PyErr_Format(PyExc_TypeError, "decode_extended(data, position_step)");
+    if (step_arg(args[1], &step) < 0 || PyObject_GetBuffer(args[0], &data, PyBUF_SIMPLE) < 0) return NULL;
+    const int status = extended_decode(data.buf, data.len, step, &e);
     PyBuffer_Release(&data);
     if (status != FRAME_OK) return PyLong_FromLong(status);
     const dtsa_frame *f = &e.own;
@@ -87,12 +88,14 @@ static PyObject *py_encode_extended(PyObject *module, PyObject *args)
     dtsa_frame *f = &e.own;
     const char *leases;
     Py_ssize_t lease_count;
-    PyObject *gossip, *relay;
+    PyObject *gossip, *relay, *step_object;
+    double step;
     uint8_t out[FRAME_MAX];
     (void)module;
-    if (!PyArg_ParseTuple(args, "iIi(ddd)(ddd)(ddd)ippO!y#O!", &f->sender, &f->slot, &f->c_r, &f->p[0], &f->p[1], &f->p[2],
+    if (!PyArg_ParseTuple(args, "iIi(ddd)(ddd)(ddd)ippO!y#O!O", &f->sender, &f->slot, &f->c_r, &f->p[0], &f->p[1], &f->p[2],
                           &f->v[0], &f->v[1], &f->v[2], &f->c[0], &f->c[1], &f->c[2], &e.c_s, &e.leaving, &e.probation,
-                          &PyTuple_Type, &gossip, &leases, &lease_count, &PyTuple_Type, &relay))
+                          &PyTuple_Type, &gossip, &leases, &lease_count, &PyTuple_Type, &relay, &step_object) ||
+        step_arg(step_object, &step) < 0)
         return NULL;
     const int bad = lease_count > SECTIONS * SECTION_BYTES || e.c_s < 0 || e.c_s > 253 || read_gossip(gossip, &e) < 0 ||
                     read_relay(relay, &e) < 0;
@@ -100,7 +103,7 @@ static PyObject *py_encode_extended(PyObject *module, PyObject *args)
     if (bad) return PyBytes_FromStringAndSize("", 0);
     memcpy(e.leases, leases, (size_t)lease_count);
     e.lease_count = (int)lease_count;
-    return PyBytes_FromStringAndSize((const char *)out, extended_encode(&e, out));
+    return PyBytes_FromStringAndSize((const char *)out, extended_encode(&e, step, out));
 }
 
 static PyObject *py_lease_state_bytes(PyObject *module, PyObject *args)
@@ -114,8 +117,9 @@ static PyObject *py_lease_state_bytes(PyObject *module, PyObject *args)
 PyMethodDef lease_methods[] = {
     {"lease_state_bytes", py_lease_state_bytes, METH_VARARGS,
      "lease_state_bytes(agents, anchor_every) -> bytes of state of one agent"},
-    {"decode_extended", py_decode_extended, METH_O, "decode_extended(data) -> dict, or a negative error"},
+    {"decode_extended", (PyCFunction)(void (*)(void))py_decode_extended, METH_FASTCALL,
+     "decode_extended(data, position_step) -> dict, or a negative error"},
     {"encode_extended", py_encode_extended, METH_VARARGS,
-     "encode_extended(sender, slot, c_r, p, v, c, c_s, leaving, probation, gossip, leases, relay) -> bytes, empty if not encodable"},
+     "encode_extended(sender, slot, c_r, p, v, c, c_s, leaving, probation, gossip, leases, relay, position_step) -> bytes, empty if not encodable"},
     {NULL, NULL, 0, NULL},
 };

@@ -91,6 +91,7 @@ static int read_params(swarm *s, PyObject *p)
     s->profile = (int)number_or(p, "profile", &bad);
     s->key = (uint64_t)number_or(p, "key", &bad);
     s->gossip = (int)number_or(p, "gossip", &bad);
+    s->position_step = real_or(p, "position_step", &bad);
     s->lease.anchor_every = (int)number_or(p, "anchor_every", &bad);
     s->lease.open_every = (int)number_or(p, "open_every", &bad);
     s->lease.adoption = (int)number_or(p, "adoption", &bad);
@@ -107,6 +108,10 @@ static int read_params(swarm *s, PyObject *p)
     if (bad || avoid_params_from_dict(avoid, &s->avoid) < 0) return -1;
     if (s->n < 1 || s->local_count < 0 || s->view_count < 0 || s->steps < 1 || s->decay_len < 1) {
         PyErr_SetString(PyExc_ValueError, "sizes must be positive");
+        return -1;
+    }
+    if (!(s->position_step > 0.0)) {
+        PyErr_SetString(PyExc_ValueError, "position_step must be positive");
         return -1;
     }
     s->dt = s->slot_s / s->steps;

@@ -252,7 +252,8 @@ void swarm_emit(swarm *s, int64_t slot)
             f->c[i] = s->cmd[i * s->local_count + l];
         }
         uint8_t *out = s->frames + (long)l * FRAME_MAX;
-        s->frame_len[l] = (uint8_t)(s->profile == PROFILE_EXTENDED ? extended_emit(s, l, slot, f, out) : frame_encode(f, out));
+        s->frame_len[l] = (uint8_t)(s->profile == PROFILE_EXTENDED ? extended_emit(s, l, slot, f, out)
+                                                                          : frame_encode(f, s->position_step, out));
         if (s->frame_len[l]) s->senders[s->sender_count++] = l;
     }
 }
@@ -281,7 +282,7 @@ int swarm_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const u
 {
     if (s->profile == PROFILE_EXTENDED) return extended_hear(s, slot, data, length, mask);
     dtsa_frame f;
-    if (frame_decode(data, length, &f) != FRAME_OK || f.profile == PROFILE_EXTENDED) {
+    if (frame_decode(data, length, s->position_step, &f) != FRAME_OK || f.profile == PROFILE_EXTENDED) {
         s->malformed++;
         return 0;
     }
@@ -305,7 +306,7 @@ void swarm_end(swarm *s, int64_t slot)
         const int l = s->senders[i], view = view_of(s, l);
         dtsa_frame f;
         if (s->sent_slot[(long)view * s->n + s->local[l]] == slot) continue;
-        if (frame_decode(s->frames + (long)l * FRAME_MAX, s->frame_len[l], &f) == FRAME_OK)
+        if (frame_decode(s->frames + (long)l * FRAME_MAX, s->frame_len[l], s->position_step, &f) == FRAME_OK)
             swarm_learn(s, view, &f, slot);
     }
     if (s->policy == POLICY_LEASE) {
