@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core import Scenario, SwarmConfig
+from dtsa_agent.core import make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.ros.common import names
@@ -83,6 +84,7 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
 
     :raises ConfigError: for options that do not fit the run.
     """
+    make_scenario(run.swarm)  # says so if the field is larger than frames can say
     agents = run.swarm.agents
     if options.processes is not None and options.processes > agents:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
