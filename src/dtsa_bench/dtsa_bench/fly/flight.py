@@ -17,8 +17,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from dtsa_agent.core import Scenario, SwarmConfig
-from dtsa_agent.core import make_scenario
+from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.ros.common import names
