@@ -12,10 +12,12 @@ from node_helpers import end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
 
+from dtsa_msgs.msg import Transmission
 from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
+from dtsa_agent.ros.common import names
 from dtsa_bench.fly.recorded_channel import RecordedFlight
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_channel_sim import Channel, ChannelConfig
@@ -23,7 +25,8 @@ from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
-from dtsa_channel_sim.ros.observer import ChannelObserver, ObserverError, Observers, SlotLimit
+from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus, ObserverError, Observers, SlotLimit
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 
 class Diary(ChannelObserver):
@@ -143,3 +146,51 @@ def test_an_observer_that_fails_ends_the_flight_by_name_and_the_bag_is_readable(
     assert flight.write_results(pictures=False)["end"] == "stopped"
     assert json.loads((out / "summary.json").read_text())["slots"]["total"] == 25
     assert np.array(flight.measurement.positions).shape == (26, 3, 3)
+
+
+class LateSender(ChannelObserver):
+    """Answers for two agents; in one slot both send, agent 1 so long ago that it cannot be on the air any more."""
+
+    def __init__(self, node: Node, channel: RealtimeChannel) -> None:
+        topic = f"{names.SWARM}/{names.TRANSMISSION}"
+        self._publisher = node.create_publisher(Transmission, topic, names.lockstep_qos(16))
+        self._channel = channel
+        self._sent = False
+        self.frames: list[tuple[int, list[bool], int]] = []  # sender, received, collided
+
+    def idle(self, status: ChannelStatus) -> None:
+        slot, long_ago = (status.slot + 20, -30 * self._channel.slot_ns) if status.slot >= 0 else (0, 0)
+        sending = status.slot >= 0 and not self._sent
+        self._sent |= sending
+        nothing, size = [0.0] * 6, 24 if sending else 0
+        self._publisher.publish(
+            Transmission(
+                run=self._channel.run_id, slot=slot, agent=[1, 2], length=[size] * 2, data=bytes(2 * size),
+                offset_ns=[long_ago, 0], chosen=[0, 0], reason=[0, 0], digest=[0, 0], score=[0.0, 0.0],
+                steps=1, track=nothing, velocity=nothing, command=nothing, goal=nothing,
+            )
+        )  # fmt: skip
+
+    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        for row, sender in enumerate(verdict.senders):
+            assert verdict.received is not None
+            assert verdict.collided is not None
+            self.frames.append((sender, verdict.received[row].tolist(), verdict.collided[row]))
+
+
+@pytest.mark.ros
+def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        node = Node("channel", context=graph.node.context, enable_rosout=False)
+        model = Channel(ChannelConfig(agents=2))
+        channel = RealtimeChannel(node, model, 1, referee=SlotLimit(60))
+        sender = LateSender(graph.node, channel)
+        channel.observe(sender)
+        try:
+            channel.run(stop=False)
+        finally:
+            channel.close()
+            node.destroy_node()
+    assert channel.air.late == 1
+    # Nobody heard agent 1, and it disturbed nobody; agent 2 was heard by the one other agent.
+    assert sorted(sender.frames) == [(1, [False, False], 0), (2, [True, False], 0)]

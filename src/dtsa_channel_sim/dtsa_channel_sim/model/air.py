@@ -162,13 +162,13 @@ class Air(Generic[Key]):
         :param positions: (3, N), m, frame map; needed with a limited range or capture.
         :param keep: True when transmissions of the next slot may begin before it.
         """
-        medium, before = self._channel.medium(slot), list(self._near)
+        medium = self._channel.medium(slot)
         end_ns = (slot + 1) * self._channel.config.slot_ns
-        self._near[:] = [*(frame for frame in before if frame.end_ns > end_ns),
-                         *(frame for frame in frames if keep or frame.end_ns > end_ns)]  # fmt: skip
+        on_air = [*self._near, *frames]
+        first = len(self._near)
+        self._near[:] = [frame for k, frame in enumerate(on_air) if frame.end_ns > end_ns or (keep and k >= first)]
         return [
-            medium.judge(slot, frame, [*before, *(other for other in frames if other is not frame)], positions)
-            for frame in frames
+            medium.judge(slot, frame, on_air[:k] + on_air[k + 1 :], positions) for k, frame in enumerate(frames, first)
         ]
 
     def _slot(self, time_ns: int) -> int:

@@ -6,7 +6,7 @@ frames survives, that who sends does not hear, when a radio finds the air busy, 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ Mask = NDArray[np.bool_]
 Positions = NDArray[np.float64]
 #: Distances below this are taken as this when powers are compared, m.
 _NEAREST_M = 0.01
+_NO_POWER = np.zeros(0)
 
 
 class OnAir(NamedTuple):
@@ -96,7 +97,7 @@ class Medium:
         #: everywhere.
         self.everywhere = not self.needs_positions and self._groups is None
 
-    def judge(self, slot: int, frame: OnAir, others: Iterable[OnAir], positions: Positions | None = None) -> Reception:
+    def judge(self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Positions | None = None) -> Reception:
         """Return what became of one transmission among others.
 
         :param slot: slot whose random numbers count.
@@ -105,14 +106,14 @@ class Medium:
         :param positions: (3, N), m, frame map; needed for range and capture only.
         :raises LocalProtocolError: when positions are needed and missing.
         """
-        reach, collided = self._undisturbed(frame, others, positions)
-        clear = reach & ~collided
+        clear, collided = self._undisturbed(frame, others, positions)
         if self._jam:
             received = np.zeros_like(clear)
+        elif self.losses.none:
+            return Reception(clear, 0, collided)
         else:
-            received = clear if self.losses.none else clear & ~self.losses.lost(slot, frame.sender)[0]
-        lost = int(np.count_nonzero(clear) - np.count_nonzero(received))
-        return Reception(received, lost, int(np.count_nonzero(collided)))
+            received = clear & ~self.losses.lost(slot, frame.sender)[0]
+        return Reception(received, int(np.count_nonzero(clear) - np.count_nonzero(received)), collided)
 
     def senses(self, receiver: int, when_ns: int, frame: OnAir, positions: Positions | None = None) -> bool:
         """Return whether a radio that listens finds the air busy with a transmission.
@@ -130,15 +131,17 @@ class Medium:
             return False
         return self.everywhere or bool(self._heard(frame.sender, positions, self._disturb2)[0][receiver - 1])
 
-    def _undisturbed(self, frame: OnAir, others: Iterable[OnAir], positions: Positions | None) -> tuple[Mask, Mask]:
-        """Return (reach, collided), (N,) each: who would hear it alone, and who of these does not."""
+    def _undisturbed(self, frame: OnAir, others: Sequence[OnAir], positions: Positions | None) -> tuple[Mask, int]:
+        """Return who hears a transmission but for noise, (N,), and how many in its reach do not."""
         reach, power = self._heard(frame.sender, positions, self._range2)
+        if not others:
+            return reach, 0
         disturbed = np.zeros(self._agents, dtype=np.bool_)
-        noise = np.zeros(self._agents)
-        deaf = np.zeros(self._agents, dtype=np.bool_)
+        noise = np.zeros(self._agents) if self._capture else _NO_POWER
+        deaf = []  # indices of those that send meanwhile
         for other in others:
             if other.deafens(frame):
-                deaf[other.sender - 1] = True
+                deaf.append(other.sender - 1)
             if other.overlaps(frame):
                 heard, strength = self._heard(other.sender, positions, self._disturb2)
                 disturbed |= heard
@@ -146,12 +149,15 @@ class Medium:
                     noise += np.where(heard, strength, 0.0)
         if self._capture:
             disturbed &= power < self._capture * noise
-        return reach, reach & (disturbed | deaf)
+        if deaf:
+            disturbed[deaf] = True
+        collided = reach & disturbed
+        return reach & ~collided, int(np.count_nonzero(collided))
 
     def _heard(self, sender: int, positions: Positions | None, range2: float) -> tuple[Mask, NDArray[np.float64]]:
-        """Return who is near enough to a sender, (N,), and the power there, relative to that at 1 m."""
+        """Return who is near enough to a sender, (N,), and the power there, relative to that at 1 m (with capture)."""
         heard = np.ones(self._agents, dtype=np.bool_)
-        power = heard.astype(np.float64) if not self._capture else np.zeros(0)
+        power = _NO_POWER
         if self._groups is not None:
             heard &= self._groups == self._groups[sender - 1]
         if self.needs_positions:
