@@ -31,9 +31,13 @@ class Graph:
         self.node, self.executor, self.environment = node, executor, environment
         self.processes: list[subprocess.Popen[str]] = []
 
-    def start(self, module: str, *arguments: str) -> subprocess.Popen[str]:
-        """Starts ``python -m module --ros-args arguments``."""
-        command = [sys.executable, "-m", module, "--ros-args", *arguments]
+    def start(self, module: str, *arguments: str, logs: bool = False) -> subprocess.Popen[str]:
+        """Starts ``python -m module --ros-args arguments``.
+
+        :param logs: whether the node's log goes to standard error, beside its own last line.
+        """
+        quiet = [] if logs else ["--disable-stdout-logs"]
+        command = [sys.executable, "-m", module, "--ros-args", *quiet, *arguments]
         process = subprocess.Popen(
             command, env=self.environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
         )

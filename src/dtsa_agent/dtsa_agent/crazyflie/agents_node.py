@@ -31,6 +31,7 @@ from dtsa_agent.crazyflie.units import rotate
 from dtsa_agent.keys import with_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.process import run_node
 from dtsa_agent.ros.hosting import declare_swarm
@@ -60,7 +61,7 @@ class StationNode(RealtimeNode):
         self._stamp = np.zeros(count)  # s, system clock, of that
         self._inputs, self._outputs = [], []
         for index, agent in enumerate(self.swarm.ids):
-            space = names.agent_namespace(agent)
+            space = names.agent_namespace(agent, self._namespace)
 
             def keep(message: Odometry, index: int = index) -> None:
                 self._note(index, message)
@@ -118,14 +119,13 @@ class StationNodeSettings(Settings):
     :raises ConfigError: for values that are not allowed.
     """
 
-    swarm_namespace: str = setting(names.SWARM, "namespace of what the whole swarm shares")
     command_hz: float = setting(50.0, "rate of the commands", unit="Hz", minimum=1, maximum=100)
     priority: int = setting(0, "real-time priority; 0: none", minimum=0, maximum=90)
 
 
 def _body(stop: Stop, supervised: bool) -> None:
     plain = {"start_parameter_services": False, "enable_rosout": False} if supervised else {}
-    node = Node("crazyflie_agents", namespace=names.SWARM, **plain)
+    node, space = swarm_wide_node("crazyflie_agents", plain)
     try:
         config = declare_swarm(node)
         listed = ParameterDescriptor(description="ids of the agents in this process; [0]: all", read_only=True)

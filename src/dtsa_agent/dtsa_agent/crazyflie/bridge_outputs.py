@@ -17,9 +17,14 @@ from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.crazyflie.units import VehicleState, to_map
 from dtsa_agent.crazyflie.vehicle import Snapshot, Vehicle
+from dtsa_agent.ros.common.covariances import UNKNOWN, diagonal
 
 LATEST_ONLY = QoSProfile(depth=1)
 FRAME = "map"
+# The firmware logs no variances: standard deviations of 3 cm, 0.1 rad and 0.1 m/s are cautious for its estimator with a
+# positioning system. Body rates are not logged.
+POSE_COVARIANCE = diagonal(0.03**2, 0.1**2)
+TWIST_COVARIANCE = diagonal(0.1**2, UNKNOWN)
 
 
 class Outputs:
@@ -57,6 +62,7 @@ class Outputs:
         if message is None:
             message = self._odom_message[name] = Odometry(child_frame_id=f"{name}/base_link")
             message.header.frame_id = FRAME
+            message.pose.covariance, message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
         message.header.stamp = stamp
         p, q = message.pose.pose.position, message.pose.pose.orientation
         p.x, p.y, p.z = x, y, z

@@ -13,6 +13,7 @@ from dtsa_agent.core.settings import Setting
 
 from .common import names
 from .common.loop import Stop
+from .common.namespaces import declare_swarm_namespace
 from .common.parameters import declare_setting
 from .common.process import node_options, run_node
 from .hosting import declare_swarm, host_agents
@@ -20,18 +21,20 @@ from .hosting import declare_swarm, host_agents
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
 
 
-def _make_node(supervised: bool) -> tuple[Node, int]:
-    """The node in its agent's namespace, and the agent's id: parameter ``id``, or the namespace's number."""
+def _make_node(supervised: bool) -> tuple[Node, int, str]:
+    """The node in its agent's namespace, the agent's id (parameter ``id``, or the namespace's number), its swarm."""
     plain = node_options(supervised)
     node = Node("agent", namespace=_UNNAMED, **plain)
     namespace = node.get_namespace()
     digits = namespace.rpartition("cf")[2]
     agent = _own_id(node, int(digits) if digits.isdigit() and namespace != _UNNAMED else 1)
+    space = declare_swarm_namespace(node)
     if namespace == _UNNAMED:
         node.destroy_node()
-        node = Node("agent", namespace=names.agent_namespace(agent), **plain)
+        node = Node("agent", namespace=names.agent_namespace(agent, space), **plain)
         _own_id(node, agent)
-    return node, agent
+        declare_swarm_namespace(node)
+    return node, agent, space
 
 
 def _own_id(node: Node, default: int) -> int:
@@ -40,12 +43,12 @@ def _own_id(node: Node, default: int) -> int:
 
 
 def _body(stop: Stop, supervised: bool) -> None:
-    node, agent = _make_node(supervised)
+    node, agent, space = _make_node(supervised)
     try:
         config = declare_swarm(node)
         if agent > config.agents:
             raise ConfigError("id", agent, f"1 to {config.agents}, the number of agents")
-        host_agents(node, [agent], config, stop, spaces=[node.get_namespace()])
+        host_agents(node, [agent], config, stop, space, spaces=[node.get_namespace()])
     finally:
         node.destroy_node()
 

@@ -11,7 +11,7 @@ from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
 from dtsa_agent.core import AbstractSwarm, SwarmConfig
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.core.settings import Settings, setting
 from dtsa_agent.keys import with_key
@@ -21,8 +21,6 @@ from .common.loop import Stop
 from .common.parameters import declare_settings
 from .swarm_node import SwarmNode
 
-MODES = ("lockstep", "realtime")
-
 
 @dataclass(frozen=True, slots=True)
 class HostSettings(Settings):
@@ -31,10 +29,11 @@ class HostSettings(Settings):
     :raises ConfigError: for values that are not allowed.
     """
 
-    swarm_namespace: str = setting(names.SWARM, "namespace of what the whole swarm shares")
     odometry: bool = setting(True, "offer each agent's true motion as <agent>/odom")
     mode: str = setting(
-        MODES[0], "in lockstep all wait for each other; in real time each agent has a clock of its own", choices=MODES
+        names.MODES[0],
+        "in lockstep all wait for each other; in real time each agent has a clock of its own",
+        choices=names.MODES,
     )
 
 
@@ -70,6 +69,7 @@ def host_agents(
     ids: Sequence[int],
     config: SwarmConfig,
     stop: Stop,
+    space: str = names.SWARM,
     shared: bool = False,
     spaces: Sequence[str] | None = None,
 ) -> None:
@@ -79,14 +79,14 @@ def host_agents(
     :param ids: ids of the agents that live in it.
     :param config: the settings that all agents share.
     :param stop: the signal flag.
+    :param space: namespace of what the whole swarm shares.
     :param shared: whether one table serves all.
-    :param spaces: namespace of each agent; default: ``/cf1``, ``/cf2``, ...
+    :param spaces: namespace of each agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
     :raises ConfigError: for settings that are not usable.
     """
     if shared and not shareable(config):
         raise ConfigError("shared_view", True, f"false with policy {config.policy}")
     host = HostSettings(**declare_settings(node, HostSettings))
-    space = host.swarm_namespace.rstrip("/")
     swarm = with_key(make_swarm(config, local=sorted(ids), shared_view=shared and host.mode == "lockstep"))
     if host.mode == "lockstep":
         agents: SwarmNode = SwarmNode(node, swarm, space)
@@ -94,8 +94,13 @@ def host_agents(
         agents = _realtime(node, swarm, space)
     if host.odometry:
         agents.offer_odometry(spaces)
+    logger = node.get_logger()
     try:
         agents.run(stop)
+        logger.info(f"ends after slot {agents.slot}: {'stopped by a signal' if stop else 'the run is over'}")
+    except DtsaError as error:
+        logger.error(f"ends after slot {agents.slot}: {error}")
+        raise
     finally:
         agents.loop.close()
 

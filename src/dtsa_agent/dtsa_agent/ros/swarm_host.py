@@ -6,12 +6,11 @@ import sys
 from collections.abc import Sequence
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
-from rclpy.node import Node
 
 from dtsa_agent.core.settings import Setting
 
-from .common import names
 from .common.loop import Stop
+from .common.namespaces import swarm_wide_node
 from .common.parameters import declare_setting
 from .common.process import node_options, run_node
 from .hosting import declare_swarm, host_agents
@@ -27,8 +26,7 @@ SHARED = Setting(
 
 
 def _body(stop: Stop, supervised: bool) -> None:
-    plain = node_options(supervised)
-    node = Node("swarm_host", namespace=names.SWARM, **plain)
+    node, space = swarm_wide_node("swarm_host", node_options(supervised))
     try:
         config = declare_swarm(node)
         listed = ParameterDescriptor(
@@ -38,7 +36,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         )
         ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
         shared = declare_setting(node, SHARED)
-        host_agents(node, parse_ids(ids, config.agents), config, stop, shared)
+        host_agents(node, parse_ids(ids, config.agents), config, stop, space, shared)
     finally:
         node.destroy_node()
 

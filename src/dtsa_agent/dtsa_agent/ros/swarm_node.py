@@ -20,7 +20,9 @@ from dtsa_agent.core import AbstractSwarm, AgentGroup
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
 
 from .common import names
+from .common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
 from .common.loop import Loop, Stop
+from .common.waiting import Waiting
 from .common.wire import split_frames, unpack_received
 
 _ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
@@ -52,8 +54,12 @@ class SwarmNode:
         self._message.steps = config.steps
         self._channel_seen = 0.0  # time.monotonic()
         self._odometry: list[tuple[int, Publisher]] = []
+        self._frames: list[str] = []  # of the bodies in odometry
         self._watched: list[tuple[int, Publisher]] = []
         qos = names.lockstep_qos(waiting)
+        self._namespace = swarm_namespace
+        self._waiting = Waiting(node.get_logger())
+        self._begun = False
         self._publisher = node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
         self.loop = Loop(node, Slot, f"{swarm_namespace}/{names.SLOT}", qos)
 
@@ -65,12 +71,14 @@ class SwarmNode:
     def offer_odometry(self, namespaces: Sequence[str] | None = None) -> None:
         """Offers each agent's true motion as ``odom``; published only while somebody subscribes.
 
-        :param namespaces: one an agent; default: ``/cf1``, ``/cf2``, ...
+        :param namespaces: one an agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
         """
-        for index, space in enumerate(namespaces or map(names.agent_namespace, self.swarm.ids)):
+        default = [names.agent_namespace(agent, self._namespace) for agent in self.swarm.ids]
+        for index, space in enumerate(namespaces or default):
             topic = f"{space.rstrip('/')}/{names.ODOMETRY}"
             publisher = self.node.create_publisher(Odometry, topic, _ODOMETRY_DEPTH)
             self._odometry.append((index, publisher))
+            self._frames.append(names.body_frame(space))
 
     def idle(self) -> None:
         """Looks around; called about ten times a second.
@@ -82,7 +90,19 @@ class SwarmNode:
             self._channel_seen = now
         elif now - self._channel_seen > _GONE_S:
             raise LocalProtocolError(f"the channel has gone after slot {self.slot} without ending the run")
+        self._tell_progress()
         self._watched = [entry for entry in self._odometry if entry[1].get_subscription_count()]
+
+    def _tell_progress(self) -> None:
+        """Says on the node's logger whom it waits for, and that slot 0 has begun."""
+        if self.slot >= 0:
+            if not self._begun:
+                self._begun = True
+                self.node.get_logger().info(f"slot 0 has begun: run {self.run_id:08x}")
+            return
+        there = self.loop.subscription.get_publisher_count()
+        topic = self.loop.subscription.topic_name
+        self._waiting.tell("waiting for slot 0: the channel is there" if there else f"waiting for a channel on {topic}")
 
     def run(self, stop: Stop) -> None:
         """Answers slot messages until the run is over or a signal comes."""
@@ -156,12 +176,14 @@ class SwarmNode:
 
     def _publish_odometry(self, stamp: Time) -> None:
         message = Odometry()
+        message.pose.covariance = POSE_COVARIANCE
+        message.twist.covariance = TWIST_COVARIANCE
         message.header.frame_id = names.FRAME
         message.header.stamp = stamp
         place, speed = message.pose.pose.position, message.twist.twist.linear
         for index, publisher in self._watched:
             # The attitude is not modelled, it is the identity: the body's axes are those of the map.
-            message.child_frame_id = f"cf{self.swarm.ids[index]}/base_link"
+            message.child_frame_id = self._frames[index]
             place.x, place.y, place.z = self.swarm.position[:, index].tolist()
             speed.x, speed.y, speed.z = self.swarm.velocity[:, index].tolist()
             publisher.publish(message)

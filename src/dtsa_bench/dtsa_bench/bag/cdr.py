@@ -13,6 +13,8 @@ from itertools import repeat
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.ros.common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
+
 HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian
 STAMP = struct.Struct("<iI")
 _VECTOR = struct.Struct("<3d")
@@ -61,7 +63,7 @@ class OdometryPacker:
 
     The orientation is the identity, so that the axes of the child frame are those of the frame: the
     twist, which Odometry gives in the child frame (REP-103, REP-147), holds the velocity in the frame as
-    it is. Covariances are 0.
+    it is. Covariances do not claim certainty: see dtsa_agent.ros.common.covariances.
 
     :param child_frames: child frame of each body.
     :param frame: the frame that positions are given in.
@@ -74,8 +76,8 @@ class OdometryPacker:
             message.stamp(frame)
             message.text(child)
             position = message.number("d", *repeat(0.0, 3))
-            message.number("d", 0.0, 0.0, 0.0, 1.0, *repeat(0.0, 36))
-            twist = message.number("d", *repeat(0.0, 6 + 36))
+            message.number("d", 0.0, 0.0, 0.0, 1.0, *POSE_COVARIANCE)
+            twist = message.number("d", *repeat(0.0, 6), *TWIST_COVARIANCE)
             self._templates.append((bytearray(HEADER + message.data), position + 4, twist + 4))
 
     def pack(self, stamp_ns: int, position: NDArray[np.float64], velocity: NDArray[np.float64]) -> list[bytes]:

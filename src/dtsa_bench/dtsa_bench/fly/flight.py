@@ -133,7 +133,9 @@ def fly(
         # Started first: the interpreter of each process needs longer than all that follows here.
         late = _start_agents(children, run, options, directory)
         try:
-            rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            # The log goes to /rosout alone: the progress line tells the same here.
+            quiet = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
+            rclpy.init(args=quiet, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
             if started:
                 started(children)
             return _fly(context, run, directory, children, progress, options, stop, late)
@@ -152,7 +154,7 @@ def _fly(
     stop: Stop,
     late: Sequence[LateStart],
 ) -> Flight:
-    node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
+    node = Node("channel", namespace=names.SWARM, context=context)
     try:
         declare_channel(node, run.air)
         flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)

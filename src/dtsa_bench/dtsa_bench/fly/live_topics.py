@@ -26,12 +26,13 @@ class LiveTopics(ChannelObserver):
     :param scenario: the scenario.
     :param slot_ns: ns, length of a slot.
     :param run_id: the run's id.
+    :param space: namespace of the swarm's topics.
     """
 
-    def __init__(self, node: Node, scenario: Scenario, slot_ns: int, run_id: int) -> None:
+    def __init__(self, node: Node, scenario: Scenario, slot_ns: int, run_id: int, space: str = names.SWARM) -> None:
         self._messages = SlotMessages(scenario, slot_ns, run_id)
         self._decision, self._reception, self._markers = self._publishers = tuple(
-            node.create_publisher(kind, f"{names.SWARM}/{topic}", 10)
+            node.create_publisher(kind, f"{space}/{topic}", 10)
             for kind, topic in ((Decision, names.DECISION), (Reception, names.RECEPTION), (MarkerArray, names.MARKERS))
         )
         self._watched = [False, False, False]

@@ -53,6 +53,10 @@ class FlightMeasurement(ChannelObserver, Referee):
     def over(self, slot: int, answers: Answers) -> bool:
         return bool(self.metrics.end)
 
+    @property
+    def reason(self) -> str:
+        return str(self.metrics.end or "")
+
     def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         self._outcome = verdict.outcome
         self._compared = answers.digest.copy(), answers.chosen.copy()

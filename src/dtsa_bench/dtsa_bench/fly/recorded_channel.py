@@ -15,14 +15,14 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.settings import Setting, settings_of
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_setting, declare_settings
 from dtsa_agent.ros.common.process import run_node
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
-from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig
 from dtsa_channel_sim.ros.answer_limits import AnswerLimits
-from dtsa_channel_sim.ros.channel_node import follow_parameters
-from dtsa_channel_sim.ros.diagnostics import Diagnostics
+from dtsa_channel_sim.ros.channel_node import follow_parameters, watch
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 from dtsa_channel_sim.ros.ros_channel import new_run_id
@@ -44,10 +44,18 @@ class RecordedFlight:
     :param startup_s: s of wall time that all agents have to answer for the first time.
     :param answer_s: s of wall time that all agents have to answer any later slot, in lockstep.
     :param end_s: s of wall time that the nodes have to hear of the end.
+    :param space: namespace of the swarm's topics; those in the bag have the default one.
     """
 
     def __init__(
-        self, node: Node, run: RunConfig, directory: Path, startup_s: float, answer_s: float, end_s: float = 4.0
+        self,
+        node: Node,
+        run: RunConfig,
+        directory: Path,
+        startup_s: float,
+        answer_s: float,
+        end_s: float = 4.0,
+        space: str = names.SWARM,
     ) -> None:
         self.run_config, self.directory = run, directory
         self.scenario = make_scenario(run.swarm)
@@ -55,6 +63,7 @@ class RecordedFlight:
         model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
         self.run_id = new_run_id()
         limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run_id": self.run_id}
+        limits["swarm_namespace"] = space
         self.channel: LockstepChannel | RealtimeChannel
         if run.mode == LOCKSTEP:
             self.channel = LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
@@ -64,9 +73,9 @@ class RecordedFlight:
         self.channel.observe(
             FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
             self.measurement,
-            LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id),
-            Diagnostics(node),
+            LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
         )
+        watch(self.channel, node, run.to_dict(), space)
         self._clocks = ClockStatistics(run.swarm.agents)
         if run.mode != LOCKSTEP:
             self.channel.observe(self._clocks)
@@ -120,16 +129,21 @@ def declare_run(node: Node) -> RunConfig:
         air = ChannelConfig.from_yaml(file, **given, **derived)
     else:
         air = ChannelConfig.from_dict({**channel, **derived})
-    return RunConfig(swarm, air, RunLimits(**declare_settings(node, RunLimits)))
+    limits = RunLimits(**declare_settings(node, RunLimits))
+    clocks = ClockConfig(**declare_settings(node, ClockConfig, prefix="clocks."))
+    plain = {
+        spec.name: declare_setting(node, spec) for spec in settings_of(RunConfig) if spec.name in ("mode", "align")
+    }
+    return RunConfig(swarm, air, limits, clocks=clocks, **plain)
 
 
 def _body(stop: Stop, supervised: bool) -> None:
-    node = Node("channel", namespace=names.SWARM)
+    node, space = swarm_wide_node("channel")
     try:
         run = declare_run(node)
         directory = new_directory(declare_setting(node, Setting("out", "text", "flight", "directory for the results")))
         wait = AnswerLimits(**declare_settings(node, AnswerLimits))
-        flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s)
+        flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s, space=space)
         try:
             flight.channel.run(stop)
         finally:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dtsa_msgs.msg import RunStatus
 from rcl_interfaces.msg import ParameterType
+from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common import names
@@ -16,6 +18,7 @@ from dtsa_channel_sim import Change
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver
+from dtsa_channel_sim.ros.run_topics import RunState, configuration_message
 
 from .slot_messages import SlotMessages
 
@@ -48,6 +51,8 @@ class FlightRecorder(ChannelObserver):
         self._reception = add(f"{names.SWARM}/{names.RECEPTION}", "dtsa_msgs/msg/Reception")
         self._decision = add(f"{names.SWARM}/{names.DECISION}", "dtsa_msgs/msg/Decision")
         self._markers = add(f"{names.SWARM}/{names.MARKERS}", "visualization_msgs/msg/MarkerArray")
+        self._status = add(f"{names.SWARM}/{names.STATUS}", "dtsa_msgs/msg/RunStatus", "latched")
+        settings = add(f"{names.SWARM}/{names.CONFIGURATION}", "dtsa_msgs/msg/Configuration", "latched")
         self._event = 0
         spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
@@ -57,6 +62,9 @@ class FlightRecorder(ChannelObserver):
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
         self._complete = -1  # last slot that all have answered
+        self._state = RunState(run_id, self._slot_ns)
+        told = bytes(serialize_message(configuration_message(run.to_dict(), run_id)))
+        self.bag.write(settings, told, names.TIME_ZERO_NS, names.TIME_ZERO_NS)
 
     def _time_ns(self, slot: int) -> int:
         """Simulated time at which a slot starts, ns."""
@@ -70,6 +78,26 @@ class FlightRecorder(ChannelObserver):
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         self._complete = slot
+        if not slot:
+            self._state.phase = RunStatus.FLYING
+            self._write_status()
+
+    def agent_silent(self, agent: int) -> None:
+        self._state.lose(agent)
+        if self._complete >= 0:
+            self._write_status()
+
+    def agents_back(self, agents: list[int]) -> None:
+        self._state.regain(agents)
+        self._write_status()
+
+    def ended(self, slot: int, reason: str, failed: bool) -> None:
+        self._state.phase, self._state.reason = RunStatus.ENDED, reason
+
+    def _write_status(self) -> None:
+        self._state.slot = max(0, self._complete)
+        at = self._time_ns(self._state.slot)
+        self.bag.write(self._status, bytes(serialize_message(self._state.message())), at, at)
 
     def _write_messages(self, slot: int) -> None:
         """Writes a slot's own message and all answers to it, in the order of their ids."""
@@ -110,6 +138,7 @@ class FlightRecorder(ChannelObserver):
         for slot in sorted({*self._messages, *self._answers}):
             if slot <= self._complete:
                 self._write_messages(slot)
+        self._write_status()
         self.bag.close()
 
 

@@ -1,13 +1,13 @@
 """``ros2 run dtsa_channel_sim channel``: the radio channel as a node, without a recorder.
 
-It runs until SIGINT or SIGTERM, or for a given number of slots. `recorded_channel` of dtsa_bench adds the recording,
-the metrics and the end of a flight.
+It runs until SIGINT or SIGTERM, or for a given number of slots, in lockstep or in real time. `recorded_channel` of
+dtsa_bench adds the recording, the metrics and the end of a flight.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +17,9 @@ from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import setting, settings_of
-from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.names import MODES
+from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_settings, from_parameter
 from dtsa_agent.ros.common.process import run_node
 from dtsa_channel_sim.model.channel import Channel
@@ -29,6 +30,10 @@ from .answer_limits import AnswerLimits
 from .diagnostics import Diagnostics
 from .lockstep import LockstepChannel
 from .observer import SlotLimit
+from .realtime_channel import RealtimeChannel
+from .ros_channel import RosChannel
+from .run_log import RunLog
+from .run_topics import RunTopics
 
 
 def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str, Any]:
@@ -73,20 +78,44 @@ class ChannelNodeSettings(AnswerLimits):
     """
 
     slots: int = setting(0, "the run ends after so many slots; 0: by a signal only", minimum=0, maximum=2**31)
+    mode: str = setting(
+        MODES[0],
+        "in lockstep all wait for each other; in real time each agent has a clock of its own",
+        choices=MODES,
+    )
     steps: int = setting(1, "control instants in a slot, as the agents have", minimum=1, maximum=255)
 
 
+def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: str) -> None:
+    """Lets everybody on the graph know how a run is doing: topics, diagnostics, transforms, the log.
+
+    :param channel: the channel.
+    :param node: its node.
+    :param settings: the settings of the run by section.
+    :param space: namespace of the swarm's topics.
+    """
+    lockstep = isinstance(channel, LockstepChannel)
+    channel.observe(
+        RunLog(node, channel.run_id, lockstep),
+        RunTopics(node, settings, channel.run_id, channel.slot_ns, space),
+        Diagnostics(node, channel.slot_ns),
+    )
+
+
 def _body(stop: Stop, supervised: bool) -> None:
-    node = Node("channel", namespace=names.SWARM)
+    node, space = swarm_wide_node("channel")
     try:
         values = declare_channel(node, ChannelConfig(agents=12))
         run = ChannelNodeSettings(**declare_settings(node, ChannelNodeSettings))
-        medium = Channel(ChannelConfig.from_dict(values))
-        referee = SlotLimit(run.slots)
-        channel = LockstepChannel(node, medium, run.steps, run.answer_s, referee=referee, startup_s=run.startup_s)
-        channel.observe(Diagnostics(node))
-        follow_parameters(node, medium, channel.change_settings)
+        config = ChannelConfig.from_dict(values)
+        medium, referee = Channel(config), SlotLimit(run.slots)
+        kind = LockstepChannel if run.mode == MODES[0] else RealtimeChannel
+        channel = kind(
+            node, medium, run.steps, run.answer_s, referee=referee, startup_s=run.startup_s, swarm_namespace=space
+        )
         try:
+            watch(channel, node, {"mode": run.mode, "channel": config.to_dict()}, space)
+            follow_parameters(node, medium, channel.change_settings)
             channel.run(stop)
         finally:
             channel.close()

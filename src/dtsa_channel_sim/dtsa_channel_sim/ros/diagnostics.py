@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
+from std_msgs.msg import Header
 
+from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.stamps import time_of
 from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
 
 from .answers import Answers
@@ -12,14 +15,16 @@ from .observer import ChannelObserver, ChannelStatus
 
 
 class Diagnostics(ChannelObserver):
-    """Publishes the channel's status once a second, while somebody listens.
+    """Publishes the channel's status once a second of wall time, stamped in the run's time, while somebody listens.
 
     :param node: the channel's node.
+    :param slot_ns: ns, length of a slot.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, slot_ns: int) -> None:
+        self._slot_ns = slot_ns
+        self._name = f"{node.get_namespace().strip('/')}: channel"
         self._counts = [0, 0, 0]  # slots by outcome
-        self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._ticks = 0
 
@@ -38,11 +43,10 @@ class Diagnostics(ChannelObserver):
         }
         told = DiagnosticStatus(
             level=DiagnosticStatus.WARN if status.unusable else DiagnosticStatus.OK,
-            name="channel",
+            name=self._name,
             message=f"slot {status.slot}",
             hardware_id="simulated",
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
-        array = DiagnosticArray(status=[told])
-        array.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(array)
+        stamp = time_of(names.slot_time_ns(max(0, status.slot), self._slot_ns))
+        self._publisher.publish(DiagnosticArray(header=Header(stamp=stamp), status=[told]))

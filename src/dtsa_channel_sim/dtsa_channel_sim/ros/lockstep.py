@@ -39,7 +39,7 @@ class LockstepChannel(RosChannel):
         self._complaint, self._complaint_time = "", 0.0
         self._bytes = b""
 
-    def run(self, stop: object) -> None:
+    def _run(self, stop: object) -> None:
         """Runs slot after slot until the run is over or ``stop`` is true. The agents are told to end.
 
         :param stop: looked at in every slot, true once a signal has come.

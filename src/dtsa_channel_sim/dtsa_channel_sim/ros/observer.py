@@ -31,6 +31,7 @@ class ChannelStatus:
     slot: int  # the last one opened (lockstep) or closed (real time); -1: none yet
     unusable: int  # messages that could not be read, or came from agents that do not exist
     awaited: list[int]  # ids of the agents whose answers are missing
+    lag_ms: float = 0.0  # by how much the channel is late now, in real time
 
 
 class ChannelObserver:
@@ -108,6 +109,14 @@ class ChannelObserver:
         :raises DtsaError: to end the run with an error.
         """
 
+    def ended(self, slot: int, reason: str, failed: bool) -> None:
+        """The run is over; called once, before ``close``.
+
+        :param slot: the last slot begun; -1: none.
+        :param reason: why, as people read it.
+        :param failed: whether an error has ended it.
+        """
+
     def close(self) -> None:
         """The run is over, whatever the reason; called once. What is open has to be finished here."""
 
@@ -122,6 +131,11 @@ class Referee(Protocol):
         :param answers: the answers; valid during the call.
         """
 
+    @property
+    def reason(self) -> str:
+        """Why the run ends; empty while it goes on."""
+        return ""
+
 
 class SlotLimit(Referee):
     """Ends a run after a number of slots.
@@ -131,9 +145,15 @@ class SlotLimit(Referee):
 
     def __init__(self, slots: int = 0) -> None:
         self._slots = slots
+        self._over = False
 
     def over(self, slot: int, answers: Answers) -> bool:
-        return 0 < self._slots <= slot
+        self._over = 0 < self._slots <= slot
+        return self._over
+
+    @property
+    def reason(self) -> str:
+        return f"{self._slots} slots have passed" if self._over else ""
 
 
 class Observers(ChannelObserver):
@@ -190,6 +210,9 @@ class Observers(ChannelObserver):
 
     def idle(self, status: ChannelStatus) -> None:
         self._tell("idle", status)
+
+    def ended(self, slot: int, reason: str, failed: bool) -> None:
+        self._tell("ended", slot, reason, failed)
 
     def close(self) -> None:
         """Closes all observers, also when some of them fail.

@@ -70,7 +70,7 @@ class RealtimeChannel(RosChannel):
         self._grace_ns = round(_GRACE * self.slot_ns)
         self._close_ns = self._grace_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
 
-    def run(self, stop: object) -> None:
+    def _run(self, stop: object) -> None:
         """Runs until the run is over or ``stop`` is true.
 
         :raises LocalProtocolError: when an agent does not report at the start.

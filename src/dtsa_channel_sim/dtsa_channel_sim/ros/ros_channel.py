@@ -13,6 +13,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
+from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Loop
 from dtsa_agent.ros.common.wire import pack_received
@@ -61,9 +62,10 @@ class RosChannel:
         self.unusable = 0  # messages that could not be read, or came from agents that do not exist
         self._observers = Observers()
         self._referee = referee or SlotLimit()
+        self._reason, self._failed = "", False  # why the run has ended, and whether an error ended it
         self._startup_s, self._end_s = startup_s, end_s
         self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", names.lockstep_qos(waiting))
-        self._clock = node.create_publisher(Clock, "/clock", 10)
+        self._clock = node.create_publisher(Clock, names.clock_topic(swarm_namespace), 10)
         self._clock_watched = False
         answers_qos = names.lockstep_qos(waiting * self.agents)
         self.loop = Loop(node, Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", answers_qos, raw=True)
@@ -79,6 +81,14 @@ class RosChannel:
         :param stop: looked at again and again, true once a signal has come.
         :raises DtsaError: when an agent or an observer fails.
         """
+        try:
+            self._run(stop)
+            self._reason = self._referee.reason or ("stopped by a signal" if stop else "")
+        except DtsaError as error:
+            self._reason, self._failed = str(error), True
+            raise
+
+    def _run(self, stop: object) -> None:
         raise NotImplementedError
 
     def change_settings(self, change: Change) -> None:
@@ -115,6 +125,12 @@ class RosChannel:
 
         :raises DtsaError: when an observer could not be closed.
         """
+        try:
+            self._observers.ended(self.slot, self._reason or "ended early", self._failed)
+        finally:
+            self._close()
+
+    def _close(self) -> None:
         try:
             self._observers.close()
         finally:

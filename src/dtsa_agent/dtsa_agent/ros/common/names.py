@@ -7,11 +7,15 @@ from typing import Any
 SWARM = "/swarm"  # namespace of what the whole swarm shares
 FRAME = "map"  # the room's centre, ENU
 
+MODES = ("lockstep", "realtime")
+
 SLOT = "slot"
 TRANSMISSION = "transmission"
 RECEPTION = "reception"
 DECISION = "decision"
 MARKERS = "markers"
+CONFIGURATION = "configuration"
+STATUS = "status"
 ODOMETRY = "odom"
 
 # In real time nobody waits for a process that gets no time: some seconds of messages wait for it instead.
@@ -21,14 +25,49 @@ REALTIME_WAITING = 64
 TIME_ZERO_NS = 1_000_000_000
 
 
-def agent_namespace(agent: int) -> str:
-    """Namespace of one agent, e.g. ``/cf3``."""
-    return f"/cf{agent}"
+def agent_namespace(agent: int, swarm_namespace: str = SWARM) -> str:
+    """Namespace of one agent: ``/cf3``, or ``/north/cf3`` in a swarm that is not the default one.
+
+    :param agent: its id.
+    :param swarm_namespace: namespace of what the whole swarm shares.
+    """
+    return f"{swarm_prefix(swarm_namespace)}/cf{agent}"
+
+
+def swarm_prefix(swarm_namespace: str) -> str:
+    """What stands before the names of a swarm's agents: nothing for the default swarm, ``/north`` for ``/north``.
+
+    :param swarm_namespace: namespace of what the whole swarm shares.
+    """
+    return "" if swarm_namespace == SWARM else swarm_namespace.rstrip("/")
+
+
+def body_frame(agent_namespace: str) -> str:
+    """Frame of an agent's body, as ``cf3/base_link`` or ``north/cf3/base_link``.
+
+    :param agent_namespace: the agent's namespace.
+    """
+    return f"{agent_namespace.strip('/')}/base_link"
+
+
+def clock_topic(swarm_namespace: str) -> str:
+    """The topic of the simulated time: ``/clock``, or the swarm's own one beside other swarms.
+
+    :param swarm_namespace: namespace of what the whole swarm shares.
+    """
+    return f"{swarm_prefix(swarm_namespace)}/clock"
 
 
 def slot_time_ns(slot: int, slot_ns: int) -> int:
     """Simulated time at which a slot starts, ns."""
     return TIME_ZERO_NS + slot * slot_ns
+
+
+def latched_qos() -> Any:
+    """The last message, for late subscribers too."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def lockstep_qos(writers: int = 1) -> Any:

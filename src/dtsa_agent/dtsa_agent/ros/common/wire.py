@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 # Where the run's id lies in the messages that carry one, as CDR: after 4 bytes of representation and a header in frame
 # "map". It is random, and so outside all that is compared between flights.
 RUN_BYTES = slice(20, 24)
-RUN_MESSAGES = frozenset(f"dtsa_msgs/msg/{name}" for name in ("Slot", "Transmission", "Reception", "Decision"))
+RUN_MESSAGES = frozenset(
+    f"dtsa_msgs/msg/{name}" for name in ("Slot", "Transmission", "Reception", "Decision", "Configuration", "RunStatus")
+)
 
 
 def without_run(data: bytes | memoryview) -> bytes:

@@ -1,0 +1,36 @@
+"""Lines on a node's logger that come again and again, but ever more seldom."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+_FIRST_S = 2.0
+_LONGEST_S = 60.0
+
+
+class Waiting:
+    """Says that somebody waits, at once and then with a growing period; anew when it waits for something else.
+
+    :param logger: the node's logger.
+    """
+
+    def __init__(self, logger: Any) -> None:
+        self._logger = logger
+        self._text = ""
+        self._since_s = self._next_s = 0.0  # time.monotonic()
+        self._period_s = _FIRST_S
+
+    def tell(self, text: str) -> None:
+        """Says it if it is time to; called as often as one likes.
+
+        :param text: what is waited for.
+        """
+        now = time.monotonic()
+        if text != self._text:
+            self._text, self._since_s, self._next_s, self._period_s = text, now, now + _FIRST_S, _FIRST_S
+            self._logger.info(text)
+        elif now >= self._next_s:
+            self._period_s = min(2 * self._period_s, _LONGEST_S)
+            self._next_s = now + self._period_s
+            self._logger.warning(f"{text}, for {now - self._since_s:.0f} s now")
