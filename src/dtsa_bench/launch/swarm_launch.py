@@ -1,9 +1,11 @@
 """A recorded flight: the channel with its recorder, and the agents, each in its namespace.
 
 ``ros2 launch dtsa_bench swarm_launch.py agents:=12 policy:=dtsa loss:=0.05 out:=flight_1``
+``ros2 launch dtsa_bench swarm_launch.py mode:=realtime policy:=lease swarm_namespace:=/north out:=flight_2``
 
-Every setting of the swarm, the channel and the end of a run is a launch argument; ``--show-args`` lists them. When the
-flight is over the agents end by themselves, and so does the launch; if the channel fails, the agents are ended.
+Every setting of the swarm, the channel, the clocks and the end of a run is a launch argument; ``--show-args`` lists
+them. When the flight is over the agents end by themselves, and so does the launch; if the channel fails, the agents are
+ended.
 """
 
 from __future__ import annotations
@@ -16,10 +18,13 @@ from launch_ros.actions import Node
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import settings_of
-from dtsa_bench.run_config import FROM_SWARM, RunLimits
-from dtsa_channel_sim import ChannelConfig
+from dtsa_agent.ros.common import names
+from dtsa_bench.fly.agent_parameters import clock_parameters
+from dtsa_bench.run_config import FROM_SWARM, MODES, RunConfig, RunLimits, from_swarm
+from dtsa_channel_sim import ChannelConfig, ClockConfig
 
 UNSET = ""  # the node's own default
+CLOCKS = "clocks."  # stands before the names of the clocks' settings
 
 
 def _settings(cls: type) -> list:
@@ -30,24 +35,42 @@ def _settings(cls: type) -> list:
     ]
 
 
-def _given(context: LaunchContext, cls: type) -> dict:
-    """Parameters from the launch arguments that were given."""
+def _given(context: LaunchContext, cls: type, prefix: str = "") -> dict:
+    """Settings from the launch arguments that were given."""
     values = {}
     for setting in _settings(cls):
-        text = LaunchConfiguration(setting.name).perform(context)
+        text = LaunchConfiguration(prefix + setting.name).perform(context)
         if text != UNSET:
             values[setting.name] = text if setting.kind == "values" else setting.parse(text)
     return values
 
 
+def _run_config(context: LaunchContext, swarm: SwarmConfig, channel: dict) -> RunConfig:
+    """The run as far as the agents' parameters depend on it.
+
+    :raises ConfigError: for settings that are not usable.
+    """
+    file = LaunchConfiguration("channel_file").perform(context)
+    values = {**channel, **from_swarm(swarm)}
+    air = ChannelConfig.from_yaml(file, **values) if file else ChannelConfig.from_dict(values)
+    mode = LaunchConfiguration("mode").perform(context)
+    align = LaunchConfiguration("align").perform(context) == "true"
+    return RunConfig(swarm, air, mode=mode, clocks=ClockConfig(**_given(context, ClockConfig, CLOCKS)), align=align)
+
+
 def _nodes(context: LaunchContext) -> list[Node]:
-    swarm = _given(context, SwarmConfig)
+    swarm, channel = _given(context, SwarmConfig), _given(context, ChannelConfig)
     config = SwarmConfig.from_dict({key: value for key, value in swarm.items() if key != "options"})
+    run = _run_config(context, config, channel)
+    space = "/" + LaunchConfiguration("swarm_namespace").perform(context).strip("/")
     processes = LaunchConfiguration("processes").perform(context)
-    run = {
+    recorded = {
         **swarm,
-        **_given(context, ChannelConfig),
+        **channel,
         **_given(context, RunLimits),
+        **{CLOCKS + name: value for name, value in _given(context, ClockConfig, CLOCKS).items()},
+        "mode": run.mode,
+        "align": run.align,
         "out": LaunchConfiguration("out").perform(context),
         "channel_file": LaunchConfiguration("channel_file").perform(context),
     }
@@ -55,21 +78,22 @@ def _nodes(context: LaunchContext) -> list[Node]:
         Node(
             package="dtsa_bench",
             executable="recorded_channel",
-            namespace="swarm",
+            namespace=space,
             name="channel",
-            parameters=[run],
+            parameters=[recorded],
             output="screen",
             on_exit=Shutdown(reason="the flight is over"),
         )
     ]
+    shared = {**swarm, "mode": run.mode, "swarm_namespace": space}
     if processes == "per-agent":
         nodes += [
             Node(
                 package="dtsa_agent",
                 executable="agent",
-                namespace=f"cf{agent}",
+                namespace=names.agent_namespace(agent, space),
                 name="agent",
-                parameters=[{**swarm, "id": agent}],
+                parameters=[{**shared, "id": agent, **clock_parameters(run, [agent])}],
                 output="screen",
             )
             for agent in range(1, config.agents + 1)
@@ -79,17 +103,17 @@ def _nodes(context: LaunchContext) -> list[Node]:
         raise ConfigError("processes", processes, f"per-agent, or 1 to {config.agents}, the number of agents")
     count = int(processes)
     bounds = [config.agents * index // count for index in range(count + 1)]
-    nodes += [
-        Node(
+    for index in range(count):
+        ids = list(range(bounds[index] + 1, bounds[index + 1] + 1))
+        host = Node(
             package="dtsa_agent",
             executable="swarm_host",
-            namespace="swarm",
+            namespace=space,
             name=f"swarm_host_{index + 1}",
-            parameters=[{**swarm, "ids": list(range(bounds[index] + 1, bounds[index + 1] + 1))}],
+            parameters=[{**shared, "ids": ids, **clock_parameters(run, ids)}],
             output="screen",
         )
-        for index in range(count)
-    ]
+        nodes.append(host)
     return nodes
 
 
@@ -97,9 +121,9 @@ def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for."""
     arguments = [
         DeclareLaunchArgument(
-            setting.name, default_value=UNSET, description=f"{setting.description} [{setting.default}]"
+            prefix + setting.name, default_value=UNSET, description=f"{setting.description} [{setting.default}]"
         )
-        for cls in (SwarmConfig, ChannelConfig, RunLimits)
+        for cls, prefix in ((SwarmConfig, ""), (ChannelConfig, ""), (RunLimits, ""), (ClockConfig, CLOCKS))
         for setting in _settings(cls)
     ]
     arguments += [
@@ -108,9 +132,17 @@ def generate_launch_description() -> LaunchDescription:
         ),
         DeclareLaunchArgument(
             "mode",
-            default_value="lockstep",
-            choices=["lockstep"],
-            description="lockstep; for flights in real time: tools/dtsa fly --mode realtime",
+            default_value=MODES[0],
+            choices=MODES,
+            description="lockstep: all wait for each other; realtime: each agent has a clock of its own",
+        ),
+        DeclareLaunchArgument(
+            "align", default_value="true", choices=["true", "false"], description="real time: agents align their clocks"
+        ),
+        DeclareLaunchArgument(
+            "swarm_namespace",
+            default_value=names.SWARM,
+            description="namespace of the swarm's topics; agents are in it unless it is the default",
         ),
         DeclareLaunchArgument("out", default_value="flight", description="new directory for the bag and the results"),
         DeclareLaunchArgument("channel_file", default_value="", description="YAML file with settings of the channel"),

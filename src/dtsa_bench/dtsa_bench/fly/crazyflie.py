@@ -43,7 +43,7 @@ from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .children import Child, Children, describe_end
 from .domain import ros_domain
-from .flight import END_S, Flight, run_environment
+from .flight import END_S, QUIET, Flight, run_environment
 from .options import FlightOptions
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
@@ -324,7 +324,7 @@ def fly_crazyflies(
         ended = _Ended(stop)
         mission: Mission | None = None
         try:
-            rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            rclpy.init(args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
             node = Node("mission", context=context, enable_rosout=False, start_parameter_services=False)
             mission = Mission(node, settings, scenario, ended, progress.show)
             mission.bridge_alive = bridge.check
@@ -363,7 +363,7 @@ def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, dir
 
 def _exchange(context: Context, run: RunConfig, directory: Path, agents: Children, bridge: Children,
               progress: ProgressLine, options: FlightOptions, ended: _Ended) -> Flight:  # fmt: skip
-    node = Node("channel", namespace=names.SWARM, context=context, enable_rosout=False)
+    node = Node("channel", namespace=names.SWARM, context=context)
     try:
         declare_channel(node, run.air)
         flight = RecordedFlight(node, run, directory, options.startup_s, answer_s=2.0, end_s=END_S)

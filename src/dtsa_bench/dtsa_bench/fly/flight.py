@@ -26,11 +26,11 @@ from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
-from dtsa_channel_sim import make_clocks
 from dtsa_channel_sim.ros.answers import named
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
+from .agent_parameters import clock_parameters
 from .children import Children
 from .domain import ros_domain
 from .options import FlightOptions
@@ -44,6 +44,9 @@ ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
 }
+
+# The log of this process's nodes goes to /rosout alone: the progress line tells the same here.
+QUIET = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
 
 END_S = 1.0  # wall time in which the nodes are to hear of the end; those that have not are ended then
 
@@ -133,9 +136,7 @@ def fly(
         # Started first: the interpreter of each process needs longer than all that follows here.
         late = _start_agents(children, run, options, directory)
         try:
-            # The log goes to /rosout alone: the progress line tells the same here.
-            quiet = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
-            rclpy.init(args=quiet, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            rclpy.init(args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
             if started:
                 started(children)
             return _fly(context, run, directory, children, progress, options, stop, late)
@@ -190,7 +191,7 @@ def _start_agents(children: Children, run: RunConfig, options: FlightOptions, di
     late: list[LateStart] = []
     if options.processes is None:
         for agent in range(1, swarm.agents + 1):
-            place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_parameters(run, [agent])]
+            place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_arguments(run, [agent])]
             start = partial(children.start, f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
             if agent in options.late:
                 late.append(LateStart(options.late[agent], agent, start))
@@ -201,22 +202,13 @@ def _start_agents(children: Children, run: RunConfig, options: FlightOptions, di
     for number, ids in enumerate(split(swarm.agents, options.processes), 1):
         own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_view:={shared}"]
         name = f"swarm_host_{number} with {named(ids)}"
-        children.start(name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_parameters(run, ids)])
+        children.start(name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_arguments(run, ids)])
     return late
 
 
-def _clock_parameters(run: RunConfig, ids: list[int]) -> list[str]:
-    """The clocks of some agents, and how long a frame takes, for real time."""
-    if run.mode == LOCKSTEP:
-        return []
-    clocks = [make_clocks(run.clocks, run.swarm.agents)[agent - 1] for agent in ids]
-    airtime, link = run.air.airtime, run.air.link_delay_ns
-    fixed = airtime.total_ns(0)
-    values = {
-        "clock_offset_ns": [clock.offset_ns for clock in clocks],
-        "clock_drift_ppb": [clock.drift_ppb for clock in clocks],
-        "clock_jitter_ns": float(run.clocks.jitter_ns),
-        "align": str(run.align).lower(),
-        "flight_time_ns": [fixed + link, airtime.total_ns(1) - fixed],
-    }
-    return [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+def _clock_arguments(run: RunConfig, ids: list[int]) -> list[str]:
+    return [word for name, value in clock_parameters(run, ids).items() for word in ("-p", f"{name}:={_plain(value)}")]
+
+
+def _plain(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)

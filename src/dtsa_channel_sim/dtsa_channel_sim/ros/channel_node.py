@@ -34,6 +34,7 @@ from .realtime_channel import RealtimeChannel
 from .ros_channel import RosChannel
 from .run_log import RunLog
 from .run_topics import RunTopics
+from .transforms import Transforms
 
 
 def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str, Any]:
@@ -99,6 +100,7 @@ def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: s
         RunLog(node, channel.run_id, lockstep),
         RunTopics(node, settings, channel.run_id, channel.slot_ns, space),
         Diagnostics(node, channel.slot_ns),
+        Transforms(node, channel.agents, channel.slot_ns, space),
     )
 
 

@@ -1,0 +1,30 @@
+"""What the agents' processes of a run have to be told beside the swarm's settings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from dtsa_bench.run_config import LOCKSTEP, RunConfig
+from dtsa_channel_sim import make_clocks
+
+
+def clock_parameters(run: RunConfig, ids: Sequence[int]) -> dict[str, Any]:
+    """The clocks of some agents, and how long a frame takes, in real time; nothing in lockstep.
+
+    :param run: the run.
+    :param ids: the agents' ids.
+    """
+    if run.mode == LOCKSTEP:
+        return {}
+    all_clocks = make_clocks(run.clocks, run.swarm.agents)
+    clocks = [all_clocks[agent - 1] for agent in ids]
+    airtime, link = run.air.airtime, run.air.link_delay_ns
+    fixed = airtime.total_ns(0)
+    return {
+        "clock_offset_ns": [clock.offset_ns for clock in clocks],
+        "clock_drift_ppb": [clock.drift_ppb for clock in clocks],
+        "clock_jitter_ns": float(run.clocks.jitter_ns),
+        "align": run.align,
+        "flight_time_ns": [fixed + link, airtime.total_ns(1) - fixed],
+    }

@@ -1,0 +1,80 @@
+"""Crazyflies: the bridge alone, for other nodes to fly them; or a whole recorded mission. With simulated ones, too.
+
+``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm.yaml``
+``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm.yaml mission:=true out:=mission_1``
+``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm_simulated.yaml mission:=true simulated:=true``
+
+The first Ctrl-C lands all, a second one stops all motors. A mission brings its own bridge, agents and channel.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ament_index_python.packages import get_package_prefix
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.config import load_swarm
+
+LAND_S = "60.0"  # from Ctrl-C until SIGTERM: all land first
+
+
+def _bench(executable: str) -> str:
+    return os.path.join(get_package_prefix("dtsa_bench"), "lib", "dtsa_bench", executable)
+
+
+def _processes(context: LaunchContext) -> list:
+    config = LaunchConfiguration("config").perform(context)
+    if not config:
+        raise ConfigError("config", config, "the path of a swarm's YAML file")
+    load_swarm(Path(config))  # what is wrong with it is said before anything starts
+    actions = []
+    if LaunchConfiguration("simulated").perform(context) == "true":
+        fleet = [_bench("fake_crazyflie"), "--config", config, "--quiet"]
+        actions.append(ExecuteProcess(cmd=fleet, output="screen", name="fake_crazyflie"))
+    over = Shutdown(reason="the Crazyflies have landed")
+    if LaunchConfiguration("mission").perform(context) == "true":
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        out = LaunchConfiguration("out").perform(context)
+        more = LaunchConfiguration("options").perform(context).split()
+        fly = [_bench("dtsa"), "fly", "--backend", "cflib", "--config", config, "--domain", domain, "--out", out, *more]
+        actions.append(ExecuteProcess(cmd=fly, output="screen", name="mission", sigterm_timeout=LAND_S, on_exit=over))
+        return actions
+    bridge = Node(
+        package="dtsa_agent",
+        executable="crazyflie_bridge",
+        name="crazyflie_bridge",
+        parameters=[{"config": os.path.abspath(config)}],
+        output="screen",
+        sigterm_timeout=LAND_S,
+        on_exit=over,
+    )
+    return [*actions, bridge]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """What ``ros2 launch`` asks for."""
+    yes_no = ["true", "false"]
+    described = {
+        "config": "the swarm's YAML file",
+        "mission": "fly a recorded mission",
+        "simulated": "the Crazyflies are simulated ones",
+        "out": "directory for a mission's bag and results",
+        "options": "further options of a mission, as `fly` has them",
+    }
+    defaults = {"mission": "false", "simulated": "false", "out": "mission"}
+    arguments = [
+        DeclareLaunchArgument(
+            name,
+            default_value=defaults.get(name, ""),
+            choices=yes_no if defaults.get(name) in yes_no else None,
+            description=text,
+        )
+        for name, text in described.items()
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=_processes)])
