@@ -135,7 +135,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         ids = parse_ids(ids, config.agents)
         zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
         swarm = with_key(make_swarm(config, local=ids))
-        space, rate = station.swarm_namespace.rstrip("/"), station.command_hz
+        rate = station.command_hz
         agents = StationNode(node, swarm, space, command_hz=rate, offset_ns=zero, drift_ppb=zero, align=False)
         try:
             agents.run(stop)
