@@ -10,8 +10,7 @@ int avoid_level_in_force = -1; /* -1: not yet decided */
 int avoid_vector_level(int level)
 {
     int best = 0;
-    if (level < 0 && avoid_level_in_force >= 0)
-        return avoid_level_in_force;
+    if (level < 0 && avoid_level_in_force >= 0) return avoid_level_in_force;
 #if AVOID_HAVE_AVX2
     __builtin_cpu_init();
     best = __builtin_cpu_supports("avx2") ? 1 : 0;
@@ -20,10 +19,7 @@ int avoid_vector_level(int level)
     return avoid_level_in_force;
 }
 
-int avoid_scratch_doubles(int n)
-{
-    return PLANES * avoid_plane_length(n);
-}
+int avoid_scratch_doubles(int n) { return PLANES * avoid_plane_length(n); }
 
 /* Leaves alone what exceeds v_max by rounding only: for a vector that was limited before the branch would be a toss. */
 static inline void limit(double v[3], double v_max)
@@ -38,7 +34,8 @@ static inline void limit(double v[3], double v_max)
 }
 
 /* v_pref = min(v_max, K_P d) towards the goal. */
-static void prefer(const avoid_params *params, const double position[3], const double goal[3], double preferred[3])
+static void prefer(const avoid_params *params, const double position[3], const double goal[3],
+                   double preferred[3])
 {
     for (int axis = 0; axis < 3; axis++)
         preferred[axis] = params->gain * (goal[axis] - position[axis]);
@@ -51,7 +48,8 @@ AVOID_INLINE void potential_body(const avoid_query *q, double command[3])
 {
     const avoid_params *params = q->params;
     const v4d px = v4_all(q->position[0]), py = v4_all(q->position[1]), pz = v4_all(q->position[2]);
-    const v4d strength = v4_all(params->strength), least = v4_all(0.02), most = v4_all(4.0 * params->v_max);
+    const v4d strength = v4_all(params->strength), least = v4_all(0.02),
+              most = v4_all(4.0 * params->v_max);
     const v4d tiny = v4_all(1e-12), one = v4_all(1.0);
     v4d sum_x = v4_all(0.0), sum_y = sum_x, sum_z = sum_x;
 
@@ -71,11 +69,11 @@ AVOID_INLINE void potential_body(const avoid_query *q, double command[3])
         const v4d core = v4_all(params->core) + v4_load(margin);
         const v4d squared = dx * dx + dy * dy + dz * dz;
         const v4i near = squared < reach * reach;
-        if (!v4_bits(near))
-            continue;
+        if (!v4_bits(near)) continue;
         const v4d distance = v4_sqrt(squared);
         const v4d inverse = one / v4_max(distance, tiny);
-        const v4d f = v4_min(strength * (one / v4_max(distance - core, least) - one / (reach - core)), most);
+        const v4d f =
+            v4_min(strength * (one / v4_max(distance - core, least) - one / (reach - core)), most);
         const v4d scaled = v4_keep(near, f * inverse);
         const v4d side = scaled * v4_all(params->tangential);
         /* f (e + 0.3 z x e), z x e = (-e_y, e_x, 0) */
@@ -109,16 +107,22 @@ void avoid_potential(const avoid_query *query, double command[3])
 /* --- one agent ------------------------------------------------------------------------------------------------- */
 
 void avoid_command(int kind, const avoid_params *params, int n, int self, const double position[3],
-                   const double velocity[3], const double goal[3], const double *others_p, const double *others_v,
-                   const double *age_s, double *scratch, double command[3])
+                   const double velocity[3], const double goal[3], const double *others_p,
+                   const double *others_v, const double *age_s, double *scratch, double command[3])
 {
     avoid_query query = {
-        .params = params, .n = n, .self = self, .position = position, .velocity = velocity, .goal = goal,
-        .others_p = others_p, .others_v = others_v, .age_s = params->margin_rate > 0.0 ? age_s : NULL,
+        .params = params,
+        .n = n,
+        .self = self,
+        .position = position,
+        .velocity = velocity,
+        .goal = goal,
+        .others_p = others_p,
+        .others_v = others_v,
+        .age_s = params->margin_rate > 0.0 ? age_s : NULL,
         .scratch = scratch,
     };
-    if (avoid_level_in_force < 0)
-        avoid_vector_level(-1);
+    if (avoid_level_in_force < 0) avoid_vector_level(-1);
     prefer(params, position, goal, query.preferred);
     if (kind == AVOID_ORCA) {
         /* a small turn to the right lets symmetric meetings resolve */
@@ -132,8 +136,7 @@ void avoid_command(int kind, const avoid_params *params, int n, int self, const 
     } else if (kind == AVOID_BVC) {
         avoid_bvc(&query, command);
     } else {
-        for (int axis = 0; axis < 3; axis++)
-            command[axis] = query.preferred[axis];
+        for (int axis = 0; axis < 3; axis++) command[axis] = query.preferred[axis];
     }
     limit(command, params->v_max);
 }

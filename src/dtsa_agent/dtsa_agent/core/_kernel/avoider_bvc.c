@@ -6,8 +6,9 @@
 #include "avoider_internal.h"
 #include "avoider_solver.h"
 
-#define STIFFNESS 1e6  /* violates a wall by (pull in m) / STIFFNESS */
-#define TOLERANCE 1e-4 /* m, a wall violated by more than this: the cell is empty (as in the firmware) */
+#define STIFFNESS 1e6 /* violates a wall by (pull in m) / STIFFNESS */
+#define TOLERANCE                                                                                  \
+    1e-4 /* m, a wall violated by more than this: the cell is empty (as in the firmware) */
 
 /* Walls a.x <= c of the cell around the own position, unit normals, stored as n = -a, b = -c; returns how many. */
 static int bvc_walls(const avoid_query *q)
@@ -19,24 +20,22 @@ static int bvc_walls(const avoid_query *q)
     const double side = params->horizon * params->v_max;
     int m = 0;
     for (int j = 0; j < n; j++) {
-        if (j == q->self)
-            continue;
+        if (j == q->self) continue;
         double dx = q->others_p[j] - q->position[0];
         double dy = q->others_p[n + j] - q->position[1];
         double dz = q->others_p[2 * n + j] - q->position[2];
-        if (!(dx * dx + dy * dy + dz * dz < (double)INFINITY))
-            continue;
+        if (!(dx * dx + dy * dy + dz * dz < (double)INFINITY)) continue;
         /* in coordinates in which an agent is a ball of radius 1 */
         const double margin = q->age_s ? 0.5 * avoid_margin(params, q->age_s[j]) : 0.0;
         const double across = 1.0 / (params->radius + margin);
         const double up = across / params->stretch_z;
-        if (dx == 0.0 && dy == 0.0 && dz == 0.0)
-            dx = j > q->self ? 1e-9 : -1e-9;
+        if (dx == 0.0 && dy == 0.0 && dz == 0.0) dx = j > q->self ? 1e-9 : -1e-9;
         dx *= across;
         dy *= across;
         dz *= up;
         const double distance = sqrt(dx * dx + dy * dy + dz * dz);
-        const double ax = dx * across / distance, ay = dy * across / distance, az = dz * up / distance;
+        const double ax = dx * across / distance, ay = dy * across / distance,
+                     az = dz * up / distance;
         const double norm = sqrt(ax * ax + ay * ay + az * az);
         const double wall = (0.5 * distance - 1.0) / norm;
         if (wall > 2.0 * side) /* beyond the box's corners (sqrt(3) side) */
@@ -61,13 +60,13 @@ static int bvc_walls(const avoid_query *q)
 /* How far one can go along `d` before the first wall, as a share of d; at least 0. */
 static double bvc_share(const avoid_query *q, int m, const double d[3])
 {
-    const double *x = avoid_plane(q, PLANE_X), *y = avoid_plane(q, PLANE_Y), *z = avoid_plane(q, PLANE_Z);
+    const double *x = avoid_plane(q, PLANE_X), *y = avoid_plane(q, PLANE_Y),
+                 *z = avoid_plane(q, PLANE_Z);
     const double *b = avoid_plane(q, PLANE_B);
     double share = (double)INFINITY;
     for (int k = 0; k < m; k++) {
         const double along = x[k] * d[0] + y[k] * d[1] + z[k] * d[2];
-        if (along < 0.0)
-            share = fmin(share, b[k] / along);
+        if (along < 0.0) share = fmin(share, b[k] / along);
     }
     return share > 0.0 ? share : 0.0;
 }
@@ -88,8 +87,7 @@ AVOID_INLINE void bvc_body(const avoid_query *q, double command[3])
     }
     const double share = bvc_share(q, m, goal);
     int inside = 1; /* the own position is in its cell */
-    for (int k = 0; k < m; k++)
-        inside &= b[k] <= 0.0;
+    for (int k = 0; k < m; k++) inside &= b[k] <= 0.0;
     if (!(inside && share >= 1.0)) {
         const double wall = share * sqrt(goal[0] * goal[0] + goal[1] * goal[1] + goal[2] * goal[2]);
         if (wall <= params->sidestep) {
@@ -98,8 +96,14 @@ AVOID_INLINE void bvc_body(const avoid_query *q, double command[3])
             goal[1] -= amount * target[0];
         }
         const soft_problem problem = {
-            .blocks = blocks, .x = x, .y = y, .z = z, .b = b, .bits = avoid_plane(q, PLANE_BITS),
-            .rho = STIFFNESS, .wish = goal,
+            .blocks = blocks,
+            .x = x,
+            .y = y,
+            .z = z,
+            .b = b,
+            .bits = avoid_plane(q, PLANE_BITS),
+            .rho = STIFFNESS,
+            .wish = goal,
         };
         soft_minimise(&problem, target);
         for (int k = 0; k < m; k++) {
@@ -109,14 +113,10 @@ AVOID_INLINE void bvc_body(const avoid_query *q, double command[3])
             }
         }
     }
-    for (int axis = 0; axis < 3; axis++)
-        command[axis] = params->gain * target[axis];
+    for (int axis = 0; axis < 3; axis++) command[axis] = params->gain * target[axis];
 }
 
-static void bvc_baseline(const avoid_query *query, double command[3])
-{
-    bvc_body(query, command);
-}
+static void bvc_baseline(const avoid_query *query, double command[3]) { bvc_body(query, command); }
 
 AVOID_AVX2 static void bvc_avx2(const avoid_query *query, double command[3])
 {

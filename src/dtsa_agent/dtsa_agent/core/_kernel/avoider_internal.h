@@ -16,7 +16,7 @@ typedef struct {
     const double *others_p, *others_v;        /* (3, n) */
     const double *age_s;                      /* (n), or NULL when margins do not count */
     double *scratch;
-    double preferred[3];                      /* m/s, v_pref, already within v_max */
+    double preferred[3]; /* m/s, v_pref, already within v_max */
 } avoid_query;
 
 /* Each writes the command before it is limited to v_max. */
@@ -27,10 +27,7 @@ void avoid_bvc(const avoid_query *query, double command[3]);
 /* Planes of the scratch memory, each long enough for n neighbours, 6 box faces and padding to whole vectors. */
 enum { PLANE_X, PLANE_Y, PLANE_Z, PLANE_B, PLANE_BITS, PLANES };
 
-static inline int avoid_plane_length(int n)
-{
-    return (n + 6 + 3) / 4 * 4 + 4;
-}
+static inline int avoid_plane_length(int n) { return (n + 6 + 3) / 4 * 4 + 4; }
 
 static inline double *avoid_plane(const avoid_query *query, int plane)
 {

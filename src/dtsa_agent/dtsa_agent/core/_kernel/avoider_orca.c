@@ -4,14 +4,16 @@
 
 /* Lanes of a block's set bits, first ones first. */
 static const int32_t LANE_LISTS[16][LANES] = {
-    {0, 0, 0, 0}, {0, 0, 0, 0}, {1, 0, 0, 0}, {0, 1, 0, 0}, {2, 0, 0, 0}, {0, 2, 0, 0}, {1, 2, 0, 0}, {0, 1, 2, 0},
-    {3, 0, 0, 0}, {0, 3, 0, 0}, {1, 3, 0, 0}, {0, 1, 3, 0}, {2, 3, 0, 0}, {0, 2, 3, 0}, {1, 2, 3, 0}, {0, 1, 2, 3},
+    {0, 0, 0, 0}, {0, 0, 0, 0}, {1, 0, 0, 0}, {0, 1, 0, 0}, {2, 0, 0, 0}, {0, 2, 0, 0},
+    {1, 2, 0, 0}, {0, 1, 2, 0}, {3, 0, 0, 0}, {0, 3, 0, 0}, {1, 3, 0, 0}, {0, 1, 3, 0},
+    {2, 3, 0, 0}, {0, 2, 3, 0}, {1, 2, 3, 0}, {0, 1, 2, 3},
 };
 static const int8_t LANE_COUNTS[16] = {0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4};
 
 AVOID_INLINE v4d orca_margin(const avoid_params *params, v4d age)
 {
-    return v4_max(v4_min(v4_all(params->margin_rate) * age, v4_all(params->margin_max)), v4_all(0.0));
+    return v4_max(v4_min(v4_all(params->margin_rate) * age, v4_all(params->margin_max)),
+                  v4_all(0.0));
 }
 
 /* Those of one block that are within reach, appended to `who`; returns their number. Without branches: which agents are
@@ -20,8 +22,7 @@ AVOID_INLINE int orca_append(int32_t *who, int first, int self, v4d dx, v4d dy, 
 {
     int bits = v4_bits(dx * dx + dy * dy + dz * dz < reach * reach);
     bits &= ~((int)((unsigned)(self - first) < LANES) << ((self - first) & (LANES - 1)));
-    for (int l = 0; l < LANES; l++)
-        who[l] = first + LANE_LISTS[bits][l];
+    for (int l = 0; l < LANES; l++) who[l] = first + LANE_LISTS[bits][l];
     return LANE_COUNTS[bits];
 }
 
@@ -37,8 +38,8 @@ AVOID_INLINE int orca_neighbours(const avoid_query *q, int32_t *who)
     int m = 0;
     for (int first = 0; first < whole; first += LANES) {
         const v4d far = q->age_s ? reach + orca_margin(params, v4_load(q->age_s + first)) : reach;
-        m += orca_append(who + m, first, q->self, v4_load(ox + first) - px, v4_load(oy + first) - py,
-                         v4_load(oz + first) - pz, far);
+        m += orca_append(who + m, first, q->self, v4_load(ox + first) - px,
+                         v4_load(oy + first) - py, v4_load(oz + first) - pz, far);
     }
     if (whole < n) {
         v4d x = v4_all((double)NAN), y = x, z = x, age = v4_all(0.0);
@@ -61,11 +62,11 @@ AVOID_INLINE v4d orca_gather(const double *plane, const int32_t *who)
 
 /* Velocities exactly at the centre of the obstacle have no nearest way out: go straight away from the neighbour. Two
  * agents at the very same point part along x, in the order of their ids. */
-AVOID_INLINE void orca_part(int self, const int32_t *who, v4i lanes, const v4d r[3], v4d *nx, v4d *ny, v4d *nz)
+AVOID_INLINE void orca_part(int self, const int32_t *who, v4i lanes, const v4d r[3], v4d *nx,
+                            v4d *ny, v4d *nz)
 {
     for (int l = 0; l < LANES; l++) {
-        if (!lanes[l])
-            continue;
+        if (!lanes[l]) continue;
         const double x = r[0][l], y = r[1][l], z = r[2][l];
         const double distance = sqrt(x * x + y * y + z * z);
         const int apart = distance > 0.0;
@@ -82,24 +83,28 @@ AVOID_INLINE int orca_half_planes(const avoid_query *q, int32_t *who, int m)
 {
     const avoid_params *params = q->params;
     const int n = q->n;
-    const double *ox = q->others_p, *oy = ox + n, *oz = oy + n, *ux_of = q->others_v, *uy_of = ux_of + n;
+    const double *ox = q->others_p, *oy = ox + n, *oz = oy + n, *ux_of = q->others_v,
+                 *uy_of = ux_of + n;
     const double *uz_of = uy_of + n;
-    double *out_x = avoid_plane(q, PLANE_X), *out_y = avoid_plane(q, PLANE_Y), *out_z = avoid_plane(q, PLANE_Z);
+    double *out_x = avoid_plane(q, PLANE_X), *out_y = avoid_plane(q, PLANE_Y),
+           *out_z = avoid_plane(q, PLANE_Z);
     double *b = avoid_plane(q, PLANE_B);
     const v4d px = v4_all(q->position[0]), py = v4_all(q->position[1]), pz = v4_all(q->position[2]);
     const v4d vx = v4_all(q->velocity[0]), vy = v4_all(q->velocity[1]), vz = v4_all(q->velocity[2]);
-    const v4d per_period = v4_all(1.0 / params->period), per_horizon = v4_all(1.0 / params->horizon);
+    const v4d per_period = v4_all(1.0 / params->period),
+              per_horizon = v4_all(1.0 / params->horizon);
     const v4d one = v4_all(1.0), half = v4_all(0.5), tiny = v4_all(1e-12), zero = v4_all(0.0);
     const int blocks = (m + LANES - 1) / LANES;
     for (int k = m; k < LANES * blocks; k++) /* padding: the last one again, wiped out below */
         who[k] = who[m - 1];
     for (int k = 0; k < LANES * blocks; k += LANES) {
         const int32_t *at = who + k;
-        const v4d x = orca_gather(ox, at) - px, y = orca_gather(oy, at) - py, z = orca_gather(oz, at) - pz;
-        const v4d ux = vx - orca_gather(ux_of, at), uy = vy - orca_gather(uy_of, at), uz = vz - orca_gather(uz_of, at);
+        const v4d x = orca_gather(ox, at) - px, y = orca_gather(oy, at) - py,
+                  z = orca_gather(oz, at) - pz;
+        const v4d ux = vx - orca_gather(ux_of, at), uy = vy - orca_gather(uy_of, at),
+                  uz = vz - orca_gather(uz_of, at);
         v4d rc = v4_all(params->radius);
-        if (q->age_s)
-            rc += orca_margin(params, orca_gather(q->age_s, at));
+        if (q->age_s) rc += orca_margin(params, orca_gather(q->age_s, at));
         const v4d r2 = x * x + y * y + z * z;
         const v4d outside = r2 - rc * rc;
         const v4d ru = x * ux + y * uy + z * uz;
@@ -137,12 +142,18 @@ AVOID_INLINE int orca_half_planes(const avoid_query *q, int32_t *who, int m)
 
 AVOID_INLINE void orca_body(const avoid_query *q, double command[3])
 {
-    int32_t *who = (int32_t *)avoid_plane(q, PLANE_BITS); /* the solver uses this memory after the half-planes */
+    int32_t *who = (int32_t *)avoid_plane(
+        q, PLANE_BITS); /* the solver uses this memory after the half-planes */
     const int m = orca_neighbours(q, who);
     const soft_problem problem = {
-        .blocks = orca_half_planes(q, who, m), .x = avoid_plane(q, PLANE_X), .y = avoid_plane(q, PLANE_Y),
-        .z = avoid_plane(q, PLANE_Z), .b = avoid_plane(q, PLANE_B), .bits = avoid_plane(q, PLANE_BITS),
-        .rho = q->params->softness, .wish = q->preferred,
+        .blocks = orca_half_planes(q, who, m),
+        .x = avoid_plane(q, PLANE_X),
+        .y = avoid_plane(q, PLANE_Y),
+        .z = avoid_plane(q, PLANE_Z),
+        .b = avoid_plane(q, PLANE_B),
+        .bits = avoid_plane(q, PLANE_BITS),
+        .rho = q->params->softness,
+        .wish = q->preferred,
     };
     soft_minimise(&problem, command);
 }

@@ -30,20 +30,11 @@ typedef double v4d __attribute__((vector_size(32)));
 typedef int64_t v4i __attribute__((vector_size(32)));
 typedef double v4d_any __attribute__((vector_size(32), aligned(8), may_alias));
 
-AVOID_INLINE v4d v4_load(const double *from)
-{
-    return *(const v4d_any *)from;
-}
+AVOID_INLINE v4d v4_load(const double *from) { return *(const v4d_any *)from; }
 
-AVOID_INLINE void v4_store(double *to, v4d x)
-{
-    *(v4d_any *)to = x;
-}
+AVOID_INLINE void v4_store(double *to, v4d x) { *(v4d_any *)to = x; }
 
-AVOID_INLINE v4d v4_all(double x)
-{
-    return (v4d){x, x, x, x};
-}
+AVOID_INLINE v4d v4_all(double x) { return (v4d){x, x, x, x}; }
 
 /* mask ? a : b, lane by lane (a mask is all ones or all zeros). */
 AVOID_INLINE v4d v4_select(v4i mask, v4d a, v4d b)
@@ -52,26 +43,14 @@ AVOID_INLINE v4d v4_select(v4i mask, v4d a, v4d b)
 }
 
 /* mask ? a : +0 */
-AVOID_INLINE v4d v4_keep(v4i mask, v4d a)
-{
-    return (v4d)(mask & (v4i)a);
-}
+AVOID_INLINE v4d v4_keep(v4i mask, v4d a) { return (v4d)(mask & (v4i)a); }
 
-AVOID_INLINE v4d v4_max(v4d a, v4d b)
-{
-    return v4_select(a > b, a, b);
-}
+AVOID_INLINE v4d v4_max(v4d a, v4d b) { return v4_select(a > b, a, b); }
 
-AVOID_INLINE v4d v4_min(v4d a, v4d b)
-{
-    return v4_select(a < b, a, b);
-}
+AVOID_INLINE v4d v4_min(v4d a, v4d b) { return v4_select(a < b, a, b); }
 
 /* Compilers make one instruction of it (no errno). */
-AVOID_INLINE v4d v4_sqrt(v4d x)
-{
-    return (v4d){sqrt(x[0]), sqrt(x[1]), sqrt(x[2]), sqrt(x[3])};
-}
+AVOID_INLINE v4d v4_sqrt(v4d x) { return (v4d){sqrt(x[0]), sqrt(x[1]), sqrt(x[2]), sqrt(x[3])}; }
 
 /* Bit l is set where lane l of the mask is. */
 AVOID_INLINE int v4_bits(v4i mask)
@@ -86,9 +65,6 @@ AVOID_INLINE int v4_bits(v4i mask)
 }
 
 /* The one order in which lanes are summed. */
-AVOID_INLINE double v4_sum(v4d x)
-{
-    return (x[0] + x[2]) + (x[1] + x[3]);
-}
+AVOID_INLINE double v4_sum(v4d x) { return (x[0] + x[2]) + (x[1] + x[3]); }
 
 #endif

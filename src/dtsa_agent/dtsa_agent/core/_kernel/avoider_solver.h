@@ -11,11 +11,11 @@
 enum { SOLVER_STEPS = 60, SOLVER_HALVINGS = 40 };
 
 typedef struct {
-    int blocks;                /* whole vectors of half-spaces; padding has n = 0, b < 0 */
+    int blocks; /* whole vectors of half-spaces; padding has n = 0, b < 0 */
     const double *x, *y, *z, *b;
-    double *bits;              /* one value a block: which of its half-spaces were violated at the last pass */
+    double *bits; /* one value a block: which of its half-spaces were violated at the last pass */
     double rho;
-    const double *wish;        /* x0 */
+    const double *wish; /* x0 */
 } soft_problem;
 
 /* Value, gradient and curvature at one point. */
@@ -35,14 +35,14 @@ AVOID_INLINE soft_pass soft_evaluate(const soft_problem *p, const double at[3])
     int64_t *before = (int64_t *)p->bits;
     int64_t changed = 0, violated = 0;
     for (int k = 0; k < p->blocks; k++) {
-        const v4d nx = v4_load(p->x + LANES * k), ny = v4_load(p->y + LANES * k), nz = v4_load(p->z + LANES * k);
+        const v4d nx = v4_load(p->x + LANES * k), ny = v4_load(p->y + LANES * k),
+                  nz = v4_load(p->z + LANES * k);
         const v4d lack = v4_load(p->b + LANES * k) - (nx * ax + ny * ay + nz * az);
         const v4i active = lack > zero;
         const int64_t bits = v4_bits(active);
         changed |= bits ^ before[k];
         before[k] = bits;
-        if (!bits)
-            continue;
+        if (!bits) continue;
         violated = 1;
         const v4d s = v4_keep(active, lack);
         const v4d mx = v4_keep(active, nx), my = v4_keep(active, ny), mz = v4_keep(active, nz);
@@ -99,38 +99,31 @@ AVOID_INLINE void soft_newton(const soft_pass *h, const soft_pass *g, double ste
 /* Writes the minimiser; returns 1 if it was reached, 0 if the steps ran out (then x is the best point found). */
 AVOID_INLINE int soft_minimise(const soft_problem *p, double x[3])
 {
-    for (int k = 0; k < p->blocks; k++)
-        ((int64_t *)p->bits)[k] = 0;
-    for (int axis = 0; axis < 3; axis++)
-        x[axis] = p->wish[axis];
+    for (int k = 0; k < p->blocks; k++) ((int64_t *)p->bits)[k] = 0;
+    for (int axis = 0; axis < 3; axis++) x[axis] = p->wish[axis];
     soft_pass here = soft_evaluate(p, x);
-    if (!here.violated)
-        return 1;
+    if (!here.violated) return 1;
     for (int k = 0; k < SOLVER_STEPS; k++) {
         double step[3];
         soft_newton(&here, &here, step);
         const double slope = step[0] * here.gx + step[1] * here.gy + step[2] * here.gz;
         const double noise = 1e-15 * (1.0 + here.value);
-        if (-slope <= 1e-28)
-            return 1;
+        if (-slope <= 1e-28) return 1;
         double t = 1.0;
         double to[3];
         soft_pass there;
         for (int halving = 0;; halving++) {
-            for (int axis = 0; axis < 3; axis++)
-                to[axis] = x[axis] + t * step[axis];
+            for (int axis = 0; axis < 3; axis++) to[axis] = x[axis] + t * step[axis];
             there = soft_evaluate(p, to);
             if (there.value <= here.value + 1e-4 * t * slope + noise || halving == SOLVER_HALVINGS)
                 break;
             t *= 0.5;
         }
-        for (int axis = 0; axis < 3; axis++)
-            x[axis] = to[axis];
+        for (int axis = 0; axis < 3; axis++) x[axis] = to[axis];
         if (t == 1.0 && !there.changed) {
             /* the minimiser of this piece; once more with its own gradient removes the rounding of the first step */
             soft_newton(&here, &there, step);
-            for (int axis = 0; axis < 3; axis++)
-                x[axis] += step[axis];
+            for (int axis = 0; axis < 3; axis++) x[axis] += step[axis];
             return 1;
         }
         here = there;

@@ -36,10 +36,14 @@ static int all_numbers(const double *x, int n)
 int frame_length(int profile)
 {
     switch (profile) {
-    case PROFILE_PAPER: return 19;
-    case PROFILE_PAPER_INTENT: return 23;
-    case PROFILE_EXTENDED: return EXTENDED_LENGTH;
-    default: return 0;
+    case PROFILE_PAPER:
+        return 19;
+    case PROFILE_PAPER_INTENT:
+        return 23;
+    case PROFILE_EXTENDED:
+        return EXTENDED_LENGTH;
+    default:
+        return 0;
     }
 }
 

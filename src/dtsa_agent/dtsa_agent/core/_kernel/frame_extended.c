@@ -25,7 +25,8 @@ static double gossip_step(double position_step) { return 2.0 * position_step; }
 
 int gossip_fits(const double p[3], const double v[3], double position_step)
 {
-    const double far = ((1 << 13) - 2) * gossip_step(position_step), fast = ((1 << 9) - 2) * VELOCITY_STEP;
+    const double far = ((1 << 13) - 2) * gossip_step(position_step),
+                 fast = ((1 << 9) - 2) * VELOCITY_STEP;
     for (int i = 0; i < 3; i++)
         if (!(fabs(p[i]) <= far && fabs(v[i]) <= fast)) return 0;
     return 1;
@@ -114,7 +115,8 @@ int extended_encode(const extended_frame *e, double position_step, uint8_t *out)
         put_gossip(&e->gossip[i], gossip_step(position_step), at);
     }
     while (section < SECTIONS) kinds[section++] = KIND_GOSSIP;
-    out[3] = (uint8_t)(out[3] | (e->probation != 0) << 1 | kinds[0] << 2 | kinds[1] << 4 | kinds[2] << 6);
+    out[3] = (uint8_t)(out[3] | (e->probation != 0) << 1 | kinds[0] << 2 | kinds[1] << 4 |
+                       kinds[2] << 6);
     return EXTENDED_LENGTH;
 }
 

@@ -17,7 +17,8 @@ static int sayable(const swarm *s, int view, int k)
 }
 
 /* The newest state of somebody not yet chosen that is `age` slots old or older and can be said; -1: none. */
-static int newest_of_age(const swarm *s, int view, int self, int64_t slot, int age, const int *chosen, int count)
+static int newest_of_age(const swarm *s, int view, int self, int64_t slot, int age,
+                         const int *chosen, int count)
 {
     const int64_t *sent = s->sent_slot + (long)view * s->n;
     int best = -1;
@@ -60,7 +61,9 @@ int gossip_collect(const swarm *s, int view, int self, int64_t slot, int room, g
 static void learn_gossip(swarm *s, int view, int64_t sampled, const gossip_entry *g)
 {
     if (sampled < 0 || s->observer[view] == g->id - 1) return;
-    if (s->sent_slot[(long)view * s->n + g->id - 1] >= sampled || !gossip_fits(g->p, g->v, s->position_step)) return;
+    if (s->sent_slot[(long)view * s->n + g->id - 1] >= sampled ||
+        !gossip_fits(g->p, g->v, s->position_step))
+        return;
     dtsa_frame f = {.sender = g->id, .c_r = g->c_r};
     for (int i = 0; i < 3; i++) {
         f.p[i] = g->p[i];
@@ -88,7 +91,8 @@ int extended_emit(swarm *s, int l, int64_t slot, const dtsa_frame *own, uint8_t 
     if (s->policy == POLICY_LEASE) lease_fill(s, l, slot, &e);
     const int used = (e.lease_count + SECTION_BYTES - 1) / SECTION_BYTES + (e.relay_mask != 0);
     if (s->gossip)
-        e.gossip_count = gossip_collect(s, s->shared ? 0 : l, s->local[l], slot, SECTIONS - used, e.gossip);
+        e.gossip_count =
+            gossip_collect(s, s->shared ? 0 : l, s->local[l], slot, SECTIONS - used, e.gossip);
     return extended_encode(&e, s->position_step, out);
 }
 
@@ -101,20 +105,24 @@ int extended_hear(swarm *s, int64_t slot, const uint8_t *data, long length, cons
     }
     const uint32_t late = (uint32_t)slot - e.own.slot;
     const int64_t sampled = slot - late;
-    if (late > 1 || !known_ids(s, &e, sampled)) {     /* unknown agents, or a frame of another time (a replay) */
+    if (late > 1 ||
+        !known_ids(s, &e, sampled)) { /* unknown agents, or a frame of another time (a replay) */
         s->foreign++;
         return 0;
     }
     for (int view = 0; view < s->view_count; view++) {
         const int speaks = s->observer[view] == e.own.sender - 1;
-        if (speaks ? s->local_count > 0 : mask && !mask[view]) continue;     /* a local sender knows what it said */
+        if (speaks ? s->local_count > 0 : mask && !mask[view])
+            continue; /* a local sender knows what it said */
         if (view < s->local_count && !s->shared && !s->present[view]) continue;
         const long at = (long)view * s->n + e.own.sender - 1;
         const int wakes = !s->in_ap[at] && e.own.c_r;
         if (s->sent_slot[at] < sampled) swarm_learn(s, view, &e.own, sampled);
         if (speaks) continue;
-        for (int i = 0; i < e.gossip_count; i++) learn_gossip(s, view, sampled - e.gossip[i].age, &e.gossip[i]);
-        if (s->policy == POLICY_LEASE && view < s->local_count) lease_listen(s, view, sampled, &e, wakes);
+        for (int i = 0; i < e.gossip_count; i++)
+            learn_gossip(s, view, sampled - e.gossip[i].age, &e.gossip[i]);
+        if (s->policy == POLICY_LEASE && view < s->local_count)
+            lease_listen(s, view, sampled, &e, wakes);
     }
     return 1;
 }

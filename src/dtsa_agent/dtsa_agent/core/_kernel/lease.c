@@ -8,7 +8,7 @@
 #include "lease.h"
 
 static const double CROWD = 8.0;
-static const int64_t GONE = INT64_MIN / 4;      /* heard: said goodbye */
+static const int64_t GONE = INT64_MIN / 4; /* heard: said goodbye */
 
 static long ring_length(int n, int every) { return (long)(every + 2) * n; }
 
@@ -35,7 +35,10 @@ lease_view lease_of(const swarm *s, int l)
     return v;
 }
 
-int lease_is_anchor(const lease_view *v, int64_t slot) { return (slot / v->n + slot % v->n) % v->every == 0; }
+int lease_is_anchor(const lease_view *v, int64_t slot)
+{
+    return (slot / v->n + slot % v->n) % v->every == 0;
+}
 
 int lease_alive(const lease_view *v, int k, int64_t slot)
 {
@@ -59,7 +62,9 @@ int lease_scheduled(const lease_view *v, int64_t slot)
 
 void lease_note(lease_view *v, int64_t turn, int lessee, int issuer)
 {
-    if (lessee == LEASE_NONE || turn <= v->a->now || turn >= v->a->now + v->window || lease_is_anchor(v, turn)) return;
+    if (lessee == LEASE_NONE || turn <= v->a->now || turn >= v->a->now + v->window ||
+        lease_is_anchor(v, turn))
+        return;
     uint8_t *there = &v->lessee[turn % v->window], *by = &v->issuer[turn % v->window];
     /* Two leases of one turn: only adoption can do that. The smaller id, so that all who know both agree. */
     if (*there == LEASE_NONE || lessee < *there) {
@@ -77,7 +82,9 @@ int lease_turns(const lease_view *v, int64_t slot, int c_s, int64_t *turns, int 
         for (int i = c_s; i >= 0; i--) {
             const int64_t turn = slot + (int64_t)j * v->n - i;
             const int anchor = lease_is_anchor(v, turn);
-            if (!i && anchor) own = 0;      /* its own turns up to its next anchor, those of the dead as far as it goes */
+            if (!i && anchor)
+                own =
+                    0; /* its own turns up to its next anchor, those of the dead as far as it goes */
             if (anchor || (!i && !own)) continue;
             if (count == room) return count;
             turns[count++] = turn;
@@ -91,7 +98,8 @@ static void roll(lease_view *v, int64_t slot)
     if (slot - a->now >= v->window) {
         memset(v->lessee, 0, 2 * (size_t)v->window);
     } else {
-        for (int64_t t = a->now; t < slot; t++) v->lessee[t % v->window] = v->issuer[t % v->window] = 0;
+        for (int64_t t = a->now; t < slot; t++)
+            v->lessee[t % v->window] = v->issuer[t % v->window] = 0;
     }
     a->now = slot;
     a->wakers -= a->wakers / v->n;
@@ -136,7 +144,9 @@ static int own_right_is_near(const lease_view *v, int self, int64_t slot)
     for (int64_t t = slot + 1; t <= slot + v->n / 2; t++) {
         const int given = v->lessee[t % v->window];
         if (given == self + 1) return 1;
-        if (t % v->n == self && (lease_is_anchor(v, t) || (given == LEASE_NONE && !v->a->probation))) return 1;
+        if (t % v->n == self &&
+            (lease_is_anchor(v, t) || (given == LEASE_NONE && !v->a->probation)))
+            return 1;
     }
     return 0;
 }
@@ -149,7 +159,8 @@ static int takes_open(const swarm *s, const lease_view *v, int self, int64_t slo
     if (v->a->woke < 0 || own_right_is_near(v, self, slot)) return 0;
     const int halvings = v->a->attempts < 5 ? v->a->attempts : 5;
     const double chance = 1.0 / ((1.0 + CROWD * v->a->wakers) * (double)(1 << halvings));
-    const uint64_t draw = mix64(s->key ^ mix64(((uint64_t)slot << 16) + (uint64_t)self + 0x4f50454eULL));
+    const uint64_t draw =
+        mix64(s->key ^ mix64(((uint64_t)slot << 16) + (uint64_t)self + 0x4f50454eULL));
     return (double)(draw >> 11) * 0x1p-53 < chance;
 }
 
@@ -160,7 +171,7 @@ int lease_decide(swarm *s, int l, int64_t slot, int *reason)
     lease_agent *a = v.a;
     *reason = REASON_NOBODY;
     if (!s->present[l]) {
-        if (a->started) {       /* whatever it knew is gone when it comes back */
+        if (a->started) { /* whatever it knew is gone when it comes back */
             lease_restart(s, l);
             swarm_reset_view(s, l);
         }
@@ -171,7 +182,8 @@ int lease_decide(swarm *s, int l, int64_t slot, int *reason)
     watch_goal(s, l, &v, slot);
     a->heard_now = 0;
     a->expected = -1;
-    const int owner = (int)(slot % v.n), given = v.lessee[slot % v.window], anchor = lease_is_anchor(&v, slot);
+    const int owner = (int)(slot % v.n), given = v.lessee[slot % v.window],
+              anchor = lease_is_anchor(&v, slot);
     if (given == LEASE_OPEN) {
         *reason = REASON_LEASE_OPEN;
         return takes_open(s, &v, self, slot) ? self : -1;
@@ -196,7 +208,8 @@ int lease_decide(swarm *s, int l, int64_t slot, int *reason)
 
 /* ---- what was heard ---- */
 
-static void judge_claim(const swarm *s, lease_view *v, int self, int64_t slot, const extended_frame *e, int was_absent)
+static void judge_claim(const swarm *s, lease_view *v, int self, int64_t slot,
+                        const extended_frame *e, int was_absent)
 {
     lease_agent *a = v->a;
     const int sender = e->own.sender - 1, distance = (sender - self + v->n) % v->n;
@@ -207,7 +220,7 @@ static void judge_claim(const swarm *s, lease_view *v, int self, int64_t slot, c
         a->anchored = 0;
         a->claimed = slot;
     } else if (a->probation && a->anchored && !e->probation && e->c_s == distance - 1) {
-        a->probation = 0;       /* the one that would give my turns away knows that I live */
+        a->probation = 0; /* the one that would give my turns away knows that I live */
     }
 }
 
@@ -229,7 +242,7 @@ void lease_listen(swarm *s, int l, int64_t slot, const extended_frame *e, int wa
         const gossip_entry *g = &e->gossip[i];
         const int64_t alive = slot - g->age;
         if (g->id - 1 == self) {
-            if (a->woke >= 0 && alive >= a->woke) a->woke = -1;      /* I have been heard */
+            if (a->woke >= 0 && alive >= a->woke) a->woke = -1; /* I have been heard */
         } else if (v.heard[g->id - 1] < alive && v.heard[g->id - 1] != GONE) {
             v.heard[g->id - 1] = alive;
         }
@@ -253,13 +266,16 @@ static void end_probation(const swarm *s, lease_view *v, int self, int64_t slot)
     /* Leases of an earlier life reach up to my first anchor at most. Without adoption nobody else gives my turns away;
      * with it, everybody who might has spoken twice by then. */
     const int64_t quiet = slot - a->claimed;
-    if (!s->lease.adoption || (quiet >= 2 * (int64_t)v->every * v->n && a->deaf <= LEASE_DEAF)) a->probation = 0;
+    if (!s->lease.adoption || (quiet >= 2 * (int64_t)v->every * v->n && a->deaf <= LEASE_DEAF))
+        a->probation = 0;
 }
 
 static void note_silence(const lease_view *v, int64_t slot)
 {
     lease_agent *a = v->a;
-    if (a->expected < 0 || v->miss[a->expected] >= LEASE_MISSED || lease_absent(v, a->expected, slot)) return;
+    if (a->expected < 0 || v->miss[a->expected] >= LEASE_MISSED ||
+        lease_absent(v, a->expected, slot))
+        return;
     if (a->deaf <= LEASE_DEAF) a->deaf++;
     if (a->deaf <= LEASE_DEAF) v->miss[a->expected]++;
 }
@@ -271,8 +287,10 @@ void lease_end(swarm *s, int64_t slot)
         lease_agent *a = v.a;
         if (!s->present[l] || !a->started) continue;
         if (s->sends[l]) {
-            if (s->reason[l] == REASON_LEASE_OPEN) a->attempts += a->attempts < 255;
-            else a->woke = -1;
+            if (s->reason[l] == REASON_LEASE_OPEN)
+                a->attempts += a->attempts < 255;
+            else
+                a->woke = -1;
         } else if (!a->heard_now) {
             note_silence(&v, slot);
         }

@@ -5,22 +5,23 @@
 #include "dtsa.h"
 
 enum {
-    LEASE_NONE = 0,       /* a turn is its owner's */
-    LEASE_OPEN = 255,     /* a turn is whoever's has just woken or joined */
-    LEASE_DEAF = 4,       /* more silent slots in a row than this, and an agent does not trust its ears */
-    LEASE_MISSED = 4      /* who missed so many expected turns gets no leases */
+    LEASE_NONE = 0,   /* a turn is its owner's */
+    LEASE_OPEN = 255, /* a turn is whoever's has just woken or joined */
+    LEASE_DEAF = 4, /* more silent slots in a row than this, and an agent does not trust its ears */
+    LEASE_MISSED = 4 /* who missed so many expected turns gets no leases */
 };
 
 /* State of one agent; followed in memory by heard (n), lessee (w), issuer (w), miss (n), quiet (n). */
 typedef struct lease_agent {
-    int64_t born;         /* slot of the first decision since the (re)start */
-    int64_t now;          /* the ring holds the turns now .. now + w - 1 */
-    int64_t idle_since;   /* -1: has something to say */
-    int64_t woke;         /* slot in which it woke or joined and since when nobody is known to have heard it, -1: none */
-    int64_t claimed;      /* slot in which probation began or was last confirmed */
-    double wakers;        /* agents that woke lately: about so many in the last n slots */
-    int32_t expected;     /* 0-based agent expected in this slot, -1: nobody in particular */
-    int32_t deaf;         /* silent slots in a row */
+    int64_t born;       /* slot of the first decision since the (re)start */
+    int64_t now;        /* the ring holds the turns now .. now + w - 1 */
+    int64_t idle_since; /* -1: has something to say */
+    int64_t
+        woke; /* slot in which it woke or joined and since when nobody is known to have heard it, -1: none */
+    int64_t claimed;  /* slot in which probation began or was last confirmed */
+    double wakers;    /* agents that woke lately: about so many in the last n slots */
+    int32_t expected; /* 0-based agent expected in this slot, -1: nobody in particular */
+    int32_t deaf;     /* silent slots in a row */
     uint8_t started, heard_now, probation, anchored, attempts, moving, leaving;
 } lease_agent;
 
@@ -39,7 +40,8 @@ lease_view lease_of(const swarm *s, int l);
 int lease_is_anchor(const lease_view *v, int64_t slot);
 int lease_absent(const lease_view *v, int k, int64_t slot);
 int lease_alive(const lease_view *v, int k, int64_t slot);
-int lease_scheduled(const lease_view *v, int64_t slot);     /* 0-based agent whose turn it is in this view, -1: nobody's */
+int lease_scheduled(const lease_view *v,
+                    int64_t slot); /* 0-based agent whose turn it is in this view, -1: nobody's */
 void lease_note(lease_view *v, int64_t turn, int lessee, int issuer);
 /* The turns a frame's lease bytes speak of, in order; the same for sender and receiver. -> number of turns. */
 int lease_turns(const lease_view *v, int64_t slot, int c_s, int64_t *turns, int room);
@@ -48,10 +50,12 @@ int lease_turns(const lease_view *v, int64_t slot, int c_s, int64_t *turns, int 
 void lease_fill(swarm *s, int l, int64_t slot, extended_frame *e);
 
 /* Called by swarm.c. */
-long lease_state_bytes(int n, int anchor_every);    /* of one agent */
+long lease_state_bytes(int n, int anchor_every); /* of one agent */
 void lease_restart(swarm *s, int l);
-int lease_decide(swarm *s, int l, int64_t slot, int *reason);      /* -> 0-based agent expected to send, -1: nobody */
-void lease_listen(swarm *s, int l, int64_t slot, const extended_frame *e, int wakes);    /* wakes: it was not in A_p */
+int lease_decide(swarm *s, int l, int64_t slot,
+                 int *reason); /* -> 0-based agent expected to send, -1: nobody */
+void lease_listen(swarm *s, int l, int64_t slot, const extended_frame *e,
+                  int wakes); /* wakes: it was not in A_p */
 void lease_end(swarm *s, int64_t slot);
 
 #endif

@@ -6,12 +6,13 @@
 static const double BUSY = 0.5;
 
 typedef struct {
-    int alive;              /* N_alive: me and those heard of lately */
-    int members;            /* N_p: those in A_p that do not miss their turns */
-    uint8_t able[LEASE_OPEN];       /* may be given a turn */
+    int alive;                /* N_alive: me and those heard of lately */
+    int members;              /* N_p: those in A_p that do not miss their turns */
+    uint8_t able[LEASE_OPEN]; /* may be given a turn */
 } electorate;
 
-static void count_electorate(const swarm *s, int l, const lease_view *v, int64_t slot, electorate *who)
+static void count_electorate(const swarm *s, int l, const lease_view *v, int64_t slot,
+                             electorate *who)
 {
     const uint8_t *in_ap = s->in_ap + (long)l * s->n;
     const int self = s->local[l];
@@ -35,7 +36,8 @@ static int count_absent_before(const lease_view *v, int self, int64_t slot)
 }
 
 /* To whom a turn is worth most: the longest wait before it, times the wait that follows. */
-static int choose_lessee(const swarm *s, int l, const lease_view *v, const electorate *who, int64_t slot, int64_t turn)
+static int choose_lessee(const swarm *s, int l, const lease_view *v, const electorate *who,
+                         int64_t slot, int64_t turn)
 {
     const int n = v->n;
     const int64_t *sent = s->sent_slot + (long)l * n;
@@ -45,7 +47,8 @@ static int choose_lessee(const swarm *s, int l, const lease_view *v, const elect
         after[k] = n + 1;
     }
     for (int d = n; d >= 1; d--) {
-        const int k = turn - d > slot ? lease_scheduled(v, turn - d) : -1, m = lease_scheduled(v, turn + d);
+        const int k = turn - d > slot ? lease_scheduled(v, turn - d) : -1,
+                  m = lease_scheduled(v, turn + d);
         if (k >= 0 && d < before[k]) before[k] = d;
         if (m >= 0) after[m] = d;
     }
@@ -53,7 +56,8 @@ static int choose_lessee(const swarm *s, int l, const lease_view *v, const elect
     long worth = 0;
     for (int k = 0; k < n; k++) {
         if (!who->able[k]) continue;
-        const long w = (long)before[k] * (after[k] < who->members + 1 ? after[k] : who->members + 1);
+        const long w =
+            (long)before[k] * (after[k] < who->members + 1 ? after[k] : who->members + 1);
         if (best < 0 || w > worth) {
             best = k;
             worth = w;
@@ -87,12 +91,14 @@ static void issue(swarm *s, int l, lease_view *v, int64_t slot, extended_frame *
     electorate who;
     const int self = s->local[l], count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
     count_electorate(s, l, v, slot, &who);
-    const int own = e->leaving ? 0 : depth(s, l, v, &who, slot), adopted = v->a->idle_since >= 0 ? v->every : 1;
+    const int own = e->leaving ? 0 : depth(s, l, v, &who, slot),
+              adopted = v->a->idle_since >= 0 ? v->every : 1;
     for (int i = 0; i < count; i++) {
         const int64_t turn = turns[i];
         const int mine = turn % v->n == self;
         uint8_t *given = &v->lessee[turn % v->window];
-        if (*given == LEASE_NONE && (turn - slot + v->n - 1) / v->n <= (mine ? own : adopted) && !v->a->probation) {
+        if (*given == LEASE_NONE && (turn - slot + v->n - 1) / v->n <= (mine ? own : adopted) &&
+            !v->a->probation) {
             if (mine && is_open(s, v, turn))
                 *given = LEASE_OPEN;
             else if (who.members && (mine || v->a->deaf <= LEASE_DEAF))
@@ -124,7 +130,9 @@ void lease_fill(swarm *s, int l, int64_t slot, extended_frame *e)
     e->probation = v.a->probation;
     e->leaving = own_turn && s->present[l] == PRESENT_LEAVING;
     v.a->leaving = (uint8_t)e->leaving;
-    e->c_s = s->lease.adoption && !v.a->probation && !e->leaving ? count_absent_before(&v, self, slot) : 0;
+    e->c_s = s->lease.adoption && !v.a->probation && !e->leaving
+                 ? count_absent_before(&v, self, slot)
+                 : 0;
     if (own_turn) issue(s, l, &v, slot, e);
     relay(&v, self, slot, e);
 }

@@ -5,8 +5,8 @@
 
 /* Smallest squared distance of agent k to agents k+1 .. n-1. */
 DTSA_SIMD
-static double nearest2(int count, const double *restrict x, const double *restrict y, const double *restrict z,
-                       double kx, double ky, double kz)
+static double nearest2(int count, const double *restrict x, const double *restrict y,
+                       const double *restrict z, double kx, double ky, double kz)
 {
     double lane[8];
     for (int i = 0; i < 8; i++) lane[i] = 1e300;
@@ -39,13 +39,15 @@ static int nearest_index(int from, int n, const double *x, const double *y, cons
     return best;
 }
 
-int metrics_distance(metrics *m, int n, int steps, int64_t slot, const double *track, double collision_m)
+int metrics_distance(metrics *m, int n, int steps, int64_t slot, const double *track,
+                     double collision_m)
 {
     int crashed = 0;
     for (int step = 0; step < steps; step++) {
         const double *x = track + (long)step * 3 * n, *y = x + n, *z = y + n;
         for (int k = 0; k < n - 1; k++) {
-            const double d2 = nearest2(n - k - 1, x + k + 1, y + k + 1, z + k + 1, x[k], y[k], z[k]);
+            const double d2 =
+                nearest2(n - k - 1, x + k + 1, y + k + 1, z + k + 1, x[k], y[k], z[k]);
             if (d2 < m->min_distance2) {
                 m->min_distance2 = d2;
                 m->pair[0] = k + 1;
@@ -66,11 +68,13 @@ int metrics_distance(metrics *m, int n, int steps, int64_t slot, const double *t
     return crashed;
 }
 
-int metrics_arrived(int n, const double *now, const double *target, const uint8_t *moving, double r_min)
+int metrics_arrived(int n, const double *now, const double *target, const uint8_t *moving,
+                    double r_min)
 {
     for (int k = 0; k < n; k++) {
         if (!moving[k]) continue;
-        const double dx = now[k] - target[k], dy = now[n + k] - target[n + k], dz = now[2 * n + k] - target[2 * n + k];
+        const double dx = now[k] - target[k], dy = now[n + k] - target[n + k],
+                     dz = now[2 * n + k] - target[2 * n + k];
         if (!(sqrt(dx * dx + dy * dy + dz * dz) <= r_min)) return 0;
     }
     return 1;
@@ -90,7 +94,8 @@ void metrics_news(metrics *m, swarm *s, int64_t slot, const double *truth, const
         for (int k = 0; k < n; k++) {
             if (!moving[k] || !ap[k] || k == observer || sent[k] < 0) continue;
             const int64_t age = slot - 1 - sent[k];
-            const double dx = p[k] - truth[k], dy = p[n + k] - truth[n + k], dz = p[2 * n + k] - truth[2 * n + k];
+            const double dx = p[k] - truth[k], dy = p[n + k] - truth[n + k],
+                         dz = p[2 * n + k] - truth[2 * n + k];
             const double error = sqrt(dx * dx + dy * dy + dz * dz);
             m->age_count += weight;
             m->age_sum += weight * age;

@@ -10,8 +10,7 @@
 enum { ARRAY_COUNT = 34 };
 
 typedef struct {
-    PyObject_HEAD
-    swarm s;
+    PyObject_HEAD swarm s;
     Py_buffer arrays[ARRAY_COUNT];
     int borrowed;
 } SwarmObject;
@@ -27,7 +26,8 @@ int step_arg(PyObject *object, double *step);
 PyObject *names_dict(void);
 
 /* A C-contiguous buffer of exactly `count` items of `itemsize` bytes; on failure sets an exception and returns -1. */
-int borrow(PyObject *object, const char *name, Py_ssize_t count, Py_ssize_t itemsize, int writable, Py_buffer *out);
+int borrow(PyObject *object, const char *name, Py_ssize_t count, Py_ssize_t itemsize, int writable,
+           Py_buffer *out);
 /* A slot's number; on failure sets an exception and returns -1. */
 int slot_arg(PyObject *object, int64_t *slot);
 

@@ -10,10 +10,12 @@ static PyObject *gossip_tuple(const extended_frame *e)
     PyObject *tuple = PyTuple_New(e->gossip_count);
     for (int i = 0; tuple && i < e->gossip_count; i++) {
         const gossip_entry *g = &e->gossip[i];
-        PyObject *item = Py_BuildValue("(iii(ddd)(ddd))", g->id, g->age, g->c_r, g->p[0], g->p[1], g->p[2], g->v[0], g->v[1],
-                                       g->v[2]);
-        if (!item) Py_CLEAR(tuple);
-        else PyTuple_SET_ITEM(tuple, i, item);
+        PyObject *item = Py_BuildValue("(iii(ddd)(ddd))", g->id, g->age, g->c_r, g->p[0], g->p[1],
+                                       g->p[2], g->v[0], g->v[1], g->v[2]);
+        if (!item)
+            Py_CLEAR(tuple);
+        else
+            PyTuple_SET_ITEM(tuple, i, item);
     }
     return tuple;
 }
@@ -37,16 +39,19 @@ static PyObject *py_decode_extended(PyObject *module, PyObject *const *args, Py_
     extended_frame e;
     (void)module;
     if (count != 2) return PyErr_Format(PyExc_TypeError, "decode_extended(data, position_step)");
-    if (step_arg(args[1], &step) < 0 || PyObject_GetBuffer(args[0], &data, PyBUF_SIMPLE) < 0) return NULL;
+    if (step_arg(args[1], &step) < 0 || PyObject_GetBuffer(args[0], &data, PyBUF_SIMPLE) < 0)
+        return NULL;
     const int status = extended_decode(data.buf, data.len, step, &e);
     PyBuffer_Release(&data);
     if (status != FRAME_OK) return PyLong_FromLong(status);
     const dtsa_frame *f = &e.own;
-    return Py_BuildValue("{s:i,s:I,s:i,s:(ddd),s:(ddd),s:(ddd),s:i,s:O,s:O,s:N,s:y#,s:N}", "sender", f->sender, "slot", f->slot,
-                         "c_r", f->c_r, "position", f->p[0], f->p[1], f->p[2], "velocity", f->v[0], f->v[1], f->v[2], "intent",
-                         f->c[0], f->c[1], f->c[2], "c_s", e.c_s, "leaving", e.leaving ? Py_True : Py_False, "probation",
-                         e.probation ? Py_True : Py_False, "gossip", gossip_tuple(&e), "leases", (const char *)e.leases,
-                         (Py_ssize_t)e.lease_count, "relay", relay_list(&e));
+    return Py_BuildValue("{s:i,s:I,s:i,s:(ddd),s:(ddd),s:(ddd),s:i,s:O,s:O,s:N,s:y#,s:N}", "sender",
+                         f->sender, "slot", f->slot, "c_r", f->c_r, "position", f->p[0], f->p[1],
+                         f->p[2], "velocity", f->v[0], f->v[1], f->v[2], "intent", f->c[0], f->c[1],
+                         f->c[2], "c_s", e.c_s, "leaving", e.leaving ? Py_True : Py_False,
+                         "probation", e.probation ? Py_True : Py_False, "gossip", gossip_tuple(&e),
+                         "leases", (const char *)e.leases, (Py_ssize_t)e.lease_count, "relay",
+                         relay_list(&e));
 }
 
 static int read_gossip(PyObject *tuple, extended_frame *e)
@@ -55,10 +60,11 @@ static int read_gossip(PyObject *tuple, extended_frame *e)
     if (count > SECTIONS) return -1;
     for (Py_ssize_t i = 0; i < count; i++) {
         gossip_entry *g = &e->gossip[i];
-        if (!PyArg_ParseTuple(PyTuple_GET_ITEM(tuple, i), "iii(ddd)(ddd)", &g->id, &g->age, &g->c_r, &g->p[0], &g->p[1], &g->p[2],
-                              &g->v[0], &g->v[1], &g->v[2]))
+        if (!PyArg_ParseTuple(PyTuple_GET_ITEM(tuple, i), "iii(ddd)(ddd)", &g->id, &g->age, &g->c_r,
+                              &g->p[0], &g->p[1], &g->p[2], &g->v[0], &g->v[1], &g->v[2]))
             return -1;
-        if (g->id < 1 || g->id > EXTENDED_SENDER_MAX || g->age < 1 || g->age > GOSSIP_AGE_MAX) return -1;
+        if (g->id < 1 || g->id > EXTENDED_SENDER_MAX || g->age < 1 || g->age > GOSSIP_AGE_MAX)
+            return -1;
         for (int axis = 0; axis < 3; axis++)
             if (g->p[axis] != g->p[axis] || g->v[axis] != g->v[axis]) return -1;
     }
@@ -92,13 +98,14 @@ static PyObject *py_encode_extended(PyObject *module, PyObject *args)
     double step;
     uint8_t out[FRAME_MAX];
     (void)module;
-    if (!PyArg_ParseTuple(args, "iIi(ddd)(ddd)(ddd)ippO!y#O!O", &f->sender, &f->slot, &f->c_r, &f->p[0], &f->p[1], &f->p[2],
-                          &f->v[0], &f->v[1], &f->v[2], &f->c[0], &f->c[1], &f->c[2], &e.c_s, &e.leaving, &e.probation,
-                          &PyTuple_Type, &gossip, &leases, &lease_count, &PyTuple_Type, &relay, &step_object) ||
+    if (!PyArg_ParseTuple(args, "iIi(ddd)(ddd)(ddd)ippO!y#O!O", &f->sender, &f->slot, &f->c_r,
+                          &f->p[0], &f->p[1], &f->p[2], &f->v[0], &f->v[1], &f->v[2], &f->c[0],
+                          &f->c[1], &f->c[2], &e.c_s, &e.leaving, &e.probation, &PyTuple_Type,
+                          &gossip, &leases, &lease_count, &PyTuple_Type, &relay, &step_object) ||
         step_arg(step_object, &step) < 0)
         return NULL;
-    const int bad = lease_count > SECTIONS * SECTION_BYTES || e.c_s < 0 || e.c_s > 253 || read_gossip(gossip, &e) < 0 ||
-                    read_relay(relay, &e) < 0;
+    const int bad = lease_count > SECTIONS * SECTION_BYTES || e.c_s < 0 || e.c_s > 253 ||
+                    read_gossip(gossip, &e) < 0 || read_relay(relay, &e) < 0;
     if (PyErr_Occurred()) return NULL;
     if (bad) return PyBytes_FromStringAndSize("", 0);
     memcpy(e.leases, leases, (size_t)lease_count);
@@ -120,6 +127,7 @@ PyMethodDef lease_methods[] = {
     {"decode_extended", (PyCFunction)(void (*)(void))py_decode_extended, METH_FASTCALL,
      "decode_extended(data, position_step) -> dict, or a negative error"},
     {"encode_extended", py_encode_extended, METH_VARARGS,
-     "encode_extended(sender, slot, c_r, p, v, c, c_s, leaving, probation, gossip, leases, relay, position_step) -> bytes, empty if not encodable"},
+     "encode_extended(sender, slot, c_r, p, v, c, c_s, leaving, probation, gossip, leases, relay, "
+     "position_step) -> bytes, empty if not encodable"},
     {NULL, NULL, 0, NULL},
 };

@@ -4,8 +4,7 @@
 #include <string.h>
 
 typedef struct {
-    PyObject_HEAD
-    metrics m;
+    PyObject_HEAD metrics m;
     int n;
     int64_t news_from;
     double collision_m, r_min;
@@ -18,8 +17,8 @@ static int metrics_init(MetricsObject *self, PyObject *args, PyObject *kwargs)
     static char *names[] = {"start", "target", "moving", "news_from", "collision_m", "r_min", NULL};
     PyObject *start, *target, *moving;
     long long from = 0;
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOLdd", names, &start, &target, &moving, &from, &self->collision_m,
-                                     &self->r_min))
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOLdd", names, &start, &target, &moving, &from,
+                                     &self->collision_m, &self->r_min))
         return -1;
     Py_buffer view;
     if (self->moving) {
@@ -73,12 +72,16 @@ static PyObject *metrics_update(MetricsObject *self, PyObject *const *args, Py_s
     }
     const int steps = (int)(track.len / plane);
     const double *now = (const double *)track.buf + (long)(steps - 1) * 3 * self->n;
-    int state = metrics_distance(&self->m, self->n, steps, slot, track.buf, self->collision_m) ? METRICS_CRASHED : 0;
-    if (metrics_arrived(self->n, now, self->target, self->moving, self->r_min)) state |= METRICS_ARRIVED;
+    int state = metrics_distance(&self->m, self->n, steps, slot, track.buf, self->collision_m)
+                    ? METRICS_CRASHED
+                    : 0;
+    if (metrics_arrived(self->n, now, self->target, self->moving, self->r_min))
+        state |= METRICS_ARRIVED;
     if (args[2] != Py_None && slot >= self->news_from) {
         if (!PyObject_TypeCheck(args[2], &SwarmType) || ((SwarmObject *)args[2])->s.n != self->n) {
             PyBuffer_Release(&track);
-            return PyErr_Format(PyExc_TypeError, "tables: allowed: a Swarm of %d agents, or None", self->n);
+            return PyErr_Format(PyExc_TypeError, "tables: allowed: a Swarm of %d agents, or None",
+                                self->n);
         }
         metrics_news(&self->m, &((SwarmObject *)args[2])->s, slot, now, self->moving);
     }
@@ -93,10 +96,11 @@ static PyObject *metrics_result(MetricsObject *self, PyObject *unused)
     PyObject *path = PyList_New(self->n);
     if (!path) return NULL;
     for (int k = 0; k < self->n; k++) PyList_SET_ITEM(path, k, PyFloat_FromDouble(m->path[k]));
-    return Py_BuildValue("{s:d,s:(ii),s:L,s:N,s:L,s:L,s:L,s:d,s:d}", "min_distance2", m->min_distance2, "pair", m->pair[0],
-                         m->pair[1], "min_slot", (long long)m->min_slot, "path", path, "age_count", (long long)m->age_count,
-                         "age_sum", (long long)m->age_sum, "age_max", (long long)m->age_max, "error_sum", m->error_sum,
-                         "error_max", m->error_max);
+    return Py_BuildValue("{s:d,s:(ii),s:L,s:N,s:L,s:L,s:L,s:d,s:d}", "min_distance2",
+                         m->min_distance2, "pair", m->pair[0], m->pair[1], "min_slot",
+                         (long long)m->min_slot, "path", path, "age_count", (long long)m->age_count,
+                         "age_sum", (long long)m->age_sum, "age_max", (long long)m->age_max,
+                         "error_sum", m->error_sum, "error_max", m->error_max);
 }
 
 static PyObject *metrics_drop(MetricsObject *self, PyObject *arg)
@@ -109,7 +113,8 @@ static PyObject *metrics_drop(MetricsObject *self, PyObject *arg)
 }
 
 static PyMethodDef METRICS_METHODS[] = {
-    {"update", (PyCFunction)(void (*)(void))metrics_update, METH_FASTCALL, "update(slot, track, tables) -> METRICS_CRASHED, METRICS_ARRIVED or both"},
+    {"update", (PyCFunction)(void (*)(void))metrics_update, METH_FASTCALL,
+     "update(slot, track, tables) -> METRICS_CRASHED, METRICS_ARRIVED or both"},
     {"drop", (PyCFunction)metrics_drop, METH_O, "drop(index): a mover that is lost counts no more"},
     {"result", (PyCFunction)metrics_result, METH_NOARGS, "result() -> the sums so far"},
     {NULL, NULL, 0, NULL},
@@ -119,7 +124,8 @@ PyTypeObject MetricsType = {
     PyVarObject_HEAD_INIT(NULL, 0).tp_name = "dtsa_agent.core._kernel.Metrics",
     .tp_basicsize = sizeof(MetricsObject),
     .tp_flags = Py_TPFLAGS_DEFAULT,
-    .tp_doc = "Metrics(start, target, moving, news_from, collision_m, r_min): sums over one flight.",
+    .tp_doc =
+        "Metrics(start, target, moving, news_from, collision_m, r_min): sums over one flight.",
     .tp_new = PyType_GenericNew,
     .tp_init = (initproc)metrics_init,
     .tp_dealloc = (destructor)metrics_dealloc,

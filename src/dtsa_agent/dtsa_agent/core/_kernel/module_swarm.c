@@ -36,35 +36,48 @@ typedef struct {
     const char *name;
     size_t offset;
     Py_ssize_t itemsize;
-    char shape;     /* what the count is made of, see array_count */
+    char shape; /* what the count is made of, see array_count */
 } array_spec;
 
 #define FIELD(name, size, shape) {#name, offsetof(swarm, name), size, shape}
 static const array_spec ARRAYS[] = {
-    FIELD(local, 4, 'l'), FIELD(observer, 4, 'v'), FIELD(start, 8, 'N'), FIELD(target, 8, 'N'),
-    FIELD(sent_p, 8, 'T'), FIELD(sent_v, 8, 'T'), FIELD(sent_c, 8, 'T'), FIELD(sent_slot, 8, 't'), FIELD(last, 8, 't'),
-    FIELD(in_ap, 1, 't'), FIELD(entry_hash, 4, 't'), FIELD(view_hash, 4, 'v'), FIELD(est_p, 8, 'T'), FIELD(est_v, 8, 'T'),
-    FIELD(g, 8, 't'), FIELD(h, 8, 't'), FIELD(pos, 8, 'L'), FIELD(vel, 8, 'L'), FIELD(cmd, 8, 'L'), FIELD(goal, 8, 'L'),
-    FIELD(track, 8, 'S'), FIELD(active, 1, 'l'), FIELD(final, 1, 'l'), FIELD(present, 1, 'l'),
-    FIELD(chosen, 2, 'l'), FIELD(reason, 1, 'l'),
-    FIELD(digest, 4, 'l'), FIELD(score, 8, 'l'), FIELD(sends, 1, 'l'), FIELD(frame_len, 1, 'l'), FIELD(frames, 1, 'F'),
-    FIELD(decay, 8, 'd'), FIELD(lease_state, 1, 'e'),
+    FIELD(local, 4, 'l'),  FIELD(observer, 4, 'v'),   FIELD(start, 8, 'N'),
+    FIELD(target, 8, 'N'), FIELD(sent_p, 8, 'T'),     FIELD(sent_v, 8, 'T'),
+    FIELD(sent_c, 8, 'T'), FIELD(sent_slot, 8, 't'),  FIELD(last, 8, 't'),
+    FIELD(in_ap, 1, 't'),  FIELD(entry_hash, 4, 't'), FIELD(view_hash, 4, 'v'),
+    FIELD(est_p, 8, 'T'),  FIELD(est_v, 8, 'T'),      FIELD(g, 8, 't'),
+    FIELD(h, 8, 't'),      FIELD(pos, 8, 'L'),        FIELD(vel, 8, 'L'),
+    FIELD(cmd, 8, 'L'),    FIELD(goal, 8, 'L'),       FIELD(track, 8, 'S'),
+    FIELD(active, 1, 'l'), FIELD(final, 1, 'l'),      FIELD(present, 1, 'l'),
+    FIELD(chosen, 2, 'l'), FIELD(reason, 1, 'l'),     FIELD(digest, 4, 'l'),
+    FIELD(score, 8, 'l'),  FIELD(sends, 1, 'l'),      FIELD(frame_len, 1, 'l'),
+    FIELD(frames, 1, 'F'), FIELD(decay, 8, 'd'),      FIELD(lease_state, 1, 'e'),
 };
 
 static Py_ssize_t array_count(const swarm *s, char shape)
 {
     const Py_ssize_t n = s->n, l = s->local_count, v = s->view_count;
     switch (shape) {
-    case 'l': return l;
-    case 'v': return v;
-    case 'N': return 3 * n;
-    case 'T': return 3 * n * v;
-    case 't': return n * v;
-    case 'L': return 3 * l;
-    case 'S': return 3 * l * s->steps;
-    case 'F': return l * FRAME_MAX;
-    case 'd': return 2 * (Py_ssize_t)s->decay_len;
-    default: return s->policy == POLICY_LEASE ? l * lease_state_bytes(s->n, s->lease.anchor_every) : 0;
+    case 'l':
+        return l;
+    case 'v':
+        return v;
+    case 'N':
+        return 3 * n;
+    case 'T':
+        return 3 * n * v;
+    case 't':
+        return n * v;
+    case 'L':
+        return 3 * l;
+    case 'S':
+        return 3 * l * s->steps;
+    case 'F':
+        return l * FRAME_MAX;
+    case 'd':
+        return 2 * (Py_ssize_t)s->decay_len;
+    default:
+        return s->policy == POLICY_LEASE ? l * lease_state_bytes(s->n, s->lease.anchor_every) : 0;
     }
 }
 
@@ -155,7 +168,8 @@ static int swarm_init(SwarmObject *self, PyObject *args, PyObject *kwargs)
             PyErr_Format(PyExc_KeyError, "array %s is missing", ARRAYS[i].name);
             return -1;
         }
-        if (borrow(object, ARRAYS[i].name, array_count(s, ARRAYS[i].shape), ARRAYS[i].itemsize, 1, &self->arrays[i]) < 0)
+        if (borrow(object, ARRAYS[i].name, array_count(s, ARRAYS[i].shape), ARRAYS[i].itemsize, 1,
+                   &self->arrays[i]) < 0)
             return -1;
         self->borrowed = (int)i + 1;
         *(void **)((char *)s + ARRAYS[i].offset) = self->arrays[i].buf;
@@ -168,7 +182,8 @@ static int swarm_init(SwarmObject *self, PyObject *args, PyObject *kwargs)
         PyErr_SetString(PyExc_ValueError, "policy lease: every agent needs a table of its own");
         return -1;
     }
-    const size_t avoid = (size_t)avoid_scratch_doubles(s->n), table = (size_t)(6 * s->n + priority_scratch_doubles(s->n));
+    const size_t avoid = (size_t)avoid_scratch_doubles(s->n),
+                 table = (size_t)(6 * s->n + priority_scratch_doubles(s->n));
     s->scratch = PyMem_Calloc(avoid > table ? avoid : table, sizeof(double));
     s->ages = PyMem_Calloc((size_t)s->n, sizeof(double));
     s->own = PyMem_Calloc((size_t)s->local_count + 1, sizeof(dtsa_frame));
@@ -193,7 +208,8 @@ static PyObject *senders_tuple(const swarm *s)
 {
     PyObject *tuple = PyTuple_New(s->sender_count);
     if (!tuple) return NULL;
-    for (int i = 0; i < s->sender_count; i++) PyTuple_SET_ITEM(tuple, i, PyLong_FromLong(s->senders[i]));
+    for (int i = 0; i < s->sender_count; i++)
+        PyTuple_SET_ITEM(tuple, i, PyLong_FromLong(s->senders[i]));
     return tuple;
 }
 
@@ -243,7 +259,8 @@ static PyObject *py_steer(SwarmObject *self, PyObject *const *args, Py_ssize_t c
 {
     int64_t slot;
     int step, estimate = 1;
-    if (count < 2 || count > 3) return PyErr_Format(PyExc_TypeError, "steer(slot, step, estimate=True)");
+    if (count < 2 || count > 3)
+        return PyErr_Format(PyExc_TypeError, "steer(slot, step, estimate=True)");
     if (slot_arg(args[0], &slot) < 0 || step_of(&self->s, args[1], &step) < 0) return NULL;
     if (count == 3 && (estimate = PyObject_IsTrue(args[2])) < 0) return NULL;
     swarm_steer(&self->s, slot, step, estimate);
@@ -254,7 +271,9 @@ static PyObject *py_move(SwarmObject *self, PyObject *arg)
 {
     int step;
     if (step_of(&self->s, arg, &step) < 0) return NULL;
-    if (step >= self->s.steps) return PyErr_Format(PyExc_ValueError, "step: got %d; allowed: 0 .. %d", step, self->s.steps - 1);
+    if (step >= self->s.steps)
+        return PyErr_Format(PyExc_ValueError, "step: got %d; allowed: 0 .. %d", step,
+                            self->s.steps - 1);
     swarm_move(&self->s, step);
     Py_RETURN_NONE;
 }
@@ -264,8 +283,10 @@ static PyObject *py_estimate(SwarmObject *self, PyObject *const *args, Py_ssize_
     int64_t slot;
     int step = 0;
     if (count < 1 || count > 2) return PyErr_Format(PyExc_TypeError, "estimate(slot, step=0)");
-    if (slot_arg(args[0], &slot) < 0 || (count == 2 && step_of(&self->s, args[1], &step) < 0)) return NULL;
-    for (int view = 0; view < self->s.view_count; view++) swarm_estimate(&self->s, view, slot, step);
+    if (slot_arg(args[0], &slot) < 0 || (count == 2 && step_of(&self->s, args[1], &step) < 0))
+        return NULL;
+    for (int view = 0; view < self->s.view_count; view++)
+        swarm_estimate(&self->s, view, slot, step);
     Py_RETURN_NONE;
 }
 
@@ -294,16 +315,21 @@ static PyObject *py_frame(SwarmObject *self, PyObject *arg)
 {
     const long l = PyLong_AsLong(arg);
     if (l == -1 && PyErr_Occurred()) return NULL;
-    if (l < 0 || l >= self->s.local_count) return PyErr_Format(PyExc_IndexError, "no local agent %ld", l);
-    return PyBytes_FromStringAndSize((const char *)self->s.frames + l * FRAME_MAX, self->s.frame_len[l]);
+    if (l < 0 || l >= self->s.local_count)
+        return PyErr_Format(PyExc_IndexError, "no local agent %ld", l);
+    return PyBytes_FromStringAndSize((const char *)self->s.frames + l * FRAME_MAX,
+                                     self->s.frame_len[l]);
 }
 
 static PyObject *py_restart(SwarmObject *self, PyObject *arg)
 {
     const long l = PyLong_AsLong(arg);
     if (l == -1 && PyErr_Occurred()) return NULL;
-    if (l < 0 || l >= self->s.local_count) return PyErr_Format(PyExc_IndexError, "no local agent %ld", l);
-    if (self->s.shared) return PyErr_Format(PyExc_ValueError, "restart: agents that share a table cannot restart alone");
+    if (l < 0 || l >= self->s.local_count)
+        return PyErr_Format(PyExc_IndexError, "no local agent %ld", l);
+    if (self->s.shared)
+        return PyErr_Format(PyExc_ValueError,
+                            "restart: agents that share a table cannot restart alone");
     swarm_reset_view(&self->s, (int)l);
     if (self->s.policy == POLICY_LEASE) lease_restart(&self->s, (int)l);
     Py_RETURN_NONE;
@@ -313,8 +339,10 @@ static PyObject *py_lease_status(SwarmObject *self, PyObject *arg)
 {
     const long l = PyLong_AsLong(arg);
     if (l == -1 && PyErr_Occurred()) return NULL;
-    if (l < 0 || l >= self->s.local_count) return PyErr_Format(PyExc_IndexError, "no local agent %ld", l);
-    if (self->s.policy != POLICY_LEASE) return PyErr_Format(PyExc_ValueError, "lease_status: the policy is not lease");
+    if (l < 0 || l >= self->s.local_count)
+        return PyErr_Format(PyExc_IndexError, "no local agent %ld", l);
+    if (self->s.policy != POLICY_LEASE)
+        return PyErr_Format(PyExc_ValueError, "lease_status: the policy is not lease");
     const lease_view v = lease_of(&self->s, (int)l);
     int alive = 1, absent = 0;
     for (int k = 0; k < v.n; k++) {
@@ -322,9 +350,10 @@ static PyObject *py_lease_status(SwarmObject *self, PyObject *arg)
         alive += lease_alive(&v, k, v.a->now);
         absent += lease_absent(&v, k, v.a->now);
     }
-    return Py_BuildValue("{s:O,s:O,s:L,s:i,s:i,s:i}", "probation", v.a->probation ? Py_True : Py_False, "deaf",
-                         v.a->deaf > LEASE_DEAF ? Py_True : Py_False, "woke", (long long)v.a->woke, "alive", alive, "absent",
-                         absent, "silent_slots", v.a->deaf);
+    return Py_BuildValue("{s:O,s:O,s:L,s:i,s:i,s:i}", "probation",
+                         v.a->probation ? Py_True : Py_False, "deaf",
+                         v.a->deaf > LEASE_DEAF ? Py_True : Py_False, "woke", (long long)v.a->woke,
+                         "alive", alive, "absent", absent, "silent_slots", v.a->deaf);
 }
 
 static PyObject *py_reset(SwarmObject *self, PyObject *unused)
@@ -347,18 +376,26 @@ static PyObject *get_foreign(SwarmObject *self, void *closure)
 }
 
 static PyMethodDef SWARM_METHODS[] = {
-    {"decide", (PyCFunction)py_decide, METH_O, "decide(slot): fills chosen, reason, score, digest, sends"},
-    {"emit", (PyCFunction)py_emit, METH_O, "emit(slot) -> local indices of all that send; encodes their frames"},
+    {"decide", (PyCFunction)py_decide, METH_O,
+     "decide(slot): fills chosen, reason, score, digest, sends"},
+    {"emit", (PyCFunction)py_emit, METH_O,
+     "emit(slot) -> local indices of all that send; encodes their frames"},
     {"begin", (PyCFunction)py_begin, METH_O, "begin(slot): decide and emit"},
     {"fly", (PyCFunction)py_fly, METH_O, "fly(slot): commands and motion during a slot"},
-    {"steer", (PyCFunction)(void (*)(void))py_steer, METH_FASTCALL, "steer(slot, step, estimate=True): commands at one instant"},
+    {"steer", (PyCFunction)(void (*)(void))py_steer, METH_FASTCALL,
+     "steer(slot, step, estimate=True): commands at one instant"},
     {"move", (PyCFunction)py_move, METH_O, "move(step): motion over one control period"},
-    {"estimate", (PyCFunction)(void (*)(void))py_estimate, METH_FASTCALL, "estimate(slot, step=0): fills the estimates"},
-    {"hear", (PyCFunction)(void (*)(void))py_hear, METH_FASTCALL, "hear(slot, data, mask=None) -> accepted"},
+    {"estimate", (PyCFunction)(void (*)(void))py_estimate, METH_FASTCALL,
+     "estimate(slot, step=0): fills the estimates"},
+    {"hear", (PyCFunction)(void (*)(void))py_hear, METH_FASTCALL,
+     "hear(slot, data, mask=None) -> accepted"},
     {"end", (PyCFunction)py_end, METH_O, "end(slot): counters and silence"},
-    {"frame", (PyCFunction)py_frame, METH_O, "frame(index) -> bytes of a local agent's frame in this slot"},
-    {"restart", (PyCFunction)py_restart, METH_O, "restart(index): a local agent forgets everything but its settings"},
-    {"lease_status", (PyCFunction)py_lease_status, METH_O, "lease_status(index) -> dict, policy lease"},
+    {"frame", (PyCFunction)py_frame, METH_O,
+     "frame(index) -> bytes of a local agent's frame in this slot"},
+    {"restart", (PyCFunction)py_restart, METH_O,
+     "restart(index): a local agent forgets everything but its settings"},
+    {"lease_status", (PyCFunction)py_lease_status, METH_O,
+     "lease_status(index) -> dict, policy lease"},
     {"reset", (PyCFunction)py_reset, METH_NOARGS, "reset(): back to the start"},
     {NULL, NULL, 0, NULL},
 };

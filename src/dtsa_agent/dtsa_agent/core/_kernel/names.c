@@ -67,12 +67,8 @@ static const struct {
     const char *const *names;
     int count;
 } LISTS[] = {
-    LIST("policies", POLICIES),
-    LIST("estimators", ESTIMATORS),
-    LIST("avoiders", AVOIDERS),
-    LIST("selections", SELECTIONS),
-    LIST("profiles", PROFILES),
-    LIST("reasons", REASONS),
+    LIST("policies", POLICIES),     LIST("estimators", ESTIMATORS), LIST("avoiders", AVOIDERS),
+    LIST("selections", SELECTIONS), LIST("profiles", PROFILES),     LIST("reasons", REASONS),
 };
 
 PyObject *names_dict(void)

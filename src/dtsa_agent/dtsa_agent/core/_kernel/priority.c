@@ -36,8 +36,8 @@ static inline double arcsin_series(double z)
 DTSA_SIMD
 static void eta_row(int count, double slot_s, const double *restrict px, const double *restrict py,
                     const double *restrict pz, const double *restrict vx, const double *restrict vy,
-                    const double *restrict vz, double kpx, double kpy, double kpz, double kvx, double kvy, double kvz,
-                    double *restrict eta)
+                    const double *restrict vz, double kpx, double kpy, double kpz, double kvx,
+                    double kvy, double kvz, double *restrict eta)
 {
     for (int j = 0; j < count; j++) {
         const double dx = kpx - px[j], dy = kpy - py[j], dz = kpz - pz[j];
@@ -45,7 +45,8 @@ static void eta_row(int count, double slot_s, const double *restrict px, const d
         const double d2 = dx * dx + dy * dy + dz * dz;
         const double w2 = wx * wx + wy * wy + wz * wz;
         const double product = sqrt(d2 * w2);
-        const int none = !(product > 0.0);    /* v_jk = 0: eta = 0; p_kj = 0: crashed, the run is over */
+        const int none =
+            !(product > 0.0); /* v_jk = 0: eta = 0; p_kj = 0: crashed, the run is over */
         const double inverse = 1.0 / (none ? 1.0 : product);
         double x = (wx * dx + wy * dy + wz * dz) * inverse;
         x = x > 1.0 ? 1.0 : x;
@@ -83,15 +84,16 @@ static double sum_row(int count, const double *eta)
     return (s0 + s1) + (s2 + s3);
 }
 
-void priority_values(int n, double slot_s, const double *p, const double *v, double *g, double *scratch)
+void priority_values(int n, double slot_s, const double *p, const double *v, double *g,
+                     double *scratch)
 {
     double *eta = scratch;
     const double *px = p, *py = p + n, *pz = p + 2 * n, *vx = v, *vy = v + n, *vz = v + 2 * n;
     for (int k = 0; k < n; k++) g[k] = 0.0;
     for (int k = 0; k < n - 1; k++) {
         const int from = k + 1, count = n - from;
-        eta_row(count, slot_s, px + from, py + from, pz + from, vx + from, vy + from, vz + from, px[k], py[k], pz[k],
-                vx[k], vy[k], vz[k], eta);
+        eta_row(count, slot_s, px + from, py + from, pz + from, vx + from, vy + from, vz + from,
+                px[k], py[k], pz[k], vx[k], vy[k], vz[k], eta);
         add_row(count, eta, g + from);
         g[k] += sum_row(count, eta);
     }
@@ -109,7 +111,8 @@ static int oldest(int n, const int64_t *h, const uint8_t *set)
 }
 
 /* The selection function read literally: one scan that keeps the significantly greater of two. */
-static int select_pairwise(int n, double epsilon, const double *g, const int64_t *h, const uint8_t *in_ap, int *reason)
+static int select_pairwise(int n, double epsilon, const double *g, const int64_t *h,
+                           const uint8_t *in_ap, int *reason)
 {
     int best = -1;
     *reason = REASON_PRIORITY;
@@ -121,7 +124,7 @@ static int select_pairwise(int n, double epsilon, const double *g, const int64_t
         }
         const double top = g[k] > g[best] ? g[k] : g[best];
         const double gap = g[k] > g[best] ? g[k] - g[best] : g[best] - g[k];
-        if (top > 0.0 && gap / top > epsilon) {            /* eq:pfs: significantly different */
+        if (top > 0.0 && gap / top > epsilon) { /* eq:pfs: significantly different */
             if (g[k] > g[best]) best = k, *reason = REASON_PRIORITY;
         } else {
             *reason = REASON_TIE;
@@ -131,8 +134,8 @@ static int select_pairwise(int n, double epsilon, const double *g, const int64_t
     return best;
 }
 
-int select_sender(int n, int selection, double epsilon, const double *g, const int64_t *h, const uint8_t *in_ap,
-                  uint8_t *candidates, int *reason)
+int select_sender(int n, int selection, double epsilon, const double *g, const int64_t *h,
+                  const uint8_t *in_ap, uint8_t *candidates, int *reason)
 {
     double top = 0.0;
     int any = 0;

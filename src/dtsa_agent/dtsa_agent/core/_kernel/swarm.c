@@ -37,7 +37,8 @@ static void rehash(swarm *s, int view, int k)
         x = mix64(x ^ bits(s->sent_p[plane + (long)i * s->n]));
         x = mix64(x ^ bits(s->sent_v[plane + (long)i * s->n]));
     }
-    const uint32_t hash = (uint32_t)(x ^ x >> 32); /* players of bags refuse numbers that a double cannot hold */
+    const uint32_t hash =
+        (uint32_t)(x ^ x >> 32); /* players of bags refuse numbers that a double cannot hold */
     s->view_hash[view] ^= s->entry_hash[at] ^ hash;
     s->entry_hash[at] = hash;
 }
@@ -69,7 +70,8 @@ void swarm_reset_tables(swarm *s)
             s->pos[i * s->local_count + l] = p;
             s->vel[i * s->local_count + l] = s->cmd[i * s->local_count + l] = 0.0;
             s->goal[i * s->local_count + l] = s->target[i * n + s->local[l]];
-            for (int step = 0; step < s->steps; step++) s->track[(step * 3 + i) * s->local_count + l] = p;
+            for (int step = 0; step < s->steps; step++)
+                s->track[(step * 3 + i) * s->local_count + l] = p;
         }
         s->active[l] = s->present[l] = 1;
         s->frame_len[l] = s->sends[l] = 0;
@@ -83,20 +85,22 @@ void swarm_reset_tables(swarm *s)
 /* ---- estimation (eq:estimate) ---- */
 
 DTSA_SIMD
-static void extrapolate(int n, const double *restrict p, const double *restrict v, const double *restrict age,
-                        double *restrict out)
+static void extrapolate(int n, const double *restrict p, const double *restrict v,
+                        const double *restrict age, double *restrict out)
 {
     for (int k = 0; k < n; k++) out[k] = p[k] + v[k] * age[k];
 }
 
-static void estimate_into(const swarm *s, int view, int kind, int64_t slot, int step, double *p, double *v)
+static void estimate_into(const swarm *s, int view, int kind, int64_t slot, int step, double *p,
+                          double *v)
 {
     const int n = s->n;
     const long plane = (long)view * 3 * n;
     const int64_t *sent = s->sent_slot + (long)view * n;
     double *age = s->ages;
     const double offset = step * s->dt;
-    for (int k = 0; k < n; k++) age[k] = sent[k] < 0 ? 0.0 : (double)(slot - sent[k]) * s->slot_s + offset;
+    for (int k = 0; k < n; k++)
+        age[k] = sent[k] < 0 ? 0.0 : (double)(slot - sent[k]) * s->slot_s + offset;
     if (kind == ESTIMATE_INTENT) {
         for (int k = 0; k < n; k++) {
             const int64_t ago = sent[k] < 0 ? 0 : (slot - sent[k]) * s->steps + step;
@@ -140,7 +144,7 @@ void swarm_estimate(swarm *s, int view, int64_t slot, int step)
 /* ---- decisions ---- */
 
 typedef struct {
-    int index;      /* 0-based, -1: nobody */
+    int index; /* 0-based, -1: nobody */
     int reason;
     double score;
 } choice;
@@ -166,7 +170,8 @@ static choice choose(swarm *s, int view, int64_t slot)
     const int64_t *last = s->last + (long)view * n;
     int64_t *h = s->h + (long)view * n;
     if (s->policy == POLICY_TDMA) return (choice){(int)(slot % n), REASON_TDMA, 0.0};
-    if (s->policy == POLICY_DTSA && s->boot_round && slot < n) return (choice){(int)slot, REASON_BOOT, 0.0};
+    if (s->policy == POLICY_DTSA && s->boot_round && slot < n)
+        return (choice){(int)slot, REASON_BOOT, 0.0};
     const choice back = choose_outside(s, slot, in_ap);
     if (back.index >= 0) return back;
 
@@ -178,7 +183,8 @@ static choice choose(swarm *s, int view, int64_t slot)
     }
     if (!members) return (choice){-1, REASON_NOBODY, 0.0};
     if (s->policy == POLICY_AGE) return (choice){oldest, REASON_OLDEST, 0.0};
-    if (s->age_cap > 0.0 && (double)h[oldest] >= s->age_cap * members) return (choice){oldest, REASON_AGE_CAP, 0.0};
+    if (s->age_cap > 0.0 && (double)h[oldest] >= s->age_cap * members)
+        return (choice){oldest, REASON_AGE_CAP, 0.0};
 
     double *p = s->scratch, *v = p + 3 * n, *g = s->g + (long)view * n;
     const int kind = s->estimator == ESTIMATE_INTENT ? ESTIMATE_INTENT : ESTIMATE_LINEAR;
@@ -199,7 +205,8 @@ static choice choose_aloha(const swarm *s, int view, int64_t slot, int self)
     int members = 0;
     for (int k = 0; k < s->n; k++) members += in_ap[k];
     const uint64_t draw = mix64(s->key ^ mix64((uint64_t)slot * 65536u + (uint64_t)self + 1)) >> 11;
-    if (in_ap[self] && (double)draw * 0x1p-53 * members < 1.0) return (choice){self, REASON_RANDOM, 0.0};
+    if (in_ap[self] && (double)draw * 0x1p-53 * members < 1.0)
+        return (choice){self, REASON_RANDOM, 0.0};
     return (choice){-1, REASON_RANDOM, 0.0};
 }
 
@@ -232,7 +239,7 @@ int swarm_far_from_goal(const swarm *s, int l)
         const double d = s->goal[i * s->local_count + l] - s->pos[i * s->local_count + l];
         e2 += d * d;
     }
-    return sqrt(e2) > s->r_min;     /* eq:remaining_t_slots */
+    return sqrt(e2) > s->r_min; /* eq:remaining_t_slots */
 }
 
 void swarm_emit(swarm *s, int64_t slot)
@@ -252,8 +259,9 @@ void swarm_emit(swarm *s, int64_t slot)
             f->c[i] = s->cmd[i * s->local_count + l];
         }
         uint8_t *out = s->frames + (long)l * FRAME_MAX;
-        s->frame_len[l] = (uint8_t)(s->profile == PROFILE_EXTENDED ? extended_emit(s, l, slot, f, out)
-                                                                          : frame_encode(f, s->position_step, out));
+        s->frame_len[l] =
+            (uint8_t)(s->profile == PROFILE_EXTENDED ? extended_emit(s, l, slot, f, out)
+                                                     : frame_encode(f, s->position_step, out));
         if (s->frame_len[l]) s->senders[s->sender_count++] = l;
     }
 }
@@ -265,7 +273,7 @@ void swarm_learn(swarm *s, int view, const dtsa_frame *f, int64_t sampled)
 {
     const int n = s->n, k = f->sender - 1;
     const long at = (long)view * n + k, plane = (long)view * 3 * n + k;
-    const int rests = f->c_r == 0;      /* out of A_p: it stands at its target, where all know that */
+    const int rests = f->c_r == 0; /* out of A_p: it stands at its target, where all know that */
     for (int i = 0; i < 3; i++) {
         const long e = plane + (long)i * n;
         s->sent_p[e] = rests && s->targets_known ? s->target[i * n + k] : f->p[i];
@@ -282,12 +290,13 @@ int swarm_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const u
 {
     if (s->profile == PROFILE_EXTENDED) return extended_hear(s, slot, data, length, mask);
     dtsa_frame f;
-    if (frame_decode(data, length, s->position_step, &f) != FRAME_OK || f.profile == PROFILE_EXTENDED) {
+    if (frame_decode(data, length, s->position_step, &f) != FRAME_OK ||
+        f.profile == PROFILE_EXTENDED) {
         s->malformed++;
         return 0;
     }
     const uint32_t late = (uint32_t)slot - f.slot;
-    if (f.sender > s->n || late > 1) {      /* an unknown agent, or a frame of another time (a replay) */
+    if (f.sender > s->n || late > 1) { /* an unknown agent, or a frame of another time (a replay) */
         s->foreign++;
         return 0;
     }
@@ -306,7 +315,8 @@ void swarm_end(swarm *s, int64_t slot)
         const int l = s->senders[i], view = view_of(s, l);
         dtsa_frame f;
         if (s->sent_slot[(long)view * s->n + s->local[l]] == slot) continue;
-        if (frame_decode(s->frames + (long)l * FRAME_MAX, s->frame_len[l], s->position_step, &f) == FRAME_OK)
+        if (frame_decode(s->frames + (long)l * FRAME_MAX, s->frame_len[l], s->position_step, &f) ==
+            FRAME_OK)
             swarm_learn(s, view, &f, slot);
     }
     if (s->policy == POLICY_LEASE) {
@@ -319,7 +329,7 @@ void swarm_end(swarm *s, int64_t slot)
         if (k < 0) continue;
         const long at = (long)l * s->n + k;
         if (s->last[at] < slot) {
-            s->last[at] = slot;     /* eq:secondary */
+            s->last[at] = slot; /* eq:secondary */
             rehash(s, l, k);
         }
     }
@@ -344,14 +354,15 @@ void swarm_steer(swarm *s, int64_t slot, int step, int estimate)
         if (aged) {
             const int64_t *sent = s->sent_slot + (long)view * n;
             for (int k = 0; k < n; k++)
-                s->ages[k] = sent[k] < 0 ? 0.0 : (double)(slot - sent[k]) * s->slot_s + step * s->dt;
+                s->ages[k] =
+                    sent[k] < 0 ? 0.0 : (double)(slot - sent[k]) * s->slot_s + step * s->dt;
         }
         const double position[3] = {s->pos[l], s->pos[count + l], s->pos[2 * count + l]};
         const double velocity[3] = {s->vel[l], s->vel[count + l], s->vel[2 * count + l]};
         const double goal[3] = {s->goal[l], s->goal[count + l], s->goal[2 * count + l]};
         double command[3];
-        avoid_command(s->avoider, &s->avoid, n, s->local[l], position, velocity, goal, p, v, aged ? s->ages : 0,
-                      s->scratch, command);
+        avoid_command(s->avoider, &s->avoid, n, s->local[l], position, velocity, goal, p, v,
+                      aged ? s->ages : 0, s->scratch, command);
         c[0] = command[0];
         c[count] = command[1];
         c[2 * count] = command[2];
@@ -362,7 +373,8 @@ void swarm_move(swarm *s, int step)
 {
     const int count = s->local_count;
     for (int l = 0; l < count; l++)
-        if (s->present[l] && (s->active[l] || s->vel[l] != 0.0 || s->vel[count + l] != 0.0 || s->vel[2 * count + l] != 0.0))
+        if (s->present[l] && (s->active[l] || s->vel[l] != 0.0 || s->vel[count + l] != 0.0 ||
+                              s->vel[2 * count + l] != 0.0))
             vehicle_step(&s->vehicle, s->dt, s->pos + l, s->vel + l, s->cmd + l, count);
     memcpy(s->track + (long)step * 3 * count, s->pos, sizeof(double) * 3 * (size_t)count);
 }

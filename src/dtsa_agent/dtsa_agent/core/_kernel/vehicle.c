@@ -3,8 +3,8 @@
 #include <math.h>
 
 /* One axis triple. Every operation is rounded by itself (no contraction), so the scalar and the vectorised loop agree. */
-static inline void step_one(double tau, double a_max, double dt, double *px, double *py, double *pz, double *vx,
-                            double *vy, double *vz, double cx, double cy, double cz)
+static inline void step_one(double tau, double a_max, double dt, double *px, double *py, double *pz,
+                            double *vx, double *vy, double *vz, double cx, double cy, double cz)
 {
     double ax = (cx - *vx) / tau;
     double ay = (cy - *vy) / tau;
@@ -21,15 +21,16 @@ static inline void step_one(double tau, double a_max, double dt, double *px, dou
     *pz += dt * *vz;
 }
 
-void vehicle_step(const vehicle_params *params, double dt, double *position, double *velocity, const double *command,
-                  int stride)
+void vehicle_step(const vehicle_params *params, double dt, double *position, double *velocity,
+                  const double *command, int stride)
 {
-    step_one(params->tau, params->a_max, dt, &position[0], &position[stride], &position[2 * stride], &velocity[0],
-             &velocity[stride], &velocity[2 * stride], command[0], command[stride], command[2 * stride]);
+    step_one(params->tau, params->a_max, dt, &position[0], &position[stride], &position[2 * stride],
+             &velocity[0], &velocity[stride], &velocity[2 * stride], command[0], command[stride],
+             command[2 * stride]);
 }
 
-void vehicle_step_all(const vehicle_params *params, double dt, int n, double *position, double *velocity,
-                      const double *command)
+void vehicle_step_all(const vehicle_params *params, double dt, int n, double *position,
+                      double *velocity, const double *command)
 {
     const double tau = params->tau;
     const double a_max = params->a_max;
@@ -37,5 +38,6 @@ void vehicle_step_all(const vehicle_params *params, double dt, int n, double *po
     double *restrict vx = velocity, *restrict vy = velocity + n, *restrict vz = velocity + 2 * n;
     const double *restrict cx = command, *restrict cy = command + n, *restrict cz = command + 2 * n;
     for (int k = 0; k < n; k++)
-        step_one(tau, a_max, dt, &px[k], &py[k], &pz[k], &vx[k], &vy[k], &vz[k], cx[k], cy[k], cz[k]);
+        step_one(tau, a_max, dt, &px[k], &py[k], &pz[k], &vx[k], &vy[k], &vz[k], cx[k], cy[k],
+                 cz[k]);
 }

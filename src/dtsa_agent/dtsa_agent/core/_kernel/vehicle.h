@@ -3,8 +3,8 @@
 #define DTSA_VEHICLE_H
 
 typedef struct {
-    double tau;    /* s, time constant of the velocity response */
-    double a_max;  /* m/s^2, largest acceleration (norm) */
+    double tau;   /* s, time constant of the velocity response */
+    double a_max; /* m/s^2, largest acceleration (norm) */
 } vehicle_params;
 
 /* One integration step of dt seconds for one vehicle; position and velocity (3 values, `stride` doubles apart) are
@@ -14,7 +14,7 @@ void vehicle_step(const vehicle_params *params, double dt, double *position, dou
                   const double *command, int stride);
 
 /* The same bits for n vehicles whose states are planes (3, n), faster than n calls. */
-void vehicle_step_all(const vehicle_params *params, double dt, int n, double *position, double *velocity,
-                      const double *command);
+void vehicle_step_all(const vehicle_params *params, double dt, int n, double *position,
+                      double *velocity, const double *command);
 
 #endif
