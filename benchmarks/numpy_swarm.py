@@ -204,7 +204,7 @@ def core_slot(swarm: Swarm, slot: int) -> int:
 def both(config: SwarmConfig) -> tuple[Swarm, NumpySwarm]:
     """The same swarm twice, at its start."""
     scenario = make_scenario(config)
-    core = Swarm(config, scenario, shared_view=True)
+    core = Swarm(config, scenario, shared_table=True)
     scenario.advance(0, core)
     return core, NumpySwarm(config, scenario)
 

@@ -77,7 +77,7 @@ def test_a_key_belongs_to_authenticated_swarms_and_only_there() -> None:
 @pytest.mark.parametrize("policy", ["tdma", "dtsa"])
 def test_a_group_shares_a_table_until_the_first_frame_that_not_all_have_heard(policy: str) -> None:
     config = SwarmConfig(agents=5, policy=policy, seed=6)
-    group, plain = AgentGroup(Swarm(config, shared_view=True)), Swarm(config)
+    group, plain = AgentGroup(Swarm(config, shared_table=True)), Swarm(config)
     for slot in range(120):
         plain.scenario.advance(slot, plain)
         senders = group.on_slot(slot)

@@ -142,7 +142,7 @@ def test_each_agent_alone_computes_what_all_together_compute() -> None:
 def test_the_swarm_gets_goals_activity_and_what_all_know() -> None:
     config = SwarmConfig(agents=6, scenario="staggered", stagger_slots=10, moving=4, policy="tdma")
     for shared in (True, False):
-        swarm = Swarm(config, shared_view=shared)
+        swarm = Swarm(config, shared_table=shared)
         made = swarm.scenario
         assert made.plan is not None
         late = int(np.flatnonzero(made.plan.begin == 10)[0])
@@ -170,7 +170,7 @@ def test_the_swarm_gets_goals_activity_and_what_all_know() -> None:
 
 def test_where_goals_are_not_known_who_rests_is_where_it_said() -> None:
     config = SwarmConfig(agents=4, scenario="waypoints", policy="tdma", r_min=0.5)
-    swarm = Swarm(config, shared_view=True)
+    swarm = Swarm(config, shared_table=True)
     swarm.scenario.advance(0, swarm)
     swarm.position[:, 0] = swarm.goal[:, 0] + np.array([0.3, 0.0, 0.0])
     data = swarm.frame(swarm.begin(0)[0])

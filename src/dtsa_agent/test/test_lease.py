@@ -316,8 +316,8 @@ def test_settings_that_are_refused(settings: dict[str, Any], field: str) -> None
 
 
 def test_every_agent_needs_a_table_of_its_own() -> None:
-    with pytest.raises(ConfigError, match="shared_view"):
-        Swarm(SwarmConfig(policy="lease"), shared_view=True)
+    with pytest.raises(ConfigError, match="shared_table"):
+        Swarm(SwarmConfig(policy="lease"), shared_table=True)
 
 
 def test_open_turns_visit_all_owners() -> None:

@@ -149,7 +149,7 @@ def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number
         (AGENT, ["agents:=0"], "agent: error: agents: got 0; allowed: a whole number, 1 to 1024"),
         (AGENT, ["id:=13"], "agent: error: id: got 13; allowed: 1 to 12"),
         (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
-        (HOST, ["policy:=aloha", "shared_view:=true"], "swarm_host: error: shared_view: got True; allowed: false"),
+        (HOST, ["policy:=aloha", "shared_table:=true"], "swarm_host: error: shared_table: got True; allowed: false"),
     ],
 )
 def test_bad_parameters_are_one_line_and_exit_code_2(
@@ -197,7 +197,7 @@ def test_a_host_answers_for_all_its_agents_in_one_message(tmp_path: Path) -> Non
 @pytest.mark.parametrize(("policy", "scenario"), [("tdma", "exchange"), ("dtsa", "exchange"), ("age", "stop-and-go")])
 def test_agents_that_shared_a_table_go_on_alone_as_if_they_never_had(policy: str, scenario: str) -> None:
     config = SwarmConfig(agents=6, policy=policy, scenario=scenario, seed=4)
-    shared, alone = Swarm(config, shared_view=True), Swarm(config)
+    shared, alone = Swarm(config, shared_table=True), Swarm(config)
     random = np.random.default_rng(1)
     for slot in range(300):
         alone.scenario.advance(slot, alone)

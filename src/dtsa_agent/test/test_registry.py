@@ -20,7 +20,7 @@ CORE = Path(registry.__file__).parent
 
 
 def flown(policy: str, shared: bool, slots: int = 60) -> Swarm:
-    swarm = Swarm(SwarmConfig(agents=6, moving=4, policy=policy, seed=3), shared_view=shared)
+    swarm = Swarm(SwarmConfig(agents=6, moving=4, policy=policy, seed=3), shared_table=shared)
     for slot in range(slots):
         swarm.scenario.advance(slot, swarm)
         senders = swarm.begin(slot)
@@ -70,7 +70,7 @@ def test_a_policy_is_what_its_row_says(row: PolicyRow) -> None:
     if row.may_share:
         assert np.array_equal(flown(row.name, shared=True).position, own.position)
     if row.agent_state:
-        with pytest.raises(ConfigError, match="shared_view"):
+        with pytest.raises(ConfigError, match="shared_table"):
             flown(row.name, shared=True)
         assert own.lease_status(0)["probation"] is False
         own.restart(0)

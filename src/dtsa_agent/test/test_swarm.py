@@ -71,7 +71,7 @@ def test_never_two_senders_and_everyone_agrees(policy: str, agents: int, data: s
 @pytest.mark.parametrize("estimator", ["hold", "linear", "intent", "oracle"])
 def test_one_shared_table_changes_nothing_without_loss(policy: str, estimator: str) -> None:
     config = SwarmConfig(agents=12, moving=6, policy=policy, estimator=estimator, slot_ms=20, seed=4)
-    own, shared = Swarm(config), Swarm(config, shared_view=True)
+    own, shared = Swarm(config), Swarm(config, shared_table=True)
     for slot in range(500):
         assert one_slot(own, slot) == one_slot(shared, slot)
         assert np.array_equal(own.track, shared.track)
@@ -143,11 +143,11 @@ def test_nobody_in_a_p_is_silent_for_longer_than_the_age_cap(cap: float) -> None
 
 def test_hoverers_leave_a_p_and_come_to_rest_at_their_targets() -> None:
     swarm, _ = fly(12, agents=12, moving=2, policy="dtsa")
-    for view in range(12):
-        assert np.array_equal(swarm.in_ap[view].astype(bool), swarm.scenario.moving)
+    for table in range(12):
+        assert np.array_equal(swarm.in_ap[table].astype(bool), swarm.scenario.moving)
         outside = ~swarm.scenario.moving
-        assert np.array_equal(swarm.sent_position[view][:, outside], swarm.scenario.target[:, outside])
-        assert not swarm.sent_velocity[view][:, outside].any()
+        assert np.array_equal(swarm.sent_position[table][:, outside], swarm.scenario.target[:, outside])
+        assert not swarm.sent_velocity[table][:, outside].any()
 
 
 def test_arrived_agents_leave_a_p_and_return_when_they_are_pushed_away() -> None:

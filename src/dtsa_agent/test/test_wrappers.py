@@ -63,8 +63,8 @@ def test_wrapped_swarms_fly_like_the_plain_one(policy: str, wrap: type[SwarmWrap
 
 def test_an_authenticated_swarm_gives_its_shared_table_up_like_the_plain_one() -> None:
     config = SwarmConfig(agents=5, policy="dtsa", seed=3)
-    plain: AbstractSwarm = Swarm(config, shared_view=True)
-    sealed: AbstractSwarm = AuthenticatedSwarm(Swarm(config, shared_view=True), Authenticator(KEY))
+    plain: AbstractSwarm = Swarm(config, shared_table=True)
+    sealed: AbstractSwarm = AuthenticatedSwarm(Swarm(config, shared_table=True), Authenticator(KEY))
     for slot in range(40):
         for swarm in (plain, sealed):
             swarm.begin(slot)

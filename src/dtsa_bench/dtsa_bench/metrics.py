@@ -142,7 +142,7 @@ class FlightMetrics:
         away = self._last[:, back] - self.scenario.target[:, back]
         return bool((np.sqrt((away * away).sum(axis=0)) <= self.run.swarm.r_min).all())
 
-    def compare_views(self, slot: int, digests: NDArray[np.uint32], chosen: NDArray[np.uint16]) -> None:
+    def compare_tables(self, slot: int, digests: NDArray[np.uint32], chosen: NDArray[np.uint16]) -> None:
         """Takes in what all agents believe at the start of a slot, where that may differ.
 
         :param slot: its number.
@@ -222,7 +222,7 @@ class FlightMetrics:
             "completion_time_s": self.completion_slot * swarm.slot_ns / 1e9 if self.completion_slot >= 0 else None,
             "flight_time_s": flown,
             "first_divergence_slot": self.split_slot if self.split_slot >= 0 else None,
-            "equal_views_share": 1.0 - self._split / self._compared if self._compared else 1.0,
+            "equal_tables_share": 1.0 - self._split / self._compared if self._compared else 1.0,
             "agreement_share": 1.0 - self._torn / self._compared if self._compared else 1.0,
             "lost_agents": sorted(self.lost),
             "age_mean_slots": sums["age_sum"] / news if news else None,

@@ -84,7 +84,7 @@ def may_share(run: RunConfig) -> bool:
 def simulate(
     run: RunConfig,
     *,
-    shared_view: bool | None = None,
+    shared_table: bool | None = None,
     trace: bool = False,
     observer: int = 1,
     ages: bool = True,
@@ -92,15 +92,15 @@ def simulate(
     """Flies one run.
 
     :param run: the run.
-    :param shared_view: one table for all agents; None: where :func:`may_share` allows it.
+    :param shared_table: one table for all agents; None: where :func:`may_share` allows it.
     :param trace: keep what happened in every slot.
     :param observer: id whose table the trace follows.
     :param ages: measure ages and estimate errors; without them a run is a little faster.
     """
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
-    shared = may_share(run) if shared_view is None else shared_view
-    swarm = with_key(make_swarm(run.swarm, scenario, shared_view=shared))
+    shared = may_share(run) if shared_table is None else shared_table
+    swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
     metrics = FlightMetrics(run, scenario)
     kept = Trace() if trace else None
     _fly(swarm, Channel(run.air), metrics, kept, observer, ages)
@@ -115,8 +115,8 @@ def _fly(
     frame, arbitrate, update = swarm.frame, channel.arbitrate, metrics.update
     ids, track, position = swarm.ids, swarm.track, swarm.position
     tables = swarm if ages else None
-    view = 0 if swarm.shared else observer - 1
-    compare = None if swarm.shared else metrics.compare_views  # one table cannot differ from itself
+    table = 0 if swarm.shared else observer - 1
+    compare = None if swarm.shared else metrics.compare_tables  # one table cannot differ from itself
     slot = 0
     while True:
         advance(slot, swarm)
@@ -135,18 +135,18 @@ def _fly(
         end(slot)
         over = update(slot, track, tables, verdict.outcome)
         if kept is not None:
-            _keep(kept, swarm, slot, verdict.senders, verdict.outcome, view)
+            _keep(kept, swarm, slot, verdict.senders, verdict.outcome, table)
         if over:
             return
         slot += 1
 
 
-def _keep(kept: Trace, swarm: AbstractSwarm, slot: int, senders: tuple[int, ...], outcome: int, view: int) -> None:
+def _keep(kept: Trace, swarm: AbstractSwarm, slot: int, senders: tuple[int, ...], outcome: int, table: int) -> None:
     kept.senders.append(senders)
     kept.outcomes.append(outcome)
-    kept.reasons.append(int(swarm.reason[view]))
+    kept.reasons.append(int(swarm.reason[table]))
     kept.tracks.append(swarm.track.copy())
     swarm.estimate(slot + 1)
-    kept.estimates.append(swarm.estimate_position[view].copy())
-    kept.heard.append(swarm.sent_position[view].copy())
-    kept.heard_slot.append(swarm.sent_slot[view].copy())
+    kept.estimates.append(swarm.estimate_position[table].copy())
+    kept.heard.append(swarm.sent_position[table].copy())
+    kept.heard_slot.append(swarm.sent_slot[table].copy())

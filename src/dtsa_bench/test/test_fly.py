@@ -202,7 +202,7 @@ def test_the_channel_changes_in_flight_and_the_bag_still_verifies(tmp_path: Path
     with ros_graph(tmp_path) as graph:
         parameters = ["agents:=4", "seed:=3", "tail_s:=3600.0", f"out:={out}"]
         channel = graph.start("dtsa_bench.fly.recorded_channel", *[w for p in parameters for w in ("-p", p)])
-        host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=4", "-p", "seed:=3", "-p", "shared_view:=true")
+        host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=4", "-p", "seed:=3", "-p", "shared_table:=true")
         bag = out / "bag" / "bag_0.mcap"
         graph.until(lambda: bag.exists() and bag.stat().st_size > 20_000)
         change = graph.node.create_client(SetParameters, "/swarm/channel/set_parameters")

@@ -47,7 +47,7 @@ def plain(flight: Flight) -> dict[str, Any]:
 def test_without_loss_one_table_for_all_makes_no_difference(policy: str, more: dict[str, Any]) -> None:
     config = run(agents=9, policy=policy, timeout_s=2.0, **{"moving": 8, **more})
     assert may_share(config)
-    one, many = (simulate(config, shared_view=shared, trace=True) for shared in (True, False))
+    one, many = (simulate(config, shared_table=shared, trace=True) for shared in (True, False))
     assert one.swarm.sent_slot.shape[0] == 1
     assert many.swarm.sent_slot.shape[0] == 9
     assert one.trace is not None
@@ -81,7 +81,7 @@ def test_where_views_may_differ_everyone_has_a_table(more: dict[str, Any]) -> No
 
 def test_loss_makes_the_tables_of_dtsa_differ_and_wastes_slots() -> None:
     lossless, lossy = (
-        simulate(run(agents=12, loss=loss, timeout_s=2.0, stop_on_crash=False), shared_view=False)
+        simulate(run(agents=12, loss=loss, timeout_s=2.0, stop_on_crash=False), shared_table=False)
         for loss in (0.0, 0.1)
     )
     assert len(set(lossless.swarm.digest.tolist())) == 1
@@ -192,7 +192,7 @@ def test_one_lost_frame_splits_the_views_of_dtsa_but_not_the_choice_of_tdma() ->
     cases = (("dtsa", 0.0), ("dtsa", 0.01), ("tdma", 0.01))
     whole, torn, tdma = (fly(agents=12, loss=p, policy=name) for name, p in cases)
     assert whole.summary()["first_divergence_slot"] is None
-    assert whole.summary()["agreement_share"] == whole.summary()["equal_views_share"] == 1.0
+    assert whole.summary()["agreement_share"] == whole.summary()["equal_tables_share"] == 1.0
     assert 0 < torn.summary()["first_divergence_slot"] < 100
     assert torn.summary()["agreement_share"] < 0.6
-    assert tdma.summary()["equal_views_share"] < 1.0 == tdma.summary()["agreement_share"]
+    assert tdma.summary()["equal_tables_share"] < 1.0 == tdma.summary()["agreement_share"]

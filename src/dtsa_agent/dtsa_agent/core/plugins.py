@@ -153,7 +153,7 @@ def make_swarm(
     config: SwarmConfig,
     scenario: Scenario | None = None,
     local: Sequence[int] | None = None,
-    shared_view: bool = False,
+    shared_table: bool = False,
     observers: Sequence[int] | None = None,
 ) -> AbstractSwarm:
     """A :class:`Swarm`, in a :class:`PluginSwarm` if the configuration names plug-ins.
@@ -163,7 +163,7 @@ def make_swarm(
     :raises ConfigError: for ids and plug-ins that do not exist.
     """
     if not uses_plugins(config):
-        return Swarm(config, scenario, local, shared_view, observers)
+        return Swarm(config, scenario, local, shared_table, observers)
     return PluginSwarm(Swarm(config, scenario, local, False, observers))
 
 

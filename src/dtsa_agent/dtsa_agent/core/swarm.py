@@ -29,7 +29,7 @@ class Swarm(AbstractSwarm):
     :param config: the settings that all agents share.
     :param scenario: starts and goals; default: made from ``config``.
     :param local: ids of the agents that live here, ascending; default: all.
-    :param shared_view: one table serves all local agents. Right only where all hear the same, i.e. without loss.
+    :param shared_table: one table serves all local agents. Right only where all hear the same, i.e. without loss.
     :param observers: with ``local=[]``: ids of the observers whose tables are kept (0: one that hears everything).
     :raises ConfigError: for ids that do not exist, or settings that need agents that are not here.
     """
@@ -39,7 +39,7 @@ class Swarm(AbstractSwarm):
         config: SwarmConfig,
         scenario: Scenario | None = None,
         local: Sequence[int] | None = None,
-        shared_view: bool = False,
+        shared_table: bool = False,
         observers: Sequence[int] | None = None,
     ) -> None:
         self.config = config
@@ -49,19 +49,19 @@ class Swarm(AbstractSwarm):
         self._check_ids("local", self.ids)
         count, agents = len(self.ids), config.agents
         self.local = np.array(self.ids, dtype=np.int32) - 1
-        seen = observers if observers is not None else ([0] if shared_view else self.ids)
+        seen = observers if observers is not None else ([0] if shared_table else self.ids)
         self._check_ids("observers", tuple(i for i in seen if i))
         self.observer = np.array(seen, dtype=np.int32) - 1
-        self.shared = bool(shared_view)
+        self.shared = bool(shared_table)
         self.rows = np.arange(count)
         if config.estimator_row.needs_everybody and 0 < count < agents:
             others = ", ".join(row.name for row in ESTIMATORS.rows.values() if not row.needs_everybody)
             allowed = f"{others}: it needs all agents in one process"
             raise ConfigError("estimator", config.estimator, allowed)
         row = config.policy_row
-        if shared_view and row.agent_state:
+        if shared_table and row.agent_state:
             why = f"False: with policy {row.name} every agent knows something of its own"
-            raise ConfigError("shared_view", True, why)
+            raise ConfigError("shared_table", True, why)
         lease = _kernel.lease_state_bytes(agents, config.anchor_every) if row.agent_state else 0
         self._make_tables(len(self.observer), agents)
         self._make_agents(count, config.steps, lease)
@@ -80,7 +80,7 @@ class Swarm(AbstractSwarm):
         profile = PROFILE_PAPER_INTENT if config.estimator_row.needs_intent else PROFILE_PAPER
         self._decay = decay_table(model.vehicle.tau, config.slot_s / config.steps)
         return {
-            "agents": config.agents, "local_count": count, "view_count": len(self.observer), "steps": config.steps,
+            "agents": config.agents, "local_count": count, "table_count": len(self.observer), "steps": config.steps,
             "shared": int(self.shared), "slot_s": config.slot_s, "policy": POLICIES.number(config.policy),
             "estimator": ESTIMATORS.number(config.estimator), "avoider": model.kind,
             "selection": SELECTIONS.index(config.selection), "epsilon": float(config.epsilon),
@@ -104,7 +104,7 @@ class Swarm(AbstractSwarm):
             "local": self.local, "observer": self.observer, "start": self._start, "target": self._target,
             "sent_p": self.sent_position, "sent_v": self.sent_velocity, "sent_c": self.sent_intent,
             "sent_slot": self.sent_slot, "last": self.last_turn, "in_ap": self.in_ap, "entry_hash": self.entry_hash,
-            "view_hash": self.table_hash, "est_p": self.estimate_position, "est_v": self.estimate_velocity,
+            "table_hash": self.table_hash, "est_p": self.estimate_position, "est_v": self.estimate_velocity,
             "g": self.priority, "h": self.counter, "pos": self.position, "vel": self.velocity, "cmd": self.command,
             "goal": self.goal, "track": self.track, "active": self.active, "final": self.final, "present": self.present,
             "chosen": self.chosen, "reason": self.reason, "digest": self.digest, "score": self.score,

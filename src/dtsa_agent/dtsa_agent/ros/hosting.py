@@ -85,9 +85,9 @@ def host_agents(
     :raises ConfigError: for settings that are not usable.
     """
     if shared and not shareable(config):
-        raise ConfigError("shared_view", True, f"false with policy {config.policy}")
+        raise ConfigError("shared_table", True, f"false with policy {config.policy}")
     host = HostSettings(**declare_settings(node, HostSettings))
-    swarm = with_key(make_swarm(config, local=sorted(ids), shared_view=shared and host.mode == "lockstep"))
+    swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared and host.mode == "lockstep"))
     if host.mode == "lockstep":
         agents: SwarmNode = SwarmNode(node, swarm, space)
     else:

@@ -17,7 +17,7 @@ from .hosting import declare_swarm, host_agents
 from .swarm_node import parse_ids
 
 SHARED = Setting(
-    "shared_view",
+    "shared_table",
     "bool",
     False,
     "one table serves all agents here, for as long as all hear the same; policies tdma, dtsa and age; only faster, "

@@ -49,7 +49,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("chosen", "", "id of the agent that it takes for the sender; 0: nobody"),
         ("reason", "", "why, by name"),
         ("score", "1", "priority value g of the chosen agent, 0 where the policy has none"),
-        ("digest", "", "digest of the agent's view: equal digests, equal tables"),
+        ("digest", "", "digest of the agent's table: equal digests, equal tables"),
     ],
     "states": [
         ("time_s", "s", "time of the state, counted from the start of slot 0"),

@@ -129,7 +129,7 @@ def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0
     :param least_s: short flights are repeated for so long; the fastest counts, others were disturbed.
     """
     config = SwarmConfig(agents=agents, moving=agents - agents % 2, policy=policy)
-    swarm = Swarm(config, shared_view=True)
+    swarm = Swarm(config, shared_table=True)
     scenario = swarm.scenario
     way = float(np.linalg.norm(scenario.target - scenario.start, axis=0).max())
     count = min(most_slots, int((way / 1.5 + 2.0) / config.slot_s))

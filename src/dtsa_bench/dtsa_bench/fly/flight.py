@@ -200,7 +200,7 @@ def _start_agents(children: Children, run: RunConfig, options: FlightOptions, di
         return late
     shared = str(run.mode == LOCKSTEP and may_share(run)).lower()
     for number, ids in enumerate(split(swarm.agents, options.processes), 1):
-        own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_view:={shared}"]
+        own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_table:={shared}"]
         name = f"swarm_host_{number} with {named(ids)}"
         children.start(name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_arguments(run, ids)])
     return late

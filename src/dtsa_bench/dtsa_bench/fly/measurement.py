@@ -44,7 +44,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         if not slot:
             self.begin_s = time.monotonic()
             return
-        self.metrics.compare_views(slot - 1, *self._compared)
+        self.metrics.compare_tables(slot - 1, *self._compared)
         if self._oracle:
             self._tables.estimate_position[:] = answers.position
         if self.metrics.update(slot - 1, answers.track, self._tables, self._outcome):

@@ -114,7 +114,7 @@ class Experiment:
         shared: bool = False,
     ) -> None:
         self.config = config
-        self.swarm = Swarm(config, still_scenario(config.agents, config.seed), shared_view=shared)
+        self.swarm = Swarm(config, still_scenario(config.agents, config.seed), shared_table=shared)
         self.channel = Channel(channel or ChannelConfig(agents=config.agents, slot_ns=config.slot_ns, seed=config.seed))
         self.warmup = warmup
         self.moving: NDArray[np.bool_] = np.zeros(config.agents, dtype=np.bool_)

@@ -6,7 +6,7 @@ from __future__ import annotations
 VALUES = (
     "min_distance_m", "efficiency_mean", "completion_time_s", "flight_time_s", "age_mean_slots",
     "age_max_slots", "estimate_error_mean_m", "estimate_error_max_m", "slots_total", "slots_success",
-    "slots_collision", "slots_idle", "agreement_share", "equal_views_share", "first_divergence_slot",
+    "slots_collision", "slots_idle", "agreement_share", "equal_tables_share", "first_divergence_slot",
     "wall_time_s",
 )  # fmt: skip
 COMMON = ("seed", "status", "reason", "collided")

@@ -110,7 +110,7 @@ class LockstepCheck:
         self.crowded += len(verdict.senders) > 1
         swarm = rebuild.swarm
         self.agreement = self.agreement and bool((swarm.chosen == swarm.chosen[0]).all())
-        self.metrics.compare_views(slot, swarm.digest, swarm.chosen)
+        self.metrics.compare_tables(slot, swarm.digest, swarm.chosen)
         self.metrics.update(slot, swarm.track, swarm, verdict.outcome)
         return True
 

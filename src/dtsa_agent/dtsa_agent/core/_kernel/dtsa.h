@@ -128,7 +128,7 @@ typedef struct lease_config {
 } lease_config;
 
 typedef struct swarm {
-    int n, local_count, view_count, steps;
+    int n, local_count, table_count, steps;
     int shared; /* one table serves every agent */
     double slot_s, dt;
     int policy, estimator, avoider, selection;
@@ -144,7 +144,7 @@ typedef struct swarm {
     vehicle_params vehicle;
     lease_config lease;
 
-    /* Borrowed from NumPy: v = view_count, l = local_count, n = agents. */
+    /* Borrowed from NumPy: v = table_count, l = local_count, n = agents. */
     const int32_t *local;             /* (l) 0-based agent of each local slot */
     const int32_t *observer;          /* (v) 0-based agent of each table, -1: serves all */
     const double *start;              /* (3, n) */
@@ -155,7 +155,7 @@ typedef struct swarm {
         last; /* (v, n) slot in which this table last took the agent for the sender; h = slot - 1 - last */
     uint8_t *in_ap;                 /* (v, n) */
     uint32_t *entry_hash;           /* (v, n) */
-    uint32_t *view_hash;            /* (v) */
+    uint32_t *table_hash;           /* (v) */
     double *est_p, *est_v;          /* (v, 3, n) */
     double *g;                      /* (v, n) */
     int64_t *h;                     /* (v, n) */
@@ -188,10 +188,10 @@ typedef struct swarm {
 enum { PRESENT_LEAVING = 2 };
 
 void swarm_reset_tables(swarm *s);
-void swarm_reset_view(swarm *s, int view); /* knows nothing but the settings */
+void swarm_reset_table(swarm *s, int table); /* knows nothing but the settings */
 int swarm_far_from_goal(const swarm *s, int l);
-void swarm_learn(swarm *s, int view, const dtsa_frame *f, int64_t sampled);
-void swarm_estimate(swarm *s, int view, int64_t slot, int step);
+void swarm_learn(swarm *s, int table, const dtsa_frame *f, int64_t sampled);
+void swarm_estimate(swarm *s, int table, int64_t slot, int step);
 void swarm_decide(swarm *s, int64_t slot);
 void swarm_emit(
     swarm *s,
@@ -205,7 +205,7 @@ uint64_t mix64(uint64_t x);
 
 /* ---- gossip.c ---- */
 
-int gossip_collect(const swarm *s, int view, int self, int64_t slot, int room,
+int gossip_collect(const swarm *s, int table, int self, int64_t slot, int room,
                    gossip_entry *out); /* -> number */
 int extended_emit(swarm *s, int l, int64_t slot, const dtsa_frame *own, uint8_t *out);
 int extended_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const uint8_t *mask);

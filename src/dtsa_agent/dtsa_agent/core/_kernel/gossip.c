@@ -5,9 +5,9 @@
 #include "lease.h"
 
 /* What a table holds of an agent, and whether gossip can say it. */
-static int sayable(const swarm *s, int view, int k)
+static int sayable(const swarm *s, int table, int k)
 {
-    const long plane = (long)view * 3 * s->n + k;
+    const long plane = (long)table * 3 * s->n + k;
     double p[3], v[3];
     for (int i = 0; i < 3; i++) {
         p[i] = s->sent_p[plane + (long)i * s->n];
@@ -17,38 +17,38 @@ static int sayable(const swarm *s, int view, int k)
 }
 
 /* The newest state of somebody not yet chosen that is `age` slots old or older and can be said; -1: none. */
-static int newest_of_age(const swarm *s, int view, int self, int64_t slot, int age,
+static int newest_of_age(const swarm *s, int table, int self, int64_t slot, int age,
                          const int *chosen, int count)
 {
-    const int64_t *sent = s->sent_slot + (long)view * s->n;
+    const int64_t *sent = s->sent_slot + (long)table * s->n;
     int best = -1;
     for (int k = 0; k < s->n; k++) {
         const int64_t old = slot - sent[k];
         if (k == self || sent[k] < 0 || old < age || old > GOSSIP_AGE_MAX) continue;
         int taken = 0;
         for (int i = 0; i < count; i++) taken |= chosen[i] == k;
-        if (!taken && (best < 0 || sent[k] > sent[best]) && sayable(s, view, k)) best = k;
+        if (!taken && (best < 0 || sent[k] > sent[best]) && sayable(s, table, k)) best = k;
     }
     return best;
 }
 
 /* Every state is said again three times: at once, which mends single losses soonest, and at two later times, which bring it
  * to those who were deaf for a while. */
-int gossip_collect(const swarm *s, int view, int self, int64_t slot, int room, gossip_entry *out)
+int gossip_collect(const swarm *s, int table, int self, int64_t slot, int room, gossip_entry *out)
 {
-    const int64_t *sent = s->sent_slot + (long)view * s->n;
+    const int64_t *sent = s->sent_slot + (long)table * s->n;
     const int later = 2 + s->n / 16, ages[2 * SECTIONS] = {1, later, 2 * later, 1, 1, 1};
     int best[SECTIONS], count = 0;
     for (int i = 0; i < 2 * SECTIONS && count < room; i++) {
-        const int k = newest_of_age(s, view, self, slot, ages[i], best, count);
+        const int k = newest_of_age(s, table, self, slot, ages[i], best, count);
         if (k >= 0) best[count++] = k;
     }
     for (int i = 0; i < count; i++) {
         const int k = best[i];
-        const long plane = (long)view * 3 * s->n + k;
+        const long plane = (long)table * 3 * s->n + k;
         out[i].id = k + 1;
         out[i].age = (int)(slot - sent[k]);
-        out[i].c_r = s->in_ap[(long)view * s->n + k];
+        out[i].c_r = s->in_ap[(long)table * s->n + k];
         for (int axis = 0; axis < 3; axis++) {
             out[i].p[axis] = s->sent_p[plane + (long)axis * s->n];
             out[i].v[axis] = s->sent_v[plane + (long)axis * s->n];
@@ -58,10 +58,10 @@ int gossip_collect(const swarm *s, int view, int self, int64_t slot, int room, g
 }
 
 /* A state that somebody else heard replaces an older one only; one at the codec's limit may be a wrong one. */
-static void learn_gossip(swarm *s, int view, int64_t sampled, const gossip_entry *g)
+static void learn_gossip(swarm *s, int table, int64_t sampled, const gossip_entry *g)
 {
-    if (sampled < 0 || s->observer[view] == g->id - 1) return;
-    if (s->sent_slot[(long)view * s->n + g->id - 1] >= sampled ||
+    if (sampled < 0 || s->observer[table] == g->id - 1) return;
+    if (s->sent_slot[(long)table * s->n + g->id - 1] >= sampled ||
         !gossip_fits(g->p, g->v, s->position_step))
         return;
     dtsa_frame f = {.sender = g->id, .c_r = g->c_r};
@@ -69,7 +69,7 @@ static void learn_gossip(swarm *s, int view, int64_t sampled, const gossip_entry
         f.p[i] = g->p[i];
         f.v[i] = f.c[i] = g->v[i];
     }
-    swarm_learn(s, view, &f, sampled);
+    swarm_learn(s, table, &f, sampled);
 }
 
 static int known_ids(const swarm *s, const extended_frame *e, int64_t slot)
@@ -110,19 +110,19 @@ int extended_hear(swarm *s, int64_t slot, const uint8_t *data, long length, cons
         s->foreign++;
         return 0;
     }
-    for (int view = 0; view < s->view_count; view++) {
-        const int speaks = s->observer[view] == e.own.sender - 1;
-        if (speaks ? s->local_count > 0 : mask && !mask[view])
+    for (int table = 0; table < s->table_count; table++) {
+        const int speaks = s->observer[table] == e.own.sender - 1;
+        if (speaks ? s->local_count > 0 : mask && !mask[table])
             continue; /* a local sender knows what it said */
-        if (view < s->local_count && !s->shared && !s->present[view]) continue;
-        const long at = (long)view * s->n + e.own.sender - 1;
+        if (table < s->local_count && !s->shared && !s->present[table]) continue;
+        const long at = (long)table * s->n + e.own.sender - 1;
         const int wakes = !s->in_ap[at] && e.own.c_r;
-        if (s->sent_slot[at] < sampled) swarm_learn(s, view, &e.own, sampled);
+        if (s->sent_slot[at] < sampled) swarm_learn(s, table, &e.own, sampled);
         if (speaks) continue;
         for (int i = 0; i < e.gossip_count; i++)
-            learn_gossip(s, view, sampled - e.gossip[i].age, &e.gossip[i]);
-        if (s->policy == POLICY_LEASE && view < s->local_count)
-            lease_listen(s, view, sampled, &e, wakes);
+            learn_gossip(s, table, sampled - e.gossip[i].age, &e.gossip[i]);
+        if (s->policy == POLICY_LEASE && table < s->local_count)
+            lease_listen(s, table, sampled, &e, wakes);
     }
     return 1;
 }

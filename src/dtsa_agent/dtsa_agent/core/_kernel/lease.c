@@ -18,9 +18,9 @@ long lease_state_bytes(int n, int every)
     return (bytes + 7) / 8 * 8;
 }
 
-lease_view lease_of(const swarm *s, int l)
+lease_scope lease_of(const swarm *s, int l)
 {
-    lease_view v;
+    lease_scope v;
     uint8_t *block = s->lease_state + (long)l * lease_state_bytes(s->n, s->lease.anchor_every);
     v.n = s->n;
     v.every = s->lease.anchor_every;
@@ -35,23 +35,23 @@ lease_view lease_of(const swarm *s, int l)
     return v;
 }
 
-int lease_is_anchor(const lease_view *v, int64_t slot)
+int lease_is_anchor(const lease_scope *v, int64_t slot)
 {
     return (slot / v->n + slot % v->n) % v->every == 0;
 }
 
-int lease_alive(const lease_view *v, int k, int64_t slot)
+int lease_alive(const lease_scope *v, int k, int64_t slot)
 {
     return v->heard[k] >= 0 && slot - v->heard[k] <= v->patience;
 }
 
-int lease_absent(const lease_view *v, int k, int64_t slot)
+int lease_absent(const lease_scope *v, int k, int64_t slot)
 {
     const int64_t sign = v->heard[k] == -1 ? v->a->born : v->heard[k];
     return slot - sign > v->patience;
 }
 
-int lease_scheduled(const lease_view *v, int64_t slot)
+int lease_scheduled(const lease_scope *v, int64_t slot)
 {
     const int given = v->lessee[slot % v->window], owner = (int)(slot % v->n);
     if (given == LEASE_OPEN) return -1;
@@ -60,7 +60,7 @@ int lease_scheduled(const lease_view *v, int64_t slot)
     return owner;
 }
 
-void lease_note(lease_view *v, int64_t turn, int lessee, int issuer)
+void lease_note(lease_scope *v, int64_t turn, int lessee, int issuer)
 {
     if (lessee == LEASE_NONE || turn <= v->a->now || turn >= v->a->now + v->window ||
         lease_is_anchor(v, turn))
@@ -75,7 +75,7 @@ void lease_note(lease_view *v, int64_t turn, int lessee, int issuer)
     }
 }
 
-int lease_turns(const lease_view *v, int64_t slot, int c_s, int64_t *turns, int room)
+int lease_turns(const lease_scope *v, int64_t slot, int c_s, int64_t *turns, int room)
 {
     int count = 0, own = 1;
     for (int j = 1; j <= v->every; j++)
@@ -92,7 +92,7 @@ int lease_turns(const lease_view *v, int64_t slot, int c_s, int64_t *turns, int 
     return count;
 }
 
-static void roll(lease_view *v, int64_t slot)
+static void roll(lease_scope *v, int64_t slot)
 {
     lease_agent *a = v->a;
     if (slot - a->now >= v->window) {
@@ -113,7 +113,7 @@ void lease_restart(swarm *s, int l)
 
 /* Whoever begins with slot 0 begins with everybody else. Whoever comes later may have lived before, and may have given
  * turns away that it knows nothing of. */
-static void start(lease_view *v, int64_t slot)
+static void start(lease_scope *v, int64_t slot)
 {
     lease_agent *a = v->a;
     a->started = 1;
@@ -125,7 +125,7 @@ static void start(lease_view *v, int64_t slot)
     a->woke = slot;
 }
 
-static void watch_goal(swarm *s, int l, lease_view *v, int64_t slot)
+static void watch_goal(swarm *s, int l, lease_scope *v, int64_t slot)
 {
     lease_agent *a = v->a;
     const int moving = swarm_far_from_goal(s, l);
@@ -139,7 +139,7 @@ static void watch_goal(swarm *s, int l, lease_view *v, int64_t slot)
     a->moving = (uint8_t)moving;
 }
 
-static int own_right_is_near(const lease_view *v, int self, int64_t slot)
+static int own_right_is_near(const lease_scope *v, int self, int64_t slot)
 {
     for (int64_t t = slot + 1; t <= slot + v->n / 2; t++) {
         const int given = v->lessee[t % v->window];
@@ -154,7 +154,7 @@ static int own_right_is_near(const lease_view *v, int self, int64_t slot)
 /* An OPEN turn is for those whom nobody expects. The first one is taken at once, or with a chance that falls with the number
  * of agents that wake in these days; without an answer (a gossip entry of mine in the frames that follow) the chance halves
  * each time, so that many who woke together get out of each other's way. */
-static int takes_open(const swarm *s, const lease_view *v, int self, int64_t slot)
+static int takes_open(const swarm *s, const lease_scope *v, int self, int64_t slot)
 {
     if (v->a->woke < 0 || own_right_is_near(v, self, slot)) return 0;
     const int halvings = v->a->attempts < 5 ? v->a->attempts : 5;
@@ -167,13 +167,13 @@ static int takes_open(const swarm *s, const lease_view *v, int self, int64_t slo
 int lease_decide(swarm *s, int l, int64_t slot, int *reason)
 {
     const int self = s->local[l];
-    lease_view v = lease_of(s, l);
+    lease_scope v = lease_of(s, l);
     lease_agent *a = v.a;
     *reason = REASON_NOBODY;
     if (!s->present[l]) {
         if (a->started) { /* whatever it knew is gone when it comes back */
             lease_restart(s, l);
-            swarm_reset_view(s, l);
+            swarm_reset_table(s, l);
         }
         return -1;
     }
@@ -208,7 +208,7 @@ int lease_decide(swarm *s, int l, int64_t slot, int *reason)
 
 /* ---- what was heard ---- */
 
-static void judge_claim(const swarm *s, lease_view *v, int self, int64_t slot,
+static void judge_claim(const swarm *s, lease_scope *v, int self, int64_t slot,
                         const extended_frame *e, int was_absent)
 {
     lease_agent *a = v->a;
@@ -226,7 +226,7 @@ static void judge_claim(const swarm *s, lease_view *v, int self, int64_t slot,
 
 void lease_listen(swarm *s, int l, int64_t slot, const extended_frame *e, int wakes)
 {
-    lease_view v = lease_of(s, l);
+    lease_scope v = lease_of(s, l);
     lease_agent *a = v.a;
     const int self = s->local[l], sender = e->own.sender - 1;
     if (!a->started) return;
@@ -258,7 +258,7 @@ void lease_listen(swarm *s, int l, int64_t slot, const extended_frame *e, int wa
 
 /* ---- the slot is over ---- */
 
-static void end_probation(const swarm *s, lease_view *v, int self, int64_t slot)
+static void end_probation(const swarm *s, lease_scope *v, int self, int64_t slot)
 {
     lease_agent *a = v->a;
     if (slot % v->n == self && lease_is_anchor(v, slot)) a->anchored = 1;
@@ -270,7 +270,7 @@ static void end_probation(const swarm *s, lease_view *v, int self, int64_t slot)
         a->probation = 0;
 }
 
-static void note_silence(const lease_view *v, int64_t slot)
+static void note_silence(const lease_scope *v, int64_t slot)
 {
     lease_agent *a = v->a;
     if (a->expected < 0 || v->miss[a->expected] >= LEASE_MISSED ||
@@ -283,7 +283,7 @@ static void note_silence(const lease_view *v, int64_t slot)
 void lease_end(swarm *s, int64_t slot)
 {
     for (int l = 0; l < s->local_count; l++) {
-        lease_view v = lease_of(s, l);
+        lease_scope v = lease_of(s, l);
         lease_agent *a = v.a;
         if (!s->present[l] || !a->started) continue;
         if (s->sends[l]) {

@@ -34,17 +34,17 @@ typedef struct {
     uint8_t *quiet;       /* (n) in probation: sends in anchors only */
     int n, window, every; /* every: M */
     int64_t patience;     /* slots without a sign of life after which an agent is thought absent */
-} lease_view;
+} lease_scope;
 
-lease_view lease_of(const swarm *s, int l);
-int lease_is_anchor(const lease_view *v, int64_t slot);
-int lease_absent(const lease_view *v, int k, int64_t slot);
-int lease_alive(const lease_view *v, int k, int64_t slot);
-int lease_scheduled(const lease_view *v,
-                    int64_t slot); /* 0-based agent whose turn it is in this view, -1: nobody's */
-void lease_note(lease_view *v, int64_t turn, int lessee, int issuer);
+lease_scope lease_of(const swarm *s, int l);
+int lease_is_anchor(const lease_scope *v, int64_t slot);
+int lease_absent(const lease_scope *v, int k, int64_t slot);
+int lease_alive(const lease_scope *v, int k, int64_t slot);
+int lease_scheduled(const lease_scope *v,
+                    int64_t slot); /* 0-based agent whose turn it is in this table, -1: nobody's */
+void lease_note(lease_scope *v, int64_t turn, int lessee, int issuer);
 /* The turns a frame's lease bytes speak of, in order; the same for sender and receiver. -> number of turns. */
-int lease_turns(const lease_view *v, int64_t slot, int c_s, int64_t *turns, int room);
+int lease_turns(const lease_scope *v, int64_t slot, int c_s, int64_t *turns, int room);
 
 /* lease_issue.c */
 void lease_fill(swarm *s, int l, int64_t slot, extended_frame *e);

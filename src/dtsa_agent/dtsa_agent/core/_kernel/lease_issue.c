@@ -11,7 +11,7 @@ typedef struct {
     uint8_t able[LEASE_OPEN]; /* may be given a turn */
 } electorate;
 
-static void count_electorate(const swarm *s, int l, const lease_view *v, int64_t slot,
+static void count_electorate(const swarm *s, int l, const lease_scope *v, int64_t slot,
                              electorate *who)
 {
     const uint8_t *in_ap = s->in_ap + (long)l * s->n;
@@ -28,7 +28,7 @@ static void count_electorate(const swarm *s, int l, const lease_view *v, int64_t
 }
 
 /* Number of consecutive ids before me that nobody has heard of for long. */
-static int count_absent_before(const lease_view *v, int self, int64_t slot)
+static int count_absent_before(const lease_scope *v, int self, int64_t slot)
 {
     int count = 0;
     while (count < v->n - 1 && lease_absent(v, (self - 1 - count + v->n) % v->n, slot)) count++;
@@ -36,7 +36,7 @@ static int count_absent_before(const lease_view *v, int self, int64_t slot)
 }
 
 /* To whom a turn is worth most: the longest wait before it, times the wait that follows. */
-static int choose_lessee(const swarm *s, int l, const lease_view *v, const electorate *who,
+static int choose_lessee(const swarm *s, int l, const lease_scope *v, const electorate *who,
                          int64_t slot, int64_t turn)
 {
     const int n = v->n;
@@ -67,7 +67,7 @@ static int choose_lessee(const swarm *s, int l, const lease_view *v, const elect
 }
 
 /* How many of its next turns an idle agent gives away. */
-static int depth(const swarm *s, int l, const lease_view *v, const electorate *who, int64_t slot)
+static int depth(const swarm *s, int l, const lease_scope *v, const electorate *who, int64_t slot)
 {
     const lease_agent *a = v->a;
     if (a->idle_since < 0 || !who->members || a->deaf > LEASE_DEAF || slot < v->n) return 0;
@@ -78,14 +78,14 @@ static int depth(const swarm *s, int l, const lease_view *v, const electorate *w
 }
 
 /* One of S turns is for those who wake; two, while many do. */
-static int is_open(const swarm *s, const lease_view *v, int64_t turn)
+static int is_open(const swarm *s, const lease_scope *v, int64_t turn)
 {
     const int every = s->lease.open_every;
     if (!every) return 0;
     return turn % every == 0 || (v->a->wakers > BUSY && turn % every == every / 2);
 }
 
-static void issue(swarm *s, int l, lease_view *v, int64_t slot, extended_frame *e)
+static void issue(swarm *s, int l, lease_scope *v, int64_t slot, extended_frame *e)
 {
     int64_t turns[LEASE_ROOM];
     electorate who;
@@ -110,7 +110,7 @@ static void issue(swarm *s, int l, lease_view *v, int64_t slot, extended_frame *
     }
 }
 
-static void relay(const lease_view *v, int self, int64_t slot, extended_frame *e)
+static void relay(const lease_scope *v, int self, int64_t slot, extended_frame *e)
 {
     int count = 0;
     for (int d = 1; d <= RELAY_REACH && count < RELAY_IDS; d++) {
@@ -125,7 +125,7 @@ static void relay(const lease_view *v, int self, int64_t slot, extended_frame *e
 void lease_fill(swarm *s, int l, int64_t slot, extended_frame *e)
 {
     const int self = s->local[l];
-    lease_view v = lease_of(s, l);
+    lease_scope v = lease_of(s, l);
     const int own_turn = slot % v.n == self;
     e->probation = v.a->probation;
     e->leaving = own_turn && s->present[l] == PRESENT_LEAVING;

@@ -83,14 +83,14 @@ int metrics_arrived(int n, const double *now, const double *target, const uint8_
 void metrics_news(metrics *m, swarm *s, int64_t slot, const double *truth, const uint8_t *moving)
 {
     const int n = s->n;
-    for (int view = 0; view < s->view_count; view++) {
-        const int observer = s->observer[view];
+    for (int table = 0; table < s->table_count; table++) {
+        const int observer = s->observer[table];
         const int64_t weight = observer < 0 ? n - 1 : 1;
-        const uint8_t *ap = s->in_ap + (long)view * n;
-        const int64_t *sent = s->sent_slot + (long)view * n;
-        const double *p = s->est_p + (long)view * 3 * n;
+        const uint8_t *ap = s->in_ap + (long)table * n;
+        const int64_t *sent = s->sent_slot + (long)table * n;
+        const double *p = s->est_p + (long)table * 3 * n;
         double errors = 0.0;
-        swarm_estimate(s, view, slot, 0);
+        swarm_estimate(s, table, slot, 0);
         for (int k = 0; k < n; k++) {
             if (!moving[k] || !ap[k] || k == observer || sent[k] < 0) continue;
             const int64_t age = slot - 1 - sent[k];

@@ -41,26 +41,26 @@ int avoid_params_from_dict(PyObject *dict, avoid_params *params)
 
 /* The buffers of one call; all are released together. */
 typedef struct {
-    Py_buffer views[8];
+    Py_buffer tables[8];
     int count;
 } borrowed;
 
 static void give_back(borrowed *b)
 {
-    while (b->count > 0) PyBuffer_Release(&b->views[--b->count]);
+    while (b->count > 0) PyBuffer_Release(&b->tables[--b->count]);
 }
 
 /* count: number of doubles wanted, or -1 for any whole multiple of 3. */
 static Py_buffer *take(borrowed *b, PyObject *object, const char *name, Py_ssize_t count,
                        int writable)
 {
-    Py_buffer *view = &b->views[b->count];
+    Py_buffer *table = &b->tables[b->count];
     const int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (writable ? PyBUF_WRITABLE : 0);
-    if (PyObject_GetBuffer(object, view, flags) < 0) return NULL;
+    if (PyObject_GetBuffer(object, table, flags) < 0) return NULL;
     b->count++;
-    const Py_ssize_t items = view->len / (Py_ssize_t)sizeof(double);
-    if (view->itemsize != sizeof(double) || !view->format || view->format[0] != 'd' ||
-        view->format[1]) {
+    const Py_ssize_t items = table->len / (Py_ssize_t)sizeof(double);
+    if (table->itemsize != sizeof(double) || !table->format || table->format[0] != 'd' ||
+        table->format[1]) {
         PyErr_Format(PyExc_ValueError, "%s: items must be float64", name);
         return NULL;
     }
@@ -68,7 +68,7 @@ static Py_buffer *take(borrowed *b, PyObject *object, const char *name, Py_ssize
         PyErr_Format(PyExc_ValueError, "%s: wrong number of values: %zd", name, items);
         return NULL;
     }
-    return view;
+    return table;
 }
 
 static int check_kind(int kind)

@@ -20,31 +20,31 @@ static int metrics_init(MetricsObject *self, PyObject *args, PyObject *kwargs)
     if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OOOLdd", names, &start, &target, &moving, &from,
                                      &self->collision_m, &self->r_min))
         return -1;
-    Py_buffer view;
+    Py_buffer table;
     if (self->moving) {
         PyErr_SetString(PyExc_RuntimeError, "metrics are created once");
         return -1;
     }
-    if (PyObject_GetBuffer(moving, &view, PyBUF_C_CONTIGUOUS) < 0) return -1;
-    const int n = (int)view.len;
+    if (PyObject_GetBuffer(moving, &table, PyBUF_C_CONTIGUOUS) < 0) return -1;
+    const int n = (int)table.len;
     self->n = n;
     self->news_from = from;
     self->moving = PyMem_Malloc((size_t)n + 1);
     self->m.path = PyMem_Calloc((size_t)n + 1, sizeof(double));
     self->m.last_position = PyMem_Calloc((size_t)(3 * n) + 1, sizeof(double));
     self->target = PyMem_Calloc((size_t)(3 * n) + 1, sizeof(double));
-    if (self->moving) memcpy(self->moving, view.buf, (size_t)n);
-    PyBuffer_Release(&view);
+    if (self->moving) memcpy(self->moving, table.buf, (size_t)n);
+    PyBuffer_Release(&table);
     if (!self->moving || !self->m.path || !self->m.last_position || !self->target) {
         PyErr_NoMemory();
         return -1;
     }
-    if (borrow(start, "start", 3 * n, 8, 0, &view) < 0) return -1;
-    memcpy(self->m.last_position, view.buf, sizeof(double) * 3 * (size_t)n);
-    PyBuffer_Release(&view);
-    if (borrow(target, "target", 3 * n, 8, 0, &view) < 0) return -1;
-    memcpy(self->target, view.buf, sizeof(double) * 3 * (size_t)n);
-    PyBuffer_Release(&view);
+    if (borrow(start, "start", 3 * n, 8, 0, &table) < 0) return -1;
+    memcpy(self->m.last_position, table.buf, sizeof(double) * 3 * (size_t)n);
+    PyBuffer_Release(&table);
+    if (borrow(target, "target", 3 * n, 8, 0, &table) < 0) return -1;
+    memcpy(self->target, table.buf, sizeof(double) * 3 * (size_t)n);
+    PyBuffer_Release(&table);
     self->m.min_distance2 = 1e300;
     return 0;
 }

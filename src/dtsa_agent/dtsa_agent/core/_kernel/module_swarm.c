@@ -44,7 +44,7 @@ static const array_spec ARRAYS[] = {
     FIELD(local, 4, 'l'),  FIELD(observer, 4, 'v'),   FIELD(start, 8, 'N'),
     FIELD(target, 8, 'N'), FIELD(sent_p, 8, 'T'),     FIELD(sent_v, 8, 'T'),
     FIELD(sent_c, 8, 'T'), FIELD(sent_slot, 8, 't'),  FIELD(last, 8, 't'),
-    FIELD(in_ap, 1, 't'),  FIELD(entry_hash, 4, 't'), FIELD(view_hash, 4, 'v'),
+    FIELD(in_ap, 1, 't'),  FIELD(entry_hash, 4, 't'), FIELD(table_hash, 4, 'v'),
     FIELD(est_p, 8, 'T'),  FIELD(est_v, 8, 'T'),      FIELD(g, 8, 't'),
     FIELD(h, 8, 't'),      FIELD(pos, 8, 'L'),        FIELD(vel, 8, 'L'),
     FIELD(cmd, 8, 'L'),    FIELD(goal, 8, 'L'),       FIELD(track, 8, 'S'),
@@ -56,7 +56,7 @@ static const array_spec ARRAYS[] = {
 
 static Py_ssize_t array_count(const swarm *s, char shape)
 {
-    const Py_ssize_t n = s->n, l = s->local_count, v = s->view_count;
+    const Py_ssize_t n = s->n, l = s->local_count, v = s->table_count;
     switch (shape) {
     case 'l':
         return l;
@@ -86,7 +86,7 @@ static int read_params(swarm *s, PyObject *p)
     int bad = 0;
     s->n = (int)number_or(p, "agents", &bad);
     s->local_count = (int)number_or(p, "local_count", &bad);
-    s->view_count = (int)number_or(p, "view_count", &bad);
+    s->table_count = (int)number_or(p, "table_count", &bad);
     s->steps = (int)number_or(p, "steps", &bad);
     s->shared = (int)number_or(p, "shared", &bad);
     s->slot_s = real_or(p, "slot_s", &bad);
@@ -119,7 +119,7 @@ static int read_params(swarm *s, PyObject *p)
         return -1;
     }
     if (bad || avoid_params_from_dict(avoid, &s->avoid) < 0) return -1;
-    if (s->n < 1 || s->local_count < 0 || s->view_count < 0 || s->steps < 1 || s->decay_len < 1) {
+    if (s->n < 1 || s->local_count < 0 || s->table_count < 0 || s->steps < 1 || s->decay_len < 1) {
         PyErr_SetString(PyExc_ValueError, "sizes must be positive");
         return -1;
     }
@@ -145,9 +145,9 @@ static int check_indices(const swarm *s)
 {
     for (int l = 0; l < s->local_count; l++)
         if (s->local[l] < 0 || s->local[l] >= s->n) return -1;
-    for (int v = 0; v < s->view_count; v++)
+    for (int v = 0; v < s->table_count; v++)
         if (s->observer[v] < -1 || s->observer[v] >= s->n) return -1;
-    if (s->local_count && s->view_count < (s->shared ? 1 : s->local_count)) return -1;
+    if (s->local_count && s->table_count < (s->shared ? 1 : s->local_count)) return -1;
     return 0;
 }
 
@@ -285,8 +285,8 @@ static PyObject *py_estimate(SwarmObject *self, PyObject *const *args, Py_ssize_
     if (count < 1 || count > 2) return PyErr_Format(PyExc_TypeError, "estimate(slot, step=0)");
     if (slot_arg(args[0], &slot) < 0 || (count == 2 && step_of(&self->s, args[1], &step) < 0))
         return NULL;
-    for (int view = 0; view < self->s.view_count; view++)
-        swarm_estimate(&self->s, view, slot, step);
+    for (int table = 0; table < self->s.table_count; table++)
+        swarm_estimate(&self->s, table, slot, step);
     Py_RETURN_NONE;
 }
 
@@ -299,7 +299,7 @@ static PyObject *py_hear(SwarmObject *self, PyObject *const *args, Py_ssize_t co
     if (slot_arg(args[0], &slot) < 0) return NULL;
     if (PyObject_GetBuffer(args[1], &data, PyBUF_SIMPLE) < 0) return NULL;
     if (count == 3 && args[2] != Py_None) {
-        if (borrow(args[2], "mask", self->s.view_count, 1, 0, &mask) < 0) {
+        if (borrow(args[2], "mask", self->s.table_count, 1, 0, &mask) < 0) {
             PyBuffer_Release(&data);
             return NULL;
         }
@@ -330,7 +330,7 @@ static PyObject *py_restart(SwarmObject *self, PyObject *arg)
     if (self->s.shared)
         return PyErr_Format(PyExc_ValueError,
                             "restart: agents that share a table cannot restart alone");
-    swarm_reset_view(&self->s, (int)l);
+    swarm_reset_table(&self->s, (int)l);
     if (self->s.policy == POLICY_LEASE) lease_restart(&self->s, (int)l);
     Py_RETURN_NONE;
 }
@@ -343,7 +343,7 @@ static PyObject *py_lease_status(SwarmObject *self, PyObject *arg)
         return PyErr_Format(PyExc_IndexError, "no local agent %ld", l);
     if (self->s.policy != POLICY_LEASE)
         return PyErr_Format(PyExc_ValueError, "lease_status: the policy is not lease");
-    const lease_view v = lease_of(&self->s, (int)l);
+    const lease_scope v = lease_of(&self->s, (int)l);
     int alive = 1, absent = 0;
     for (int k = 0; k < v.n; k++) {
         if (k == self->s.local[l]) continue;

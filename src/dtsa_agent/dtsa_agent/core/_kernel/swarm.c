@@ -25,10 +25,10 @@ static uint64_t bits(double x)
     return u;
 }
 
-/* Keeps the digest of a view: the XOR of one hash an entry, so that a change costs one entry. */
-static void rehash(swarm *s, int view, int k)
+/* Keeps the digest of a table: the XOR of one hash an entry, so that a change costs one entry. */
+static void rehash(swarm *s, int table, int k)
 {
-    const long plane = (long)view * 3 * s->n + k, at = (long)view * s->n + k;
+    const long plane = (long)table * 3 * s->n + k, at = (long)table * s->n + k;
     uint64_t x = mix64((uint64_t)k + 1);
     x = mix64(x ^ (uint64_t)s->sent_slot[at]);
     x = mix64(x ^ (uint64_t)s->last[at]);
@@ -39,16 +39,16 @@ static void rehash(swarm *s, int view, int k)
     }
     const uint32_t hash =
         (uint32_t)(x ^ x >> 32); /* players of bags refuse numbers that a double cannot hold */
-    s->view_hash[view] ^= s->entry_hash[at] ^ hash;
+    s->table_hash[table] ^= s->entry_hash[at] ^ hash;
     s->entry_hash[at] = hash;
 }
 
-void swarm_reset_view(swarm *s, int view)
+void swarm_reset_table(swarm *s, int table)
 {
     const int n = s->n;
-    s->view_hash[view] = 0;
+    s->table_hash[table] = 0;
     for (int k = 0; k < n; k++) {
-        const long plane = (long)view * 3 * n + k, at = (long)view * n + k;
+        const long plane = (long)table * 3 * n + k, at = (long)table * n + k;
         for (int i = 0; i < 3; i++) {
             s->sent_p[plane + (long)i * n] = s->start[i * n + k];
             s->sent_v[plane + (long)i * n] = s->sent_c[plane + (long)i * n] = 0.0;
@@ -56,14 +56,14 @@ void swarm_reset_view(swarm *s, int view)
         s->sent_slot[at] = s->last[at] = -1;
         s->in_ap[at] = 1;
         s->entry_hash[at] = 0;
-        rehash(s, view, k);
+        rehash(s, table, k);
     }
 }
 
 void swarm_reset_tables(swarm *s)
 {
     const int n = s->n;
-    for (int view = 0; view < s->view_count; view++) swarm_reset_view(s, view);
+    for (int table = 0; table < s->table_count; table++) swarm_reset_table(s, table);
     for (int l = 0; l < s->local_count; l++) {
         for (int i = 0; i < 3; i++) {
             const double p = s->start[i * n + s->local[l]];
@@ -91,12 +91,12 @@ static void extrapolate(int n, const double *restrict p, const double *restrict 
     for (int k = 0; k < n; k++) out[k] = p[k] + v[k] * age[k];
 }
 
-static void estimate_into(const swarm *s, int view, int kind, int64_t slot, int step, double *p,
+static void estimate_into(const swarm *s, int table, int kind, int64_t slot, int step, double *p,
                           double *v)
 {
     const int n = s->n;
-    const long plane = (long)view * 3 * n;
-    const int64_t *sent = s->sent_slot + (long)view * n;
+    const long plane = (long)table * 3 * n;
+    const int64_t *sent = s->sent_slot + (long)table * n;
     double *age = s->ages;
     const double offset = step * s->dt;
     for (int k = 0; k < n; k++)
@@ -126,12 +126,12 @@ static void estimate_into(const swarm *s, int view, int kind, int64_t slot, int 
     }
 }
 
-void swarm_estimate(swarm *s, int view, int64_t slot, int step)
+void swarm_estimate(swarm *s, int table, int64_t slot, int step)
 {
-    double *p = s->est_p + (long)view * 3 * s->n, *v = s->est_v + (long)view * 3 * s->n;
+    double *p = s->est_p + (long)table * 3 * s->n, *v = s->est_v + (long)table * 3 * s->n;
     if (s->estimator == ESTIMATE_EXTERNAL) return;
     if (s->estimator != ESTIMATE_ORACLE) {
-        estimate_into(s, view, s->estimator, slot, step, p, v);
+        estimate_into(s, table, s->estimator, slot, step, p, v);
         return;
     }
     for (int l = 0; l < s->local_count; l++)
@@ -163,12 +163,12 @@ static choice choose_outside(const swarm *s, int64_t slot, const uint8_t *in_ap)
 }
 
 /* Whose turn it is in the eyes of one table; the same for every agent whose table is the same. */
-static choice choose(swarm *s, int view, int64_t slot)
+static choice choose(swarm *s, int table, int64_t slot)
 {
     const int n = s->n;
-    const uint8_t *in_ap = s->in_ap + (long)view * n;
-    const int64_t *last = s->last + (long)view * n;
-    int64_t *h = s->h + (long)view * n;
+    const uint8_t *in_ap = s->in_ap + (long)table * n;
+    const int64_t *last = s->last + (long)table * n;
+    int64_t *h = s->h + (long)table * n;
     if (s->policy == POLICY_TDMA) return (choice){(int)(slot % n), REASON_TDMA, 0.0};
     if (s->policy == POLICY_DTSA && s->boot_round && slot < n)
         return (choice){(int)slot, REASON_BOOT, 0.0};
@@ -186,9 +186,9 @@ static choice choose(swarm *s, int view, int64_t slot)
     if (s->age_cap > 0.0 && (double)h[oldest] >= s->age_cap * members)
         return (choice){oldest, REASON_AGE_CAP, 0.0};
 
-    double *p = s->scratch, *v = p + 3 * n, *g = s->g + (long)view * n;
+    double *p = s->scratch, *v = p + 3 * n, *g = s->g + (long)table * n;
     const int kind = s->estimator == ESTIMATE_INTENT ? ESTIMATE_INTENT : ESTIMATE_LINEAR;
-    estimate_into(s, view, kind, slot, 0, p, v);
+    estimate_into(s, table, kind, slot, 0, p, v);
     priority_values(n, s->slot_s, p, v, g, v + 3 * n);
     choice c;
     c.index = select_sender(n, s->selection, s->epsilon, g, h, in_ap, 0, &c.reason);
@@ -197,9 +197,9 @@ static choice choose(swarm *s, int view, int64_t slot)
 }
 
 /* ALOHA: each agent in A_p sends with probability 1 / N_p, by a seeded draw that depends on slot and id only. */
-static choice choose_aloha(const swarm *s, int view, int64_t slot, int self)
+static choice choose_aloha(const swarm *s, int table, int64_t slot, int self)
 {
-    const uint8_t *in_ap = s->in_ap + (long)view * s->n;
+    const uint8_t *in_ap = s->in_ap + (long)table * s->n;
     const choice back = choose_outside(s, slot, in_ap);
     if (back.index >= 0) return back;
     int members = 0;
@@ -210,24 +210,24 @@ static choice choose_aloha(const swarm *s, int view, int64_t slot, int self)
     return (choice){-1, REASON_RANDOM, 0.0};
 }
 
-static int view_of(const swarm *s, int l) { return s->shared ? 0 : l; }
+static int table_of(const swarm *s, int l) { return s->shared ? 0 : l; }
 
 void swarm_decide(swarm *s, int64_t slot)
 {
     choice c = {-1, REASON_NOBODY, 0.0};
     for (int l = 0; l < s->local_count; l++) {
-        const int view = view_of(s, l), self = s->local[l];
+        const int table = table_of(s, l), self = s->local[l];
         if (s->policy == POLICY_LEASE) {
             c.index = lease_decide(s, l, slot, &c.reason);
         } else if (s->policy == POLICY_ALOHA) {
-            c = choose_aloha(s, view, slot, self);
+            c = choose_aloha(s, table, slot, self);
         } else if (l == 0 || !s->shared) {
-            c = choose(s, view, slot);
+            c = choose(s, table, slot);
         }
         s->chosen[l] = (uint16_t)(c.index + 1);
         s->reason[l] = (uint8_t)c.reason;
         s->score[l] = c.score;
-        s->digest[l] = s->view_hash[view];
+        s->digest[l] = s->table_hash[table];
         s->sends[l] = c.index == self && s->present[l];
     }
 }
@@ -269,10 +269,10 @@ void swarm_emit(swarm *s, int64_t slot)
 /* ---- what the air carried ---- */
 
 /* One observer learns one agent's sent state. */
-void swarm_learn(swarm *s, int view, const dtsa_frame *f, int64_t sampled)
+void swarm_learn(swarm *s, int table, const dtsa_frame *f, int64_t sampled)
 {
     const int n = s->n, k = f->sender - 1;
-    const long at = (long)view * n + k, plane = (long)view * 3 * n + k;
+    const long at = (long)table * n + k, plane = (long)table * 3 * n + k;
     const int rests = f->c_r == 0; /* out of A_p: it stands at its target, where all know that */
     for (int i = 0; i < 3; i++) {
         const long e = plane + (long)i * n;
@@ -283,7 +283,7 @@ void swarm_learn(swarm *s, int view, const dtsa_frame *f, int64_t sampled)
     s->sent_slot[at] = sampled;
     s->in_ap[at] = !rests;
     if (s->last[at] < sampled) s->last[at] = sampled;
-    rehash(s, view, k);
+    rehash(s, table, k);
 }
 
 int swarm_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const uint8_t *mask)
@@ -300,10 +300,10 @@ int swarm_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const u
         s->foreign++;
         return 0;
     }
-    for (int view = 0; view < s->view_count; view++) {
-        if (mask && !mask[view]) continue;
-        if (s->sent_slot[(long)view * s->n + f.sender - 1] >= slot - late) continue;
-        swarm_learn(s, view, &f, slot - late);
+    for (int table = 0; table < s->table_count; table++) {
+        if (mask && !mask[table]) continue;
+        if (s->sent_slot[(long)table * s->n + f.sender - 1] >= slot - late) continue;
+        swarm_learn(s, table, &f, slot - late);
     }
     return 1;
 }
@@ -312,12 +312,12 @@ void swarm_end(swarm *s, int64_t slot)
 {
     /* A sender knows what it said, whether or not anybody heard it: its own entry is the last SENT state. */
     for (int i = 0; i < s->sender_count; i++) {
-        const int l = s->senders[i], view = view_of(s, l);
+        const int l = s->senders[i], table = table_of(s, l);
         dtsa_frame f;
-        if (s->sent_slot[(long)view * s->n + s->local[l]] == slot) continue;
+        if (s->sent_slot[(long)table * s->n + s->local[l]] == slot) continue;
         if (frame_decode(s->frames + (long)l * FRAME_MAX, s->frame_len[l], s->position_step, &f) ==
             FRAME_OK)
-            swarm_learn(s, view, &f, slot);
+            swarm_learn(s, table, &f, slot);
     }
     if (s->policy == POLICY_LEASE) {
         lease_end(s, slot);
@@ -342,17 +342,17 @@ void swarm_steer(swarm *s, int64_t slot, int step, int estimate)
     const int n = s->n, count = s->local_count;
     const int aged = s->avoid.margin_rate > 0.0;
     for (int l = 0; l < count; l++) {
-        const int view = view_of(s, l);
+        const int table = table_of(s, l);
         double *c = s->cmd + l;
         if (!s->active[l] || !s->present[l]) {
             c[0] = c[count] = c[2 * count] = 0.0;
             if (!(l == 0 && s->shared)) continue;
         }
-        const double *p = s->est_p + (long)view * 3 * n, *v = s->est_v + (long)view * 3 * n;
-        if (estimate && (l == 0 || !s->shared)) swarm_estimate(s, view, slot, step);
+        const double *p = s->est_p + (long)table * 3 * n, *v = s->est_v + (long)table * 3 * n;
+        if (estimate && (l == 0 || !s->shared)) swarm_estimate(s, table, slot, step);
         if (!s->active[l] || !s->present[l]) continue;
         if (aged) {
-            const int64_t *sent = s->sent_slot + (long)view * n;
+            const int64_t *sent = s->sent_slot + (long)table * n;
             for (int k = 0; k < n; k++)
                 s->ages[k] =
                     sent[k] < 0 ? 0.0 : (double)(slot - sent[k]) * s->slot_s + step * s->dt;
