@@ -10,6 +10,7 @@ COMMANDS = {
     "fly": "one flight with real ROS 2 nodes, recorded to a bag",
     "simulate": "one or many flights without ROS, as fast as the machine allows",
     "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
+    "soak": "what is too long for the tests: kills, faults, load and memory over hours",
     "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
     "replay": "play a bag back into the ROS graph",
     "verify": "check a bag: was every decision what the protocol says?",

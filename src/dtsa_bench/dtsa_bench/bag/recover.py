@@ -1,8 +1,9 @@
 """Makes a full bag of what a killed recorder, a full disk or a damaged disk left.
 
 The file is read record by record, without its index. Chunks that are whole are kept if their checksum
-fits; of a chunk that was cut off, all messages that are whole. Where the records make no sense, the next
-chunk is searched for. The original is only read.
+fits. A chunk that was cut off is left out where the recorder closed chunks after complete steps of the run only:
+what is saved is a run up to such a step. From other bags all messages of it that are whole are kept. Where the
+records make no sense, the next chunk is searched for. The original is only read.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from dtsa_bench.bag.errors import UnusableBag
 from dtsa_bench.bag.place import bag_of, find_file
 from dtsa_bench.bag.reader import PACKED_MESSAGES
 from dtsa_bench.bag.schema import Definition
-from dtsa_bench.bag.writer import BagWriter
+from dtsa_bench.bag.writer import BROKEN_OFF, COMPLETE, MARKED, BagWriter
 
 _LAST_OPCODE = container.DATA_END
 _INDEX = struct.Struct("<HI")
@@ -148,6 +149,9 @@ class _Salvage:
             return  # its own length is damaged, not its end missing
         part = container.decompress_part(head, self._data[position + head.offset :])
         entries = self._open(part[: head.size], position)
+        if self.custom_data.get(MARKED) == COMPLETE and not self._keep_damaged:
+            self.notes.append(f"the last chunk is cut off; {len(entries)} messages of an unfinished step are left out")
+            return
         self.notes.append(f"the last chunk is cut off; {len(entries)} messages of it are whole")
         yield from entries
 
@@ -301,5 +305,7 @@ def _copy(salvage: _Salvage, result: Recovery, progress: Callable[[int], None] |
                 progress(number)
         result.saved = writer.counts
         result.start_ns, result.end_ns = writer.time_range_ns
+        if not result.closed:
+            writer.custom_data[BROKEN_OFF] = str(result.end_ns)
     if unknown:
         salvage.notes.append(f"{unknown} messages belong to topics whose definition is lost")

@@ -3,7 +3,8 @@
 `<directory>/<name>_0.mcap` holds the messages in compressed chunks with all indexes,
 `<directory>/metadata.yaml` describes it. A chunk is closed and handed to the operating system every half
 second, so that a killed recorder loses no more than that; `dtsa_bench.bag.recover` makes a full bag of
-what it left.
+what it left. A recorder that says where a step of its run is complete (`mark`) gets chunks that end there and
+nowhere else: whatever byte such a file is cut at, its whole chunks are a run up to a complete step.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ from dtsa_bench.bag.qos import Profile, dump, resolve
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
 FLUSH_S = 0.5
+BROKEN_OFF = "broken_off"  # key of custom_data of a bag saved from a file that was not finished: its end, ns
+MARKED = "chunks"  # key of custom_data of a bag whose chunks end where a step of the run is complete,
+COMPLETE = "complete steps"  # and its value
+_UNLIMITED = 1 << 62  # bytes: chunks end at marks
+_RECORD_BYTES = 31  # bytes of a message record beside its data
 
 
 class BagWriter:
@@ -42,6 +48,7 @@ class BagWriter:
     :param custom_data: further texts for `custom_data` of the metadata.
     :param ros_distro: ROS distribution named in the metadata.
     :param min_time_ns: ns, earliest log time that is accepted.
+    :param marked: whether chunks end at a `mark` only; who records calls it after each step of the run.
     :raises ConfigError: if the directory is in use or the compression is unknown.
     :raises BagError: if the directory cannot be made or written to.
     """
@@ -55,6 +62,7 @@ class BagWriter:
         custom_data: Mapping[str, str] | None = None,
         ros_distro: str = "jazzy",
         min_time_ns: int = MIN_TIME_NS,
+        marked: bool = False,
     ) -> None:
         if compression not in COMPRESSIONS:
             raise ConfigError("compression", compression, ", ".join(COMPRESSIONS))
@@ -69,6 +77,10 @@ class BagWriter:
                 "seed": str({**config, **config.get("swarm", {})}.get("seed", "")),
                 "configuration": json.dumps(config, sort_keys=True),
             }
+        if marked:
+            self.custom_data[MARKED] = COMPLETE
+        self._marked, self._chunk_size = marked, chunk_size
+        self._chunk_bytes = 0  # in the chunk that is being filled
         self._min_time_ns = min_time_ns
         self.path = self.directory / f"{self.directory.resolve().name}_0.mcap"
         self._ros_distro = ros_distro
@@ -88,7 +100,8 @@ class BagWriter:
             self._stream = self.path.open("xb")
         except OSError as error:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
-        self._mcap = Writer(self._stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
+        size = _UNLIMITED if marked else chunk_size
+        self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
         try:
             self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
             self._add_metadata_record()
@@ -179,12 +192,22 @@ class BagWriter:
             self._start_ns = log_time_ns
         if log_time_ns > self._end_ns:
             self._end_ns = log_time_ns
-        if monotonic() >= self._next_flush:
+        if self._marked:
+            self._chunk_bytes += len(data) + _RECORD_BYTES
+        elif monotonic() >= self._next_flush:
+            self.flush()
+
+    def mark(self) -> None:
+        """What has been written until now is a run up to a complete step: a chunk may end here.
+
+        :raises BagError: if what is due cannot be saved.
+        """
+        if self._marked and (monotonic() >= self._next_flush or self._chunk_bytes > self._chunk_size):
             self.flush()
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system. `write` does this by itself every half
-        second of wall time; a recorder that may wait long for its next message calls it too.
+        """Hand everything written so far to the operating system. `write`, or `mark` where there are marks, does
+        this by itself every half second of wall time; a recorder that may wait long for its next message calls it too.
 
         :raises BagError: if that fails, on a full disk for example.
         """
@@ -193,7 +216,7 @@ class BagWriter:
             self._mcap.flush()
         except OSError as error:
             self._fail(error)
-        self._unsaved = 0
+        self._unsaved = self._chunk_bytes = 0
         self._next_flush = monotonic() + FLUSH_S
 
     def close(self) -> None:

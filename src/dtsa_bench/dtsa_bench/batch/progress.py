@@ -6,6 +6,8 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +32,23 @@ def run_batch(
     :raises DtsaError: see :func:`~dtsa_bench.batch.pool.run_all`.
     """
     journal = Journal(directory, plan, work.code())
+    with ending_on_signals(journal), Progress(journal) as progress:
+        cores = len(os.sched_getaffinity(0)) if jobs is None else jobs
+        return run_all(plan, work, journal, jobs=cores, cluster=cluster, progress=progress.advance)
+
+
+@contextmanager
+def ending_on_signals(journal: Journal) -> Iterator[None]:
+    """Closes a journal at the end; on Ctrl-C and SIGTERM it says what is saved.
+
+    :param journal: of the batch that runs.
+    :raises KeyboardInterrupt: on both signals.
+    """
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:
-        with Progress(journal) as progress:
-            cores = len(os.sched_getaffinity(0)) if jobs is None else jobs
-            return run_all(plan, work, journal, jobs=cores, cluster=cluster, progress=progress.advance)
+        yield
     except KeyboardInterrupt:
-        saved = f"{len(journal.rows())} runs are saved in {directory}"
+        saved = f"{len(journal.rows())} runs are saved in {journal.directory}"
         print(f"dtsa: interrupted; {saved}, the same command goes on from there", file=sys.stderr)
         raise
     finally:

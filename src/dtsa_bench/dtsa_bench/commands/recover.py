@@ -43,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"{topic:{width}}  {count:>9}{missing}")
     seconds = (result.end_ns - result.start_ns) / 1e9
     print(f"saved {result.count} messages, {seconds:.3f} s of simulated time, to {result.directory}")
+    if not result.closed:
+        print(f"  the recording breaks off at {result.end_ns / 1e9:.3f} s; `verify` checks it up to there")
     for note in result.damaged or ["the file was whole: nothing was lost"]:
         print(f"  {note}")
     return 0

@@ -53,7 +53,8 @@ def _print(result: object) -> None:
     assert isinstance(result, Result)
     pace = result.simulated_s / result.wall_time_s if result.wall_time_s else 0.0
     verdict = "everything is what the protocol gives" if result.ok else "NOT what the protocol gives"
-    print(f"{result.bag}: {verdict}")
+    end = f", up to slot {result.slots - 1}, where the recording breaks off" if result.broken_off and result.ok else ""
+    print(f"{result.bag}: {verdict}{end}")
     took = f"{result.simulated_s:.2f} s in {result.wall_time_s:.2f} s ({pace:.0f} x)"
     print(f"  {result.mode}, {result.slots} slots, {took}")
     if result.checked:

@@ -43,7 +43,7 @@ class FlightRecorder(ChannelObserver):
         self._packed = SlotMessages(scenario, self._slot_ns, run_id)
         agents = run.swarm.agents
         self.bag = BagWriter(
-            directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}"}
+            directory, run.to_dict(), custom_data={"seed": str(run.swarm.seed), RUN_ID: f"{run_id:08x}"}, marked=True
         )
         add = self.bag.add_topic
         self._slot = add(f"{names.SWARM}/{names.SLOT}", "dtsa_msgs/msg/Slot")
@@ -110,10 +110,13 @@ class FlightRecorder(ChannelObserver):
     def _write_pending(self) -> None:
         """Writes all about the slot before the last one that was answered."""
         if self._pending_slot < self._complete:
-            self._write_messages(self._pending_slot)
+            # What came too late for its own slot is written with the next one.
+            for slot in sorted(slot for slot in {*self._messages, *self._answers} if slot <= self._pending_slot):
+                self._write_messages(slot)
             for channel, data, at in self._pending:
                 self.bag.write(channel, data, at, at)
             self._pending = []
+            self.bag.mark()
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self._write_pending()

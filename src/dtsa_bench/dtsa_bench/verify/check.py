@@ -9,6 +9,7 @@ from pathlib import Path
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.bag.errors import BagError, UnusableBag
 from dtsa_bench.bag.reader import Bag
+from dtsa_bench.bag.writer import BROKEN_OFF
 
 from .lockstep import LockstepCheck
 from .result import Difference, Mismatch, Result
@@ -25,7 +26,7 @@ def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) 
     begin = time.perf_counter()
     with Bag(path) as bag:
         mode = str(bag.config.get("mode", "lockstep"))
-        result = Result(str(path), mode)
+        result = Result(str(path), mode, broken_off=BROKEN_OFF in bag.custom_data)
         try:
             _check(bag, mode, result, progress)
         except Mismatch as mismatch:

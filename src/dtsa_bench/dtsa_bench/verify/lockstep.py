@@ -183,6 +183,9 @@ class LockstepCheck:
             )
 
     def _check_summary(self) -> None:
+        if self.result.broken_off:
+            self.result.skipped["summary.json"] = "the recording breaks off before the end of the flight"
+            return
         path = Path(self.bag.path).parent.parent / "summary.json"
         if not path.is_file():
             self.result.skipped["summary.json"] = "not beside the bag"

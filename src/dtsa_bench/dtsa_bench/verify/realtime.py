@@ -101,7 +101,7 @@ class RealtimeCheck:
     def _finish(self) -> None:
         result, frames = self.result, self.frames
         summary = self._summary()
-        late = summary.get("late_frames", 0)
+        late = summary.get("late_frames", frames.dropped if result.broken_off else 0)
         for what, times in frames.check_overlaps(late).items():
             result.count(what, times)
         missed = summary.get("missed_reports", len(self._carried))
@@ -336,6 +336,9 @@ class RealtimeCheck:
             self.result.count("odometry", len(row))
 
     def _summary(self) -> dict[str, Any]:
+        if self.result.broken_off:
+            self.result.skipped["summary.json"] = "the recording breaks off before the end of the flight"
+            return {}
         path = Path(self.bag.path).parent.parent / "summary.json"
         if not path.is_file():
             self.result.skipped["summary.json"] = "not beside the bag"

@@ -61,6 +61,7 @@ class Result:
     checked: dict[str, int] = field(default_factory=dict)  # what was compared and found equal -> how often
     skipped: dict[str, str] = field(default_factory=dict)  # what was not checked -> why
     safety: dict[str, Any] = field(default_factory=dict)
+    broken_off: bool = False  # the recorder was stopped before it had finished: checked up to there
     difference: Difference | None = None
 
     @property
@@ -79,6 +80,7 @@ class Result:
             "mode": self.mode,
             "ok": self.ok,
             "slots": self.slots,
+            "broken_off": self.broken_off,
             "simulated_s": self.simulated_s,
             "wall_time_s": self.wall_time_s,
             "checked": self.checked,

@@ -1,0 +1,166 @@
+"""A flight of `dtsa fly` as a process of its own, and what it has started: for soaks, which kill and stop them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from .item import NotMet
+
+PATIENCE_S = 180.0  # s of wall time that anything may take
+_BEGUN_BYTES = 6_000  # of the bag: some slots have been recorded
+ENDLESS = ("--tail-s", "3600", "--no-picture")  # of simulated time, long enough to be disturbed
+
+
+def command(*words: str) -> list[str]:
+    """Words that run a command of `dtsa` in this environment."""
+    return [sys.executable, "-m", "dtsa_bench", *words]
+
+
+def dtsa(*words: str, patience_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
+    """Runs a command of `dtsa` to its end.
+
+    :param words: the command and its options.
+    :param patience_s: s, after which it counts as hung.
+    :raises NotMet: if it does not end.
+    """
+    try:
+        return subprocess.run(command(*words), capture_output=True, text=True, timeout=patience_s, check=False)
+    except subprocess.TimeoutExpired:
+        raise NotMet(f"`dtsa {' '.join(words[:1])}` did not end within {patience_s:g} s") from None
+
+
+def until(condition: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
+    """Waits for something.
+
+    :param condition: what is waited for.
+    :param what: the same in words.
+    :param patience_s: s, how long.
+    :raises NotMet: if it does not happen.
+    """
+    deadline = time.monotonic() + patience_s
+    while not condition():
+        if time.monotonic() > deadline:
+            raise NotMet(f"{what}: not within {patience_s:g} s")
+        time.sleep(0.02)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and is not waited for does not."""
+    try:
+        return b") Z " not in Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return False
+
+
+def children(supervisor: int) -> list[int]:
+    """Processes that a flight has started and that are still there, whoever their parent is by now."""
+    mark = f"DTSA_SUPERVISOR={supervisor}".encode()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                if mark in (entry / "environ").read_bytes().split(b"\0") and alive(int(entry.name)):
+                    found.append(int(entry.name))
+    return sorted(found)
+
+
+@dataclass(slots=True)
+class Running:
+    """A flight under way."""
+
+    out: Path
+    process: subprocess.Popen[bytes]
+    domain: int = 0  # ROS domain; 0: its own choice
+    known: list[int] = field(default_factory=list)  # its node processes when it had begun
+
+    @property
+    def bag(self) -> Path:
+        """The file that is being recorded."""
+        return self.out / "bag" / "bag_0.mcap"
+
+    def bag_bytes(self) -> int:
+        """Size of the file that is being recorded; 0: not there yet."""
+        with contextlib.suppress(OSError):
+            return self.bag.stat().st_size
+        return 0
+
+    def said(self) -> str:
+        """Everything on standard error until now."""
+        return (self.out.parent / "said.txt").read_text(errors="replace")
+
+    def pid_of(self, agent: int) -> int:
+        """Process of one agent, in flights with a process each."""
+        name = f"__ns:=/cf{agent}".encode()
+        for pid in children(self.process.pid):
+            if name in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                return pid
+        raise NotMet(f"cf{agent} has no process")
+
+    def end(self, patience_s: float = PATIENCE_S) -> int:
+        """Waits for the flight to end by itself; its exit code.
+
+        :param patience_s: s, how long.
+        :raises NotMet: if it does not.
+        """
+        try:
+            return self.process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            raise NotMet(f"the flight did not end within {patience_s:g} s") from None
+
+    def nobody_left(self) -> None:
+        """Waits until no process of the flight is left.
+
+        :raises NotMet: if one stays.
+        """
+        until(lambda: not children(self.process.pid), "all processes of the flight end", 20.0)
+
+
+@contextmanager
+def flying(directory: Path, *words: str, begun: bool = True, files_bytes: int = 0) -> Iterator[Running]:
+    """A flight; whatever happens to it, no process of it is left afterwards.
+
+    :param directory: where its directory `out` and what it says are put.
+    :param words: options of `dtsa fly`.
+    :param begun: wait until some slots are in its bag.
+    :param files_bytes: largest size of a file that it can write; 0: any.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+
+    def limit() -> None:
+        import resource
+
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (files_bytes, files_bytes))
+
+    with (directory / "said.txt").open("wb") as said:
+        process = subprocess.Popen(
+            command("fly", "--out", str(directory / "out"), *words),
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            preexec_fn=limit if files_bytes else None,
+        )
+    flight = Running(directory / "out", process)
+    try:
+        if begun:
+            until(lambda: process.poll() is not None or flight.bag_bytes() > _BEGUN_BYTES, "the flight begins")
+            if process.poll() is not None:
+                raise NotMet(f"the flight ended before it had begun: {flight.said().strip()[-300:]}")
+            flight.known = children(process.pid)
+        yield flight
+    finally:
+        left = children(process.pid)
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        for pid in {*left, *children(process.pid)}:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)

@@ -1,0 +1,136 @@
+"""Runs a soak item by item, within a limit of time, and writes what it found."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from dtsa_bench.batch.journal import Journal
+from dtsa_bench.batch.progress import Progress, ending_on_signals
+from dtsa_bench.batch.table import write_whole
+from dtsa_bench.batch.task import FAILED, Row, Task, attempt
+
+from .item import Item, Soak, SoakPlan
+
+_PACKAGES = Path(__file__).resolve().parents[3]  # where the packages' sources lie side by side
+PASSED = "passed"
+
+
+def code_digest() -> str:
+    """A digest of all Python sources: rows of different code are never mixed."""
+    digest = hashlib.sha256()
+    for name in ("dtsa_agent", "dtsa_channel_sim", "dtsa_bench", "dtsa_msgs"):
+        for path in sorted((_PACKAGES / name).rglob("*")):
+            if path.suffix in (".py", ".c", ".h", ".msg") and "test" not in path.parts:
+                digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def run_soak(soak: Soak, directory: Path, minutes: float, sample: bool = False) -> dict[str, Any]:
+    """Does what a directory's journal does not have yet, one item after the other.
+
+    :param soak: the soak.
+    :param directory: where the journal is; made if it does not exist.
+    :param minutes: no item begins later than this.
+    :param sample: only the items that the ordinary tests run.
+    :returns: the record of the soak, see :func:`record_of`.
+    :raises KeyboardInterrupt: on Ctrl-C and SIGTERM; finished items are kept.
+    """
+    plan, end = SoakPlan(soak, sample), time.monotonic() + 60.0 * minutes
+    journal = Journal(directory, plan, code_digest())
+    state = _machine()
+    before = _load()
+    with ending_on_signals(journal), Progress(journal) as progress:
+        rows = journal.rows()
+        for task in plan.tasks():
+            if task.key in rows:
+                continue
+            if time.monotonic() >= end:
+                break
+            row = _one(soak, plan.items[task.cell], task)
+            journal.append([row])
+            rows[task.key] = row
+            if row["status"] == FAILED:
+                print(f"{plan.name}: {plan.items[task.cell].name}: {row['reason']}", file=sys.stderr)
+            progress.advance(1, task.cost)
+    record = record_of(plan, rows, state)
+    return {**record, "load": {"before": before, "after": _load()}}
+
+
+def _one(soak: Soak, item: Item, task: Task) -> Row:
+    begin, load = time.monotonic(), _load()
+
+    def run(_: Task) -> tuple[str, Row]:
+        with tempfile.TemporaryDirectory(prefix="dtsa-soak-") as directory:
+            return PASSED, soak.run(item, Path(directory))
+
+    row = attempt(task, run)
+    return {**row, "item": item.name, "wall_s": round(time.monotonic() - begin, 1), "load": load[0]}
+
+
+def record_of(plan: SoakPlan, rows: dict[str, Row], state: dict[str, Any]) -> dict[str, Any]:
+    """What is kept of a soak.
+
+    :param plan: the items.
+    :param rows: those that are finished, by key.
+    :param state: what it ran on.
+    """
+    tasks = list(plan.tasks())
+    done = [rows[task.key] for task in tasks if task.key in rows]
+    failures = [{"item": row["item"], "reason": row["reason"]} for row in done if row["status"] == FAILED]
+    return {
+        "soak": plan.name,
+        "promise": plan.soak.promise,
+        **state,
+        "seeds": sorted({row["seed"] for row in done}),
+        "items": len(tasks),
+        "finished": len(done),
+        "wall_s": round(sum(row["wall_s"] for row in done), 1),
+        "load_of_items": [min((r["load"] for r in done), default=0.0), max((r["load"] for r in done), default=0.0)],
+        "figures": plan.soak.figures([row for row in done if row["status"] != FAILED]),
+        "failures": failures,
+    }
+
+
+def write_record(path: Path, record: dict[str, Any]) -> None:
+    """Writes a soak's record as JSON, whole or not at all.
+
+    :param path: the file; its directory is made.
+    :param record: what :func:`run_soak` returned.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json.dumps(record, indent=1) + "\n")
+
+
+def _machine() -> dict[str, Any]:
+    """The commit, and whether the tree differs from it; cores and Python."""
+    commit = _git("rev-parse", "HEAD")
+    return {
+        "commit": commit or "unknown",
+        "tree_changed": bool(_git("status", "--porcelain", "--untracked-files=no")) if commit else None,
+        "date": time.strftime("%Y-%m-%dT%H:%MZ", time.gmtime()),
+        "cores": len(os.sched_getaffinity(0)),
+        "python": ".".join(map(str, sys.version_info[:3])),
+    }
+
+
+def _git(*words: str) -> str:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(_PACKAGES), *words], capture_output=True, text=True, timeout=30, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def _load() -> list[float]:
+    """Load of the machine over the last 1, 5 and 15 minutes."""
+    return [float(word) for word in Path("/proc/loadavg").read_text(encoding="ascii").split()[:3]]
