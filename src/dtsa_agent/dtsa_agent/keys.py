@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from dtsa_agent.core import AbstractSwarm, ConfigError
+from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig
 from dtsa_agent.core.authentication import AuthenticatedSwarm, Authenticator
 
 VARIABLE = "DTSA_AUTH_KEY"
@@ -16,9 +16,23 @@ def with_key(swarm: AbstractSwarm) -> AbstractSwarm:
     :param swarm: as it was made.
     :raises ConfigError: if there is no key, or none that is usable.
     """
-    if swarm.config.auth:
-        text = os.environ.get(VARIABLE, "")
-        if not text:
-            raise ConfigError(VARIABLE, text, "32 to 64 hexadecimal digits in the environment, because auth is on")
-        return AuthenticatedSwarm(swarm, Authenticator.from_hex(text, swarm.config.auth_session))
-    return swarm
+    authenticator = _authenticator(swarm.config)
+    return AuthenticatedSwarm(swarm, authenticator) if authenticator else swarm
+
+
+def check_key(config: SwarmConfig) -> None:
+    """Looks whether there is a usable key where the settings ask for one, before anything is started or written.
+
+    :param config: the swarm's settings.
+    :raises ConfigError: if there is none.
+    """
+    _authenticator(config)
+
+
+def _authenticator(config: SwarmConfig) -> Authenticator | None:
+    if not config.auth:
+        return None
+    text = os.environ.get(VARIABLE, "")
+    if not text:
+        raise ConfigError(VARIABLE, text, "32 to 64 hexadecimal digits in the environment, because auth is on")
+    return Authenticator.from_hex(text, config.auth_session)

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core import ConfigError, LocalProtocolError, Swarm, SwarmConfig
-from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
+from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator, is_pattern
 
 KEY = bytes(range(32))
+RANDOM_KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
 FUZZ_FRAMES = 1_000_000
 
 
@@ -64,8 +65,44 @@ def test_the_key_is_never_shown() -> None:
         Authenticator.from_hex("secret" * 6)
     assert "secret" not in str(caught.value)
     with pytest.raises(ConfigError, match="auth_session"):
-        Authenticator.from_hex(KEY.hex(), 2**64)
-    assert Authenticator.from_hex(KEY.hex()).seal(b"x", 1) == Authenticator(KEY).seal(b"x", 1)
+        Authenticator.from_hex(RANDOM_KEY, 2**64)
+    assert Authenticator.from_hex(RANDOM_KEY).seal(b"x", 1) == Authenticator(bytes.fromhex(RANDOM_KEY)).seal(b"x", 1)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        bytes(16),
+        b"\xa5" * 32,
+        b"secret" * 4,
+        b"swarmkey" * 2,
+        bytes(range(32)),
+        bytes(range(255, 239, -1)),
+        bytes(17 * k % 256 for k in range(16)),
+    ],
+)
+def test_keys_that_are_a_pattern_are_refused(key: bytes) -> None:
+    with pytest.raises(ConfigError, match="auth_key: got 'bytes in a pattern'; allowed: random ones"):
+        Authenticator.from_hex(key.hex())
+
+
+@given(st.binary(min_size=16, max_size=32).filter(lambda key: len(set(key)) > 8))
+def test_keys_with_a_pattern_nowhere_are_taken(key: bytes) -> None:
+    assert is_pattern(key + key)
+    if not is_pattern(key):
+        Authenticator.from_hex(key.hex())
+
+
+def test_of_ten_thousand_frames_of_another_run_with_the_same_key_none_is_taken() -> None:
+    """Slots count from 0 in each flight: only the session tells one from another."""
+    flight, other = (Authenticator(KEY, session) for session in (0x1234_5678_9ABC, 0x1234_5678_9ABD))
+    taken = 0
+    for slot in range(10_000):
+        data = slot.to_bytes(4, "little") * 5
+        taken += flight.open(other.seal(data, slot), slot, late=1) is not None
+    assert (taken, flight.rejected) == (0, 10_000)
+    flight.begin(0x1234_5678_9ABD)
+    assert flight.open(other.seal(b"frame", 3), 3) == b"frame"
 
 
 @pytest.mark.parametrize("length", [0, 57])

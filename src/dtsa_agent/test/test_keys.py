@@ -9,9 +9,9 @@ import pytest
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 from dtsa_agent.core.plugins import make_swarm
-from dtsa_agent.keys import VARIABLE, with_key
+from dtsa_agent.keys import VARIABLE, check_key, with_key
 
-KEY = "00112233445566778899aabbccddeeff"
+KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
 
 
 @pytest.fixture(autouse=True)
@@ -70,3 +70,22 @@ def test_a_missing_or_bad_key_is_said_without_showing_it(monkeypatch: pytest.Mon
     with pytest.raises(ConfigError) as caught:
         swarm()
     assert not text or text not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "00" * 16])
+def test_a_key_can_be_looked_for_before_anything_is_made(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    check_key(SwarmConfig(auth=True))
+    monkeypatch.setenv(VARIABLE, text)
+    check_key(SwarmConfig())
+    with pytest.raises(ConfigError):
+        check_key(SwarmConfig(auth=True))
+
+
+def test_a_session_can_begin_when_the_flight_does() -> None:
+    sealed, other = swarm(policy="tdma"), swarm(policy="tdma")
+    first = one_slot(sealed, 0)[0]
+    other.begin_session(7)
+    assert one_slot(other, 0)[0][:-4] == first[:-4]
+    before = other.rejected
+    assert not other.hear(0, first)
+    assert other.rejected == before + 1

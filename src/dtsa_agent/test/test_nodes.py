@@ -15,7 +15,7 @@ from node_helpers import Graph, end_of, ros_graph
 pytest.importorskip("dtsa_msgs.msg")
 
 from builtin_interfaces.msg import Time
-from dtsa_msgs.msg import Decision, Slot, Transmission
+from dtsa_msgs.msg import Decision, Process, Slot, Transmission
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 from std_msgs.msg import Header
@@ -24,6 +24,7 @@ from dtsa_agent.core import REASONS, Scenario, Swarm, SwarmConfig, decode_frame,
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import format_values, parse_values, settings_of
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.runs import Run
 from dtsa_agent.ros.common.wire import pack_received, split_frames, unpack_received
 
 AGENT, HOST = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host"
@@ -35,16 +36,32 @@ class Channel:
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.answers: list[Transmission] = []
+        self.run = Run.draw()
+        self.processes: list[Process] = []  # what processes have told about themselves
         qos = names.lockstep_qos()
+        graph.node.create_subscription(Process, "/swarm/process", self.processes.append, qos)
         self.publisher = graph.node.create_publisher(Slot, "/swarm/slot", qos)
         graph.node.create_subscription(Transmission, "/swarm/transmission", self._put, qos)
 
     def _put(self, message: Transmission) -> None:
         self.answers.append(message)
 
+    def call(self) -> Process:
+        """Calls until a process tells about itself."""
+        message = Slot(run=self.run.number, phase=Slot.PREPARE, data=array("B", self.run.call("/test")))
+        self.graph.until(lambda: self.processes, lambda: self.publisher.publish(message))
+        return self.processes[-1]
+
+    def end(self, slot: int) -> None:
+        """Ends the run."""
+        proof = array("B", self.run.proof)
+        self.publisher.publish(Slot(run=self.run.number, slot=slot, phase=Slot.END, data=proof))
+
     def ask(self, slot: int, phase: int = Slot.RUN, **fields: object) -> Transmission:
         """Opens a slot and waits for the answer; slot 0 is repeated until the node is there."""
-        message = Slot(slot=slot, phase=phase, heard_slot=max(0, slot - 1), **fields)
+        if not slot:
+            self.call()
+        message = Slot(run=self.run.number, slot=slot, phase=phase, heard_slot=max(0, slot - 1), **fields)
         before = len(self.answers)
         if slot:
             self.publisher.publish(message)
@@ -69,10 +86,10 @@ def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> Non
         frame = decode_frame(bytes(second.data))
         assert (frame.sender, frame.slot) == (2, 1)
         count = len(channel.answers)
-        channel.publisher.publish(Slot(slot=1, heard_slot=0))
+        channel.publisher.publish(Slot(run=channel.run.number, slot=1, heard_slot=0))
         graph.until(lambda: len(channel.answers) > count)
         assert channel.answers[-1] == second  # asked again: the same answer, nothing has moved
-        channel.publisher.publish(Slot(slot=2, phase=Slot.END))
+        channel.end(2)
         assert end_of(agent) == (0, "")
 
 
@@ -95,13 +112,32 @@ def test_odometry_is_sent_to_who_listens_reliably_like_rviz(tmp_path: Path) -> N
 
 
 @pytest.mark.ros
-def test_a_node_that_missed_slots_says_so_and_ends(tmp_path: Path) -> None:
+def test_slots_that_cannot_be_under_way_and_forged_ends_change_nothing(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
         channel = Channel(graph)
         agent = graph.start(AGENT, "-p", "id:=1", "-p", "agents:=2")
         channel.ask(0)
-        channel.publisher.publish(Slot(slot=7, heard_slot=6))
-        assert end_of(agent) == (1, "agent: error: slot 7 follows slot 0: this node has missed slots\n")
+        run = channel.run.number
+        for strange in (
+            Slot(run=run, slot=7, heard_slot=6),
+            Slot(run=run, slot=4_000_000_000),
+            Slot(run=run, slot=1, phase=Slot.END),
+            Slot(run=run, slot=1, phase=Slot.END, data=array("B", bytes(16))),
+            Slot(run=run, slot=1, sender=array("H", [1])),
+            Slot(run=run, slot=1, sender=[2], length=[3], data=[1, 2, 3], received=[0, 0]),
+            Slot(run=run, slot=1, phase=9),
+            Slot(run=run + 1, slot=1),
+            Slot(slot=1),
+        ):
+            channel.publisher.publish(strange)
+            graph.executor.spin_once(timeout_sec=0.05)
+        assert channel.ask(1).slot == 1
+        channel.end(2)
+        assert end_of(agent)[0] == 0
+        graph.until(lambda: sum(channel.processes[-1].dropped) >= 9)
+        told = channel.processes[-1]
+        counts = dict(zip(told.dropped_reason, told.dropped, strict=True))
+        assert counts == {"slot": 2, "forged end": 2, "sizes": 2, "range": 1, "other run": 2}
 
 
 @pytest.mark.ros

@@ -82,16 +82,24 @@ def test_agents_do_not_outlive_a_killed_flight(tmp_path: Path) -> None:
 
 
 NOISE = """
-import sys, rclpy
-from dtsa_msgs.msg import Slot, Transmission
+import json, sys, rclpy
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.ros.common.agreement import agreed_settings
+from dtsa_msgs.msg import Process, Slot, Transmission
 from rclpy.serialization import serialize_message
 rclpy.init()
 node = rclpy.create_node("noise")
 publisher = node.create_publisher(Transmission, "/swarm/transmission", 10)
 message = Transmission(agent=[2], length=[0], steps=1, track=[0.0] * 3, velocity=[0.0] * 3, command=[0.0] * 3,
                        chosen=[0], reason=[0], digest=[0], score=[0.0])
+settings = json.dumps(agreed_settings(SwarmConfig(agents=2), "lockstep"))
+hello = node.create_publisher(Process, "/swarm/process", 10)
 def answer(slot):
-    message.slot = slot.slot
+    if slot.phase == Slot.PREPARE:
+        hello.publish(Process(run=slot.run, process=2, node="/noise", agent=[2], settings=settings))
+    if slot.phase != Slot.RUN:
+        return
+    message.run, message.slot = slot.run, slot.slot
     data = bytes(serialize_message(message))
     if slot.slot >= 5:
         kind = sys.argv[1]
@@ -110,8 +118,14 @@ rclpy.spin(node)
     ("kind", "said"),
     [
         ("bytes", "channel: error: cf2 sent garbage in slot 5: a message of 44 bytes that is no Transmission"),
-        ("nan", "channel: error: cf2 sent an unusable answer: positions, velocities or goals that are no"),
-        ("shape", "channel: error: cf2 sent an unusable answer: 4 numbers in track for 1 agents"),
+        (
+            "nan",
+            "channel: error: cf2 sent garbage in slot 5: cf2 sent an unusable answer: positions, velocities or",
+        ),
+        (
+            "shape",
+            "channel: error: cf2 sent garbage in slot 5: cf2 sent an unusable answer: 4 numbers in track for 1 agents",
+        ),
     ],
 )
 def test_a_node_that_sends_garbage_is_named_and_the_others_end(tmp_path: Path, kind: str, said: str) -> None:

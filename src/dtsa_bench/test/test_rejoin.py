@@ -236,12 +236,14 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
     from node_helpers import end_of, ros_graph
 
     from dtsa_agent.ros.common import names
+    from dtsa_agent.ros.common.runs import Run
 
     with ros_graph(tmp_path) as graph:
         channel = graph.node.create_publisher(Slot, "/swarm/slot", names.lockstep_qos(4))
         options = ("agents:=3", "policy:=dtsa", "mode:=realtime")
         late = graph.start("dtsa_agent.ros.agent_node", *(word for option in options for word in ("-p", option)))
-        start = Slot(phase=Slot.START)
+        run = Run.draw()
+        start = Slot(run=run.number, phase=Slot.START, data=run.call("/test"))
         start.header.stamp.sec = 1
         deadline = time.monotonic() + PATIENCE_S
         while late.poll() is None and time.monotonic() < deadline:

@@ -102,11 +102,11 @@ def test_every_policy_verifies(tmp_path: Path, arguments: tuple[str, ...]) -> No
 
 
 def test_a_sealed_flight_verifies_with_its_key_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DTSA_AUTH_KEY", "00112233445566778899aabbccddeeff")
+    monkeypatch.setenv("DTSA_AUTH_KEY", "7c1f0a93e4d25b6880b13f96c2de470a")
     words = ("--agents", "4", "--policy", "dtsa", "--processes", "2", "--auth", "--timeout-s", "0.5", "--no-picture")
     out = fly(tmp_path / "flight", *words)
     assert verify_bag(out).ok
-    monkeypatch.setenv("DTSA_AUTH_KEY", "ff112233445566778899aabbccddeeff")
+    monkeypatch.setenv("DTSA_AUTH_KEY", "ff1f0a93e4d25b6880b13f96c2de470a")
     difference = verify_bag(out).difference
     assert difference is not None
     assert difference.what == "transmission.data"
@@ -261,7 +261,7 @@ def test_a_recovered_bag_verifies_up_to_where_it_was_cut(flight: Path, tmp_path:
 @pytest.mark.parametrize("sealed", [False, True])
 def test_a_wrong_frame_is_shown_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sealed: bool) -> None:
     if sealed:
-        monkeypatch.setenv("DTSA_AUTH_KEY", "5a" * 16)
+        monkeypatch.setenv("DTSA_AUTH_KEY", "c2de470a7c1f0a93e4d25b6880b13f96")
     shape = ("--agents", "4", "--moving", "2", "--policy", "lease", "--processes", "1", "--timeout-s", "0.5")
     flight = fly(tmp_path / "flight", *shape, *(["--auth"] if sealed else []))
 

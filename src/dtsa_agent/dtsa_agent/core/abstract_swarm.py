@@ -197,6 +197,12 @@ class AbstractSwarm(SwarmState, ABC):
         :param late: slots by which a frame may arrive after its own.
         """
 
+    def begin_session(self, session: int) -> None:
+        """A flight begins: from now on only frames of its session are authentic. Without a key nothing changes.
+
+        :param session: number of the flight.
+        """
+
     @abstractmethod
     def reset(self) -> None:
         """Everything back to the start of the run."""
@@ -303,6 +309,9 @@ class SwarmWrapper(AbstractSwarm):
 
     def unseal(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
         return self.inner.unseal(data, slot, late)
+
+    def begin_session(self, session: int) -> None:
+        self.inner.begin_session(session)
 
     def reset(self) -> None:
         self.inner.reset()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+from itertools import pairwise
 
 from .abstract_swarm import FRAME_MAX, AbstractSwarm, Bytes, SwarmWrapper
 from .errors import ConfigError, LocalProtocolError
@@ -26,14 +27,13 @@ class Authenticator:
     :raises ConfigError: for a key or a session that is not usable.
     """
 
-    __slots__ = ("_keyed", "forged", "truncated")
+    __slots__ = ("_key", "_keyed", "forged", "truncated")
 
     def __init__(self, key: bytes, session: int = 0) -> None:
         if not MIN_KEY <= len(key) <= MAX_KEY:
             raise ConfigError("auth_key", f"{len(key)} bytes", f"{MIN_KEY} to {MAX_KEY} bytes")
-        if not 0 <= session < 2**64:
-            raise ConfigError("auth_session", session, "0 to 2**64 - 1")
-        self._keyed = hashlib.blake2s(session.to_bytes(8, "little"), key=key, digest_size=TAG_LENGTH, person=b"dtsa v1")
+        self._key = key
+        self.begin(session)
         #: Frames whose tag was wrong: forged, changed, of another session or another slot.
         self.forged = 0
         #: Frames too short to have a tag.
@@ -45,13 +45,27 @@ class Authenticator:
 
         :param text: 32 to 64 hexadecimal digits.
         :param session: see the class.
-        :raises ConfigError: if it is none; the key itself is not in the message.
+        :raises ConfigError: if it is none, or one that can be guessed; the key itself is not in the message.
         """
         try:
             key = bytes.fromhex(text)
         except ValueError:
             raise ConfigError("auth_key", f"{len(text)} characters", "32 to 64 hexadecimal digits") from None
+        if is_pattern(key):
+            raise ConfigError("auth_key", "bytes in a pattern", "random ones, as of `openssl rand -hex 32`")
         return cls(key, session)
+
+    def begin(self, session: int) -> None:
+        """From now on frames are those of another session.
+
+        :param session: see the class.
+        :raises ConfigError: for one that is not usable.
+        """
+        if not 0 <= session < 2**64:
+            raise ConfigError("auth_session", session, "0 to 2**64 - 1")
+        self._keyed = hashlib.blake2s(
+            session.to_bytes(8, "little"), key=self._key, digest_size=TAG_LENGTH, person=b"dtsa v1"
+        )
 
     @property
     def rejected(self) -> int:
@@ -93,6 +107,17 @@ class Authenticator:
         return None
 
 
+def is_pattern(key: bytes) -> bool:
+    """Whether a key is no random one: a short text again and again, or bytes that go up or down in equal steps.
+
+    :param key: 1 byte or more.
+    """
+    length = len(key)
+    if any(key[period:] == key[:-period] for period in range(1, length // 2 + 1)):
+        return True
+    return len({(after - before) % 256 for before, after in pairwise(key)}) <= 1
+
+
 class AuthenticatedSwarm(SwarmWrapper):
     """A swarm whose frames leave with a tag; only frames with a right one come in, others are counted.
 
@@ -123,6 +148,9 @@ class AuthenticatedSwarm(SwarmWrapper):
 
     def unseal(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
         return self.authenticator.open(data, slot, late)
+
+    def begin_session(self, session: int) -> None:
+        self.authenticator.begin(session)
 
     def with_own_tables(self, slot: int) -> AuthenticatedSwarm:
         swarm = AuthenticatedSwarm(self.inner.with_own_tables(slot), self.authenticator)

@@ -107,7 +107,8 @@ class SwarmConfig(Settings):
     )
     auth_session: int = setting(
         0,
-        "number of the flight for that code; a new one whenever slots count from 0 again",
+        "number of the flight for that code, so that frames of other flights are none of this; 0: nodes take a random "
+        "one for each flight",
         minimum=0,
         maximum=2**63 - 1,
     )

@@ -19,12 +19,14 @@ from dtsa_agent.core.joining import Listeners
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 
 from .common import names
+from .common.checks import SIZES, SLOT, Unusable, check_start
 from .common.loop import Stop
 from .common.stamps import header_of, ns_of
 from .common.wire import split_frames, unpack_received
 from .swarm_node import SwarmNode
 
 _PPB = 1_000_000_000
+_LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
@@ -66,6 +68,8 @@ class RealtimeNode(SwarmNode):
     :param resume_at: m, x, y, z of each agent in turn: where its vehicle hovers when it comes into a flight under way;
         none: at its start in the scenario.
     """
+
+    mode = "realtime"
 
     def __init__(
         self,
@@ -119,6 +123,18 @@ class RealtimeNode(SwarmNode):
         """
         return np.asarray(time_ns + time_ns * self._drift // _PPB + self._offset)
 
+    def _plausible(self, message: Slot) -> None:
+        now = time.monotonic_ns()
+        if message.phase == Slot.START:
+            if not 0 < ns_of(message.header.stamp) <= now + _LONGEST_LEAD_NS:
+                raise Unusable(SLOT, f"a start at {ns_of(message.header.stamp) / _PPB:.3f} s, which cannot be")
+        elif message.phase == Slot.RUN and self._zero:
+            if not len(message.sender):
+                raise Unusable(SIZES, "a delivery without a frame")
+            here = max(self.slot, (now - self._zero) // self.slot_ns)
+            check_start(message.heard_slot * self.slot_ns, here * self.slot_ns)
+            check_start(self._began_ns(message), now - self._zero)
+
     def run(self, stop: Stop) -> None:
         """Flies until the run is over or a signal comes; with policy ``lease`` agents first say that they leave.
 
@@ -155,10 +171,9 @@ class RealtimeNode(SwarmNode):
         """Answers the channel's call, or takes the start time; False when the run is over."""
         if message.phase == Slot.PREPARE:
             self._called = True
-            self.run_id = message.run
-            self._answer(0, message.header, ())
+            self._answer(0, message.header, (), message.run)
         elif message.phase == Slot.START:
-            self.run_id = message.run
+            self._begin(message.run)
             self._zero = ns_of(message.header.stamp)
             if not self._called:
                 now = self.local_ns(time.monotonic_ns() - self._zero)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from array import array
 from collections.abc import Sequence
 from typing import Any
@@ -17,16 +16,19 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
 from dtsa_agent.core import AbstractSwarm, AgentGroup
-from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
+from dtsa_agent.core.errors import ConfigError
 
 from .common import names
+from .common.agreement import agreed_settings
+from .common.checks import SLOT, Unusable
 from .common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
 from .common.loop import Loop, Stop
 from .common.waiting import Waiting
 from .common.wire import split_frames, unpack_received
+from .membership import Membership
 
+_STRANGERS = 32  # messages that may wait beside the channel's
 _ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
-_GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
 
 
 class SwarmNode:
@@ -41,18 +43,18 @@ class SwarmNode:
     :param waiting: a quarter of the messages that may wait to be read: 1 is enough in lockstep.
     """
 
+    mode = "lockstep"
+
     def __init__(self, node: Node, swarm: AbstractSwarm, swarm_namespace: str = names.SWARM, waiting: int = 1) -> None:
         self.node = node
         self.config = config = swarm.config
         self.agents = AgentGroup(swarm)
-        self.run_id = 0  # as the channel says
         self.slot = -1  # the slot that has been answered
         self._goal = b""  # as last told
         self._nothing = np.zeros((0, config.agents), dtype=np.uint8)  # heard by whom, in a slot without frames
         self._message = Transmission()
         self._message.agent = array("H", swarm.ids)
         self._message.steps = config.steps
-        self._channel_seen = 0.0  # time.monotonic()
         self._odometry: list[tuple[int, Publisher]] = []
         self._frames: list[str] = []  # of the bodies in odometry
         self._watched: list[tuple[int, Publisher]] = []
@@ -61,12 +63,47 @@ class SwarmNode:
         self._waiting = Waiting(node.get_logger())
         self._begun = False
         self._publisher = node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
-        self.loop = Loop(node, Slot, f"{swarm_namespace}/{names.SLOT}", qos)
+        settings = agreed_settings(config, self.mode)
+        self.membership = Membership(node, swarm.ids, settings, swarm_namespace, self._dropped_frames, self._plausible)
+        intake = self.membership.intake
+        topic = f"{swarm_namespace}/{names.SLOT}"
+        # Messages of strangers must not push the channel's out before they are read.
+        reading = names.lockstep_qos(max(waiting, _STRANGERS // 4))
+        self.loop = Loop(node, Slot, topic, reading, intake=intake, admits=self.membership.admits)
 
     @property
     def swarm(self) -> AbstractSwarm:
         """The agents that live here."""
         return self.agents.swarm
+
+    @property
+    def run_id(self) -> int:
+        """The run that these agents take part in; 0: none yet."""
+        return self.membership.run
+
+    def _dropped_frames(self) -> dict[str, int]:
+        """Frames that these agents have kept out so far, by reason."""
+        swarm = self.agents.swarm
+        return {
+            "frame malformed": swarm.malformed,
+            "frame foreign": swarm.foreign,
+            "frame rejected": swarm.rejected,
+        }
+
+    def _plausible(self, message: Slot) -> None:
+        """Whether a slot message can be the next one.
+
+        :raises Unusable: if it cannot.
+        """
+        # The channel waits for this node's answer: it can be nowhere else.
+        if message.phase == Slot.RUN and not 0 <= message.slot - self.slot <= 1:
+            raise Unusable(SLOT, f"slot {message.slot} after slot {self.slot}")
+
+    def _begin(self, run: int) -> None:
+        """The run begins for these agents."""
+        self.membership.begin(run)
+        if self.config.auth and not self.config.auth_session:
+            self.swarm.begin_session(self.membership.session)
 
     def offer_odometry(self, namespaces: Sequence[str] | None = None) -> None:
         """Offers each agent's true motion as ``odom``; published only while somebody subscribes.
@@ -85,11 +122,7 @@ class SwarmNode:
 
         :raises LocalProtocolError: when the channel has gone without ending the run.
         """
-        now = time.monotonic()
-        if self.slot < 0 or self.loop.subscription.get_publisher_count():
-            self._channel_seen = now
-        elif now - self._channel_seen > _GONE_S:
-            raise LocalProtocolError(f"the channel has gone after slot {self.slot} without ending the run")
+        self.membership.idle(self.loop.subscription.get_publisher_count(), self.slot)
         self._tell_progress()
         self._watched = [entry for entry in self._odometry if entry[1].get_subscription_count()]
 
@@ -112,18 +145,17 @@ class SwarmNode:
         """Answers a slot message.
 
         :returns: False when the run is over.
-        :raises LocalProtocolError: when slot messages were missed.
         """
         if message.phase == Slot.END:
             return False
-        self.run_id = message.run
-        slot = message.slot
-        if slot != self.slot + 1:
-            if slot == self.slot:  # asked again: the answer was given before the channel could hear it
-                self._publisher.publish(self._message)
-            elif slot > self.slot:
-                raise LocalProtocolError(f"slot {slot} follows slot {self.slot}: this node has missed slots")
+        if message.phase != Slot.RUN:
             return True
+        slot = message.slot
+        if slot == self.slot:  # asked again: the answer was given before the channel could hear it
+            self._publisher.publish(self._message)
+            return True
+        if not slot:
+            self._begin(message.run)
         if slot:
             self._hear(message, slot - 1)
             self.agents.on_slot_end()
@@ -143,19 +175,14 @@ class SwarmNode:
         count = len(message.sender)
         if not count:
             return self.agents.on_frames(slot, (), (), self._nothing)
-        try:
-            heard = unpack_received(memoryview(message.received), count, self.config.agents)
-            frames = split_frames(memoryview(message.data), message.length)
-            if len(frames) != count:
-                raise ValueError(f"{len(frames)} frames of {count} senders")
-        except ValueError as error:
-            raise RemoteProtocolError(f"the channel's message for slot {message.slot} is unusable: {error}") from None
+        heard = unpack_received(memoryview(message.received), count, self.config.agents)
+        frames = split_frames(memoryview(message.data), message.length)
         return self.agents.on_frames(slot, message.sender, frames, heard)
 
-    def _answer(self, slot: int, header: Header, senders: Sequence[int]) -> None:
+    def _answer(self, slot: int, header: Header, senders: Sequence[int], run: int | None = None) -> None:
         swarm, message = self.swarm, self._message
         message.header = header
-        message.run = self.run_id
+        message.run = self.membership.run if run is None else run
         message.slot = slot
         frames = [swarm.frame(index) for index in senders]
         message.length = array("B", bytes(len(swarm.ids)))

@@ -33,6 +33,7 @@ from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.paths import shortest_s
 from dtsa_agent.crazyflie.priority import give_way, take_priority
 from dtsa_agent.crazyflie.units import to_map
+from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
@@ -309,6 +310,7 @@ def fly_crazyflies(
     """
     if run.mode == LOCKSTEP:
         raise ConfigError("mode", run.mode, "realtime: vehicles do not wait for the agents")
+    check_key(run.swarm)
     require_cflib()
     scenario = check_places(settings, run.swarm)
     with ros_domain(options.domain) as domain:

@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.joining import check_joinable
+from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
@@ -86,6 +87,7 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
 
     :raises ConfigError: for options that do not fit the run.
     """
+    check_key(run.swarm)
     make_scenario(run.swarm)  # says so if the field is larger than frames can say
     agents = run.swarm.agents
     if options.processes is not None and options.processes > agents:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,14 @@ from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.settings import Setting, settings_of
+from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.agreement import agreed_settings
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_setting, declare_settings
 from dtsa_agent.ros.common.process import run_node
+from dtsa_agent.ros.common.runs import Run
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig
@@ -25,7 +29,6 @@ from dtsa_channel_sim.ros.answer_limits import AnswerLimits
 from dtsa_channel_sim.ros.channel_node import follow_parameters, watch
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
-from dtsa_channel_sim.ros.ros_channel import new_run_id
 
 from .clock_statistics import ClockStatistics
 from .live_topics import LiveTopics
@@ -57,12 +60,16 @@ class RecordedFlight:
         end_s: float = 4.0,
         space: str = names.SWARM,
     ) -> None:
+        identity = Run.draw(run.swarm.auth_session)
+        agreed = agreed_settings(run.swarm, run.mode)
+        if run.swarm.auth:  # the bag says in which session its frames are authentic
+            run = replace(run, swarm=replace(run.swarm, auth_session=identity.session))
         self.run_config, self.directory = run, directory
         self.scenario = make_scenario(run.swarm)
         self.measurement = FlightMeasurement(run, self.scenario)
         model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
-        self.run_id = new_run_id()
-        limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run_id": self.run_id}
+        self.run_id = identity.number
+        limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed}
         limits["swarm_namespace"] = space
         self.channel: LockstepChannel | RealtimeChannel
         if run.mode == LOCKSTEP:
@@ -85,6 +92,7 @@ class RecordedFlight:
         """The flight's results."""
         channel = self.channel
         result = {**self.measurement.summary(), "unusable_messages": channel.unusable}
+        result["not_taken_in"] = dict(sorted(channel.dropped().items()))
         if isinstance(channel, RealtimeChannel):
             result |= {
                 "mode": self.run_config.mode,
@@ -141,6 +149,7 @@ def _body(stop: Stop, supervised: bool) -> None:
     node, space = swarm_wide_node("channel")
     try:
         run = declare_run(node)
+        check_key(run.swarm)
         directory = new_directory(declare_setting(node, Setting("out", "text", "flight", "directory for the results")))
         wait = AnswerLimits(**declare_settings(node, AnswerLimits))
         flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s, space=space)

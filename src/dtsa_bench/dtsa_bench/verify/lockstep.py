@@ -20,7 +20,7 @@ from .result import Difference, Mismatch, Result
 from .stream import Streams
 
 EVENTS = "/parameter_events"
-_NOT_COMPARED = ("wall_time_s", "realtime_factor", "unusable_messages")
+_NOT_COMPARED = ("wall_time_s", "realtime_factor", "unusable_messages", "not_taken_in")
 
 
 class LockstepCheck:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.errors import RemoteProtocolError
+from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unusable, check_frames
 from dtsa_agent.ros.common.wire import split_frames
 
 Array = NDArray[np.float64]
@@ -70,16 +69,13 @@ class Answers:
 
         :param message: a dtsa_msgs/Transmission.
         :returns: False if its agents have answered already (a message sent twice); nothing is changed then.
-        :raises RemoteProtocolError: if its fields do not fit together, naming the agents as far as it does.
+        :raises Unusable: if its fields do not fit together, naming the agents as far as it does.
         """
         count, at = self._where(message.agent)
         if self.answered[at].any():
             return False
-        try:
-            self._check(message, count)
-            frames = split_frames(memoryview(message.data), message.length) if len(message.data) else []
-        except ValueError as error:
-            raise RemoteProtocolError(f"{named(message.agent)} sent an unusable answer: {error}") from None
+        self._check(message, count)
+        frames = split_frames(memoryview(message.data), message.length) if len(message.data) else []
         self.track[:, :, at] = np.frombuffer(message.track).reshape(self.steps, 3, count)
         self.velocity[:, at] = np.frombuffer(message.velocity).reshape(3, count)
         self.command[:, at] = np.frombuffer(message.command).reshape(3, count)
@@ -100,19 +96,29 @@ class Answers:
     def _check(self, message: Any, count: int) -> None:
         """Whether the fields of a message fit together.
 
-        :raises ValueError: if they do not.
+        :raises Unusable: if they do not.
         """
         if message.steps != self.steps:
-            raise ValueError(f"{message.steps} control instants a slot instead of {self.steps}")
+            raise self._unusable(RANGE, message, f"{message.steps} control instants a slot instead of {self.steps}")
         for name, length in self._lengths:
             found = len(getattr(message, name))
             if found != length * count and (name != "goal" or found):
-                raise ValueError(f"{found} numbers in {name} for {count} agents")
-        if not len(message.data) and any(message.length):
-            raise ValueError(f"0 bytes of frames, {sum(message.length)} in their lengths")
-        # A sum is finite only if all its terms are.
-        if not math.isfinite(sum(message.track) + sum(message.velocity) + sum(message.command) + sum(message.goal)):
-            raise ValueError("positions, velocities or goals that are no numbers")
+                raise self._unusable(SIZES, message, f"{found} numbers in {name} for {count} agents")
+        if len(message.data) or any(message.length):
+            check_frames(message.length, message.data)
+        if max(message.chosen) > self.agents:
+            raise self._unusable(RANGE, message, f"{max(message.chosen)} chosen of {self.agents} agents")
+        # A sum of squares is finite only if all its terms are, and small only if they are.
+        for name in ("track", "velocity", "command", "goal"):
+            values = np.frombuffer(getattr(message, name))
+            if not values @ values <= FARTHEST_M**2:
+                raise self._unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
+        if np.isnan(message.score).any():
+            raise self._unusable(RANGE, message, "scores that are no numbers")
+
+    @staticmethod
+    def _unusable(reason: str, message: Any, detail: str) -> Unusable:
+        return Unusable(reason, f"{named(message.agent)} sent an unusable answer: {detail}")
 
     def carry(self, before: Answers) -> None:
         """Takes over from the slot before what nobody has told about this one: who is silent stays where it was.
@@ -134,8 +140,8 @@ class Answers:
         if known is None:
             index = np.array(ids, dtype=np.intp) - 1
             if not len(index) or index[0] < 0 or index[-1] >= self.agents or (np.diff(index) <= 0).any():
-                raise RemoteProtocolError(
-                    f"a message for agents {list(ids)}; allowed: ascending ids from 1 to {self.agents}"
+                raise Unusable(
+                    UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: ascending ids from 1 to {self.agents}"
                 )
             run = index[-1] - index[0] + 1 == len(index)
             known = len(index), slice(int(index[0]), int(index[-1]) + 1) if run else index

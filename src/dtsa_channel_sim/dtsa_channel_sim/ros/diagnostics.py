@@ -37,12 +37,13 @@ class Diagnostics(ChannelObserver):
             return
         values = {
             "slot": status.slot,
-            "unusable messages": status.unusable,
+            "not taken in": sum(status.dropped.values()),
             "agents awaited": status.awaited,
+            **{f"not taken in: {reason}": count for reason, count in sorted(status.dropped.items())},
             **{f"slots: {name}": count for name, count in zip(OUTCOMES, self._counts, strict=True)},
         }
         told = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if status.unusable else DiagnosticStatus.OK,
+            level=DiagnosticStatus.WARN if status.dropped else DiagnosticStatus.OK,
             name=self._name,
             message=f"slot {status.slot}",
             hardware_id="simulated",

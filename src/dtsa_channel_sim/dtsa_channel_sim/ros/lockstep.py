@@ -12,6 +12,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import OTHER_RUN, SLOT, UNREADABLE, Unusable
+from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
@@ -20,6 +22,7 @@ from .answers import named
 from .ros_channel import RosChannel, put_frames
 
 _REPEAT_S = 0.1  # until all agents have answered slot 0, it is sent again and again
+_REPEAT_LATER_S = 0.5  # and any later slot
 _GARBAGE_PATIENCE_S = 0.5
 
 
@@ -44,10 +47,13 @@ class LockstepChannel(RosChannel):
 
         :param stop: looked at in every slot, true once a signal has come.
         :raises LocalProtocolError: when an agent does not answer in time.
-        :raises RemoteProtocolError: when an answer is unusable.
+        :raises RemoteProtocolError: when an agent sends unusable messages only.
+        :raises ConfigError: before slot 0, when nodes do not fit together.
         :raises DtsaError: when an observer fails.
         """
         try:
+            if not self._call(stop):
+                return
             verdict: Verdict | None = None
             frames: dict[int, bytes] = {}
             slot = 0
@@ -112,28 +118,37 @@ class LockstepChannel(RosChannel):
             raise LocalProtocolError(
                 f"{named(self.answers.silent)} did not answer slot {slot} within {limit:g} s: dead or hung?"
             )
-        if slot == 0 and now - repeat > _REPEAT_S:
+        if now - repeat > (_REPEAT_LATER_S if slot else _REPEAT_S):
             self._publisher.publish(self._bytes)
             return now
         return repeat
 
     def _take(self, slot: int, data: bytes) -> None:
         try:
-            message = deserialize_message(data, Transmission)
-        except Exception as error:  # rclpy has no common base for what a message can do to it
-            self._complain(f"a message of {len(data)} bytes that is no Transmission ({str(error).splitlines()[0]})")
-            return
-        if message.slot != slot:
+            message = self._decoded(data)
+            if message.slot < slot:
+                return  # an answer that was asked for twice
             if message.slot > slot:
-                self._complain(f"{named(message.agent)} answered slot {message.slot}, which has not begun")
+                raise Unusable(SLOT, f"{named(message.agent)} answered slot {message.slot}, which has not begun")
+            fresh = self.answers.add(message)
+        except Unusable as error:
+            self.intake.drop(error.reason, str(error))
+            self._complaint, self._complaint_time = str(error), time.monotonic()
             return
-        if not len(message.agent) or min(message.agent) < 1 or max(message.agent) > self.agents:
-            self._complain(f"a message for agents {list(message.agent)[:8]}")
-            return
-        if self.answers.add(message):
+        if fresh:
             self._observers.answer_received(slot, message.agent.tobytes(), data)
 
-    def _complain(self, text: str) -> None:
-        """Unreadable messages name no sender: if an answer then is missing, this is why."""
-        self.unusable += 1
-        self._complaint, self._complaint_time = text, time.monotonic()
+    def _decoded(self, data: bytes) -> Any:
+        """A transmission message of one of this run's processes.
+
+        :raises Unusable: if it is none.
+        """
+        try:
+            message = deserialize_message(data, Transmission)
+        except Exception as error:  # rclpy has no common base for what a message can do to it
+            said = (str(error).splitlines() or [""])[0]
+            raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no Transmission ({said})") from None
+        if message.run != self.run_id:
+            raise Unusable(OTHER_RUN, f"an answer of run {run_text(message.run)}")
+        self.roster.check_sender(message.agent, self.loop.number, time.monotonic())
+        return message

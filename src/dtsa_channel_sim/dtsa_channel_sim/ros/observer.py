@@ -29,7 +29,7 @@ class ChannelStatus:
     """How the channel is doing."""
 
     slot: int  # the last one opened (lockstep) or closed (real time); -1: none yet
-    unusable: int  # messages that could not be read, or came from agents that do not exist
+    dropped: dict[str, int]  # messages and frames not taken in, by reason
     awaited: list[int]  # ids of the agents whose answers are missing
     lag_ms: float = 0.0  # by how much the channel is late now, in real time
 

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
-from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
+from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import OTHER_RUN, SIZES, UNREADABLE, Unusable, check_start
+from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of, time_of
 from dtsa_channel_sim.model.air import Air, FrameVerdict
 from dtsa_channel_sim.model.airtime import LONGEST_FRAME
@@ -50,10 +52,11 @@ class RealtimeChannel(RosChannel):
     :param more: as for :class:`RosChannel`.
     """
 
+    mode = "realtime"
+
     def __init__(self, node: Node, channel: Channel, steps: int, answer_s: float = 0.0, **more: Any) -> None:
         super().__init__(node, channel, steps, waiting=names.REALTIME_WAITING, **more)
         self.missed = 0  # reports of agents that came too late to count
-        self.lost: set[int] = set()  # ids of agents that have fallen silent
         self.returned: set[int] = set()  # ids of those that were, and report again
         self.air: Air[_Sent] = Air(channel)
         self._steps = steps
@@ -116,6 +119,8 @@ class RealtimeChannel(RosChannel):
 
     def _prepare(self, stop: object) -> bool:
         """Waits until all agents have reported, and tells them when slot 0 starts."""
+        if not self._call(stop, self.lost):
+            return False
         begin = time.monotonic()
         repeat = 0.0
         self.answers.open()
@@ -125,12 +130,13 @@ class RealtimeChannel(RosChannel):
             now = time.monotonic()
             if now - repeat > _REPEAT_S:
                 repeat = now
-                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE))
+                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, data=self._calling))
             data = self.loop.wait()
             if data is not None:
                 message = self._decoded(data)
                 if message is not None:
-                    self.answers.add(message)
+                    with self.intake.guard():
+                        self.answers.add(message)
             self._housekeeping()
             if now - begin > self._startup_s:
                 missing = named(set(self.answers.silent) - self.lost)
@@ -142,7 +148,8 @@ class RealtimeChannel(RosChannel):
 
     def _tell_start(self) -> None:
         self._told = time.monotonic()
-        self._publisher.publish(Slot(header=header_of(self._zero), run=self.run_id, phase=Slot.START))
+        header = header_of(self._zero)
+        self._publisher.publish(Slot(header=header, run=self.run_id, phase=Slot.START, data=self._calling))
 
     def _fly(self, stop: object) -> None:
         tick = now = 0
@@ -166,16 +173,16 @@ class RealtimeChannel(RosChannel):
             self._housekeeping()
 
     def _decoded(self, data: bytes) -> Any:
-        try:
-            message = deserialize_message(data, Transmission)
-        except Exception:  # rclpy has no common base for what a message can do to it
-            self.unusable += 1
-            return None
-        ids = message.agent
-        if not len(ids) or min(ids) < 1 or max(ids) > self.agents:
-            self.unusable += 1
-            return None
-        return message
+        with self.intake.guard():
+            try:
+                message = deserialize_message(data, Transmission)
+            except Exception:  # rclpy has no common base for what a message can do to it
+                raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no Transmission") from None
+            if message.run != self.run_id:
+                raise Unusable(OTHER_RUN, f"an answer of run {run_text(message.run)}")
+            self.roster.check_sender(message.agent, self.loop.number, time.monotonic())
+            return message
+        return None
 
     def _take(self, data: bytes) -> None:
         """Takes in one process's report for one slot."""
@@ -183,6 +190,12 @@ class RealtimeChannel(RosChannel):
         if message is None:
             return
         slot, now = message.slot, time.monotonic_ns() - self._zero
+        with self.intake.guard():
+            for offset in message.offset_ns:
+                check_start(slot * self.slot_ns + offset, now)
+            self._take_report(slot, now, message, data)
+
+    def _take_report(self, slot: int, now: int, message: Any, data: bytes) -> None:
         if slot > now // self.slot_ns + _AHEAD:
             self.missed += len(message.agent)
             return
@@ -191,12 +204,11 @@ class RealtimeChannel(RosChannel):
         else:  # too late for the slot's account; what it sends may still be on the air
             self.missed += len(message.agent)
             book = Answers(self.agents, self._steps)
-        try:
-            fresh = len(message.offset_ns) == len(message.agent) and book.add(message)
-        except RemoteProtocolError:
-            self.unusable += 1
-            return
-        if not fresh:
+        if not slot and not len(message.offset_ns):
+            return  # an answer to the call
+        if len(message.offset_ns) != len(message.agent):
+            raise Unusable(SIZES, f"{len(message.offset_ns)} offsets of {len(message.agent)} agents")
+        if not book.add(message):
             return
         self._observers.answer_received(slot, message.agent.tobytes(), data)
         self._observers.report(message)

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-import secrets
+import json
 import time
 from array import array
+from collections.abc import Callable, Iterator, Mapping, Set
+from contextlib import contextmanager
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from dtsa_msgs.msg import Slot, Transmission
+from dtsa_msgs.msg import Process, Slot, Transmission
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.loop import Loop
+from dtsa_agent.ros.common.checks import OTHER_SENDER, check_slot
+from dtsa_agent.ros.common.intake import Intake, add_counts
+from dtsa_agent.ros.common.loop import Feed, Loop
+from dtsa_agent.ros.common.runs import Run
 from dtsa_agent.ros.common.wire import pack_received
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
 
-from .answers import Answers
+from .answers import Answers, named
 from .observer import ChannelObserver, ChannelStatus, Observers, Referee, SlotLimit
+from .roster import Roster
 
 _REPEAT_S = 0.1
+_CALL_NS = 5_000_000
+_OTHER_CHANNEL_S = 0.3  # whoever calls or opens slots for so long is a channel
+_MOST_PROCESSES = 64  # messages of processes taken in at a time
 
 
 class RosChannel:
@@ -39,8 +48,11 @@ class RosChannel:
     :param swarm_namespace: namespace of the swarm's topics.
     :param startup_s: s of wall time that all agents have to answer for the first time.
     :param end_s: s of wall time that the nodes have to hear of the end.
-    :param run_id: the run's id in all its messages, 32 bits; None: a random one.
+    :param run: the run's id, which all its messages carry; None: a new one.
+    :param agreed: settings that the agents must share; those of the medium in any case.
     """
+
+    mode = "lockstep"
 
     def __init__(
         self,
@@ -52,14 +64,16 @@ class RosChannel:
         swarm_namespace: str = names.SWARM,
         startup_s: float = 60.0,
         end_s: float = 4.0,
-        run_id: int | None = None,
+        run: Run | None = None,
+        agreed: Mapping[str, Any] | None = None,
     ) -> None:
         self.node, self.model = node, channel
         self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
-        self.run_id = new_run_id() if run_id is None else run_id
+        self._identity = run or Run.draw()
+        self.intake = Intake(node.get_logger())
         self.slot = -1
         self.answers = Answers(self.agents, steps)
-        self.unusable = 0  # messages that could not be read, or came from agents that do not exist
+        self.lost: set[int] = set()  # ids of agents that have fallen silent
         self._observers = Observers()
         self._referee = referee or SlotLimit()
         self._reason, self._failed = "", False  # why the run has ended, and whether an error ended it
@@ -69,6 +83,28 @@ class RosChannel:
         self._clock_watched = False
         answers_qos = names.lockstep_qos(waiting * self.agents)
         self.loop = Loop(node, Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", answers_qos, raw=True)
+        settings = {"agents": self.agents, "slot_ms": self.slot_ns / 1e6, "steps": steps, "mode": self.mode}
+        self.roster = Roster(self.agents, self._identity.number, agreed or settings, node.get_fully_qualified_name())
+        self._processes = Feed(
+            node, Process, f"{swarm_namespace}/{names.PROCESS}", names.lockstep_qos(self.agents), intake=self.intake
+        )
+        self._calling = array("B", self._identity.call(node.get_fully_qualified_name()))
+
+    @property
+    def run_id(self) -> int:
+        """The run's id."""
+        return self._identity.number
+
+    @property
+    def unusable(self) -> int:
+        """Number of messages that the channel has not taken in."""
+        return self.intake.total
+
+    def dropped(self) -> dict[str, int]:
+        """Messages and frames that the channel and the agents have not taken in, by reason."""
+        total = dict(self.intake.counts)
+        add_counts(total, self.roster.dropped())
+        return total
 
     def observe(self, *observers: ChannelObserver) -> None:
         """Adds observers; they are told in this order, after those that are there already."""
@@ -97,14 +133,105 @@ class RosChannel:
 
     # For the two modes.
 
+    def _call(self, stop: object, absent: Set[int] = frozenset()) -> bool:
+        """Calls the agents until all have shown who they are and what they fly with; False when stopped.
+
+        :param absent: ids of agents that nobody waits for.
+        :raises ConfigError: when two do not fit together, or another channel is there.
+        :raises LocalProtocolError: when some do not answer in time.
+        """
+        with self._other_channels() as look_for_others:
+            return self._introduce_all(stop, absent, look_for_others)
+
+    def _introduce_all(self, stop: object, absent: Set[int], look_for_others: Callable[[], None]) -> bool:
+        begin, repeat = time.monotonic(), 0.0
+        while not self.roster.complete(time.monotonic(), absent):
+            if stop:
+                return False
+            now = time.monotonic()
+            if now - repeat > _REPEAT_S:
+                repeat = now
+                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, data=self._calling))
+            self.loop.wait(_CALL_NS)  # what is said before the run begins does not count
+            self._hear_processes()
+            look_for_others()
+            self._housekeeping()
+            if now - begin > self._startup_s:
+                missing = named(set(self.roster.missing) - absent)
+                raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
+        self.roster.close()
+        return True
+
+    @contextmanager
+    def _other_channels(self) -> Iterator[Callable[[], None]]:
+        """Listens to the channel's own topic; gives a function that takes in what others say there."""
+        topic = self._publisher.topic_name
+        feed = Feed(self.node, Slot, topic, names.lockstep_qos(), intake=self.intake)
+        heard: dict[int, float] = {}  # by run: when it was first heard
+
+        def look() -> None:
+            for _ in range(_MOST_PROCESSES):
+                message = feed.take()
+                if message is None:
+                    return
+                if message.run in (0, self.run_id) or len(heard) >= _MOST_PROCESSES:
+                    continue
+                with self.intake.guard():
+                    check_slot(message, self.agents)
+                    now = time.monotonic()
+                    if now - heard.setdefault(message.run, now) > _OTHER_CHANNEL_S:
+                        others = ", ".join(self._other_nodes(topic))
+                        raise ConfigError("run", str(self._identity), f"no other channel on {topic}; there is {others}")
+
+        try:
+            yield look
+        finally:
+            feed.close()
+            self.node.destroy_subscription(feed.subscription)
+
+    def _other_nodes(self, topic: str) -> list[str]:
+        """Nodes that publish on a topic beside this one."""
+        found = self.node.get_publishers_info_by_topic(topic)
+        nodes = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in found]
+        if self.node.get_fully_qualified_name() in nodes:
+            nodes.remove(self.node.get_fully_qualified_name())
+        return nodes or ["one that has just gone"]
+
+    def _hear_processes(self) -> None:
+        """Takes in what processes say about themselves.
+
+        :raises ConfigError: before the run has begun, when two do not fit together.
+        """
+        for _ in range(_MOST_PROCESSES):
+            message = self._processes.take()
+            if message is None:
+                return
+            with self.intake.guard():
+                try:
+                    self.roster.hear(message, time.monotonic())
+                except ConfigError as error:
+                    self._refuse(message.process, error)
+                    if not self.roster.closed:
+                        raise
+                    self.intake.drop(OTHER_SENDER, f"{message.node}: {error}")
+
+    def _refuse(self, process: int, error: ConfigError) -> None:
+        """Tells a process that it cannot take part."""
+        reason = json.dumps([error.field, error.value, error.allowed], default=str).encode()
+        data = array("B", process.to_bytes(8, "little") + reason)
+        self._publisher.publish(Slot(run=self.run_id, phase=Slot.REFUSE, data=data))
+
     def _housekeeping(self) -> None:
         if self.loop.housekeeping():
             self._clock_watched = self._clock.get_subscription_count() > 0
+            self._hear_processes()
+            for process, error in self.roster.settle(time.monotonic(), self.lost) if self.roster.closed else ():
+                self._refuse(process, error)
             self._idle()
 
     def _idle(self) -> None:
-        awaited = self.answers.silent if self.answers.missing else []
-        self._observers.idle(ChannelStatus(self.slot, self.unusable, awaited))
+        awaited = self.answers.silent if self.roster.closed else self.roster.missing
+        self._observers.idle(ChannelStatus(self.slot, self.dropped(), awaited))
 
     def _goes_on(self, slot: int, answers: Answers) -> bool:
         """All agents have answered a slot; whether the run goes on."""
@@ -118,7 +245,8 @@ class RosChannel:
     def _publish_end(self) -> None:
         """Tells all nodes that the run is over."""
         if self.node.context.ok():
-            self._publisher.publish(Slot(run=self.run_id, slot=max(0, self.slot + 1), phase=Slot.END))
+            proof = array("B", self._identity.proof)
+            self._publisher.publish(Slot(run=self.run_id, slot=max(0, self.slot + 1), phase=Slot.END, data=proof))
 
     def close(self) -> None:
         """Closes the observers first, waits until all nodes know that the run is over or have left, frees the handles.
@@ -135,6 +263,7 @@ class RosChannel:
             self._observers.close()
         finally:
             self._see_off()
+            self._processes.close()
             self.loop.close()
 
     def _see_off(self) -> None:
@@ -145,11 +274,7 @@ class RosChannel:
             if self._publisher.wait_for_all_acked(Duration(seconds=_REPEAT_S)):
                 break
             self._publish_end()
-
-
-def new_run_id() -> int:
-    """A random id for a run, 1 to 2^32 - 1; 64 bits would be more than some viewers can show."""
-    return secrets.randbelow(2**32 - 1) + 1
+        self._hear_processes()  # they end with their last counts
 
 
 def put_frames(message: Slot, senders: list[int], frames: list[bytes], received: Any) -> None:

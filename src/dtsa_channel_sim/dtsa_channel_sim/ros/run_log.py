@@ -30,7 +30,6 @@ class RunLog(ChannelObserver):
         self._flying = False
         self._slot, self._since_s = -1, time.monotonic()
         self._told = False  # that the slot is slow
-        self._unusable = 0
         self._logger.info(f"run {run_id:08x}: waiting for the agents")
 
     def all_answered(self, slot: int, answers: Answers) -> None:
@@ -39,9 +38,6 @@ class RunLog(ChannelObserver):
             self._logger.info("slot 0: all agents have answered, the run starts")
 
     def idle(self, status: ChannelStatus) -> None:
-        if status.unusable > self._unusable:
-            self._logger.warning(f"{status.unusable} messages could not be used so far", throttle_duration_sec=10.0)
-            self._unusable = status.unusable
         if not self._flying:
             if status.awaited:
                 self._waiting.tell(f"waiting for {named(status.awaited)} to answer")

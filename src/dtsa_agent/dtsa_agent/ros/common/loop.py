@@ -23,8 +23,12 @@ from rclpy.qos import QoSProfile
 
 from dtsa_agent.core.errors import LocalProtocolError
 
+from .checks import UNREADABLE
+from .intake import Intake
+
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
 HOUSEKEEPING_S = 0.1
+_MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
 
 
 class Stop:
@@ -68,34 +72,83 @@ class _OwnHands(CallbackGroup):
         pass
 
 
-class Loop:
-    """Serves one subscription as fast as Python can, and the rest of its node now and then.
+class Feed:
+    """A subscription whose messages are taken by whoever wants them, when they want them.
 
     :param node: the node that subscribes.
     :param msg_type: type of the messages.
     :param topic: what it subscribes to.
     :param qos: quality of service.
     :param raw: messages are taken as serialised bytes.
+    :param intake: counts messages that cannot be read; None: they are errors.
+    :param admits: says by a message and its publisher's number for it whether it is taken in; None: all are.
     """
 
-    def __init__(self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, raw: bool = False) -> None:
-        self._node = node
+    def __init__(
+        self,
+        node: Node,
+        msg_type: Any,
+        topic: str,
+        qos: QoSProfile,
+        raw: bool = False,
+        intake: Intake | None = None,
+        admits: Callable[[Any, int | None], bool] | None = None,
+    ) -> None:
         self.subscription = node.create_subscription(
             msg_type, topic, self._never, qos, callback_group=_OwnHands(), raw=raw
         )
-        self._handle = self.subscription.handle
+        self.handle = self.subscription.handle
+        self.number: int | None = None  # of the message taken last, as its publisher counts
         self._type, self._raw = msg_type, raw
-        self._executor: SingleThreadedExecutor | None = None
+        self._intake, self._admits = intake, admits
         self._stack = ExitStack()
-        context = node.context.handle
-        for handle in (self._handle, context):
-            self._stack.enter_context(handle)
-        self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, context)
-        self._next_housekeeping = 0.0
-        gc.freeze()  # nothing made so far is garbage: do not look at it again and again
+        self._stack.enter_context(self.handle)
 
     def _never(self, message: Any) -> None:
         raise LocalProtocolError("an executor took a message that is not its own")
+
+    def take(self) -> Any:
+        """A message that is there already, or None; also None after many that were not taken in."""
+        for _ in range(_MOST_DROPPED):
+            try:
+                taken = self.handle.take_message(self._type, self._raw)
+            except Exception as error:  # rclpy has no common base for what a message can do to it
+                if self._intake is None:
+                    raise
+                self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
+                continue
+            if taken is None:
+                return None
+            message, info = taken
+            self.number = info["publication_sequence_number"]
+            if self._admits is None or self._admits(message, self.number):
+                return message
+        return None
+
+    def close(self) -> None:
+        """Gives the handles back."""
+        self._stack.close()
+
+
+class Loop(Feed):
+    """Serves one subscription as fast as Python can, and the rest of its node now and then.
+
+    :param node: the node that subscribes.
+    :param msg_type: type of the messages.
+    :param topic: what it subscribes to.
+    :param qos: quality of service.
+    :param more: as for :class:`Feed`.
+    """
+
+    def __init__(self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, **more: Any) -> None:
+        super().__init__(node, msg_type, topic, qos, **more)
+        self._node = node
+        self._executor: SingleThreadedExecutor | None = None
+        context = node.context.handle
+        self._stack.enter_context(context)
+        self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, context)
+        self._next_housekeeping = 0.0
+        gc.freeze()  # nothing made so far is garbage: do not look at it again and again
 
     def wait(self, timeout_ns: int = _POLL_NS) -> Any:
         """The next message, or None after a while.
@@ -104,14 +157,9 @@ class Loop:
         """
         wait_set = self._wait_set
         wait_set.clear_entities()
-        wait_set.add_subscription(self._handle)
+        wait_set.add_subscription(self.handle)
         wait_set.wait(timeout_ns)
         return self.take()
-
-    def take(self) -> Any:
-        """A message that is there already, or None."""
-        taken = self._handle.take_message(self._type, self._raw)
-        return None if taken is None else taken[0]
 
     def housekeeping(self) -> bool:
         """Serves parameters and timers if it is time; whether it did."""
@@ -148,4 +196,4 @@ class Loop:
         """Gives the handles back."""
         if self._executor is not None:
             self._executor.shutdown(timeout_sec=0)
-        self._stack.close()
+        super().close()

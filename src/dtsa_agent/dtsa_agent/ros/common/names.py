@@ -11,6 +11,7 @@ MODES = ("lockstep", "realtime")
 
 SLOT = "slot"
 TRANSMISSION = "transmission"
+PROCESS = "process"
 RECEPTION = "reception"
 DECISION = "decision"
 MARKERS = "markers"

@@ -1,0 +1,29 @@
+"""The settings that all nodes of a flight must share."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from dtsa_agent.core.config import SwarmConfig
+
+
+def agreed_settings(config: SwarmConfig, mode: str) -> dict[str, Any]:
+    """The settings that all nodes of a flight must share, as plain values.
+
+    :param config: the swarm's settings.
+    :param mode: lockstep or realtime.
+    """
+    values = {**config.to_dict(), "steps": config.steps, "mode": mode}
+    return dict(json.loads(json.dumps(values, sort_keys=True, default=str)))
+
+
+def settings_hash(settings: Mapping[str, Any]) -> int:
+    """A number of 64 bits that two sets of settings share only if they are equal.
+
+    :param settings: plain values.
+    """
+    text = json.dumps(settings, sort_keys=True, separators=(",", ":"))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")

@@ -1,0 +1,53 @@
+"""Processes of this machine, as others name them in messages: alive, or gone for good."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessName:
+    """A process that can be looked for on its machine."""
+
+    node: str  # with the namespace
+    machine: str  # its boot and its process namespace
+    pid: int
+    started: int  # clock ticks after the boot
+
+    @classmethod
+    def own(cls, node: str) -> ProcessName:
+        """This process.
+
+        :param node: its node's name, with the namespace.
+        """
+        return cls(node, _machine(), os.getpid(), _started(os.getpid()))
+
+    def __str__(self) -> str:
+        return f"{self.node} (process {self.pid})"
+
+    @property
+    def gone(self) -> bool:
+        """Whether the process has ended for sure. A stopped one has not; of other machines nothing is known."""
+        if not self.started or self.machine != _machine() or self.pid <= 0:
+            return False
+        return _started(self.pid) != self.started
+
+
+def _machine() -> str:
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:  # another kernel
+        return ""
+
+
+def _started(pid: int) -> int:
+    """When a process started, in clock ticks after the boot; 0: there is none, or it is a zombie."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return 0
+    fields = stat.rpartition(b")")[2].split()
+    return 0 if fields[0] in (b"Z", b"X") else int(fields[19])

@@ -1,0 +1,209 @@
+"""Which run a process of agents belongs to: the handshake with the channel, and which messages are that run's."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from dtsa_msgs.msg import Process, Slot
+from rclpy.node import Node
+from std_msgs.msg import Header
+
+from dtsa_agent.core.errors import ConfigError, LocalProtocolError
+
+from .common import names
+from .common.agreement import settings_hash
+from .common.checks import FORGED_END, OTHER_RUN, OTHER_SENDER, RANGE, OnePublisher, Unusable, check_slot
+from .common.intake import Intake, add_counts
+from .common.runs import Call, run_text
+
+_GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
+_TELL_S = 0.5  # counts are told that often at most
+_REFUSED_S = 2.0  # who has taken part for so long is not sent away any more
+_MOST_CALLERS = 16
+
+
+class _Caller:
+    """A channel that has called."""
+
+    def __init__(self, call: Call) -> None:
+        self.call = call
+        self.publisher = OnePublisher()
+        self.knows_settings = False
+
+
+class Membership:
+    """Answers channels that call, binds to the run that begins, and keeps out what is not of that run.
+
+    :param node: the ROS node.
+    :param ids: ids of the agents here.
+    :param settings: as :func:`agreed_settings` gives them.
+    :param swarm_namespace: namespace of the swarm's topics.
+    :param dropped_frames: number of frames kept out so far, by reason.
+    :param plausible: raises :class:`Unusable` for a slot message that cannot be the next one, by its slot and time.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        ids: Sequence[int],
+        settings: Mapping[str, Any],
+        swarm_namespace: str = names.SWARM,
+        dropped_frames: Callable[[], dict[str, int]] = dict,
+        plausible: Callable[[Slot], None] = lambda message: None,
+    ) -> None:
+        self.run = 0  # the run's id; 0: none has begun yet
+        self.intake = Intake(node.get_logger())
+        self._agents, self._dropped_frames, self._plausible = int(settings["agents"]), dropped_frames, plausible
+        self._callers: dict[int, _Caller] = {}  # by run
+        self._began_s = self._told_s = self._seen_s = 0.0  # monotonic
+        self._told: dict[str, int] = {}
+        self._following = 0  # another run that calls while this one lasts
+        self._settings = json.dumps(settings, sort_keys=True, separators=(",", ":"))
+        self._hash = settings_hash(settings)
+        self._publisher = node.create_publisher(Process, f"{swarm_namespace}/{names.PROCESS}", names.lockstep_qos())
+        self._process = secrets.randbits(64)
+        self._node = node.get_fully_qualified_name()
+        self._ids = list(ids)
+
+    def admits(self, message: Slot, number: int | None) -> bool:
+        """Whether a slot message is one of this run; others are counted. A channel that calls is answered.
+
+        :param message: the message.
+        :param number: its number, as its publisher counts.
+        :raises ConfigError: when the channel refuses this process.
+        """
+        try:
+            self._check(message, number)
+        except Unusable as error:
+            self.intake.drop(error.reason, str(error))
+            return False
+        return True
+
+    def _check(self, message: Slot, number: int | None) -> None:
+        check_slot(message, self._agents)
+        run = message.run
+        calls = message.phase in (Slot.PREPARE, Slot.START)
+        if self.run and run != self.run:
+            if message.phase == Slot.PREPARE:
+                self._following = run
+                self._tell(left_over=True)
+            raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}; this one is {run_text(self.run)}")
+        caller = self._callers.get(run)
+        if caller is None:
+            if not calls:
+                raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}, which has not called this process")
+            caller = self._meet(run, bytes(message.data))
+        if message.phase == Slot.END:
+            if not caller.call.ended_by(bytes(message.data)):
+                raise Unusable(FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
+            self._told_s = 0.0
+            self._tell()
+            return
+        self._plausible(message)
+        if not caller.publisher.admits(number, time.monotonic()):
+            raise Unusable(OTHER_SENDER, f"slot message {number} of run {run_text(run)}, not of its channel's series")
+        if message.phase == Slot.REFUSE:
+            self._refused(bytes(message.data))
+        if message.phase == Slot.PREPARE or (calls and not caller.knows_settings):
+            caller.knows_settings = True
+            self._introduce(run)
+
+    def _meet(self, run: int, data: bytes) -> _Caller:
+        """A channel calls for the first time."""
+        if not run:
+            raise Unusable(OTHER_RUN, "a call without a run")
+        try:
+            call = Call.from_bytes(data)
+        except ValueError as error:
+            raise Unusable(RANGE, f"a call of nobody: {error}") from None
+        while len(self._callers) >= _MOST_CALLERS:
+            del self._callers[next(run for run in self._callers if run != self.run)]
+        caller = self._callers[run] = _Caller(call)
+        return caller
+
+    def begin(self, run: int) -> None:
+        """The run begins for this process: from now on it belongs to no other.
+
+        :param run: its id.
+        """
+        self.run = run
+        self._began_s = self._seen_s = time.monotonic()
+
+    @property
+    def session(self) -> int:
+        """Session of authenticated frames in this run, as its channel says."""
+        return self._callers[self.run].call.session
+
+    def _refused(self, data: bytes) -> None:
+        """The channel sends a process away.
+
+        :raises ConfigError: if it is this one.
+        """
+        if int.from_bytes(data[:8], "little") != self._process:
+            return
+        if self.run and time.monotonic() - self._began_s > _REFUSED_S:
+            raise Unusable(OTHER_SENDER, "this process takes part, and is told to go")
+        try:
+            field, value, allowed = json.loads(data[8:])
+        except ValueError:
+            raise Unusable(RANGE, "a refusal without a reason") from None
+        raise ConfigError(str(field)[:200], value, str(allowed)[:500])
+
+    # -- to the channel
+
+    def _introduce(self, run: int) -> None:
+        message = self._message(run)
+        message.settings = self._settings
+        self._publisher.publish(message)
+
+    def _tell(self, left_over: bool = False) -> None:
+        """Tells the counts of this run's messages, not too often."""
+        now = time.monotonic()
+        if now - self._told_s < _TELL_S:
+            return
+        counts = self.counts()
+        if left_over or (self.run and counts != self._told):
+            self._told, self._told_s = counts, now
+            self._publisher.publish(self._message(self.run))
+
+    def _message(self, run: int) -> Process:
+        counts = self.counts()
+        return Process(
+            header=Header(frame_id=names.FRAME),
+            run=run,
+            process=self._process,
+            node=self._node,
+            agent=self._ids,
+            settings_hash=self._hash,
+            dropped_reason=list(counts),
+            dropped=list(counts.values()),
+        )
+
+    def counts(self) -> dict[str, int]:
+        """Messages and frames not taken in so far, by reason."""
+        counts = dict(self.intake.counts)
+        add_counts(counts, {name: count for name, count in self._dropped_frames().items() if count})
+        return counts
+
+    # -- now and then
+
+    def idle(self, publishers: int, slot: int) -> None:
+        """Looks around; called about ten times a second.
+
+        :param publishers: number of publishers of slot messages on the graph.
+        :param slot: the last slot that was answered.
+        :raises LocalProtocolError: when the channel has gone without ending the run.
+        """
+        if not self.run:
+            return
+        self._tell()
+        caller, now = self._callers[self.run], time.monotonic()
+        if publishers:
+            self._seen_s = now
+        if now - self._seen_s > _GONE_S or caller.call.channel.gone:
+            following = f"; run {run_text(self._following)} calls now" if self._following else ""
+            raise LocalProtocolError(f"the channel has gone after slot {slot} without ending the run{following}")
