@@ -73,25 +73,31 @@ class Graph:
 @contextmanager
 def ros_graph(logs: Path) -> Iterator[Graph]:
     """A free domain with a node in it; all processes started in it end with it."""
+    with ros_domain() as domain, graph_in(domain, logs) as graph:
+        yield graph
+
+
+@contextmanager
+def graph_in(domain: int, logs: Path) -> Iterator[Graph]:
+    """A node in a domain in which there may be others; all processes started in it end with it."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    with ros_domain() as domain:
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs)}
-        context = Context()
-        rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        node = Node("test", context=context, enable_rosout=False, start_parameter_services=False)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        graph = Graph(node, executor, environment)
-        try:
-            yield graph
-        finally:
-            for process in graph.processes:
-                if process.poll() is None:
-                    process.kill()
-                process.communicate()
-            executor.shutdown()
-            node.destroy_node()
-            context.try_shutdown()
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs)}
+    context = Context()
+    rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("test", context=context, enable_rosout=False, start_parameter_services=False)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    graph = Graph(node, executor, environment)
+    try:
+        yield graph
+    finally:
+        for process in graph.processes:
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
+        executor.shutdown()
+        node.destroy_node()
+        context.try_shutdown()
 
 
 def end_of(process: subprocess.Popen[str], number: int | None = None) -> tuple[int, str]:

@@ -46,7 +46,8 @@ class Roster:
 
     def __init__(self, agents: int, run: int, agreed: Mapping[str, Any], channel: str) -> None:
         self._agents, self._run = agents, run
-        self._agreed, self._agreed_by = dict(agreed), channel
+        self._agreed = dict(agreed)
+        self._agreed_by = dict.fromkeys(agreed, channel)  # who has said so, by setting
         self._members: dict[int, Member] = {}  # by process
         self._of: dict[int, Member] = {}  # by agent
         self._groups: dict[bytes, Member] = {}  # by the ids of all agents of a process, as messages carry them
@@ -177,12 +178,12 @@ class Roster:
                 raise ConfigError(
                     f"{name} of {message.node}",
                     given.get(name),
-                    f"{self._agreed[name]!r}, as {self._agreed_by} has it",
+                    f"{self._agreed[name]!r}, as {self._agreed_by[name]} has it",
                 )
         further = sorted(set(given) - set(self._agreed))
         if further:  # a channel without agents' settings of its own: those of the first process count
             self._agreed.update((name, given[name]) for name in further)
-            self._agreed_by = message.node[:200]
+            self._agreed_by.update(dict.fromkeys(further, message.node[:200]))
 
     def _hear_other(self, message: Process, now_s: float) -> None:
         """A process of another run answers our call.
