@@ -254,11 +254,11 @@ def test_settings_that_differ_are_refused_before_slot_0(
 def test_two_processes_with_the_same_agent_are_refused_before_slot_0(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
         for name in ("one", "two"):
-            graph.start(AGENT, "-r", f"__ns:=/{name}", "-p", "id:=1", "-p", "agents:=2")
+            graph.start(AGENT, "-r", f"__node:={name}", "-p", "id:=1", "-p", "agents:=2")
         code, said = end_of(graph.start(CHANNEL, "-p", "agents:=2"))
     assert code == 2
     assert re.search(
-        r"ids of /(one|two)/agent: got \[1\]; allowed: agents of no other process; /(one|two)/agent has cf1", said
+        r"ids of /cf1/(one|two): got \[1\]; allowed: agents of no other process; /cf1/(one|two) has cf1", said
     )
 
 
