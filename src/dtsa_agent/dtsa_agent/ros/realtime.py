@@ -11,9 +11,11 @@ import numpy as np
 from dtsa_msgs.msg import Slot
 from numpy.typing import NDArray
 from rclpy.duration import Duration
+from rclpy.task import Future
 
 from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING
 from dtsa_agent.core.alignment import ClockAligner
+from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import Listeners
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
@@ -134,6 +136,13 @@ class RealtimeNode(SwarmNode):
             here = max(self.slot, (now - self._zero) // self.slot_ns)
             check_start(message.heard_slot * self.slot_ns, here * self.slot_ns)
             check_start(self._began_ns(message), now - self._zero)
+
+    def attach(self) -> Future:
+        """Agents with clocks of their own need the loop's timing.
+
+        :raises LocalProtocolError: always.
+        """
+        raise LocalProtocolError("agents in real time run in a loop of their own, not in an executor")
 
     def run(self, stop: Stop) -> None:
         """Flies until the run is over or a signal comes; with policy ``lease`` agents first say that they leave.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,20 +13,22 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.task import Future
 from std_msgs.msg import Header
 
 from dtsa_agent.core import AbstractSwarm, AgentGroup
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import ConfigError, DtsaError
 
 from .common import names
 from .common.agreement import agreed_settings
 from .common.checks import SLOT, Unusable
 from .common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
-from .common.loop import Loop, Stop
+from .common.loop import HOUSEKEEPING_S, Loop, Stop
 from .common.waiting import Waiting
 from .common.wire import split_frames, unpack_received
 from .membership import Membership
 
+_LOOK_S = 0.001  # an executor looks for messages so often
 _STRANGERS = 32  # messages that may wait beside the channel's
 _ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
 
@@ -140,6 +142,39 @@ class SwarmNode:
     def run(self, stop: Stop) -> None:
         """Answers slot messages until the run is over or a signal comes."""
         self.loop.run(self.on_slot, self.idle, stop)
+
+    def attach(self) -> Future:
+        """Lets an ordinary executor serve these agents, instead of :meth:`run`: slower, with the same results.
+
+        Add :attr:`node` to the executor. In lockstep only: agents with clocks of their own need the loop's timing.
+
+        :returns: done when the run is over; holds the error if one ended it.
+        """
+        over = Future()
+        loop = self.loop
+
+        def guarded(act: Callable[[], bool]) -> Callable[[], None]:
+            def call() -> None:
+                try:
+                    if not over.done() and not act():
+                        over.set_result(None)
+                except DtsaError as error:
+                    over.set_exception(error)
+
+            return call
+
+        def serve() -> bool:
+            message = loop.take()
+            return message is None or self.on_slot(message)
+
+        def look_around() -> bool:
+            self.idle()
+            return True
+
+        # Messages are taken by the loop's own hands: what cannot be read would end an executor that takes it.
+        self.node.create_timer(_LOOK_S, guarded(serve))
+        self.node.create_timer(HOUSEKEEPING_S, guarded(look_around))
+        return over
 
     def on_slot(self, message: Slot) -> bool:
         """Answers a slot message.
