@@ -200,6 +200,28 @@ def test_a_bag_played_into_a_live_flight_changes_nothing(tmp_path: Path, undistu
     assert set(summary["not_taken_in"]) == {"other run"}
 
 
+def test_malformed_messages_of_every_kind_end_and_freeze_nobody_in_real_time(tmp_path: Path) -> None:
+    def attack(stranger: Stranger, process: subprocess.Popen[str]) -> None:
+        stranger.listen(3, process)
+        run = stranger.last.run
+        hosted = Transmission(
+            run=run, slot=stranger.last.slot, agent=[1, 2], length=[0, 0], offset_ns=[2**62, -(2**62)]
+        )
+        for message in (hosted, Transmission(run=run, slot=4_000_000_000, agent=[1, 2], offset_ns=[0, 0])):
+            stranger.publishers[names.TRANSMISSION].publish(message)
+        for late_s in (2**31 - 1, 0):
+            start = Slot(run=run, phase=Slot.START)
+            start.header.stamp.sec = late_s
+            stranger.publishers[names.SLOT].publish(start)
+        flood(stranger, process)
+
+    shape = ("--mode", "realtime", "--slot-ms", "20", "--policy", "lease", "--tail-s", "4")
+    summary = disturbed(tmp_path, attack, *SHAPE, *shape)
+    assert summary["end"] == "completed"
+    assert summary["lost_agents"] == []
+    assert sum(summary["not_taken_in"].values()) > 60
+
+
 # -- the handshake
 
 

@@ -30,7 +30,8 @@ from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_agent.crazyflie.units import rotate
 from dtsa_agent.keys import with_key
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.checks import OTHER_SENDER, OnePublisher, Unusable, check_odometry
+from dtsa_agent.ros.common.loop import Feed, Stop
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.process import run_node
@@ -59,14 +60,14 @@ class StationNode(RealtimeNode):
         self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
         self._stamp = np.zeros(count)  # s, system clock, of that
-        self._inputs, self._outputs = [], []
-        for index, agent in enumerate(self.swarm.ids):
+        self._inputs: list[Feed] = []
+        self._bridges: list[OnePublisher] = []  # who tells where each vehicle is
+        self._outputs = []
+        for agent in self.swarm.ids:
             space = names.agent_namespace(agent, self._namespace)
-
-            def keep(message: Odometry, index: int = index) -> None:
-                self._note(index, message)
-
-            self._inputs.append(node.create_subscription(Odometry, f"{space}/{names.ODOMETRY}", keep, LATEST))
+            topic = f"{space}/{names.ODOMETRY}"
+            self._inputs.append(Feed(node, Odometry, topic, LATEST, intake=self.membership.intake))
+            self._bridges.append(OnePublisher())
             self._outputs.append(node.create_publisher(VelocityWorld, f"{space}/cmd_velocity_world", 1))
 
     @property
@@ -75,13 +76,24 @@ class StationNode(RealtimeNode):
         return bool(np.isinf(self._heard).any())
 
     def _sense(self) -> None:
-        for index, subscription in enumerate(self._inputs):
-            taken = subscription.handle.take_message(Odometry, False)
-            if taken is not None:
-                self._note(index, taken[0])
+        for index, feed in enumerate(self._inputs):
+            message = feed.take()
+            if message is not None:
+                with self.membership.intake.guard():
+                    self._check(index, message, feed.number)
+                    self._note(index, message)
         # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
         age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
         self._vehicles.place(self._measured + self.swarm.velocity * age)
+
+    def _check(self, index: int, message: Odometry, number: int | None) -> None:
+        """Whether odometry can be that of a vehicle, and of the bridge that has told of it so far.
+
+        :raises Unusable: if it cannot. Without any for a while the vehicle gets no commands, and the bridge holds it.
+        """
+        check_odometry(message)
+        if not self._bridges[index].admits(number, time.monotonic()):
+            raise Unusable(OTHER_SENDER, f"odometry of cf{self.swarm.ids[index]} from two publishers")
 
     def _note(self, index: int, message: Odometry) -> None:
         place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from dtsa_msgs.msg import Process, Slot
+from nav_msgs.msg import Odometry
 
 from dtsa_agent.core.abstract_swarm import FRAME_MAX
 from dtsa_agent.core.errors import RemoteProtocolError
@@ -27,6 +28,7 @@ REASONS = (UNREADABLE, OTHER_RUN, OTHER_SENDER, UNKNOWN, SIZES, RANGE, SLOT, FOR
 
 LARGEST_SLOT = 2**31 - 1  # 248 days of 10 ms slots
 FARTHEST_M = 1e6  # no vehicle is farther from the room's centre, or faster, than this many m or m/s
+FARTHEST_ODOMETRY_M, FASTEST_ODOMETRY_MPS = 1000.0, 100.0  # of vehicles that really fly
 _WINDOW = 1000  # messages of one publisher that may have been missed
 _SILENT_S = 0.3  # after such a silence the numbers may begin elsewhere
 _LONGEST_TEXT = 65536
@@ -144,6 +146,20 @@ def check_process(message: Process, agents: int) -> None:
         raise Unusable(SIZES, f"{len(message.dropped)} counts for {len(message.dropped_reason)} reasons")
     if len(message.settings) > _LONGEST_TEXT or any(len(reason) > 64 for reason in message.dropped_reason):
         raise Unusable(SIZES, f"{len(message.settings)} characters of settings")
+
+
+def check_odometry(message: Odometry) -> None:
+    """A measured place, attitude and velocity that a vehicle of a swarm can have.
+
+    :param message: the message.
+    :raises Unusable: for others.
+    """
+    place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
+    check_numbers("places", (place.x, place.y, place.z), FARTHEST_ODOMETRY_M)
+    check_numbers("velocities", (speed.x, speed.y, speed.z), FASTEST_ODOMETRY_MPS)
+    check_numbers("attitudes", (q.x, q.y, q.z, q.w))
+    if not 0.9 < math.hypot(q.x, q.y, q.z, q.w) < 1.1:
+        raise Unusable(RANGE, "attitudes that are no unit quaternions")
 
 
 class OnePublisher:
