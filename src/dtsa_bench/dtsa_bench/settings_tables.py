@@ -21,6 +21,7 @@ from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
+NODES = ("agent", "agent, real time", "swarm_host", "crazyflie_agents", "channel", "recorded_channel")
 _BLOCK = re.compile(r"(<!-- settings: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 _HEAD = ("setting", "default", "unit", "allowed", "meaning")
 
@@ -122,6 +123,12 @@ def _allowed(spec: Setting) -> str:
     return f"{low} to {high}"
 
 
+def _node(name: str) -> str:
+    from dtsa_bench.node_tables import node_tables  # needs ROS, as no other table does
+
+    return node_tables(name)
+
+
 #: What a page may ask for, and what makes it.
 TABLES: dict[str, Callable[[], str]] = {
     "SwarmConfig": partial(grouped_tables, SwarmConfig),
@@ -135,6 +142,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "battery": partial(settings_table, BatterySettings),
     "station": partial(settings_table, StationSettings),
     "safety": partial(settings_table, SafetySettings),
+    **{f"node {name}": partial(_node, name) for name in NODES},
 }
 
 
