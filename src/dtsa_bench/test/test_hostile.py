@@ -321,6 +321,30 @@ def test_agents_end_when_their_channel_is_killed_whoever_comes_after_it(tmp_path
         assert took < 30.0  # 2 s on a machine with nothing else to do
 
 
+def test_late_duplicates_and_late_conflicts_are_sent_away_and_the_flight_goes_on(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        stranger = Stranger(graph)
+        shared = ("-p", "mode:=realtime", "-p", "agents:=2")
+        swarm = (*shared, "-p", "policy:=lease", "-p", "slot_ms:=20")
+        host = graph.start(HOST, *swarm)
+        channel = graph.start(CHANNEL, *shared, "-p", "slot_ns:=20000000", "-p", "steps:=2")
+        stranger.listen(5, channel)
+        for more, said in (
+            ((), r"ids of /cf1/agent: got \[1\]; allowed: agents of no other process; /swarm/swarm_host has cf1"),
+            (("-p", "seed:=9"), r"seed of /cf1/agent: got 9; allowed: 1, as /swarm/swarm_host has it"),
+        ):
+            late = graph.start(AGENT, *swarm, "-p", "id:=1", *more)
+            code, told = end_of(late)
+            assert code == 2
+            assert re.search(said, told)
+            graph.processes.remove(late)
+        slot = stranger.last.slot
+        graph.until(lambda: stranger.last.slot > slot + 5)
+        assert host.poll() is channel.poll() is None
+        assert end_of(channel, signal.SIGTERM)[0] == 0
+        assert end_of(host)[0] == 0
+
+
 def test_a_missing_key_is_noticed_before_anything_is_written(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "DTSA_AUTH_KEY"}
     for key in ({}, {"DTSA_AUTH_KEY": "ab" * 16}):

@@ -22,7 +22,7 @@ from .common.runs import Call, run_text
 
 _GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
 _TELL_S = 0.5  # counts are told that often at most
-_REFUSED_S = 2.0  # who has taken part for so long is not sent away any more
+_REFUSED_S = 10.0  # who has taken part for so long is not sent away any more
 _MOST_CALLERS = 16
 
 
