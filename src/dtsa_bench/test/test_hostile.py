@@ -301,6 +301,23 @@ def test_a_second_channel_is_refused_and_the_first_flies_on(tmp_path: Path) -> N
         assert end_of(host)[0] == 0
 
 
+def test_processes_of_another_run_are_refused_and_fly_on_in_their_own(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        stranger = Stranger(graph)
+        host = graph.start(HOST, "-p", "agents:=2")
+        channel = graph.start(CHANNEL, "-p", "agents:=2")
+        stranger.listen(5, channel)
+        channel.send_signal(signal.SIGSTOP)
+        code, said = end_of(graph.start(CHANNEL, "-r", "__node:=second", "-p", "agents:=2"))
+        graph.processes.pop()
+        assert code == 2
+        assert re.search(r"run of /swarm/swarm_host: got '[0-9a-f]{8}'; allowed: no process of another run", said)
+        slot = stranger.last.slot
+        channel.send_signal(signal.SIGCONT)
+        graph.until(lambda: stranger.last.slot > slot + 20)
+        assert host.poll() is channel.poll() is None
+
+
 @pytest.mark.parametrize("restarted", [False, True])
 def test_agents_end_when_their_channel_is_killed_whoever_comes_after_it(tmp_path: Path, restarted: bool) -> None:
     with ros_graph(tmp_path) as graph:
