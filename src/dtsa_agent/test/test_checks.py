@@ -26,6 +26,8 @@ from dtsa_agent.ros.common.checks import (
     check_process,
     check_slot,
     check_start,
+    parse_json,
+    plain,
 )
 from dtsa_agent.ros.common.intake import Intake
 from dtsa_agent.ros.common.processes import ProcessName
@@ -129,10 +131,22 @@ def test_only_the_channel_can_end_its_run() -> None:
     assert ProcessName(call.channel.node, call.channel.machine, call.channel.pid, call.channel.started + 1).gone
 
 
-@given(st.one_of(st.binary(), st.text().map(str.encode), st.sampled_from([b"[]", b"{}", b'{"node": 1}', b"1" * 5000])))
+@given(
+    st.one_of(
+        st.binary(),
+        st.text().map(str.encode),
+        st.sampled_from([b"[]", b"{}", b'{"node": 1}', b"1" * 5000, b"[" * 4000]),
+    )
+)
 def test_calls_of_nobody(data: bytes) -> None:
     with pytest.raises(ValueError):  # noqa: PT011
         Call.from_bytes(data)
+
+
+def test_texts_from_outside_stand_in_one_line_and_are_never_too_deep() -> None:
+    assert plain("/cf1/agent\n\x1b[2J" + "x" * 5000) == "/cf1/agent??[2J" + "x" * 185
+    with pytest.raises(ValueError, match="nested"):
+        parse_json("[" * 60_000)
 
 
 class Log:

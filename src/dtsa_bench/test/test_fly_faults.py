@@ -84,7 +84,7 @@ def test_agents_do_not_outlive_a_killed_flight(tmp_path: Path) -> None:
 NOISE = """
 import json, sys, rclpy
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.ros.common.agreement import agreed_settings
+from dtsa_agent.ros.common.agreement import agreed_settings, settings_hash
 from dtsa_msgs.msg import Process, Slot, Transmission
 from rclpy.serialization import serialize_message
 rclpy.init()
@@ -92,11 +92,12 @@ node = rclpy.create_node("noise")
 publisher = node.create_publisher(Transmission, "/swarm/transmission", 10)
 message = Transmission(agent=[2], length=[0], steps=1, track=[0.0] * 3, velocity=[0.0] * 3, command=[0.0] * 3,
                        chosen=[0], reason=[0], digest=[0], score=[0.0])
-settings = json.dumps(agreed_settings(SwarmConfig(agents=2), "lockstep"))
+settings = agreed_settings(SwarmConfig(agents=2), "lockstep")
+shown = dict(settings=json.dumps(settings), settings_hash=settings_hash(settings))
 hello = node.create_publisher(Process, "/swarm/process", 10)
 def answer(slot):
     if slot.phase == Slot.PREPARE:
-        hello.publish(Process(run=slot.run, process=2, node="/noise", agent=[2], settings=settings))
+        hello.publish(Process(run=slot.run, process=2, node="/noise", agent=[2], **shown))
     if slot.phase != Slot.RUN:
         return
     message.run, message.slot = slot.run, slot.slot

@@ -16,7 +16,17 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 
 from .common import names
 from .common.agreement import settings_hash
-from .common.checks import FORGED_END, OTHER_RUN, OTHER_SENDER, RANGE, OnePublisher, Unusable, check_slot
+from .common.checks import (
+    FORGED_END,
+    OTHER_RUN,
+    OTHER_SENDER,
+    RANGE,
+    OnePublisher,
+    Unusable,
+    check_slot,
+    parse_json,
+    plain,
+)
 from .common.intake import Intake, add_counts
 from .common.runs import Call, run_text
 
@@ -148,10 +158,12 @@ class Membership:
         if self.run and time.monotonic() - self._began_s > _REFUSED_S:
             raise Unusable(OTHER_SENDER, "this process takes part, and is told to go")
         try:
-            field, value, allowed = json.loads(data[8:])
+            reason = parse_json(data[8:])
         except ValueError:
-            raise Unusable(RANGE, "a refusal without a reason") from None
-        raise ConfigError(str(field)[:200], value, str(allowed)[:500])
+            reason = None
+        if not isinstance(reason, list) or len(reason) != 3:
+            raise Unusable(RANGE, "a refusal without a reason")
+        raise ConfigError(plain(str(reason[0])), reason[1], plain(str(reason[2])))
 
     # -- to the channel
 

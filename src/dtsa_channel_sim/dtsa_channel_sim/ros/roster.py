@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from array import array
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
@@ -11,7 +10,18 @@ from typing import Any
 from dtsa_msgs.msg import Process
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.checks import OTHER_RUN, OTHER_SENDER, RANGE, UNKNOWN, OnePublisher, Unusable, check_process
+from dtsa_agent.ros.common.agreement import settings_hash
+from dtsa_agent.ros.common.checks import (
+    OTHER_RUN,
+    OTHER_SENDER,
+    RANGE,
+    UNKNOWN,
+    OnePublisher,
+    Unusable,
+    check_process,
+    parse_json,
+    plain,
+)
 from dtsa_agent.ros.common.intake import add_counts
 from dtsa_agent.ros.common.runs import run_text
 
@@ -105,6 +115,7 @@ class Roster:
         :raises Unusable: for a message that cannot be, or of another run.
         """
         check_process(message, self._agents)
+        message.node = plain(message.node)
         if message.run != self._run:
             self._hear_other(message, now_s)
             raise Unusable(OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
@@ -122,7 +133,7 @@ class Roster:
         rival = self._rivals.get(message.process)
         if rival is not None:
             return rival[0]
-        member = Member(message.process, message.node[:200], tuple(message.agent), now_s)
+        member = Member(message.process, message.node, tuple(message.agent), now_s)
         self._compare(message)
         if any(agent in self._of for agent in member.ids):
             if len(self._rivals) >= _MOST_STRANGERS:
@@ -168,10 +179,10 @@ class Roster:
         :raises Unusable: if they are none.
         """
         try:
-            given = json.loads(message.settings)
+            given = parse_json(message.settings)
         except ValueError:
             given = None
-        if not isinstance(given, dict):
+        if not isinstance(given, dict) or settings_hash(given) != message.settings_hash:
             raise Unusable(RANGE, f"{message.node} says nothing about its settings")
         for name in sorted(self._agreed):
             if name not in given or given[name] != self._agreed[name]:
@@ -183,7 +194,7 @@ class Roster:
         further = sorted(set(given) - set(self._agreed))
         if further:  # a channel without agents' settings of its own: those of the first process count
             self._agreed.update((name, given[name]) for name in further)
-            self._agreed_by.update(dict.fromkeys(further, message.node[:200]))
+            self._agreed_by.update(dict.fromkeys(further, message.node))
 
     def _hear_other(self, message: Process, now_s: float) -> None:
         """A process of another run answers our call.

@@ -6,6 +6,7 @@ A check raises :class:`Unusable` with one of the reasons below; nothing else abo
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -32,6 +33,7 @@ FARTHEST_ODOMETRY_M, FASTEST_ODOMETRY_MPS = 1000.0, 100.0  # of vehicles that re
 _WINDOW = 1000  # messages of one publisher that may have been missed
 _SILENT_S = 0.3  # after such a silence the numbers may begin elsewhere
 _LONGEST_TEXT = 65536
+_LONGEST_NAME = 200
 _MOST_REASONS = 64
 
 
@@ -160,6 +162,22 @@ def check_odometry(message: Odometry) -> None:
     check_numbers("attitudes", (q.x, q.y, q.z, q.w))
     if not 0.9 < math.hypot(q.x, q.y, q.z, q.w) < 1.1:
         raise Unusable(RANGE, "attitudes that are no unit quaternions")
+
+
+def parse_json(data: bytes | str) -> Any:
+    """What a text of JSON holds.
+
+    :raises ValueError: for any other text, one too deep included.
+    """
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("a text that is nested too deeply") from None
+
+
+def plain(text: str) -> str:
+    """A text from outside as it can stand in one line."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text[:_LONGEST_NAME])
 
 
 class OnePublisher:

@@ -6,8 +6,8 @@ import json
 import secrets
 from dataclasses import asdict, dataclass
 from hashlib import sha256
-from typing import Any
 
+from .checks import parse_json
 from .processes import ProcessName
 
 _PROOF_BYTES = 16
@@ -63,7 +63,7 @@ class Call:
         """
         if len(data) > _LONGEST:
             raise ValueError(f"a call of {len(data)} bytes")
-        given: Any = json.loads(data)
+        given = parse_json(data)
         kinds = {"node": str, "machine": str, "pid": int, "started": int, "end": str, "session": int}
         if not isinstance(given, dict) or set(given) != set(kinds):
             raise ValueError("not a call")
