@@ -44,6 +44,7 @@ setup(
         *([(f"share/{NAME}/launch", sorted(glob("launch/*.py")))] if glob("launch/*.py") else []),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # tells `colcon test` what runs the tests
     zip_safe=False,
     maintainer="DTSA maintainers",
     maintainer_email="maintainers@dtsa.example",

@@ -17,8 +17,11 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         *([(f"share/{NAME}/launch", sorted(glob("launch/*.py")))] if glob("launch/*.py") else []),
         *([(f"share/{NAME}/config", sorted(glob("config/*.yaml")))] if glob("config/*.yaml") else []),
+        *([(f"share/{NAME}/rviz", sorted(glob("rviz/*")))] if glob("rviz/*") else []),
+        *([(f"share/{NAME}/urdf", sorted(glob("urdf/*")))] if glob("urdf/*") else []),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # tells `colcon test` what runs the tests
     zip_safe=False,
     maintainer="DTSA maintainers",
     maintainer_email="maintainers@dtsa.example",
@@ -27,8 +30,8 @@ setup(
     entry_points={
         "console_scripts": [
             "dtsa = dtsa_bench.cli:main",
-            "recorded_channel = dtsa_bench.fly.recorded_channel:main",
-            "fake_crazyflie = dtsa_bench.fake_crazyflie.cli:main",
+            "recorded_channel = dtsa_bench.entry:recorded_channel",
+            "fake_crazyflie = dtsa_bench.entry:fake_crazyflie",
         ],
     },
 )

@@ -17,6 +17,7 @@ setup(
         *([(f"share/{NAME}/config", sorted(glob("config/*.yaml")))] if glob("config/*.yaml") else []),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # tells `colcon test` what runs the tests
     zip_safe=False,
     maintainer="DTSA maintainers",
     maintainer_email="maintainers@dtsa.example",

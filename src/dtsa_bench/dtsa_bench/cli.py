@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from dtsa_bench import __version__
+from dtsa_bench.missing import say_missing
 from dtsa_bench.registry import available, module_name
 
 PROGRAM = "dtsa"
@@ -75,6 +76,8 @@ def report(error: Exception) -> int:
 
     :returns: exit code.
     """
+    if isinstance(error, ImportError):
+        return say_missing(PROGRAM, error)
     from dtsa_agent.core.errors import ConfigError, DtsaError
 
     if isinstance(error, DtsaError):

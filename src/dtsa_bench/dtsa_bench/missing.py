@@ -1,0 +1,39 @@
+"""Packages that an installation may lack: named in one line when they are needed, with the way to get them."""
+
+from __future__ import annotations
+
+import sys
+
+_WORKSPACE = "build the workspace and source it: colcon build && . install/setup.bash"
+_HOW = {
+    **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
+    **dict.fromkeys(("mcap", "rosbags", "pyarrow", "lz4", "zstandard", "pandas", "distributed"), "pip install {}"),
+    "rclpy": "source an installation of ROS 2 Jazzy, or use tools/dtsa",
+    "yaml": "apt install python3-yaml",
+    **dict.fromkeys(("numpy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
+}
+
+
+def explained(error: ImportError) -> str:
+    """What is missing and how to get it; empty if the error is not about a package that we use.
+
+    :param error: what an import raised.
+    """
+    name = (error.name or "").split(".")[0]
+    how = _HOW.get(name)
+    return f"the Python package {name} is missing: {how.format(name)} (docs/install.md)" if how else ""
+
+
+def say_missing(program: str, error: ImportError) -> int:
+    """Prints one line about a missing package.
+
+    :param program: who needs it.
+    :param error: what an import raised.
+    :returns: exit code 2.
+    :raises ImportError: the error itself, if it is about something else.
+    """
+    text = explained(error)
+    if not text:
+        raise error
+    print(f"{program}: error: {text}", file=sys.stderr)
+    return 2
