@@ -166,8 +166,10 @@ def run_shell(arguments: list[str]) -> int:
 
 
 def has_ros2(environment: Mapping[str, str]) -> bool:
-    """Whether the real `ros2` is there. Beside the wheels, one in the path is of another distribution, and would not
-    find its parts."""
+    """Whether the real `ros2` is there.
+
+    Beside the wheels, one in the path is of another distribution, and would not find its parts.
+    """
     return layout.has_ros_installation() and shutil.which("ros2", path=environment["PATH"]) is not None
 
 
