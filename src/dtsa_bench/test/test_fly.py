@@ -98,6 +98,8 @@ def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_pa
         "/swarm/reception": total,
         "/swarm/decision": total,
         "/swarm/markers": -(-total // 10),
+        "/swarm/configuration": 1,
+        "/swarm/status": 2,  # it flies, it has ended
         **{f"/cf{k}/odom": total for k in range(1, 6)},
     }
     assert stamps[0] == 1_000_000_000

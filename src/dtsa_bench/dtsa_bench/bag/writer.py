@@ -206,8 +206,10 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system. `write`, or `mark` where there are marks, does
-        this by itself every half second of wall time; a recorder that may wait long for its next message calls it too.
+        """Hand everything written so far to the operating system.
+
+        `write`, or `mark` where there are marks, does this by itself every half second of wall time; a recorder that
+        may wait long for its next message calls it too.
 
         :raises BagError: if that fails, on a full disk for example.
         """
