@@ -115,12 +115,16 @@ def test_late_subscribers_get_settings_and_status(graph: Graph) -> None:
 def answers_in(graph: Graph, space: str, attached: bool) -> list[list[object]]:
     """What two agents answer in a run of 30 slots: served by an ordinary executor, or in a process of their own."""
     given: list[Transmission] = []
-    qos = names.lockstep_qos(64)
-    graph.node.create_subscription(Transmission, f"{space}/transmission", given.append, qos)
-    host = ["-r", f"__ns:={space}", "-p", "agents:=2"]
-    graph.start(CHANNEL, *host, "-p", "slots:=30", "-p", "loss:=0.3")
+    heard = graph.node.create_subscription(Transmission, f"{space}/transmission", given.append, names.lockstep_qos(64))
+    swarm = ["-r", f"__ns:={space}", "-p", "agents:=2"]
+
+    def start_channel() -> None:
+        graph.until(heard.get_publisher_count)  # or the test would miss the first answers
+        graph.start(CHANNEL, *swarm, "-p", "slots:=30", "-p", "loss:=0.3")
+
     if not attached:
-        process = graph.start(HOST, *host)
+        process = graph.start(HOST, *swarm)
+        start_channel()
         graph.until(lambda: process.poll() is not None)
     else:
         node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
@@ -128,6 +132,7 @@ def answers_in(graph: Graph, space: str, attached: bool) -> list[list[object]]:
         over = agents.attach()
         executor = SingleThreadedExecutor(context=graph.node.context)
         executor.add_node(node)
+        start_channel()
         graph.until(over.done, lambda: executor.spin_once(timeout_sec=0.05))
         assert over.exception() is None
         executor.shutdown()
