@@ -10,6 +10,8 @@ import pytest
 
 from dtsa_bench.batch.task import Row
 from dtsa_bench.cli import main
+from dtsa_bench.soak.faults import FAULTS, rewritten
+from dtsa_bench.soak.faults.fault import Fault
 from dtsa_bench.soak.item import Item, NotMet, Soak
 from dtsa_bench.soak.registry import SOAKS, soak_named
 from dtsa_bench.soak.runner import run_soak, write_record
@@ -95,6 +97,21 @@ def test_items_of_a_soak_have_names_of_their_own_and_settings_for_the_journal(na
     assert any(item.sample for item in soak.items)
     assert json.loads(json.dumps([dict(item.settings) for item in soak.items]))
     assert sum(item.seconds for item in soak.items) <= 90 * 60
+    assert all(item.seconds > 0 for item in soak.items)
+
+
+def test_the_table_of_faults_in_the_docs_is_the_one_that_is_run() -> None:
+    text = (Path(__file__).resolve().parents[3] / "docs" / "faults.md").read_text(encoding="utf-8")
+    assert rewritten(text) == text, "run: python -m dtsa_bench.soak.faults docs/faults.md"
+    assert len(FAULTS) >= 30
+    assert 3 * sum(fault.sample for fault in FAULTS) >= len(FAULTS)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault.sample], ids=lambda fault: fault.name)
+def test_a_fault_has_the_reaction_that_the_table_says(fault: Fault, tmp_path: Path) -> None:
+    pytest.importorskip("dtsa_msgs.msg")
+    fault.run(tmp_path)
 
 
 @pytest.mark.ros

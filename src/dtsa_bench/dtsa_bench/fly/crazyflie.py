@@ -382,7 +382,7 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         give_way()  # the bridge does not: it has to land them
         pictures = options.pictures and not ended
         summary = flight.write_results(pictures, backend="cflib", cut_short=ended.reason)
-        return Flight(summary, flight.scenario, np.array(measurement.positions), directory / BAG)
+        return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         node.destroy_node()
 

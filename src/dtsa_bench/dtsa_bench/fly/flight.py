@@ -177,7 +177,7 @@ def _fly(
             progress.end()
         children.stop()
         summary = flight.write_results(pictures=options.pictures and not stop)
-        return Flight(summary, flight.scenario, np.array(measurement.positions), directory / BAG)
+        return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         node.destroy_node()
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dtsa_agent.core import Scenario
 from dtsa_bench.metrics import FlightMetrics, metrics_tables
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver, Referee
+
+from .position_log import PositionLog
 
 
 class FlightMeasurement(ChannelObserver, Referee):
@@ -26,7 +25,7 @@ class FlightMeasurement(ChannelObserver, Referee):
     def __init__(self, run: RunConfig, scenario: Scenario) -> None:
         self.scenario = scenario
         self.metrics = FlightMetrics(run, scenario)
-        self.positions: list[NDArray[np.float64]] = []  # (3, N) m, at each slot's start
+        self.positions = PositionLog(run.swarm.agents)
         self.begin_s = self.end_s = 0.0  # wall clock: slot 0 answered by all, flight over; 0: not yet
         self._tables = metrics_tables(run, scenario, everyone=True)
         self._agents = run.swarm.agents
@@ -40,7 +39,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         return (self.end_s or time.monotonic()) - self.begin_s if self.begin_s else 0.0
 
     def all_answered(self, slot: int, answers: Answers) -> None:
-        self.positions.append(answers.position.copy())
+        self.positions.append(answers.position)
         if not slot:
             self.begin_s = time.monotonic()
             return

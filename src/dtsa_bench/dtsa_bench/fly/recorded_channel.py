@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig, make_scenario
@@ -118,7 +117,7 @@ class RecordedFlight:
             from dtsa_bench.trajectories import draw_flight
 
             picture = self.directory / "trajectories.png"
-            draw_flight(picture, self.run_config, self.scenario, np.array(positions), summary)
+            draw_flight(picture, self.run_config, self.scenario, positions.array(), summary)
         return summary
 
 

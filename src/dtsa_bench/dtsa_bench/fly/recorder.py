@@ -115,8 +115,9 @@ class FlightRecorder(ChannelObserver):
                 self._write_messages(slot)
             for channel, data, at in self._pending:
                 self.bag.write(channel, data, at, at)
+            if self._pending:  # before that no slot is complete
+                self.bag.mark()
             self._pending = []
-            self.bag.mark()
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self._write_pending()

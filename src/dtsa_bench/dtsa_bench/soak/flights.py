@@ -105,6 +105,11 @@ class Running:
                 return pid
         raise NotMet(f"cf{agent} has no process")
 
+    def environment(self, pid: int) -> dict[str, str]:
+        """Environment variables of a process of the flight."""
+        words = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
+        return dict(word.split("=", 1) for word in words if "=" in word)
+
     def end(self, patience_s: float = PATIENCE_S) -> int:
         """Waits for the flight to end by itself; its exit code.
 

@@ -23,7 +23,7 @@ class Item:
     settings: Mapping[str, Any] = field(default_factory=dict)  # JSON types
     seed: int = 0
     seconds: float = 20.0  # a rough guess of its wall time
-    sample: bool = False  # run by the ordinary tests, too
+    sample: bool = False  # in the part that takes a few minutes only
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class SoakPlan:
     """Items of a soak as the plan of a batch, for its journal and its progress.
 
     :param soak: the soak.
-    :param sample: only the items that the ordinary tests run.
+    :param sample: only the items of the sample.
     """
 
     def __init__(self, soak: Soak, sample: bool) -> None:

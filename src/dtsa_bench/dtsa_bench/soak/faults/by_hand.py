@@ -1,0 +1,177 @@
+"""Nodes started by hand: in any order, with other settings, without a channel."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dtsa_bench.soak.checks import met
+from dtsa_bench.soak.flights import PATIENCE_S, until
+from dtsa_bench.soak.item import NotMet
+
+from .fault import Fault
+
+CHANNEL = "dtsa_channel_sim.ros.channel_node"
+AGENT = "dtsa_agent.ros.agent_node"
+_TWO = ("-p", "agents:=2")
+_SLOTS = ("-p", "slots:=200")
+
+
+class Nodes:
+    """Node processes in a domain of their own.
+
+    :param directory: where each puts what it says.
+    :param domain: ROS domain.
+    """
+
+    def __init__(self, directory: Path, domain: int) -> None:
+        self.directory, self.domain = directory, domain
+        self.all: list[subprocess.Popen[bytes]] = []
+
+    def start(self, module: str, *words: str) -> subprocess.Popen[bytes]:
+        """Starts a node.
+
+        :param module: its module.
+        :param words: its ROS arguments.
+        """
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain), "ROS_LOG_DIR": str(self.directory)}
+        with (self.directory / f"{len(self.all)}.txt").open("wb") as said:
+            process = subprocess.Popen(
+                [sys.executable, "-m", module, "--ros-args", "--disable-stdout-logs", *words],
+                env=environment,
+                stderr=said,
+                stdout=subprocess.DEVNULL,
+            )
+        self.all.append(process)
+        return process
+
+    def said(self, process: subprocess.Popen[bytes]) -> str:
+        """What a node has said on its standard error."""
+        return (self.directory / f"{self.all.index(process)}.txt").read_text(errors="replace").strip()
+
+    def end(self, process: subprocess.Popen[bytes], code: int, *said: str, patience_s: float = PATIENCE_S) -> None:
+        """A node ends by itself with a code, saying something, without a traceback.
+
+        :param process: the node.
+        :param code: its exit code.
+        :param said: texts that it says.
+        :param patience_s: s of wall time that it may take.
+        """
+        try:
+            found = process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            raise NotMet(f"a node did not end within {patience_s:g} s: {self.said(process)[-200:]}") from None
+        text = self.said(process)
+        met(found == code, f"exit code {found} instead of {code}: {text[-300:]}")
+        met("Traceback" not in text, f"a traceback: {text[-300:]}")
+        for part in said:
+            met(part in text, f"it does not say {part!r}: {text[-300:]}")
+
+
+@contextmanager
+def nodes(directory: Path) -> Iterator[Nodes]:
+    """Node processes; none of them is left afterwards."""
+    from dtsa_bench.fly.domain import ros_domain
+
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with ros_domain() as domain:
+        found = Nodes(directory, domain)
+        try:
+            yield found
+        finally:
+            for process in found.all:
+                if process.poll() is None:
+                    process.kill()
+                process.wait()
+
+
+def _agents_first(directory: Path) -> None:
+    with nodes(directory) as graph:
+        agents = [graph.start(AGENT, "-p", f"id:={k}", *_TWO) for k in (1, 2)]
+        time.sleep(3.0)
+        channel = graph.start(CHANNEL, *_TWO, *_SLOTS)
+        for process in (channel, *agents):
+            graph.end(process, 0)
+
+
+def _channel_first(directory: Path) -> None:
+    with nodes(directory) as graph:
+        channel = graph.start(CHANNEL, *_TWO, *_SLOTS)
+        agents = [graph.start(AGENT, "-p", "id:=2", *_TWO)]
+        time.sleep(3.0)
+        agents.append(graph.start(AGENT, "-p", "id:=1", *_TWO))
+        for process in (channel, *agents):
+            graph.end(process, 0)
+
+
+def _agent_missing(directory: Path) -> None:
+    with nodes(directory) as graph:
+        agent = graph.start(AGENT, "-p", "id:=1", *_TWO)
+        channel = graph.start(CHANNEL, *_TWO, "-p", "startup_s:=8.0")
+        graph.end(channel, 1, "cf2 did not", "within 8 s: dead or hung?")
+        graph.end(agent, 0)
+
+
+def _channel_killed(directory: Path) -> None:
+    with nodes(directory) as graph:
+        channel = graph.start(CHANNEL, *_TWO)
+        agents = [graph.start(AGENT, "-p", f"id:={k}", *_TWO) for k in (1, 2)]
+        busy = [_ticks(process.pid) for process in agents]
+        until(lambda: all(_ticks(p.pid) > b + 100 for p, b in zip(agents, busy, strict=True)), "the run begins")
+        time.sleep(3.0)
+        channel.kill()
+        for process in agents:
+            graph.end(process, 1, "the channel has gone", patience_s=30.0)
+
+
+def _ticks(pid: int) -> int:
+    """Processor time of a process, hundredths of a second."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(words[11]) + int(words[12])
+
+
+def _wrong(module: str, *words: str, says: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", module, "--ros-args", "--disable-stdout-logs", *words],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    said = done.stderr.strip()
+    met(done.returncode == 2, f"exit code {done.returncode}: {said[-300:]}")
+    met(says in said.splitlines()[-1] and "Traceback" not in said, f"it does not say {says!r}: {said[-300:]}")
+
+
+def _unknown_policy(directory: Path) -> None:
+    _wrong(AGENT, *_TWO, "-p", "policy:=polite", says="policy")
+
+
+def _id_too_large(directory: Path) -> None:
+    _wrong(AGENT, *_TWO, "-p", "id:=7", says="id")
+
+
+def _impossible_loss(directory: Path) -> None:
+    _wrong(CHANNEL, *_TWO, "-p", "loss:=2.0", says="loss")
+
+
+_LINE = "one line that names setting and value, and code 2"
+
+FAULTS = (
+    Fault("agents before the channel", "all agents are started 3 s before the channel", "they wait; the run goes well",
+          _agents_first, True),
+    Fault("an agent after the others", "channel, then cf2, then, 3 s later, cf1", "they wait; the run goes well",
+          _channel_first),
+    Fault("an agent is never started", "an agent is missing at the start",
+          "the channel names it and ends with code 1; the agents end", _agent_missing),
+    Fault("channel killed, by hand", "SIGKILL to a channel whose agents were started by hand, lockstep",
+          "the agents say that it has gone and end with code 1", _channel_killed, True),
+    Fault("unknown policy", "an agent's parameter `policy` is unknown", _LINE, _unknown_policy, True),
+    Fault("id too large", "an agent's `id` is larger than `agents`", _LINE, _id_too_large, True),
+    Fault("impossible loss", "the channel's parameter `loss` is 2", _LINE, _impossible_loss),
+)  # fmt: skip
