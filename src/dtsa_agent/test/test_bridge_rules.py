@@ -327,7 +327,7 @@ def test_a_rule_speaks_again_after_it_had_ceased() -> None:
 # -- real-time priority -----------------------------------------------------------------------------------------------
 PRIORITY = """
 import os, resource, sys, threading
-from dtsa_agent.crazyflie.priority import give_way, stay_on_one_processor, take_priority
+from dtsa_agent.ros.common.priority import give_way, stay_on_one_processor, take_priority
 if len(sys.argv) > 1:  # an ordinary user with that limit
     resource.setrlimit(resource.RLIMIT_RTPRIO, (int(sys.argv[1]),) * 2)
     os.setgroups([])

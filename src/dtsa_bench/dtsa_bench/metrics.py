@@ -22,7 +22,6 @@ from .run_config import RunConfig
 
 Array = NDArray[np.float64]
 
-_FAR_M = 1e5
 _CRASHED: int = _kernel.METRICS_CRASHED
 _ARRIVED: int = _kernel.METRICS_ARRIVED
 
@@ -90,8 +89,8 @@ class FlightMetrics:
         self._outcomes[outcome] += 1
         if self.lost:
             track = track.copy()
-            for agent in self.lost:  # out of everybody's way, each by itself
-                track[:, :, agent - 1] = _FAR_M * agent
+            for agent in self.lost:  # its vehicle hovers where it was last known
+                track[:, :, agent - 1] = self._last[:, agent - 1]
         self._last = track[-1].copy()
         state = self._kernel.update(done, track, None if tables is None else tables.kernel)
         if self._course is not None:
@@ -115,7 +114,7 @@ class FlightMetrics:
         return self.end
 
     def lose(self, agent: int) -> None:
-        """An agent fell out of the flight: no distance to it, nor its way, counts any more.
+        """An agent fell out of the flight: its vehicle hovers where it was last known, and its way counts no more.
 
         :param agent: its id.
         """
@@ -124,7 +123,7 @@ class FlightMetrics:
         self._kernel.drop(agent - 1)
 
     def regain(self, agent: int) -> None:
-        """An agent that fell out takes part again: distances to it count, and it has to arrive.
+        """An agent that fell out takes part again: it flies, and has to arrive.
 
         Its way stays unknown, and its state stays out of the ages.
 

@@ -22,7 +22,7 @@ from node_helpers import Graph, end_of, graph_in, ros_graph
 pytest.importorskip("dtsa_msgs.msg")
 
 import dtsa_msgs.msg
-from dtsa_msgs.msg import Process, Slot, Transmission
+from dtsa_msgs.msg import Frame, Process, Report, Slot, Transmission
 from rclpy.serialization import serialize_message
 
 from dtsa_agent.ros.common import names
@@ -36,7 +36,13 @@ CHANNEL, AGENT, HOST = (
     "dtsa_agent.ros.agent_node",
     "dtsa_agent.ros.swarm_host",
 )
-TOPICS = {names.SLOT: Slot, names.TRANSMISSION: Transmission, names.PROCESS: Process}
+TOPICS = {
+    names.SLOT: Slot,
+    names.TRANSMISSION: Transmission,
+    names.AIR_FRAME: Frame,
+    names.REPORT: Report,
+    names.PROCESS: Process,
+}
 SHAPE = ("--agents", "4", "--policy", "dtsa", "--processes", "2", "--no-picture", "--tail-s", "15", "--seed", "3")
 
 
@@ -78,7 +84,7 @@ def malformed(random: np.random.Generator, cls: Any, run: int, slot: int) -> byt
     if random.random() < 0.8:
         message.run = run
     if hasattr(message, "slot") and random.random() < 0.5:
-        message.slot = slot
+        message.slot = slot if isinstance(message.slot, int) else [slot]
     data = bytes(serialize_message(message))
     if random.random() < 0.2:
         data = data[: int(random.integers(len(data)))] + bytes(random.bytes(5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ from node_helpers import end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_msgs.msg import Transmission
+from dtsa_msgs.msg import Frame, Process, Report
 from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.stamps import header_of
 from dtsa_bench.fly.recorded_channel import RecordedFlight
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_channel_sim import Channel, ChannelConfig
@@ -152,24 +154,36 @@ class LateSender(ChannelObserver):
     """Answers for two agents; in one slot both send, agent 1 so long ago that it cannot be on the air any more."""
 
     def __init__(self, node: Node, channel: RealtimeChannel) -> None:
-        topic = f"{names.SWARM}/{names.TRANSMISSION}"
-        self._publisher = node.create_publisher(Transmission, topic, names.lockstep_qos(16))
+        qos, make = names.lockstep_qos(16), node.create_publisher
+        self._air = make(Frame, f"{names.SWARM}/{names.AIR_FRAME}", qos)
+        self._reports = make(Report, f"{names.SWARM}/{names.REPORT}", qos)
+        self._processes = make(Process, f"{names.SWARM}/{names.PROCESS}", qos)
         self._channel = channel
         self._sent = False
+        self._begin_s = 0.0
         self.frames: list[tuple[int, list[bool], int]] = []  # sender, received, collided
 
+    def begun(self, at_s: float) -> None:
+        self._begin_s = at_s
+
     def idle(self, status: ChannelStatus) -> None:
-        slot, long_ago = (status.slot + 20, -30 * self._channel.slot_ns) if status.slot >= 0 else (0, 0)
-        sending = status.slot >= 0 and not self._sent
-        self._sent |= sending
-        nothing, size = [0.0] * 6, 24 if sending else 0
-        self._publisher.publish(
-            Transmission(
-                run=self._channel.run_id, slot=slot, agent=[1, 2], length=[size] * 2, data=bytes(2 * size),
-                offset_ns=[long_ago, 0], chosen=[0, 0], reason=[0, 0], digest=[0, 0], score=[0.0, 0.0],
+        run_id, slot_ns = self._channel.run_id, self._channel.slot_ns
+        slot = max(0, round((time.monotonic() - self._begin_s) * 1e9) // slot_ns + 5) if self._begin_s else 0
+        nothing = [0.0] * 6
+        settings = json.dumps({"agents": 2, "slot_ms": slot_ns / 1e6, "steps": 1, "mode": "realtime"})
+        self._processes.publish(Process(run=run_id, process=1, node="/test", agent=[1, 2], settings=settings))
+        self._reports.publish(
+            Report(
+                run=run_id, agent=[1, 2], slot=[slot], offset_ns=[0, 0], length=[0, 0],
+                chosen=[0, 0], reason=[0, 0], digest=[0, 0], score=[0.0, 0.0],
                 steps=1, track=nothing, velocity=nothing, command=nothing, goal=nothing,
             )
         )  # fmt: skip
+        if slot > 50 and not self._sent:
+            self._sent = True
+            for agent, start in ((1, slot - 40), (2, slot)):
+                header = header_of(names.slot_time_ns(start, slot_ns))
+                self._air.publish(Frame(header=header, run=run_id, slot=slot, agent=agent, data=bytes(24)))
 
     def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         for row, sender in enumerate(verdict.senders):
@@ -183,7 +197,7 @@ def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_pat
     with ros_graph(tmp_path) as graph:
         node = Node("channel", context=graph.node.context, enable_rosout=False)
         model = Channel(ChannelConfig(agents=2))
-        channel = RealtimeChannel(node, model, 1, referee=SlotLimit(60))
+        channel = RealtimeChannel(node, model, 1, referee=SlotLimit(150))
         sender = LateSender(graph.node, channel)
         channel.observe(sender)
         try:
@@ -191,6 +205,6 @@ def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_pat
         finally:
             channel.close()
             node.destroy_node()
-    assert channel.air.late == 1
-    # Nobody heard agent 1, and it disturbed nobody; agent 2 was heard by the one other agent.
-    assert sorted(sender.frames) == [(1, [False, False], 0), (2, [True, False], 0)]
+    assert channel.air.late == channel.late_frames == 1
+    # That of agent 1 disturbed nobody; agent 2 was heard by the one other agent.
+    assert sender.frames == [(2, [True, False], 0)]

@@ -21,7 +21,7 @@ from metronome import flown_again_when_overloaded
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_bench.bag.reader import Bag
-from dtsa_bench.metrics import COMPLETED, FlightMetrics
+from dtsa_bench.metrics import COMPLETED, CRASHED, FlightMetrics
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_bench.verify import verify_bag
 from dtsa_channel_sim.model.verdict import SUCCESS
@@ -352,10 +352,12 @@ def test_who_is_back_counts_again() -> None:
 
     metrics.lose(2)
     elsewhere = there.copy()
-    elsewhere[:, 1] = there[:, 0]  # where another one is: but it is not there
+    elsewhere[:, 1] = there[:, 0]  # where another one is: but what is said about a lost one does not count
     metrics.regain(2)
     metrics.lose(2)
-    assert fly(scenario.start) == ""
+    aside = scenario.start.copy()
+    aside[:, 2] += 5.0  # in nobody's way: its vehicle hovers there while its program is away
+    assert fly(aside) == ""
     metrics.regain(2)
     away = there.copy()
     away[:, 1] += 5.0
@@ -373,4 +375,17 @@ def test_who_is_back_counts_again() -> None:
     metrics.regain(2)
     fly(elsewhere)
     assert metrics.crash_slot > 0
+    assert metrics.collided_pair == (1, 2)
+
+
+def test_who_flies_into_a_dead_agents_vehicle_has_crashed() -> None:
+    config = SwarmConfig(agents=4, moving=4, slot_ms=100.0)
+    scenario = make_scenario(config)
+    metrics = FlightMetrics(RunConfig(config), scenario)
+    metrics.lose(2)
+    assert metrics.update(0, scenario.start[None], None, SUCCESS) == ""
+    into = scenario.start.copy()
+    into[:, 0] = scenario.start[:, 1]
+    into[:, 1] += 10.0  # it is not where somebody says that it is
+    assert metrics.update(1, into[None], None, SUCCESS) == CRASHED
     assert metrics.collided_pair == (1, 2)

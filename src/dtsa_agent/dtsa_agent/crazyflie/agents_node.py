@@ -26,7 +26,6 @@ from dtsa_agent.core import AbstractSwarm
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.settings import Settings, setting
 from dtsa_agent.crazyflie.external_vehicles import ExternalVehicles
-from dtsa_agent.crazyflie.priority import take_priority
 from dtsa_agent.crazyflie.units import rotate
 from dtsa_agent.keys import with_key
 from dtsa_agent.ros.common import names
@@ -34,6 +33,7 @@ from dtsa_agent.ros.common.checks import OTHER_SENDER, OnePublisher, Unusable, c
 from dtsa_agent.ros.common.loop import Feed, Stop
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_settings
+from dtsa_agent.ros.common.priority import take_priority
 from dtsa_agent.ros.common.process import run_node
 from dtsa_agent.ros.hosting import declare_swarm
 from dtsa_agent.ros.realtime import RealtimeNode

@@ -28,10 +28,10 @@ from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.bridge_inputs import Inputs
 from dtsa_agent.crazyflie.bridge_outputs import Outputs
 from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
-from dtsa_agent.crazyflie.priority import stay_on_one_processor, take_priority
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.ros.common.parameters import declare_settings
+from dtsa_agent.ros.common.priority import stay_on_one_processor, take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
 
 STATUS_HZ = 5.0

@@ -19,6 +19,7 @@ from dtsa_agent.keys import with_key
 from .common import names
 from .common.loop import Stop
 from .common.parameters import declare_settings
+from .common.priority import give_way_by
 from .swarm_node import SwarmNode
 
 
@@ -122,6 +123,12 @@ def _realtime(node: Node, swarm: AbstractSwarm, space: str) -> SwarmNode:
         2,
         "from the order to send until a receiver has the frame: for any frame, and more for each of its bytes (ns)",
     )
+    text = "by how much this process gives way to others, the channel above all: nice, 0 to 19"
+    nice = _declare(node, "nice", 0, text, ParameterType.PARAMETER_INTEGER)
+    if not 0 <= nice <= 19:
+        raise ConfigError("nice", nice, "0 to 19")
+    if nice:
+        give_way_by(nice)
     text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
     places = list(_declare(node, "resume_at", [0.0], text, ParameterType.PARAMETER_DOUBLE_ARRAY))
     if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from dtsa_msgs.msg import Slot
+from dtsa_msgs.msg import Frame, Report, Slot
 from numpy.typing import NDArray
 from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING
@@ -23,8 +24,9 @@ from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 from .common import names
 from .common.checks import SIZES, SLOT, Unusable, check_start
 from .common.loop import Stop
-from .common.stamps import header_of, ns_of
+from .common.stamps import header_of, ns_of, time_of
 from .common.wire import split_frames, unpack_received
+from .reporter import Reporter
 from .swarm_node import SwarmNode
 
 _PPB = 1_000_000_000
@@ -32,7 +34,10 @@ _LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
-_LEAD = 0.25  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time
+_LEAD = 0.25  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time,
+_LATEST_LEAD = 0.06  # or, while it misses the frame of the slot before, this long
+_BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
+_MOST_EARLY = 64  # frames of slots that are still to come here
 
 
 def slot_starts(local_ns: int, offset_ns: NDArray[np.int64], drift_ppb: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -87,7 +92,9 @@ class RealtimeNode(SwarmNode):
         super().__init__(*args, waiting=names.REALTIME_WAITING, **kwargs)
         count = len(self.swarm.ids)
         self.slot_ns = self.config.slot_ns
-        self._lead_ns = round(_LEAD * self.slot_ns)
+        self._lead_ns, self._latest_lead_ns = round(_LEAD * self.slot_ns), round(_LATEST_LEAD * self.slot_ns)
+        self._own_or_nobody = {0, *self.swarm.ids}
+        self._awaits = False  # somebody here takes another one for the slot's sender, and has not heard it yet
         self.unsent = 0  # frames that would have left half a slot late or more
         self._offset: NDArray[np.int64] = np.array(offset_ns, dtype=np.int64)
         self._drift: NDArray[np.int64] = np.array(drift_ppb, dtype=np.int64)
@@ -110,6 +117,12 @@ class RealtimeNode(SwarmNode):
         self._signals = 0
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
         self._early: list[Slot] = []  # frames of a slot that is still to come here
+
+    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
+        create = self.node.create_publisher
+        self._air = create(Frame, f"{swarm_namespace}/{names.AIR_FRAME}", qos)
+        self._telemetry = create(Report, f"{swarm_namespace}/{names.REPORT}", qos)
+        self._reporter = Reporter(self._telemetry, self.swarm)
 
     def starts(self, slot: int) -> NDArray[np.int64]:
         """When each agent's slot starts, ns after the channel's start of that slot.
@@ -173,14 +186,17 @@ class RealtimeNode(SwarmNode):
                 swarm.leave(index)
         if stop.count == self._signals and self.slot <= self._leaves_by and (swarm.present == PRESENT_LEAVING).any():
             return not self.loop.subscription.get_publisher_count()
-        self._publisher.wait_for_all_acked(_DELIVERY)
+        self._reporter.publish(self.run_id)
+        for publisher in (self._air, self._telemetry):
+            publisher.wait_for_all_acked(_DELIVERY)
         return True
 
     def _prepare(self, message: Slot) -> bool:
         """Answers the channel's call, or takes the start time; False when the run is over."""
         if message.phase == Slot.PREPARE:
             self._called = True
-            self._answer(0, message.header, (), message.run)
+            self._reporter.add_slot(message.slot, self.starts(0))
+            self._reporter.publish(message.run)
         elif message.phase == Slot.START:
             self._begin(message.run)
             self._zero = ns_of(message.header.stamp)
@@ -222,12 +238,16 @@ class RealtimeNode(SwarmNode):
 
     def _step(self) -> bool:
         """Waits for the next slot or message; False when the run is over."""
-        due = self._zero + (self.slot + 1) * self.slot_ns + int(self.starts(self.slot + 1).min()) - self._lead_ns
+        lead_ns = self._latest_lead_ns if self._awaits else self._lead_ns
+        due = self._zero + (self.slot + 1) * self.slot_ns + int(self.starts(self.slot + 1).min()) - lead_ns
         remaining = due - time.monotonic_ns()
         if remaining > 0:
             message = self.loop.wait(min(remaining, _PATIENCE_NS))
             return message is None or self._take(message)
-        while (message := self.loop.take()) is not None:
+        for _ in range(_BURST):
+            message = self.loop.take()
+            if message is None:
+                break
             if not self._take(message):
                 return False
         if -remaining > self._too_long_ns and self.config.policy_row.probation:
@@ -241,7 +261,8 @@ class RealtimeNode(SwarmNode):
             return False
         if message.phase == Slot.RUN:
             if message.heard_slot > self.slot:
-                self._early.append(message)
+                if len(self._early) < _MOST_EARLY:
+                    self._early.append(message)
             else:
                 self._take_frames(message)
         return True
@@ -251,6 +272,12 @@ class RealtimeNode(SwarmNode):
             return  # from before it began
         # In the slot in which it was sent, even if this process, or the channel's, has been kept waiting since.
         masks = self._hear(message, message.heard_slot)
+        self._awaits &= message.heard_slot < self.slot
+        if masks is not None:
+            now = time.monotonic_ns() - self._zero
+            for sender, mask in zip(message.sender, masks, strict=True):
+                if mask.any():
+                    self._reporter.add_heard(sender, message.heard_slot, self.slot, now, mask)
         if masks is None or not (self._aligners or self._timeless.any()):
             return
         late = self._lateness(message)
@@ -302,26 +329,43 @@ class RealtimeNode(SwarmNode):
             swarm.present[~self._gone] = PRESENT_LEAVING
         senders = self.agents.on_slot(slot)
         starts = self.starts(slot)
-        now = time.monotonic_ns() - self._zero - slot * self.slot_ns
-        offsets = starts.copy()
-        for index in senders:
-            jitter = self._jitter_ns * self._random[index].standard_normal() if self._jitter_ns else 0.0
-            offsets[index] = max(int(starts[index] + jitter), now)
-            if offsets[index] - starts[index] > self.slot_ns // 2:
-                # The turn is as good as over: speaking now would disturb whoever has the next one.
-                swarm.frame_length[index] = 0
-                offsets[index] = starts[index]
-                self.unsent += 1
-            elif swarm.present[index] == PRESENT_LEAVING:
-                frame = swarm.frames[index, : swarm.frame_length[index]].tobytes()
-                self._gone[index] = decode_extended(frame).leaving
-        self._message.offset_ns = array("q", offsets.tobytes())
-        header = header_of(names.slot_time_ns(slot, self.slot_ns))
+        offsets = self._send(slot, senders, starts) if senders else starts
         self.slot = slot
-        self._answer(slot, header, [index for index in senders if swarm.frame_length[index]])
+        self._awaits = not self._own_or_nobody.issuperset(swarm.chosen.tolist())
+        self._reporter.add_slot(slot, offsets)
         if self._watched:
-            self._publish_odometry(header.stamp)
+            self._publish_odometry(time_of(names.slot_time_ns(slot, self.slot_ns)))
         swarm.fly(slot)
         early, self._early = self._early, []
         for message in early:
             self._take(message)
+        if self._reporter.due():
+            self._reporter.publish(self.run_id)
+
+    def _send(self, slot: int, senders: Sequence[int], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Hands the frames of a slot over to the channel, before anything else is done.
+
+        :param senders: positions of the agents that send.
+        :param starts: (L,) ns, start of each agent's slot, from the channel's start of the slot.
+        :returns: (L,) ns, the same, but of the transmission where there is one.
+        """
+        swarm = self.swarm
+        offsets = starts.copy()
+        for index in senders:
+            jitter = self._jitter_ns * self._random[index].standard_normal() if self._jitter_ns else 0.0
+            now = time.monotonic_ns() - self._zero - slot * self.slot_ns
+            offset = max(int(starts[index] + jitter), now)
+            if offset - starts[index] > self.slot_ns // 2:
+                # The turn is as good as over: speaking now would disturb whoever has the next one.
+                swarm.frame_length[index] = 0
+                self.unsent += 1
+                continue
+            offsets[index] = offset
+            data = swarm.frames[index, : swarm.frame_length[index]].tobytes()
+            header = header_of(names.slot_time_ns(slot, self.slot_ns) + offset)
+            self._air.publish(
+                Frame(header=header, run=self.run_id, slot=slot, agent=swarm.ids[index], data=array("B", data))
+            )
+            if swarm.present[index] == PRESENT_LEAVING:
+                self._gone[index] = decode_extended(data).leaving
+        return offsets

@@ -13,6 +13,7 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_msgs.msg import Header
 
@@ -54,9 +55,6 @@ class SwarmNode:
         self.slot = -1  # the slot that has been answered
         self._goal = b""  # as last told
         self._nothing = np.zeros((0, config.agents), dtype=np.uint8)  # heard by whom, in a slot without frames
-        self._message = Transmission()
-        self._message.agent = array("H", swarm.ids)
-        self._message.steps = config.steps
         self._odometry: list[tuple[int, Publisher]] = []
         self._frames: list[str] = []  # of the bodies in odometry
         self._watched: list[tuple[int, Publisher]] = []
@@ -64,7 +62,7 @@ class SwarmNode:
         self._namespace = swarm_namespace
         self._waiting = Waiting(node.get_logger())
         self._begun = False
-        self._publisher = node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
+        self._make_publishers(swarm_namespace, qos)
         settings = agreed_settings(config, self.mode)
         self.membership = Membership(node, swarm.ids, settings, swarm_namespace, self._dropped_frames, self._plausible)
         intake = self.membership.intake
@@ -72,6 +70,12 @@ class SwarmNode:
         # Messages of strangers must not push the channel's out before they are read.
         reading = names.lockstep_qos(max(waiting, _STRANGERS // 4))
         self.loop = Loop(node, Slot, topic, reading, intake=intake, admits=self.membership.admits)
+
+    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
+        self._message = Transmission()
+        self._message.agent = array("H", self.swarm.ids)
+        self._message.steps = self.config.steps
+        self._publisher = self.node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
 
     @property
     def swarm(self) -> AbstractSwarm:

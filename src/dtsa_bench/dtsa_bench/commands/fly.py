@@ -89,11 +89,17 @@ def run(args: argparse.Namespace) -> int:
         flight = fly(config, directory, options, stop)
     print(describe(flight.summary))
     print(f"bag:     {flight.bag}\nresults: {directory / 'summary.json'}")
-    if args.picture and not stop:
+    if flight.summary.get("warning"):
+        print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
+    cut_short = flight.summary.get("cut_short")
+    if args.picture and not stop and not cut_short:
         print(f"picture: {directory / 'trajectories.png'}")
     if stop:
         print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
         return INTERRUPTED
+    if cut_short:
+        print(f"dtsa: the flight was cut short: {cut_short}", file=sys.stderr)
+        return 1
     return 0
 
 
@@ -148,17 +154,20 @@ def run_crazyflies(args: argparse.Namespace) -> int:
 
 
 def describe(summary: dict[str, Any]) -> str:
-    """A flight's results in two lines."""
+    """A flight's results in a few lines."""
     slots = summary["slots"]
     end = summary["end"]
-    if end == "completed":
-        end += f" after {summary['completion_time_s']:.2f} s"
+    arrived = "" if summary["completion_time_s"] is None else f" after {summary['completion_time_s']:.2f} s"
     if summary["collided"]:
-        end += " (cf{} and cf{})".format(*summary["collided_pair"])
+        end = "crashed (cf{} and cf{})".format(*summary["collided_pair"])
+    elif end == "completed":
+        end += arrived
     lines = [
         f"{summary['agents']} agents, {summary['moving']} moving, {summary['policy']}, {summary['estimator']}, "
         f"{summary['avoider']}: {end}"
     ]
+    if summary["collided"] and arrived:
+        lines.append(f"all were at their targets{arrived}")
     parts = [
         f"slots {slots['total']} (success {slots['success']}, collision {slots['collision']}, idle {slots['idle']})"
     ]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.crazyflie.priority import take_priority
+from dtsa_agent.ros.common.priority import take_priority
 from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import FAULTS, send_fault
 from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig

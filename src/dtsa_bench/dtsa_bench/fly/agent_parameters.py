@@ -8,6 +8,9 @@ from typing import Any
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import make_clocks
 
+# Process priority in real time: agents give way to the channel, which goes first where it may.
+AGENTS_NICE, CHANNEL_NICE = 5, -10
+
 
 def clock_parameters(run: RunConfig, ids: Sequence[int]) -> dict[str, Any]:
     """The clocks of some agents, and how long a frame takes, in real time; nothing in lockstep.
@@ -27,4 +30,5 @@ def clock_parameters(run: RunConfig, ids: Sequence[int]) -> dict[str, Any]:
         "clock_jitter_ns": float(run.clocks.jitter_ns),
         "align": run.align,
         "flight_time_ns": [fixed + link, airtime.total_ns(1) - fixed],
+        "nice": AGENTS_NICE,
     }

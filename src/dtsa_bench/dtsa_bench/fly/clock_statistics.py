@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from dtsa_channel_sim.ros.observer import ChannelObserver
 
 ON_TIME_NS = 1_000_000  # a frame this far from the swarm's common time is not on time any more
 _END = 50  # slots
+_OPEN = 2000  # slots that are not summed up yet
 
 
 class ClockStatistics(ChannelObserver):
@@ -23,13 +25,18 @@ class ClockStatistics(ChannelObserver):
     def __init__(self, agents: int) -> None:
         self._agents = agents
         self._starts: dict[int, NDArray[np.float64]] = {}  # (N,) ns by slot: own slot's start where silent
-        self._sends: list[tuple[int, int, int]] = []  # slot, agent's id, ns
+        self._sends: dict[int, list[tuple[int, int]]] = {}  # by slot: agent's id, ns
+        self._spread = array("f")  # ns, of slots that are summed up
+        self._away: dict[int, array[float]] = {}  # ns, by agent, likewise
 
-    def report(self, message: Any) -> None:
-        self.add(message.slot, message.agent, message.offset_ns, message.length)
+    def report(self, message: Any, data: bytes) -> None:
+        count = len(message.agent)
+        for row, slot in enumerate(message.slot):
+            part = slice(row * count, (row + 1) * count)
+            self.add(slot, message.agent, message.offset_ns[part], message.length[part])
 
     def add(self, slot: int, ids: Sequence[int], offsets_ns: Sequence[int], lengths: Sequence[int]) -> None:
-        """Takes in one report.
+        """Takes in what one process says of one slot.
 
         :param slot: as its agents count.
         :param ids: of the agents.
@@ -39,11 +46,22 @@ class ClockStatistics(ChannelObserver):
         starts = self._starts.get(slot)
         if starts is None:
             starts = self._starts[slot] = np.full(self._agents, np.nan)
-        for agent, offset, length in zip(ids, offsets_ns, lengths, strict=True):
-            if length:
-                self._sends.append((slot, agent, offset))
-            else:
-                starts[agent - 1] = offset
+            if len(self._starts) > _OPEN:
+                self._sum_up(min(self._starts))
+        silent = np.array(lengths) == 0
+        starts[np.array(ids)[silent] - 1] = np.array(offsets_ns)[silent]
+        for index in np.flatnonzero(~silent):
+            self._sends.setdefault(slot, []).append((ids[index], offsets_ns[index]))
+
+    def _sum_up(self, slot: int) -> None:
+        """Nothing more will be told of a slot."""
+        row = self._starts.pop(slot)
+        usable = row[~np.isnan(row)]
+        if len(usable) > 1:
+            self._spread.append(usable.max() - usable.min())
+        for agent, offset in self._sends.pop(slot, []):
+            if len(usable):
+                self._away.setdefault(agent, array("f")).append(offset - float(np.median(usable)))
 
     def summary(self) -> dict[str, Any]:
         """The results; None where nothing was reported.
@@ -52,14 +70,11 @@ class ClockStatistics(ChannelObserver):
         largest of the last 50; ``send_offset_ms``: by agent, how far its frames left from the swarm's common time (the
         median of the slot's starts); ``sends_on_time_share``: frames within 1 ms of it.
         """
-        usable = {slot: row[~np.isnan(row)] for slot, row in sorted(self._starts.items())}
-        spread = np.array([row.max() - row.min() for row in usable.values() if len(row) > 1]) / 1e6
-        common = {slot: float(np.median(row)) for slot, row in usable.items() if len(row)}
-        away: dict[int, list[float]] = {}
-        for slot, agent, offset in self._sends:
-            if slot in common:
-                away.setdefault(agent, []).append(offset - common[slot])
-        every = np.array([value for values in away.values() for value in values])
+        for slot in sorted(self._starts):
+            self._sum_up(slot)
+        spread = np.array(self._spread, dtype=np.float64) / 1e6
+        away = {agent: np.array(values, dtype=np.float64) for agent, values in sorted(self._away.items())}
+        every = np.concatenate(list(away.values())) if away else np.zeros(0)
         return {
             "clock_spread_max_ms": float(spread.max()) if len(spread) else None,
             "clock_spread_mean_ms": float(spread.mean()) if len(spread) else None,
@@ -67,6 +82,6 @@ class ClockStatistics(ChannelObserver):
             "sends_on_time_share": float((np.abs(every) <= ON_TIME_NS).mean()) if len(every) else None,
             "send_offset_ms": {
                 str(agent): {"median": float(np.median(values)) / 1e6, "max": float(max(values, key=abs)) / 1e6}
-                for agent, values in sorted(away.items())
+                for agent, values in away.items()
             },
         }

@@ -31,12 +31,12 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.paths import shortest_s
-from dtsa_agent.crazyflie.priority import give_way, take_priority
 from dtsa_agent.crazyflie.units import to_map
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
+from dtsa_agent.ros.common.priority import give_way, take_priority
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim.ros.channel_node import declare_channel
@@ -371,10 +371,11 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         flight = RecordedFlight(node, run, directory, options.startup_s, answer_s=2.0, end_s=END_S)
         channel, measurement = flight.channel, flight.measurement
         assert isinstance(channel, RealtimeChannel)
-        shown = FlightProgress(progress, measurement, run.swarm.agents, run.swarm.slot_ns)
+        shown = FlightProgress(progress, measurement, channel)
         channel.observe(Supervisor(bridge), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
         try:
             channel.run(ended)
+            ended.reason = ended.reason or channel.fell_behind
             shown.show()
         finally:
             channel.close()

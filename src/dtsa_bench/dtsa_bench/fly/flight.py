@@ -18,22 +18,25 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
+from dtsa_agent.ros.common.priority import give_way_by
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
 from dtsa_channel_sim.ros.answers import named
 from dtsa_channel_sim.ros.channel_node import declare_channel
+from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .agent_parameters import clock_parameters
+from .agent_parameters import CHANNEL_NICE, clock_parameters
 from .children import Children
 from .domain import ros_domain
+from .ending import EarlyEnd, wall_limit_s
 from .options import FlightOptions
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
@@ -162,24 +165,55 @@ def _fly(
         declare_channel(node, run.air)
         flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)
         channel, measurement = flight.channel, flight.measurement
-        shown = FlightProgress(progress, measurement, run.swarm.agents, run.swarm.slot_ns)
+        shown = FlightProgress(progress, measurement, channel)
         if isinstance(channel, RealtimeChannel):
             again = options.respawn
             channel.observe(RealtimeSupervisor(children, channel, measurement, progress.say, again, late))
         else:
             channel.observe(Supervisor(children))
         channel.observe(shown)
+        limit_s = wall_limit_s(options.wall_timeout_s, run.limits.timeout_s)
+        ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
+        failure: DtsaError | None = None
         try:
-            channel.run(stop)
-            shown.show()
-        finally:
-            channel.close()
-            progress.end()
-        children.stop()
-        summary = flight.write_results(pictures=options.pictures and not stop)
+            _run(channel, ended, shown)
+        except DtsaError as error:
+            failure = error
+        progress.end()
+        children.stop(hurry=bool(stop))
+        try:
+            pictures = options.pictures and not ended and failure is None
+            summary = flight.write_results(pictures, **_cut_short(channel, ended, failure))
+        except OSError:
+            if failure is None:
+                raise
+        if failure is not None:
+            raise failure
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         node.destroy_node()
+
+
+def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress) -> None:
+    """The flight itself; the channel is closed afterwards."""
+    first = isinstance(channel, RealtimeChannel) and not give_way_by(CHANNEL_NICE)
+    try:
+        channel.run(ended)
+        shown.show()
+    finally:
+        if ended.stop:
+            channel.hurry()
+        try:
+            channel.close()
+        finally:
+            if first:
+                give_way_by(0)
+
+
+def _cut_short(channel: Any, ended: EarlyEnd, failure: DtsaError | None) -> dict[str, str]:
+    """Why a flight ended before its time, as the summary has it; empty if it did not, or the user ended it."""
+    reason = str(failure or "") or ended.reason or getattr(channel, "fell_behind", "")
+    return {"cut_short": reason} if reason else {}
 
 
 def _start_agents(children: Children, run: RunConfig, options: FlightOptions, directory: Path) -> list[LateStart]:

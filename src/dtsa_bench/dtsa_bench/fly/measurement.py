@@ -36,12 +36,15 @@ class FlightMeasurement(ChannelObserver, Referee):
     @property
     def wall_time_s(self) -> float:
         """Wall-clock time of the flight so far, s."""
-        return (self.end_s or time.monotonic()) - self.begin_s if self.begin_s else 0.0
+        return max(0.0, (self.end_s or time.monotonic()) - self.begin_s) if self.begin_s else 0.0
+
+    def begun(self, at_s: float) -> None:
+        self.begin_s = at_s
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         self.positions.append(answers.position)
         if not slot:
-            self.begin_s = time.monotonic()
+            self.begin_s = self.begin_s or time.monotonic()
             return
         self.metrics.compare_tables(slot - 1, *self._compared)
         if self._oracle:
@@ -60,7 +63,10 @@ class FlightMeasurement(ChannelObserver, Referee):
         self._outcome = verdict.outcome
         self._compared = answers.digest.copy(), answers.chosen.copy()
         self.scenario.advance(slot, self._tables)  # what all know about each other's goals
-        if verdict.senders:
+        if answers.taken_in is not None:  # in real time the receivers themselves know best
+            for taken in answers.taken_in:
+                self._tables.hear(taken.slot, taken.data, taken.mask)
+        elif verdict.senders:
             mask = verdict.mask(self._agents)
             for row, sender in enumerate(verdict.senders):
                 if mask[row].any():

@@ -31,6 +31,13 @@ class FlightOptions(AnswerLimits):
     late: Mapping[int, float] = setting(
         {}, "real time: agents that are started so long after slot 0, s by id", kind="structure", custom=True
     )
+    wall_timeout_s: float | None = setting(
+        None,
+        "a flight that takes longer by the clock on the wall is ended; default: ten times timeout_s, at least 120",
+        unit="s",
+        minimum=1,
+        maximum=864000,
+    )
     pictures: bool = setting(True, "draw trajectories.png")
 
     def __post_init__(self) -> None:

@@ -7,6 +7,8 @@ import time
 from typing import TextIO
 
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+from dtsa_channel_sim.ros.ros_channel import RosChannel
 
 from .measurement import FlightMeasurement
 
@@ -67,13 +69,12 @@ class FlightProgress(ChannelObserver):
 
     :param line: the line.
     :param measurement: the flight so far.
-    :param agents: number of agents N.
-    :param slot_ns: ns, length of a slot.
+    :param channel: the channel.
     """
 
-    def __init__(self, line: ProgressLine, measurement: FlightMeasurement, agents: int, slot_ns: int) -> None:
-        self._line, self._measurement = line, measurement
-        self._agents, self._slot_ns = agents, slot_ns
+    def __init__(self, line: ProgressLine, measurement: FlightMeasurement, channel: RosChannel) -> None:
+        self._line, self._measurement, self._channel = line, measurement, channel
+        self._agents, self._slot_ns = channel.agents, channel.slot_ns
         self._start = time.monotonic()
 
     def idle(self, status: ChannelStatus) -> None:
@@ -91,4 +92,9 @@ class FlightProgress(ChannelObserver):
         metrics = self._measurement.metrics
         flown_s = metrics.slots * self._slot_ns / 1e9
         closest, pair = metrics.closest()
-        self._line.show(flight_text(metrics.slots, flown_s, self._measurement.wall_time_s, closest, pair))
+        text = flight_text(metrics.slots, flown_s, self._measurement.wall_time_s, closest, pair)
+        if isinstance(self._channel, RealtimeChannel):
+            pace = self._channel.pace
+            text += f"  lag {pace.lag.quantile_ms(0.99) or 0.0:.1f} ms"
+            text += f"  stalls {pace.stall_count}" if pace.stall_count else ""
+        self._line.show(text)

@@ -31,6 +31,7 @@ from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .clock_statistics import ClockStatistics
 from .live_topics import LiveTopics
+from .machine import DeliveryStatistics, channel_summary, warning
 from .measurement import FlightMeasurement
 from .recorder import FlightRecorder
 
@@ -82,9 +83,9 @@ class RecordedFlight:
             LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
         )
         watch(self.channel, node, run.to_dict(), space)
-        self._clocks = ClockStatistics(run.swarm.agents)
+        self._clocks, self._delivery = ClockStatistics(run.swarm.agents), DeliveryStatistics(run.swarm.agents)
         if run.mode != LOCKSTEP:
-            self.channel.observe(self._clocks)
+            self.channel.observe(self._clocks, self._delivery)
         follow_parameters(node, model, self.channel.change_settings)
 
     def summary(self) -> dict[str, Any]:
@@ -95,11 +96,12 @@ class RecordedFlight:
         if isinstance(channel, RealtimeChannel):
             result |= {
                 "mode": self.run_config.mode,
-                "late_frames": channel.air.late,
-                "missed_reports": channel.missed,
                 "returned_agents": sorted(channel.returned),
+                **channel_summary(channel),
+                **self._delivery.summary(),
                 **self._clocks.summary(),
             }
+            result["warning"] = warning(channel, result)
         return result
 
     def write_results(self, pictures: bool = True, **more: Any) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from dtsa_msgs.msg import RunStatus
 from rcl_interfaces.msg import ParameterType
@@ -13,7 +14,7 @@ from dtsa_agent.ros.common import names
 from dtsa_bench.bag.cdr import HEADER, SECOND, CdrBuilder, OdometryPacker
 from dtsa_bench.bag.metadata import RUN_ID
 from dtsa_bench.bag.writer import BagWriter
-from dtsa_bench.run_config import RunConfig
+from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import Change
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
@@ -54,6 +55,11 @@ class FlightRecorder(ChannelObserver):
         self._status = add(f"{names.SWARM}/{names.STATUS}", "dtsa_msgs/msg/RunStatus", "latched")
         settings = add(f"{names.SWARM}/{names.CONFIGURATION}", "dtsa_msgs/msg/Configuration", "latched")
         self._event = 0
+        self._realtime = run.mode != LOCKSTEP
+        if self._realtime:
+            self._frame = add(f"{names.SWARM}/{names.AIR_FRAME}", "dtsa_msgs/msg/Frame")
+            self._report = add(f"{names.SWARM}/{names.REPORT}", "dtsa_msgs/msg/Report")
+        self._frames: dict[int, list[tuple[bytes, int]]] = {}
         spaces = [names.agent_namespace(agent) for agent in range(1, agents + 1)]
         self._odometry = [add(f"{space}/{names.ODOMETRY}", "nav_msgs/msg/Odometry") for space in spaces]
         self._packer = OdometryPacker([f"{space[1:]}/base_link" for space in spaces], names.FRAME)
@@ -76,8 +82,18 @@ class FlightRecorder(ChannelObserver):
     def answer_received(self, slot: int, ids: bytes, data: bytes) -> None:
         self._answers.setdefault(slot, []).append((ids, data))
 
+    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
+        self._frames.setdefault(slot, []).append((data, time_ns))
+
+    def report(self, message: Any, data: bytes) -> None:
+        if len(message.slot):
+            at = self._time_ns(message.slot[-1])
+            self.bag.write(self._report, data, at, at)
+
     def all_answered(self, slot: int, answers: Answers) -> None:
         self._complete = slot
+        if self._realtime and answers.answered.any():
+            self._answers[slot] = [(b"", self._packed.transmission(slot, answers))]
         if not slot:
             self._state.phase = RunStatus.FLYING
             self._write_status()
@@ -102,6 +118,8 @@ class FlightRecorder(ChannelObserver):
     def _write_messages(self, slot: int) -> None:
         """Writes a slot's own message and all answers to it, in the order of their ids."""
         at = self._time_ns(slot)
+        for data, time_ns in self._frames.pop(slot, []):
+            self.bag.write(self._frame, data, time_ns, time_ns)
         for data, time_ns in self._messages.pop(slot, []):
             self.bag.write(self._slot, data, time_ns, time_ns)
         for _, answer in sorted(self._answers.pop(slot, [])):
@@ -111,7 +129,9 @@ class FlightRecorder(ChannelObserver):
         """Writes all about the slot before the last one that was answered."""
         if self._pending_slot < self._complete:
             # What came too late for its own slot is written with the next one.
-            for slot in sorted(slot for slot in {*self._messages, *self._answers} if slot <= self._pending_slot):
+            for slot in sorted(
+                slot for slot in {*self._messages, *self._answers, *self._frames} if slot <= self._pending_slot
+            ):
                 self._write_messages(slot)
             for channel, data, at in self._pending:
                 self.bag.write(channel, data, at, at)
@@ -139,7 +159,7 @@ class FlightRecorder(ChannelObserver):
     def close(self) -> None:
         """Writes what is complete and finishes the bag."""
         self._write_pending()
-        for slot in sorted({*self._messages, *self._answers}):
+        for slot in sorted({*self._messages, *self._answers, *self._frames}):
             if slot <= self._complete:
                 self._write_messages(slot)
         self._write_status()

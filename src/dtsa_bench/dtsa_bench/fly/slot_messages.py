@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 
 import numpy as np
-from dtsa_msgs.msg import Decision, Reception
+from dtsa_msgs.msg import Decision, Reception, Transmission
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
@@ -34,6 +34,32 @@ class SlotMessages:
 
     def _header(self, slot: int) -> Header:
         return header_of(names.slot_time_ns(slot, self._slot_ns))
+
+    def transmission(self, slot: int, answers: Answers) -> bytes:
+        """A dtsa_msgs/Transmission as CDR, of all agents that have reported for a slot in real time.
+
+        :param slot: the slot.
+        :param answers: what they reported, and their frames.
+        """
+        here = np.flatnonzero(answers.answered)
+        frames = [answers.frames.get(int(index) + 1, b"") for index in here]
+        planes = {name: getattr(answers, name)[..., here] for name in ("track", "velocity", "command", "goal")}
+        message = Transmission(
+            header=self._header(slot),
+            run=self._run_id,
+            slot=slot,
+            agent=array("H", (here + 1).astype(np.uint16).tobytes()),
+            length=array("B", [len(frame) for frame in frames]),
+            data=array("B", b"".join(frames)),
+            offset_ns=array("q", answers.offset_ns[here].tobytes()),
+            chosen=array("H", answers.chosen[here].tobytes()),
+            reason=array("B", answers.reason[here].tobytes()),
+            digest=array("I", answers.digest[here].tobytes()),
+            score=array("d", answers.score[here].tobytes()),
+            steps=answers.steps,
+            **{name: array("d", values.tobytes()) for name, values in planes.items()},
+        )
+        return bytes(serialize_message(message))
 
     def decision(self, slot: int, answers: Answers) -> bytes:
         """A dtsa_msgs/Decision as CDR.

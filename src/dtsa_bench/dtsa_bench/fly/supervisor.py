@@ -11,6 +11,7 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S, RealtimeChannel
 
 from .children import Child, Children, NodeError, describe_end
+from .machine import tight
 from .measurement import FlightMeasurement
 
 
@@ -64,6 +65,10 @@ class RealtimeSupervisor(ChannelObserver):
         for start in late:
             measurement.metrics.awaited.add(start.agent)
             channel.expect_later(start.agent, measurement.scenario.start[:, start.agent - 1])
+
+    def begun(self, at_s: float) -> None:
+        if text := tight(self._channel):
+            self._say(text)
 
     def idle(self, status: ChannelStatus) -> None:
         begin_s = self._measurement.begin_s

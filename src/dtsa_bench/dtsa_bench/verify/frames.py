@@ -62,9 +62,14 @@ class SentFrames:
         self._sent[(slot, sender)] = sent
         self._unjudged.setdefault(sender, deque()).append(sent)
 
-    def knows(self, slot: int, sender: int) -> bool:
-        """Whether a frame has gone out."""
-        return (slot, sender) in self._sent
+    def get(self, slot: int, sender: int) -> Sent | None:
+        """A frame; None if it has not gone out."""
+        return self._sent.get((slot, sender))
+
+    @property
+    def delivered(self) -> int:
+        """Receivers to which frames were delivered, over all frames."""
+        return sum(int(sent.received.sum()) for sent in self._sent.values() if sent.received is not None)
 
     def place(self, slot: int, position: NDArray[np.float64]) -> None:
         """Where all are at a slot's start, (3, N) m; kept only where the channel asks for it."""

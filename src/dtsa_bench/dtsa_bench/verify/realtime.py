@@ -26,14 +26,18 @@ from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
+from .decisions import Decisions
 from .frames import SentFrames
+from .intake import Intake
 from .lockstep import parameter_value
 from .rebuild import DECISION, RECEPTION, SLOT, TRANSMISSION
 from .result import Difference, Mismatch, Result
 from .stream import Streams
 
 EVENTS = "/parameter_events"
+FRAME, REPORT = (f"{names.SWARM}/{topic}" for topic in (names.AIR_FRAME, names.REPORT))
 REALTIME = "realtime"
+_CHECKED = (SLOT, TRANSMISSION, FRAME, REPORT, DECISION, RECEPTION, EVENTS)
 _RUN = 0  # Slot.RUN
 _SECOND = 1_000_000_000
 _SLOT_MASK = 0xFFFFFFFF  # slots have 32 bits in frames
@@ -77,12 +81,16 @@ class RealtimeCheck:
         self._events: list[tuple[int, dict[str, Any]]] = []
         self._starts: dict[int, dict[int, int]] = {}  # ns, by slot and agent
         self._last_stamp = 0
+        self._apart = FRAME in bag.topics  # frames have messages of their own
+        self._told: dict[int, set[int]] = {}  # who is in the transmissions, by slot
 
     def check(self) -> None:
         """Goes through the bag.
 
         :raises Mismatch: at the first difference.
         """
+        if self._apart:
+            self._load_frames()
         rest = (DECISION, SLOT, RECEPTION, EVENTS)
         handlers = dict(zip(rest, (self._decision, self._slot, self._reception, self._event), strict=True))
         while (message := self.streams.take(TRANSMISSION)) is not None:
@@ -101,7 +109,8 @@ class RealtimeCheck:
     def _finish(self) -> None:
         result, frames = self.result, self.frames
         summary = self._summary()
-        late = summary.get("late_frames", frames.dropped if result.broken_off else 0)
+        # Apart from all else, frames that came too late are not in the bag.
+        late = 0 if self._apart else summary.get("late_frames", frames.dropped if result.broken_off else 0)
         for what, times in frames.check_overlaps(late).items():
             result.count(what, times)
         missed = summary.get("missed_reports", len(self._carried))
@@ -118,13 +127,20 @@ class RealtimeCheck:
             result.skipped["the channel's verdicts"] = "they depend on where all were when each frame was settled"
         else:
             result.count("verdicts made again", frames.check_verdicts(self._events, late))
+        if REPORT in self.bag.topics:
+            self._reports(summary)
         self._odometry()
         self.streams.check_digest(result)
-        result.skipped["decisions and motion"] = (
-            "they depend on when each message reached each process, which the bag does not hold"
-        )
+        if REPORT in self.bag.topics:
+            result.skipped["motion"] = "it depends on when in a slot each message reached each process"
+        else:
+            result.skipped["decisions and motion"] = (
+                "they depend on when each message reached each process, which the bag does not hold"
+            )
         for topic in self.bag.topics:
-            if topic not in (SLOT, TRANSMISSION, DECISION, RECEPTION, EVENTS) and not topic.endswith("/odom"):
+            if topic not in (SLOT, TRANSMISSION, FRAME, REPORT, DECISION, RECEPTION, EVENTS) and not topic.endswith(
+                "/odom"
+            ):
                 result.skipped[topic] = "carries nothing that is not in other topics; covered by the digest"
         result.safety |= frames.safety()
         if self.own_clocks:
@@ -171,10 +187,52 @@ class RealtimeCheck:
             self._places[agent - 1].append((slot, track[-1, :, k].copy(), float(np.linalg.norm(velocity[:, k]))))
             if frames[k]:
                 self._frame(slot, agent, frames[k], track[-1, :, k], velocity[:, k], command[:, k])
-                self.frames.send(slot, agent, slot * self.slot_ns + int(offsets[k]), frames[k])
+                self._sent(slot, agent, slot * self.slot_ns + int(offsets[k]), frames[k])
         if not self.own_clocks:
             self.frames.place(slot, self.position)
+        self._told[slot] = self._told.get(slot, set()) | set(ids)
         self.result.count("transmission")
+
+    def _load_frames(self) -> None:
+        """All frames, as they were handed to the channel."""
+        for _, said in self.bag.typed([FRAME]):
+            slot, agent = int(said.slot), int(said.agent)
+            if not 1 <= agent <= self.agents or self.frames.get(slot, agent) is not None:
+                self._fail("frame.agent", "one frame an agent and slot", f"cf{agent}", "the swarm's", slot)
+            self.frames.send(slot, agent, stamp_ns(said.header.stamp) - names.TIME_ZERO_NS, said.data.tobytes())
+
+    def _sent(self, slot: int, agent: int, start_ns: int, data: bytes) -> None:
+        """A frame in a transmission: it goes out now, or is the one that has been handed over by itself."""
+        if not self._apart:
+            self.frames.send(slot, agent, start_ns, data)
+            return
+        sent = self.frames.get(slot, agent)
+        if sent is None or sent.data != data:
+            recorded = "none" if sent is None else sent.data.hex()
+            self._fail("transmission.data", recorded, data.hex(), "the frame that was handed over", slot, agent)
+        self._equal_time("transmission.offset_ns", sent.on_air.start_ns, start_ns, slot, agent)
+
+    def _reports(self, summary: dict[str, Any]) -> None:
+        """What the agents took in had been delivered to them, and what they reported is in the transmissions."""
+        intake, untold = Intake(self.frames, self.run.air.link_delay_ns, self.result.slots), 0
+        replayable = self._authenticator is not None or not self.run.swarm.auth
+        decisions = Decisions(self.run, self.frames) if replayable else None
+        for _, said in self.bag.typed([REPORT]):
+            intake.report(said)
+            if decisions is not None:
+                decisions.report(said)
+            ids = set(said.agent.tolist())
+            untold += sum(len(ids - self._told.get(s, set())) for s in said.slot.tolist() if s < self.result.slots)
+        missed = summary.get("missed_reports", untold)
+        if untold > missed:
+            self._fail("transmission", f"all but {missed} entries of reports", f"all but {untold}",
+                       "only who reported too late is missing", None)  # fmt: skip
+        self.result.count("frames taken in as they were delivered", intake.checked)
+        if decisions is None:
+            self.result.skipped["decisions"] = f"no key in {VARIABLE}"
+        else:
+            self.result.count("decisions made again", decisions.check(self.result.slots))
+        self.result.safety |= intake.summary() | {"stalls": summary.get("stalls", [])}
 
     def _frame(self, slot: int, agent: int, data: bytes, *state: NDArray[np.float64]) -> None:
         """One frame: it decodes, names its sender and slot, and says where its sender really was."""
@@ -256,7 +314,7 @@ class RealtimeCheck:
 
         Reports lie in the bag where the channel's slots start. Whoever has a fast clock is heard before that.
         """
-        while not self.frames.knows(slot, sender) and (message := self.streams.take(TRANSMISSION)) is not None:
+        while self.frames.get(slot, sender) is None and (message := self.streams.take(TRANSMISSION)) is not None:
             self._transmission(message)
 
     def _reception(self, message: Message) -> None:
@@ -282,7 +340,14 @@ class RealtimeCheck:
         """The decisions of a slot are those that the agents reported; who was late is taken to be as before."""
         said = self.bag.decode(message)
         slot = int(said.slot)
-        for agent, reported in self._decided.pop(slot, {}).items():
+        decided = self._decided.pop(slot, {})
+        if self._apart:
+            unsaid = [int(agent) for agent, chosen in zip(said.agent, said.chosen, strict=True)
+                      if chosen and int(agent) not in decided]  # fmt: skip
+            if unsaid:
+                why = "who did not report in time is taken to have chosen nobody"
+                self._fail("decision.chosen", "nobody, or a transmission", "a choice", why, slot, unsaid[0])
+        for agent, reported in decided.items():
             k = agent - 1
             recorded = int(said.chosen[k]), int(said.reason[k]), int(said.digest[k]), float(said.score[k])
             if recorded != reported and recorded == (0, 0, int(self._digests[k]), 0.0):

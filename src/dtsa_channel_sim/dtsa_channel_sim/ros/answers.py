@@ -1,7 +1,9 @@
-"""What the agents answered to one slot: collected from the transmission messages of all processes, as arrays."""
+"""What the agents did in one slot, as arrays: from the messages of all processes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,22 @@ from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unus
 from dtsa_agent.ros.common.wire import split_frames
 
 Array = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class TakenIn:
+    """A frame that agents took in during a slot, in real time."""
+
+    slot: int  # as its sender counts
+    sender: int  # id
+    data: bytes
+    arrival_ns: int  # ns, when the receivers' flight processors could have had it, from the start of slot 0
+    at_ns: NDArray[np.int64]  # (N,) ns, when each agent took it in; -1: it did not
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """(N,) who took it in."""
+        return self.at_ns >= 0
 
 
 class Answers:
@@ -33,6 +51,8 @@ class Answers:
         self.velocity = np.zeros((3, agents))  # m/s, now
         self.command = np.zeros((3, agents))  # m/s, now
         self.goal = np.zeros((3, agents))  # m
+        self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
+        self.taken_in: list[TakenIn] | None = None  # real time: what the agents say to have taken in during the slot
         self._told = np.zeros(agents, dtype=np.bool_)  # whose goals have been told
         self._layouts: dict[bytes, tuple[int, slice | NDArray[np.intp]]] = {}
         # Numbers an agent in each field of a message.
@@ -92,6 +112,25 @@ class Answers:
         self.answered[at] = True
         self.missing -= count
         return True
+
+    def put(self, at: Any, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
+        """Takes in what some agents have reported, in real time; it has been checked.
+
+        :param at: their indices.
+        :param count: how many they are.
+        :param offset_ns: (n,) ns, start of each agent's slot or transmission, from the channel's start of the slot.
+        :param motion: track, velocity, command and goal of these agents, as in a report.
+        :param decided: chosen, reason, digest and score.
+        """
+        track, velocity, command, goal = motion
+        self.track[:, :, at] = track.reshape(self.steps, 3, count)
+        for mine, given in ((self.velocity, velocity), (self.command, command), (self.goal, goal)):
+            mine[:, at] = given.reshape(3, count)
+        for name, values in decided.items():
+            getattr(self, name)[at] = values
+        self.offset_ns[at] = offset_ns
+        self._told[at] = self.answered[at] = True
+        self.missing -= count
 
     def _check(self, message: Any, count: int) -> None:
         """Whether the fields of a message fit together.

@@ -59,10 +59,32 @@ class ChannelObserver:
         :param data: the message as CDR.
         """
 
-    def report(self, message: Any) -> None:
-        """A usable answer has come in, in real time only.
+    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
+        """A usable frame message has come in, in real time only.
 
-        :param message: the dtsa_msgs/Transmission; late ones are told, too.
+        :param slot: the slot whose account it belongs to.
+        :param data: the message as CDR.
+        :param time_ns: ns, simulated time at which its transmission starts.
+        """
+
+    def report(self, message: Any, data: bytes) -> None:
+        """A usable report has come in, in real time only.
+
+        :param message: the dtsa_msgs/Report; it may tell of slots that are over.
+        :param data: the message as CDR.
+        """
+
+    def begun(self, at_s: float) -> None:
+        """It is known when slot 0 starts, in real time only.
+
+        :param at_s: s, as ``time.monotonic()`` gives it.
+        """
+
+    def stalled(self, from_ns: int, to_ns: int) -> None:
+        """The channel stood still, in real time only.
+
+        :param from_ns: ns from the start of slot 0.
+        :param to_ns: likewise.
         """
 
     def all_answered(self, slot: int, answers: Answers) -> None:
@@ -187,8 +209,17 @@ class Observers(ChannelObserver):
     def answer_received(self, slot: int, ids: bytes, data: bytes) -> None:
         self._tell("answer_received", slot, ids, data)
 
-    def report(self, message: Any) -> None:
-        self._tell("report", message)
+    def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
+        self._tell("frame_sent", slot, data, time_ns)
+
+    def report(self, message: Any, data: bytes) -> None:
+        self._tell("report", message, data)
+
+    def begun(self, at_s: float) -> None:
+        self._tell("begun", at_s)
+
+    def stalled(self, from_ns: int, to_ns: int) -> None:
+        self._tell("stalled", from_ns, to_ns)
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         self._tell("all_answered", slot, answers)

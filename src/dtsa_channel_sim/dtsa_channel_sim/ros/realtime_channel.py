@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
-from dtsa_msgs.msg import Slot, Transmission
+from dtsa_msgs.msg import Frame, Report, Slot
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
@@ -14,28 +15,38 @@ from rclpy.serialization import deserialize_message, serialize_message
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import OTHER_RUN, SIZES, UNREADABLE, Unusable, check_start
+from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.runs import run_text
-from dtsa_agent.ros.common.stamps import header_of, time_of
+from dtsa_agent.ros.common.stamps import header_of, ns_of, time_of
 from dtsa_channel_sim.model.air import Air, FrameVerdict
 from dtsa_channel_sim.model.airtime import LONGEST_FRAME
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.medium import OnAir
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 
+from .accounts import Accounts, Delivered
 from .answers import Answers, named
+from .pace import Pace
+from .roll_call import RollCall
 from .ros_channel import RosChannel, put_frames
 
 _NS = 1_000_000_000
-_TICK_NS = 500_000
+_TICK_NS = 2_000_000  # longest wait for a frame
 _REPEAT_S = 0.1
 _TELL_S = 1.0  # the start is told again so often, for processes that come later
 _LEAD_NS = 300_000_000  # from the start message to slot 0
-_GRACE = 0.35  # of a slot: a frame reaches the channel at most this late, or it is late
-_STRIDE = 0.25  # of a slot: time moves on by this much at most before messages are looked for again
-_PATIENCE = 10  # slots that a slot is kept open for agents that have not reported yet
+_GRACE = 0.15  # of a slot: frames are handed over ahead of their start; who is late by less than this still collides
+_WINDOW = 0.5  # of a slot: a frame that reaches the channel later than this after its start is dropped
+_PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports at least so long
+# After a stall the middleware repeats some messages only when its writers ask for acknowledgements, every 3 s.
+_RECOVERY_NS = 4 * _NS
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _AHEAD = 100  # slots: a report from farther in the future is none
 _AFTERLIFE = 10  # slots: a report for a later one was made after its agent had been given up
+_KEEP_NS = 10 * _NS  # an agent may tell so late that it took in a frame
+# What one pass of the loop does at most: frames, reports. Then it looks at the clock and at signals again.
+_FRAMES, _REPORTS = 64, 2
+_QUIET_NS = 1_000_000  # no account is closed this shortly before a frame has to be delivered
+_TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
 
 _Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
 
@@ -43,38 +54,65 @@ _Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sende
 class RealtimeChannel(RosChannel):
     """Medium of a swarm whose agents have clocks of their own.
 
-    Slots are the channel's own. An agent that falls silent is missed, but nobody waits for it.
+    Slots are the channel's own. An agent that falls silent is missed, but nobody waits for it. Frames come apart from
+    all else and are dealt with first; what the agents report fills an account of each slot, in which frames are long
+    delivered.
 
     :param node: the ROS node.
     :param channel: the medium.
     :param steps: control instants in a slot.
     :param answer_s: not used: nobody waits.
+    :param swarm_namespace: namespace of the swarm's topics.
     :param more: as for :class:`RosChannel`.
     """
 
     mode = "realtime"
 
-    def __init__(self, node: Node, channel: Channel, steps: int, answer_s: float = 0.0, **more: Any) -> None:
-        super().__init__(node, channel, steps, waiting=names.REALTIME_WAITING, **more)
-        self.missed = 0  # reports of agents that came too late to count
-        self.returned: set[int] = set()  # ids of those that were, and report again
+    def __init__(
+        self,
+        node: Node,
+        channel: Channel,
+        steps: int,
+        answer_s: float = 0.0,
+        swarm_namespace: str = names.SWARM,
+        **more: Any,
+    ) -> None:
+        super().__init__(
+            node, channel, steps, waiting=names.REALTIME_WAITING, swarm_namespace=swarm_namespace,
+            input_type=Frame, input_topic=names.AIR_FRAME, **more,
+        )  # fmt: skip
+        qos = names.lockstep_qos(names.REALTIME_WAITING * self.agents)
+        self._reports = Feed(node, Report, f"{swarm_namespace}/{names.REPORT}", qos, raw=True)
+        self.accounts = Accounts(self.agents, steps, max(100, _KEEP_NS // self.slot_ns))
         self.air: Air[_Sent] = Air(channel)
+        self.pace = Pace(self.slot_ns)
+        self.late_frames = 0  # came when the air had been settled past their start, and were dropped
+        self.round_ms: float | None = None  # of a round of messages before slot 0, median
+        self.returned: set[int] = set()  # ids of those that were, and report again
         self._steps = steps
         self._zero = 0
         self._told = 0.0  # time.monotonic() of the last start message
         self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
-        self._book: dict[int, Answers] = {}
         self._frames: dict[_Sent, bytes] = {}
+        self._ends: list[int] = []  # ns, when frames that have no verdict yet leave the air: a heap
+        self._settled_ns = -(2**63)
         self._settled: dict[int, list[FrameVerdict[_Sent]]] = {}
         self._heard_ns = np.zeros(self.agents, dtype=np.int64)
-        self._offset_ns = np.zeros(self.agents, dtype=np.int64)  # of each agent's slots, as last reported
+        self._recovered_ns = 0  # when all that was sent during the last stall should have come
+        self._newest = -1  # slot: last one reported by anybody
         self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
-        self._stride_ns = round(_STRIDE * self.slot_ns)
-        self._grace_ns = round(_GRACE * self.slot_ns)
-        self._close_ns = self._grace_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
+        self._hold_ns = max(round(_GRACE * self.slot_ns), channel.config.link_delay_ns)
+        self._window_ns = round(_WINDOW * self.slot_ns)
+        self._close_ns = self._hold_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
+        self._patience_ns = max(_PATIENCE_SLOTS * self.slot_ns, _PATIENCE_NS)
+
+    @property
+    def missed(self) -> int:
+        """Entries of reports that came too late to count."""
+        return self.accounts.missed
 
     def _run(self, stop: object) -> None:
-        """Runs until the run is over or ``stop`` is true.
+        """Runs until the run is over, cannot keep up, or ``stop`` is true.
 
         :raises LocalProtocolError: when an agent does not report at the start.
         :raises DtsaError: when an observer fails.
@@ -85,29 +123,37 @@ class RealtimeChannel(RosChannel):
         finally:
             self._publish_end()
 
+    def close(self) -> None:
+        """As for all channels."""
+        try:
+            super().close()
+        finally:
+            self._reports.close()
+
+    # Who takes part.
+
     def expect_later(self, agent: int, place: NDArray[np.float64]) -> None:
         """An agent will not be there at the start.
 
         :param agent: its id.
         :param place: (3,) m, where its vehicle waits.
         """
+        self.answers.track[:, :, agent - 1] = place
         self.lose(agent)
         self._given_up[agent] = -_AFTERLIFE
-        self.answers.track[:, :, agent - 1] = place
 
     def lose(self, agent: int) -> None:
         """Takes note that an agent is gone."""
         if agent not in self.lost:
             self.lost.add(agent)
             self.returned.discard(agent)
-            self._given_up[agent] = (time.monotonic_ns() - self._zero) // self.slot_ns
+            self._given_up[agent] = self._now() // self.slot_ns
             self._observers.agent_silent(agent)
 
     def last_place(self, agent: int) -> NDArray[np.float64]:
         """Where an agent has reported to be last, (3,) m."""
-        reported = [slot for slot, book in self._book.items() if book.answered[agent - 1]]
-        book = self._book[max(reported)] if reported else self.answers
-        return book.position[:, agent - 1]
+        place = self.accounts.last_place(agent)
+        return self.answers.position[:, agent - 1] if place is None else place
 
     def _welcome(self, slot: int, book: Answers) -> None:
         """Takes agents back that were lost and have reported for a slot."""
@@ -117,148 +163,208 @@ class RealtimeChannel(RosChannel):
             self.returned.update(again)
             self._observers.agents_back(again)
 
+    # Before slot 0.
+
     def _prepare(self, stop: object) -> bool:
         """Waits until all agents have reported, and tells them when slot 0 starts."""
         if not self._call(stop, self.lost):
             return False
-        begin = time.monotonic()
-        repeat = 0.0
-        self.answers.open()
-        while set(self.answers.silent) - self.lost:
+        roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling)
+        begin, repeat = time.monotonic(), 0.0
+        everybody = set(range(1, self.agents + 1))
+        awaited = set(everybody)
+        while awaited - self.lost:
             if stop:
                 return False
             now = time.monotonic()
             if now - repeat > _REPEAT_S:
                 repeat = now
-                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, data=self._calling))
-            data = self.loop.wait()
-            if data is not None:
-                message = self._decoded(data)
-                if message is not None:
-                    with self.intake.guard():
-                        self.answers.add(message)
+                roll_call.call(0)
+            self.loop.wait(_TICK_NS)
+            awaited -= roll_call.answered(0)
+            self.answers.missing = len(awaited)
+            self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
             self._housekeeping()
             if now - begin > self._startup_s:
-                missing = named(set(self.answers.silent) - self.lost)
+                missing = named(awaited - self.lost)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
+        self.round_ms = roll_call.round_ms(everybody - self.lost)
         self._zero = time.monotonic_ns() + _LEAD_NS
         self._tell_start()
+        self._observers.begun(self._zero / _NS)
         self._heard_ns[:] = 0
         return True
+
+    @property
+    def tight(self) -> bool:
+        """Whether a round of messages before slot 0 took so much of a slot that the machine may not keep up."""
+        return self.round_ms is not None and self.round_ms * 1e6 > _TIGHT * self.slot_ns
 
     def _tell_start(self) -> None:
         self._told = time.monotonic()
         header = header_of(self._zero)
         self._publisher.publish(Slot(header=header, run=self.run_id, phase=Slot.START, data=self._calling))
 
+    # The time line.
+
+    def _now(self) -> int:
+        """ns from the start of slot 0."""
+        return time.monotonic_ns() - self._zero
+
     def _fly(self, stop: object) -> None:
-        tick = now = 0
+        self.pace = Pace(self.slot_ns)
+        self.pace.passed(self._now())
+        more = False
         while not stop:
-            data = self.loop.wait(_TICK_NS)
-            while data is not None:
-                self._take(data)
+            data = self.loop.wait(0 if more else self._spare_ns(self._now()))
+            if self.pace.passed(self._now()):
+                self._resume(self._now())
+            for _ in range(_FRAMES):
+                if data is None:
+                    break
+                with self.intake.guard():
+                    self._take_frame(data)
                 data = self.loop.take()
-            # After a pause of this process, or of the whole machine, time catches up in small steps: what the others
-            # did meanwhile is still on its way.
-            now = min(time.monotonic_ns() - self._zero, now + self._stride_ns)
-            if now >= tick:
-                tick = now + _TICK_NS
-                for verdict in self.air.settle(now - self._grace_ns, self.answers.position):
-                    self._deliver(verdict)
-            while self._due(now):
+            now = self._now()
+            self._settle(now)
+            more = self._take_reports()
+            if self._spare_ns(now) > _QUIET_NS and self._due(now):
                 if not self._close_slot():
                     return
+                more = more or self._due(now)
             if time.monotonic() - self._told > _TELL_S:
                 self._tell_start()
             self._housekeeping()
+            if self._falls_behind(now):
+                return
 
-    def _decoded(self, data: bytes) -> Any:
-        with self.intake.guard():
-            try:
-                message = deserialize_message(data, Transmission)
-            except Exception:  # rclpy has no common base for what a message can do to it
-                raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no Transmission") from None
-            if message.run != self.run_id:
-                raise Unusable(OTHER_RUN, f"an answer of run {run_text(message.run)}")
-            self.roster.check_sender(message.agent, self.loop.number, time.monotonic())
-            return message
-        return None
+    def _resume(self, now: int) -> None:
+        """After a stall: what was handed over meanwhile is too late for the air, and nobody is to blame for silence."""
+        self._settle(now)
+        begun, ended = self.pace.last_stall
+        self._recovered_ns = ended + (_RECOVERY_NS if ended - begun > self._patience_ns else self._patience_ns)
+        self._heard_ns[:] = np.maximum(self._heard_ns + ended - begun, self._recovered_ns)
+        self._observers.stalled(begun, ended)
 
-    def _take(self, data: bytes) -> None:
-        """Takes in one process's report for one slot."""
-        message = self._decoded(data)
-        if message is None:
+    def _spare_ns(self, now: int) -> int:
+        """For how long there is nothing to deliver, ns."""
+        return min(max(0, self._ends[0] + self._hold_ns - now), _TICK_NS) if self._ends else _TICK_NS
+
+    def _falls_behind(self, now: int) -> bool:
+        """Whether the run cannot keep up, by its accounts or by the agents' reports."""
+        accounted = (self.slot + 2) * self.slot_ns + self._patience_ns
+        reported = (self._newest + 2) * self.slot_ns + self._patience_ns
+        alive = len(self.lost) < self.agents
+        if not self.pace.falls_behind(now, min(accounted, reported) if alive else accounted):
+            return False
+        who = "the channel" if accounted <= reported else "the agents"
+        behind = (now - min(accounted, reported)) / _NS
+        self.fell_behind = (
+            f"the machine does not keep up: {who} {'is' if who == 'the channel' else 'are'} {behind:.1f} s behind, "
+            f"since {self.pace.behind_since_s:.1f} s; longer slots or fewer processes would help"
+        )
+        return True
+
+    def _decoded(self, data: bytes, kind: type) -> Any:
+        """A message of this run.
+
+        :raises Unusable: if it is none.
+        """
+        try:
+            message: Any = deserialize_message(data, kind)
+        except Exception:  # rclpy has no common base for what a message can do to it
+            raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
+        if message.run != self.run_id:
+            raise Unusable(OTHER_RUN, f"a {kind.__name__} of run {run_text(message.run)}")
+        return message
+
+    def _take_frame(self, data: bytes) -> None:
+        """Lays a frame on the time line.
+
+        :raises Unusable: if it cannot be one.
+        """
+        message = self._decoded(data, Frame)
+        slot, agent, length = message.slot, message.agent, len(message.data)
+        self.roster.check_frame(agent, self.loop.number, time.monotonic())
+        start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
+        if not 1 <= length <= LONGEST_FRAME:
+            raise Unusable(SIZES, f"a frame of {length} bytes")
+        check_start(start_ns, now, early_ns=_AHEAD * self.slot_ns)
+        check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
+        key = (slot, agent)
+        if key in self._frames:
             return
-        slot, now = message.slot, time.monotonic_ns() - self._zero
-        with self.intake.guard():
-            for offset in message.offset_ns:
-                check_start(slot * self.slot_ns + offset, now)
-            self._take_report(slot, now, message, data)
-
-    def _take_report(self, slot: int, now: int, message: Any, data: bytes) -> None:
-        if slot > now // self.slot_ns + _AHEAD:
-            self.missed += len(message.agent)
+        if not self.air.begin(key, agent, start_ns, length):  # nobody hears it
+            self.late_frames += 1
             return
+        frame = self._frames[key] = bytes(message.data)
+        heappush(self._ends, start_ns + self.model.config.airtime.total_ns(length))
+        self._heard_ns[agent - 1] = max(now, self._heard_ns[agent - 1])
         if slot > self.slot:
-            book = self._entry(slot)
-        else:  # too late for the slot's account; what it sends may still be on the air
-            self.missed += len(message.agent)
-            book = Answers(self.agents, self._steps)
-        if not slot and not len(message.offset_ns):
-            return  # an answer to the call
-        if len(message.offset_ns) != len(message.agent):
-            raise Unusable(SIZES, f"{len(message.offset_ns)} offsets of {len(message.agent)} agents")
-        if not book.add(message):
+            self.accounts[slot].frames[agent] = frame
+        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns))
+
+    def _settle(self, now: int) -> None:
+        """Delivers all frames whose time has come."""
+        until = now - max(self._hold_ns, self._window_ns)
+        ripe = now - self._hold_ns
+        while self._ends and self._ends[0] <= ripe:
+            until = max(until, heappop(self._ends))
+        if until <= self._settled_ns:
             return
-        self._observers.answer_received(slot, message.agent.tobytes(), data)
-        self._observers.report(message)
-        for agent, offset, length in zip(message.agent, message.offset_ns, message.length, strict=True):
-            self._heard_ns[agent - 1] = now
-            self._offset_ns[agent - 1] = offset
-            key = (slot, agent)
-            if length and key not in self._frames:
-                self._frames[key] = book.frames[agent]
-                start_ns = slot * self.slot_ns + offset
-                if not self.air.begin(key, agent, start_ns, length):
-                    self._drop(key, start_ns, length)
-
-    def _entry(self, slot: int) -> Answers:
-        book = self._book.get(slot)
-        if book is None:
-            book = self._book[slot] = Answers(self.agents, self._steps)
-        return book
-
-    def _drop(self, key: _Sent, start_ns: int, length: int) -> None:
-        """Takes a frame into its slot's account that came too late to be on the air: nobody hears it."""
-        frame = OnAir.of(self.model.config.airtime, key[1], start_ns, length)
-        nobody = np.zeros(self.agents, dtype=np.bool_)
-        slot = max(0, start_ns // self.slot_ns)
-        verdict = FrameVerdict(key, key[1], slot, start_ns, frame.end_ns, frame.end_ns, nobody, 0, 0)
-        self._settled.setdefault(max(key[0], self.slot + 1), []).append(verdict)
+        self._settled_ns = until
+        for verdict in self.air.settle(until, self.answers.position):
+            self._deliver(verdict)
 
     def _deliver(self, verdict: FrameVerdict[_Sent]) -> None:
         """Sends a frame that has left the air to those that received it."""
         slot, sender = verdict.frame_id
         self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
+        self.pace.lag.add(self._now() - verdict.end_ns - self._hold_ns)
         if not verdict.received.any():
             return
-        frame = self._frames[(slot, sender)]
+        frame = self._frames[slot, sender]
         time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
         message = Slot(header=header_of(time_ns), run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=slot)
         put_frames(message, [sender], [frame], verdict.received[None])
         data = bytes(serialize_message(message))
         self._publisher.publish(data)
+        self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
         self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
+
+    # The accounts.
+
+    def _take_reports(self) -> bool:
+        """Takes in some reports; whether there may be more."""
+        for _ in range(_REPORTS):
+            data = self._reports.take()
+            if data is None:
+                return False
+            with self.intake.guard():
+                self._take_report(self._decoded(data, Report), data)
+        return True
+
+    def _take_report(self, message: Any, data: bytes) -> None:
+        """Takes in one process's report.
+
+        :raises Unusable: if it cannot be one.
+        """
+        self.roster.check_sender(message.agent, self._reports.number, time.monotonic())
+        now = self._now()
+        self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
+        heard = np.array(message.agent, dtype=np.intp) - 1
+        self._heard_ns[heard] = np.maximum(self._heard_ns[heard], now)
+        self._observers.report(message, data)
 
     def _due(self, now: int) -> bool:
         """Whether the next slot can be closed: its frames are settled, all agents have reported for the one after."""
         end = (self.slot + 2) * self.slot_ns + self._lag_ns
         if now < end + self._close_ns:
             return False
-        if now >= end + round(_PATIENCE * self.slot_ns):
+        if now >= max(end + self._patience_ns, self._recovered_ns):
             return True
-        following = self._book.get(self.slot + 2)
-        return following is not None and not set(following.silent) - self.lost
+        silent = self.accounts.silent(self.slot + 2)
+        return silent is not None and not set(silent) - self.lost
 
     def _close_slot(self) -> bool:
         """Tells the observers of a slot that has passed; False when the run is over."""
@@ -268,18 +374,22 @@ class RealtimeChannel(RosChannel):
             return False
         self.answers = book
         frames, verdict = self._verdict(slot)
+        book.taken_in = self.accounts.taken_in(slot)
         self._observers.judged(slot, book, frames, verdict)
         self._tell_time(time_of(names.slot_time_ns(slot, self.slot_ns)))
         self._observers.slot_over(slot, book, verdict)
         self.slot = slot
-        self._lag_ns = int(np.median(self._offset_ns[[k for k in range(self.agents) if k + 1 not in self.lost] or [0]]))
+        here = book.answered.copy()
+        here[[agent - 1 for agent in self.lost]] = False
+        if here.any():
+            self._lag_ns = int(np.median(book.offset_ns[here]))
         following = self._completed(slot + 1)
-        self._book.pop(slot, None)
+        self.accounts.close(slot)
         return self._goes_on(slot + 1, following)
 
     def _completed(self, slot: int) -> Answers:
         """A slot's reports, those that are missing taken from the slot before."""
-        book = self._entry(slot)
+        book = self.accounts[slot]
         if self.lost:
             self._welcome(slot, book)
         book.carry(self.answers)
@@ -295,7 +405,8 @@ class RealtimeChannel(RosChannel):
         settled = self._settled.pop(slot, [])
         frames = {}
         for verdict in settled:
-            frames[verdict.sender] = self._frames.pop(verdict.frame_id)
+            key = verdict.frame_id
+            frames[verdict.sender] = self._frames.pop(key)
         if not settled:
             return frames, Verdict(IDLE, (), None, None, None)
         outcome = COLLISION if any(verdict.collided for verdict in settled) else SUCCESS

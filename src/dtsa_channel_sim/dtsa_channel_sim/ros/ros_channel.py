@@ -33,6 +33,7 @@ _REPEAT_S = 0.1
 _CALL_NS = 5_000_000
 _OTHER_CHANNEL_S = 0.3  # whoever calls or opens slots for so long is a channel
 _MOST_PROCESSES = 64  # messages of processes taken in at a time
+_HURRY_S = 0.2
 
 
 class RosChannel:
@@ -50,6 +51,8 @@ class RosChannel:
     :param end_s: s of wall time that the nodes have to hear of the end.
     :param run: the run's id, which all its messages carry; None: a new one.
     :param agreed: settings that the agents must share; those of the medium in any case.
+    :param input_type: type of the messages that the loop waits for.
+    :param input_topic: their topic.
     """
 
     mode = "lockstep"
@@ -66,6 +69,8 @@ class RosChannel:
         end_s: float = 4.0,
         run: Run | None = None,
         agreed: Mapping[str, Any] | None = None,
+        input_type: type = Transmission,
+        input_topic: str = names.TRANSMISSION,
     ) -> None:
         self.node, self.model = node, channel
         self.agents, self.slot_ns = channel.config.agents, channel.config.slot_ns
@@ -76,13 +81,14 @@ class RosChannel:
         self.lost: set[int] = set()  # ids of agents that have fallen silent
         self._observers = Observers()
         self._referee = referee or SlotLimit()
+        self.fell_behind = ""  # why the run could not go on; real time only
         self._reason, self._failed = "", False  # why the run has ended, and whether an error ended it
         self._startup_s, self._end_s = startup_s, end_s
         self._publisher = node.create_publisher(Slot, f"{swarm_namespace}/{names.SLOT}", names.lockstep_qos(waiting))
         self._clock = node.create_publisher(Clock, names.clock_topic(swarm_namespace), 10)
         self._clock_watched = False
         answers_qos = names.lockstep_qos(waiting * self.agents)
-        self.loop = Loop(node, Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", answers_qos, raw=True)
+        self.loop = Loop(node, input_type, f"{swarm_namespace}/{input_topic}", answers_qos, raw=True)
         settings = {"agents": self.agents, "slot_ms": self.slot_ns / 1e6, "steps": steps, "mode": self.mode}
         self.roster = Roster(self.agents, self._identity.number, agreed or settings, node.get_fully_qualified_name())
         self._processes = Feed(
@@ -119,7 +125,8 @@ class RosChannel:
         """
         try:
             self._run(stop)
-            self._reason = self._referee.reason or ("stopped by a signal" if stop else "")
+            cut_short = self.fell_behind or str(getattr(stop, "reason", ""))
+            self._reason = self._referee.reason or cut_short or ("stopped by a signal" if stop else "")
         except DtsaError as error:
             self._reason, self._failed = str(error), True
             raise
@@ -247,6 +254,10 @@ class RosChannel:
         if self.node.context.ok():
             proof = array("B", self._identity.proof)
             self._publisher.publish(Slot(run=self.run_id, slot=max(0, self.slot + 1), phase=Slot.END, data=proof))
+
+    def hurry(self) -> None:
+        """The user waits for the end: nodes that do not hear of it at once are not waited for."""
+        self._end_s = min(self._end_s, _HURRY_S)
 
     def close(self) -> None:
         """Closes the observers first, waits until all nodes know that the run is over or have left, frees the handles.

@@ -43,6 +43,7 @@ class Member:
     heard_s: float  # monotonic, when it last told about itself
     dropped: dict[str, int] = field(default_factory=dict)
     publisher: OnePublisher = field(default_factory=OnePublisher)
+    frames: OnePublisher = field(default_factory=OnePublisher)  # likewise of frames, in real time
 
 
 class Roster:
@@ -224,6 +225,20 @@ class Roster:
             raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
         if not member.publisher.admits(number, now_s):
             raise Unusable(OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}'s series")
+
+    def check_frame(self, agent: int, number: int | None, now_s: float) -> None:
+        """Whether a frame can be from the process that has its sender.
+
+        :param agent: id of the sender.
+        :param number: the message's number, as its publisher counts.
+        :param now_s: s, monotonic.
+        :raises Unusable: if it cannot.
+        """
+        member = self._of.get(agent)
+        if member is None:
+            raise Unusable(UNKNOWN, f"a frame of cf{agent}, which no process has")
+        if not member.frames.admits(number, now_s):
+            raise Unusable(OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}'s series")
 
     def dropped(self) -> dict[str, int]:
         """What all processes have not taken in, by reason."""

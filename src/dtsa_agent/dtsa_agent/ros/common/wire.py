@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 # "map". It is random, and so outside all that is compared between flights.
 RUN_BYTES = slice(20, 24)
 RUN_MESSAGES = frozenset(
-    f"dtsa_msgs/msg/{name}" for name in ("Slot", "Transmission", "Reception", "Decision", "Configuration", "RunStatus")
+    f"dtsa_msgs/msg/{name}"
+    for name in (
+        "Slot",
+        "Transmission",
+        "Frame",
+        "Report",
+        "Reception",
+        "Decision",
+        "Configuration",
+        "RunStatus",
+    )
 )
 
 

@@ -1,7 +1,8 @@
-"""Real-time priority: what flies vehicles does not wait for what else the station has to do.
+"""Process priority: what flies vehicles, or is the air of all others, does not wait for what else there is to do.
 
 A Crazyflie levels out when it has heard nothing for half a second, and its emergency watchdog stops the motors after
-one second. On a busy station an ordinary process can be kept waiting for that long.
+one second. On a busy station an ordinary process can be kept waiting for that long. The simulated channel is needed by
+all agents in every slot: it goes first, agents give way to it.
 """
 
 from __future__ import annotations
@@ -46,3 +47,18 @@ def _for_all_threads(act: Callable[[int], None]) -> None:
 def give_way() -> None:
     """This thread alone is ordinary again."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def give_way_by(nice: int) -> str:
+    """Lets all threads of this process, and those that they start, give way to others, or go first.
+
+    It counts among the processes of one session: Linux shares the processor between sessions before it looks at it.
+
+    :param nice: 0 (ordinary) to 19 (gives way to all); down to -20 with the right to go first.
+    :returns: why not, or an empty text.
+    """
+    try:
+        _for_all_threads(lambda task: os.setpriority(os.PRIO_PROCESS, task, nice))
+    except OSError as error:
+        return f"{error.strerror}; see ulimit -e"
+    return ""
