@@ -3,8 +3,9 @@
 The digest is the sum, modulo 2^128, of one BLAKE2b hash a message. It does not depend on the order in
 which messages are read, but each hash covers the topic, both times, the number on the topic and the
 bytes, so that no message can be left out, moved or changed without another sum. It guards against mishaps
-and careless edits, not against somebody who writes a new digest as well. A run's random id is left out, so that the
-same flight has the same digest each time.
+and careless edits, not against somebody who writes a new digest as well. A run's random id is left out.
+Fast CDR leaves the bytes between aligned fields as they happen to be, so two recordings of one flight may differ in
+their digests although no field does.
 """
 
 from __future__ import annotations
