@@ -7,11 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.ros.common.checks import RANGE, SIZES, SLOT, Unusable, check_ids, check_numbers
+from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_ids
 
 from .answers import Answers, TakenIn, named
 
 _LONGEST = 2000  # slots in one report
+_MOST_HEARD = 20_000  # frames taken in, in one report
+_FARTHEST_OFF_NS = 60_000_000_000  # no agent's slot is farther from the channel's
 _FLOATS = ("score", "track", "velocity", "command", "goal")
 _DECIDED = {"chosen": np.uint16, "reason": np.uint8, "digest": np.uint32, "score": np.float64}
 
@@ -81,8 +83,10 @@ class Accounts:
         at, count = self._where(message.agent), len(message.agent)
         _check(message, count, self._steps)
         slots = np.frombuffer(message.slot, dtype=np.uint32).tolist()
-        if slots and slots[-1] > latest:
-            raise Unusable(SLOT, f"{named(message.agent)} reported slot {slots[-1]}, which has not begun")
+        heard_in = np.frombuffer(message.heard_in, dtype=np.uint32)
+        last = max(slots[-1] if slots else 0, int(heard_in.max()) if len(heard_in) else 0)
+        if last > latest:
+            raise Unusable(SLOT, f"{named(message.agent)} reported slot {last}, which has not begun")
         fields = {name: np.frombuffer(getattr(message, name), dtype=kind) for name, kind in _DECIDED.items()}
         offsets = np.frombuffer(message.offset_ns, dtype=np.int64)
         motion = [np.frombuffer(getattr(message, name)) for name in ("track", "velocity", "command", "goal")]
@@ -167,5 +171,16 @@ def _check(message: Any, count: int, steps: int) -> None:
         raise Unusable(SIZES, f"{who} sent a report in which {', '.join(wrong)} do not fit")
     if len(message.slot) > _LONGEST or list(message.slot) != sorted(set(message.slot)):
         raise Unusable(SLOT, f"{who} reported slots that do not ascend, or too many")
+    if heard > _MOST_HEARD:
+        raise Unusable(SIZES, f"{who} reported {heard} frames at once")
+    offsets = np.frombuffer(message.offset_ns, dtype=np.int64)
+    if entries and not -_FARTHEST_OFF_NS <= offsets.min() <= offsets.max() <= _FARTHEST_OFF_NS:
+        farthest = np.abs(offsets.astype(np.float64)).max() / 1e9
+        raise Unusable(RANGE, f"{who} reported slots {farthest:.3g} s from the channel's")
+    # A sum of squares is finite only if all its terms are, and small only if they are.
     for name in _FLOATS:
-        check_numbers(name, getattr(message, name))
+        values = np.frombuffer(getattr(message, name))
+        with np.errstate(over="ignore"):
+            size = values @ values
+        if not size <= FARTHEST_M**2:
+            raise Unusable(RANGE, f"{who} reported {name} that are no numbers, or beyond {FARTHEST_M:g}")
