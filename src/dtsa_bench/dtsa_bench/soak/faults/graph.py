@@ -15,6 +15,9 @@ from .fault import LOCKSTEP, REALTIME, Fault
 
 _SLOT = ("/swarm/slot", "dtsa_msgs/msg/Slot")
 _TRANSMISSION = ("/swarm/transmission", "dtsa_msgs/msg/Transmission")
+_FRAME = ("/swarm/frame", "dtsa_msgs/msg/Frame")
+_REPORT = ("/swarm/report", "dtsa_msgs/msg/Report")
+_PROCESS = ("/swarm/process", "dtsa_msgs/msg/Process")
 _ODOMETRY = ("/cf1/odom", "nav_msgs/msg/Odometry")
 _CLOCK = ("/clock", "rosgraph_msgs/msg/Clock")
 _OTHERS = (
@@ -91,6 +94,12 @@ FAULTS = (
           _intruded(REALTIME, _TRANSMISSION, kinds=_JUNK)),
     Fault("junk for the agents, real time", "junk on `/swarm/slot`, real time", _UNHARMED,
           _intruded(REALTIME, _SLOT, kinds=_JUNK)),
+    Fault("junk frames, real time", "junk on `/swarm/frame`, real time", _UNHARMED,
+          _intruded(REALTIME, _FRAME, kinds=_JUNK)),
+    Fault("junk reports, real time", "junk on `/swarm/report`, real time", _UNHARMED,
+          _intruded(REALTIME, _REPORT, kinds=_JUNK)),
+    Fault("junk of processes", "junk on `/swarm/process`, by which nodes show each other what they fly with", _UNHARMED,
+          _intruded(LOCKSTEP, _PROCESS, kinds=_JUNK), True),
     Fault("junk on other topics of the swarm",
           "junk on `/swarm/reception`, `/swarm/decision`, `/swarm/status`, `/swarm/configuration`",
           "nobody in the flight believes it; the flight goes on; the bag verifies",
@@ -103,7 +112,7 @@ FAULTS = (
           _intruded(LOCKSTEP, _TRANSMISSION, _SLOT, kinds=("again",))),
     Fault("another run, lockstep", "answers and slot messages with the id of another run, lockstep", _UNHARMED,
           _intruded(LOCKSTEP, _TRANSMISSION, _SLOT, kinds=("foreign",)), True),
-    Fault("another run, real time", "answers and slot messages with the id of another run, real time", _UNHARMED,
-          _intruded(REALTIME, _TRANSMISSION, _SLOT, kinds=("foreign",))),
+    Fault("another run, real time", "frames, reports and slot messages with the id of another run, real time",
+          _UNHARMED, _intruded(REALTIME, _FRAME, _REPORT, _SLOT, kinds=("foreign",))),
     Fault("bag played into a flight", "`replay` of a bag into the domain of a live flight", _UNHARMED, _replayed),
 )  # fmt: skip
