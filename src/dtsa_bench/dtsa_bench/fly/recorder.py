@@ -68,6 +68,7 @@ class FlightRecorder(ChannelObserver):
         self._pending: list[tuple[int, bytes, int]] = []  # channel, message, time: of the slot that is being flown
         self._pending_slot = -1
         self._complete = -1  # last slot that all have answered
+        self._begun: Answers | None = None  # what they answered
         self._state = RunState(run_id, self._slot_ns)
         told = bytes(serialize_message(configuration_message(run.to_dict(), run_id)))
         self.bag.write(settings, told, names.TIME_ZERO_NS, names.TIME_ZERO_NS)
@@ -92,8 +93,7 @@ class FlightRecorder(ChannelObserver):
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         self._complete = slot
-        if self._realtime and answers.answered.any():
-            self._answers[slot] = [(b"", self._packed.transmission(slot, answers))]
+        self._begun = answers
         if not slot:
             self._state.phase = RunStatus.FLYING
             self._write_status()
@@ -139,8 +139,14 @@ class FlightRecorder(ChannelObserver):
                 self.bag.mark()
             self._pending = []
 
+    def _keep_reports(self, slot: int, answers: Answers) -> None:
+        """In real time: what has been reported for a slot, kept as one transmission."""
+        if self._realtime and answers.answered.any():
+            self._answers[slot] = [(b"", self._packed.transmission(slot, answers))]
+
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self._write_pending()
+        self._keep_reports(slot, answers)  # as its decisions: more may have come since all had answered
         begin, end = self._time_ns(slot), self._time_ns(slot + 1)
         motion = self._packer.pack(begin, answers.position, answers.velocity)
         self._pending_slot = slot
@@ -158,6 +164,8 @@ class FlightRecorder(ChannelObserver):
 
     def close(self) -> None:
         """Writes what is complete and finishes the bag."""
+        if self._begun is not None and self._complete > self._pending_slot:
+            self._keep_reports(self._complete, self._begun)
         self._write_pending()
         for slot in sorted({*self._messages, *self._answers, *self._frames}):
             if slot <= self._complete:
