@@ -13,6 +13,7 @@ from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unus
 from dtsa_agent.ros.common.wire import split_frames
 
 Array = NDArray[np.float64]
+_FLOATS = ("track", "velocity", "command", "goal", "score")
 
 
 @dataclass(slots=True)
@@ -55,18 +56,11 @@ class Answers:
         self.taken_in: list[TakenIn] | None = None  # real time: what the agents say to have taken in during the slot
         self._told = np.zeros(agents, dtype=np.bool_)  # whose goals have been told
         self._layouts: dict[bytes, tuple[int, slice | NDArray[np.intp]]] = {}
-        # Numbers an agent in each field of a message.
-        self._lengths = (
-            ("length", 1),
-            ("chosen", 1),
-            ("reason", 1),
-            ("digest", 1),
-            ("score", 1),
-            ("track", 3 * steps),
-            ("velocity", 3),
-            ("command", 3),
-            ("goal", 3),
-        )
+        # Numbers an agent in each field of a message; of its frames' bytes there are as many as the lengths say.
+        self._sizes = {
+            "length": 1, "data": 0, "chosen": 1, "reason": 1, "digest": 1, "score": 1,
+            "track": 3 * steps, "velocity": 3, "command": 3, "goal": 3,
+        }  # fmt: skip
 
     @property
     def position(self) -> Array:
@@ -94,18 +88,22 @@ class Answers:
         count, at = self._where(message.agent)
         if self.answered[at].any():
             return False
-        self._check(message, count)
-        frames = split_frames(memoryview(message.data), message.length) if len(message.data) else []
-        self.track[:, :, at] = np.frombuffer(message.track).reshape(self.steps, 3, count)
-        self.velocity[:, at] = np.frombuffer(message.velocity).reshape(3, count)
-        self.command[:, at] = np.frombuffer(message.command).reshape(3, count)
-        if len(message.goal):
-            self.goal[:, at] = np.frombuffer(message.goal).reshape(3, count)
+        # Everything in here runs once a message: what is read twice is kept.
+        told = {name: getattr(message, name) for name in self._sizes}
+        self._check_sizes(message, count, told)
+        track, velocity, command, goal, score = (np.frombuffer(told[name]) for name in _FLOATS)
+        self._check_numbers(message, (track, velocity, command, goal), score)
+        frames = split_frames(memoryview(told["data"]), told["length"]) if len(told["data"]) else []
+        self.track[:, :, at] = track.reshape(self.steps, 3, count)
+        self.velocity[:, at] = velocity.reshape(3, count)
+        self.command[:, at] = command.reshape(3, count)
+        if len(goal):
+            self.goal[:, at] = goal.reshape(3, count)
             self._told[at] = True
-        self.chosen[at] = message.chosen
-        self.reason[at] = message.reason
-        self.digest[at] = message.digest
-        self.score[at] = message.score
+        self.chosen[at] = np.frombuffer(told["chosen"], dtype=np.uint16)
+        self.reason[at] = np.frombuffer(told["reason"], dtype=np.uint8)
+        self.digest[at] = np.frombuffer(told["digest"], dtype=np.uint32)
+        self.score[at] = score
         for agent, frame in zip(message.agent, frames, strict=False):
             if frame:
                 self.frames[agent] = frame
@@ -132,27 +130,33 @@ class Answers:
         self._told[at] = self.answered[at] = True
         self.missing -= count
 
-    def _check(self, message: Any, count: int) -> None:
-        """Whether the fields of a message fit together.
+    def _check_sizes(self, message: Any, count: int, told: dict[str, Any]) -> None:
+        """Whether the fields of a message are as long as its agents are many.
 
-        :raises Unusable: if they do not.
+        :raises Unusable: if they are not.
         """
         if message.steps != self.steps:
             raise self._unusable(RANGE, message, f"{message.steps} control instants a slot instead of {self.steps}")
-        for name, length in self._lengths:
-            found = len(getattr(message, name))
-            if found != length * count and (name != "goal" or found):
+        for name, values in told.items():
+            found, wanted = len(values), self._sizes[name] * count
+            if found != wanted and name != "data" and (name != "goal" or found):
                 raise self._unusable(SIZES, message, f"{found} numbers in {name} for {count} agents")
-        if len(message.data) or any(message.length):
-            check_frames(message.length, message.data)
-        if max(message.chosen) > self.agents:
-            raise self._unusable(RANGE, message, f"{max(message.chosen)} chosen of {self.agents} agents")
+        if len(told["data"]) or any(told["length"]):
+            check_frames(told["length"], told["data"])
+
+    def _check_numbers(self, message: Any, motion: tuple[Array, ...], score: Array) -> None:
+        """Whether the numbers of a message can be.
+
+        :raises Unusable: if they cannot.
+        """
+        largest = max(message.chosen)
+        if largest > self.agents:
+            raise self._unusable(RANGE, message, f"{largest} chosen of {self.agents} agents")
         # A sum of squares is finite only if all its terms are, and small only if they are.
-        for name in ("track", "velocity", "command", "goal"):
-            values = np.frombuffer(getattr(message, name))
-            if not values @ values <= FARTHEST_M**2:
+        for values in motion:
+            if not values.dot(values) <= FARTHEST_M**2:
                 raise self._unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
-        if np.isnan(message.score).any():
+        if not (score == score).all():
             raise self._unusable(RANGE, message, "scores that are no numbers")
 
     @staticmethod
