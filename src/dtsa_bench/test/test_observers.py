@@ -6,7 +6,6 @@ import json
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from fly_helpers import readable
 from node_helpers import end_of, ros_graph
@@ -19,6 +18,7 @@ from rclpy.node import Node
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.agreement import settings_hash
 from dtsa_agent.ros.common.stamps import header_of
 from dtsa_bench.fly.recorded_channel import RecordedFlight
 from dtsa_bench.run_config import RunConfig, RunLimits
@@ -147,7 +147,7 @@ def test_an_observer_that_fails_ends_the_flight_by_name_and_the_bag_is_readable(
     assert readable(out) == 25
     assert flight.write_results(pictures=False)["end"] == "stopped"
     assert json.loads((out / "summary.json").read_text())["slots"]["total"] == 25
-    assert np.array(flight.measurement.positions).shape == (26, 3, 3)
+    assert flight.measurement.positions.array().shape == (26, 3, 3)
 
 
 class LateSender(ChannelObserver):
@@ -170,8 +170,9 @@ class LateSender(ChannelObserver):
         run_id, slot_ns = self._channel.run_id, self._channel.slot_ns
         slot = max(0, round((time.monotonic() - self._begin_s) * 1e9) // slot_ns + 5) if self._begin_s else 0
         nothing = [0.0] * 6
-        settings = json.dumps({"agents": 2, "slot_ms": slot_ns / 1e6, "steps": 1, "mode": "realtime"})
-        self._processes.publish(Process(run=run_id, process=1, node="/test", agent=[1, 2], settings=settings))
+        settings = {"agents": 2, "slot_ms": slot_ns / 1e6, "steps": 1, "mode": "realtime"}
+        shown = {"settings": json.dumps(settings), "settings_hash": settings_hash(settings)}
+        self._processes.publish(Process(run=run_id, process=1, node="/test", agent=[1, 2], **shown))
         self._reports.publish(
             Report(
                 run=run_id, agent=[1, 2], slot=[slot], offset_ns=[0, 0], length=[0, 0],

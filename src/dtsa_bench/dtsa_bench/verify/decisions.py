@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dtsa_agent.core import AgentGroup, make_scenario
+from dtsa_agent.core.frame import TAG_LENGTH
+from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_bench.run_config import RunConfig
@@ -31,7 +33,7 @@ class Decisions:
     """
 
     def __init__(self, run: RunConfig, frames: SentFrames) -> None:
-        self._frames, self._agents = frames, run.swarm.agents
+        self._frames, self._config, self._agents = frames, run.swarm, run.swarm.agents
         self._steps = run.swarm.steps
         self._group = AgentGroup(with_key(make_swarm(run.swarm, make_scenario(run.swarm))))
         self._rows: dict[int, list[tuple[Any, dict[str, Any]]]] = {}
@@ -77,6 +79,9 @@ class Decisions:
                 swarm.position[:, index] = fields["track"][-1]
                 swarm.velocity[:, index] = fields["velocity"][0]
                 swarm.command[:, index] = fields["command"][0]
+                for agent in index[fields["length"] > 0]:
+                    if self._leaves(slot, int(agent) + 1):
+                        swarm.leave(int(agent))
             self._group.on_slot(slot)
             for index, fields in rows:
                 for name in _DECIDED:
@@ -89,6 +94,13 @@ class Decisions:
                     swarm.hear(heard.slot, sent.data, heard.mask)
             self._group.on_slot_end()
         return equal
+
+    def _leaves(self, slot: int, agent: int) -> bool:
+        """Whether an agent says in a frame that it leaves: what made it leave came from outside."""
+        sent = self._frames.get(slot, agent)
+        if sent is None or not self._config.policy_row.says_leaving:
+            return False
+        return decode_extended(sent.data[:-TAG_LENGTH] if self._config.auth else sent.data).leaving
 
     @staticmethod
     def _compare(slot: int, name: str, index: Any, expected: Any, recorded: Any) -> None:

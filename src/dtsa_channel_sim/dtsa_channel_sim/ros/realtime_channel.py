@@ -159,6 +159,9 @@ class RealtimeChannel(RosChannel):
         """Takes agents back that were lost and have reported for a slot."""
         again = [a for a in sorted(self.lost) if book.answered[a - 1] and slot > self._given_up[a] + _AFTERLIFE]
         if again:
+            # A new process has told about itself before it reported: it takes the place of the lost one, not of one
+            # that is back.
+            self._meet_processes()
             self.lost.difference_update(again)
             self.returned.update(again)
             self._observers.agents_back(again)

@@ -231,10 +231,14 @@ class RosChannel:
     def _housekeeping(self) -> None:
         if self.loop.housekeeping():
             self._clock_watched = self._clock.get_subscription_count() > 0
-            self._hear_processes()
-            for process, error in self.roster.settle(time.monotonic(), self.lost) if self.roster.closed else ():
-                self._refuse(process, error)
+            self._meet_processes()
             self._idle()
+
+    def _meet_processes(self) -> None:
+        """Takes in what processes say about themselves, and decides about those that came late."""
+        self._hear_processes()
+        for process, error in self.roster.settle(time.monotonic(), self.lost) if self.roster.closed else ():
+            self._refuse(process, error)
 
     def _idle(self) -> None:
         awaited = self.answers.silent if self.roster.closed else self.roster.missing
