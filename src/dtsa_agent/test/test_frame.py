@@ -16,6 +16,8 @@ from dtsa_agent.core import (
     decode_frame,
     encode_frame,
 )
+from dtsa_agent.core.frame import named_in
+from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
 
 # Written down by hand from the layout in docs/protocol.md: header 10 or 11, id, c_r, slot, position / 2 mm,
 # velocity / 1 cm/s in 12 bits each, low nibble first.
@@ -128,3 +130,13 @@ def test_what_is_no_frame_is_refused() -> None:
 def test_positions_are_little_endian_steps_of_two_millimetres() -> None:
     data = encode_frame(Frame(5, 6, 1, (0.1, -0.1, 1.998), (0.0, 0.0, 0.0)))
     assert struct.unpack_from("<3h", data, 8) == (50, -50, 999)
+
+
+@given(st.integers(1, 254), st.integers(0, 2**32 - 1), st.booleans(), st.binary(max_size=20))
+def test_a_frame_of_any_profile_names_its_sender_and_slot(sender: int, slot: int, intent: bool, tail: bytes) -> None:
+    zero = (0.0, 0.0, 0.0)
+    own = Frame(sender, slot, 1, zero, zero, zero if intent else None)
+    for data in (encode_frame(own), encode_extended(ExtendedFrame(own))):
+        assert named_in(data + tail) == (sender, slot)
+        assert named_in(data[:7]) is None
+    assert named_in(bytes(24)) is None

@@ -17,6 +17,8 @@ from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
+from dtsa_agent.core.frame import Frame as RadioFrame
+from dtsa_agent.core.frame import encode_frame
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.agreement import settings_hash
 from dtsa_agent.ros.common.stamps import header_of
@@ -184,7 +186,8 @@ class LateSender(ChannelObserver):
             self._sent = True
             for agent, start in ((1, slot - 40), (2, slot)):
                 header = header_of(names.slot_time_ns(start, slot_ns))
-                self._air.publish(Frame(header=header, run=run_id, slot=slot, agent=agent, data=bytes(24)))
+                data = encode_frame(RadioFrame(agent, slot, 1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+                self._air.publish(Frame(header=header, run=run_id, slot=slot, agent=agent, data=data))
 
     def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         for row, sender in enumerate(verdict.senders):

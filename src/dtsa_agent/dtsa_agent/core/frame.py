@@ -12,6 +12,8 @@ PROFILE_PAPER = PROFILES.index("paper")  # id, c_r, slot, position, velocity: 19
 PROFILE_PAPER_INTENT = PROFILES.index("paper-intent")  # the same and the commanded velocity: 23 bytes
 PROFILE_EXTENDED = PROFILES.index("extended")  # 56 bytes
 
+_VERSION = 1
+_HEADER_LENGTH = 8  # bytes up to the end of the slot
 TAG_LENGTH = 4  # bytes of authentication after a frame, and after what plug-ins append to it
 
 POSITION_STEP = 0.002  # m, one step of a coordinate at the default extent
@@ -67,6 +69,17 @@ def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
     if not data:
         raise LocalProtocolError(f"not encodable: {frame}")
     return data
+
+
+def named_in(data: bytes) -> tuple[int, int] | None:
+    """The id of the sender and the slot (32 bits) that a frame of any profile names; None: it is none.
+
+    :param data: the bytes, whatever follows a frame in them: bytes of plug-ins, a tag.
+    """
+    if len(data) < _HEADER_LENGTH or data[0] >> 4 != _VERSION or data[0] & 15 >= len(PROFILES):
+        return None
+    sender = data[1] if data[0] & 15 == PROFILE_EXTENDED else int.from_bytes(data[1:3], "little")
+    return sender, int.from_bytes(data[4:8], "little")
 
 
 def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:

@@ -13,8 +13,9 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.checks import OTHER_RUN, SIZES, UNREADABLE, Unusable, check_start
+from dtsa_agent.ros.common.checks import OTHER_RUN, RANGE, SIZES, UNREADABLE, Unusable, check_start
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of, ns_of, time_of
@@ -292,6 +293,8 @@ class RealtimeChannel(RosChannel):
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
         if not 1 <= length <= LONGEST_FRAME:
             raise Unusable(SIZES, f"a frame of {length} bytes")
+        if named_in(bytes(message.data)) != (agent, slot & 0xFFFFFFFF):
+            raise Unusable(RANGE, f"a frame for cf{agent} and slot {slot} that does not name them")
         check_start(start_ns, now, early_ns=_AHEAD * self.slot_ns)
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
         key = (slot, agent)
