@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.core.registry import POLICIES
+from dtsa_bench.figures.palette import agent_colour
 from dtsa_bench.run_config import RunConfig
 
 Array = NDArray[np.float64]
@@ -23,17 +23,6 @@ INK, MUTED, RULE, HOVER = "#1f2933", "#66727f", "#dfe4ea", "#aab4be"
 _LABELLED = 24  # agents that get their ids written
 _DPI = 160
 _FONT = {"font.family": "DejaVu Sans", "font.size": 9}
-
-
-def colours(scenario: Scenario) -> Array:
-    """A colour an agent, (N, 4), around the wheel by its place at the start: neighbours on the circle are alike."""
-    x, y = scenario.start[0] - scenario.start[0].mean(), scenario.start[1] - scenario.start[1].mean()
-    turn = (np.arctan2(y, x) / (2 * np.pi)) % 1.0
-    wheel = np.asarray(colormaps["hsv"](turn))
-    # Pure hues are too bright on white, and not equally so: darken by how light the eye sees them.
-    light = wheel[:, :3] @ np.array([0.2126, 0.7152, 0.0722])
-    wheel[:, :3] *= np.clip(0.42 / np.maximum(light, 0.05), 0.55, 0.92)[:, None]
-    return wheel
 
 
 def paint(axes: Axes, scenario: Scenario, positions: Array, crash: Sequence[int] | None = None) -> None:
@@ -46,7 +35,7 @@ def paint(axes: Axes, scenario: Scenario, positions: Array, crash: Sequence[int]
     """
     count = positions.shape[2]
     thin = float(np.clip(30.0 / max(count, 1), 0.55, 1.9))
-    shade = colours(scenario)
+    shade = [agent_colour(k + 1) for k in range(count)]
     extent = float(np.abs(scenario.start[:2]).max()) if count else 1.0
     for k in np.flatnonzero(~scenario.moving):
         axes.plot(*positions[-1, :2, k], "o", color=HOVER, markersize=5 + 2 * thin, markeredgecolor="white", zorder=2)
