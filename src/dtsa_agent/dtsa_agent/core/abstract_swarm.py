@@ -7,6 +7,7 @@ them and hands the rest on: authentication, plug-ins and vehicles that fly elsew
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from . import _kernel
 from .config import SwarmConfig
 from .course import Course
-from .scenario import Scenario
+from .errors import ConfigError
+from .registry import ESTIMATORS
+from .scenario import Scenario, check_extent, make_scenario
 
 Floats = NDArray[np.float64]
 Slots = NDArray[np.int64]
@@ -36,7 +39,7 @@ class SwarmState:
     config: SwarmConfig
     scenario: Scenario
     course: Course | None  # where the local agents are in the scenario's plan
-    kernel: _kernel.Swarm  # for the metrics, which read tables without a copy
+    kernel: _kernel.Swarm | None  # for the metrics, which read tables without a copy; None: the reference has none
     ids: tuple[int, ...]  # (L,) of the local agents, ascending
     local: NDArray[np.int32]  # (L,) index of each local agent
     observer: NDArray[np.int32]  # (V,) index of the agent whose table it is, -1: serves all
@@ -72,7 +75,43 @@ class SwarmState:
     sends: Bytes  # (L,)
     frame_length: Bytes  # (L,) bytes, 0: silent
     frames: Bytes  # (L, FRAME_MAX)
-    lease_state: Bytes  # (L, bytes of policy lease)
+    lease_state: Bytes  # (L, bytes of policy lease), of the compiled core
+
+    def _begin(
+        self,
+        config: SwarmConfig,
+        scenario: Scenario | None,
+        local: Sequence[int] | None,
+        shared_table: bool,
+        observers: Sequence[int] | None,
+    ) -> None:
+        """Who is here, and arrays for all of it; see :class:`~dtsa_agent.core.swarm.Swarm`."""
+        self.config = config
+        self.scenario = make_scenario(config) if scenario is None else scenario
+        check_extent(config, self.scenario)
+        self.ids = tuple(range(1, config.agents + 1) if local is None else local)
+        self._check_ids("local", self.ids)
+        count = len(self.ids)
+        self.local = np.array(self.ids, dtype=np.int32) - 1
+        seen = observers if observers is not None else ([0] if shared_table else self.ids)
+        self._check_ids("observers", tuple(i for i in seen if i))
+        self.observer = np.array(seen, dtype=np.int32) - 1
+        self.shared = bool(shared_table)
+        self.rows = np.arange(count)
+        if config.estimator_row.needs_everybody and 0 < count < config.agents:
+            others = ", ".join(row.name for row in ESTIMATORS.rows.values() if not row.needs_everybody)
+            allowed = f"{others}: it needs all agents in one process"
+            raise ConfigError("estimator", config.estimator, allowed)
+        if shared_table and config.policy_row.agent_state:
+            why = f"False: with policy {config.policy} every agent knows something of its own"
+            raise ConfigError("shared_table", True, why)
+        self._make_tables(len(self.observer), config.agents)
+        self._make_agents(count, config.steps)
+        self.course = self.scenario.course(self.local)
+
+    def _check_ids(self, name: str, ids: tuple[int, ...]) -> None:
+        if list(ids) != sorted(set(ids)) or (ids and not 1 <= ids[0] <= ids[-1] <= self.config.agents):
+            raise ConfigError(name, ids, f"ascending ids from 1 to {self.config.agents}")
 
     def _make_tables(self, tables: int, agents: int) -> None:
         planes = (tables, 3, agents)
@@ -86,7 +125,7 @@ class SwarmState:
         self.entry_hash = np.zeros((tables, agents), dtype=np.uint32)
         self.table_hash = np.zeros(tables, dtype=np.uint32)
 
-    def _make_agents(self, count: int, steps: int, lease_bytes: int) -> None:
+    def _make_agents(self, count: int, steps: int) -> None:
         self.position, self.velocity, self.command, self.goal = (np.zeros((3, count)) for _ in range(4))
         self.track = np.zeros((steps, 3, count))
         self.active, self.final, self.present = (np.ones(count, dtype=np.uint8) for _ in range(3))
@@ -95,7 +134,7 @@ class SwarmState:
         self.digest = np.zeros(count, dtype=np.uint32)
         self.score = np.zeros(count)
         self.frames = np.zeros((count, FRAME_MAX), dtype=np.uint8)
-        self.lease_state = np.zeros((count, lease_bytes), dtype=np.uint8)
+        self.lease_state = np.zeros((count, 0), dtype=np.uint8)
 
 
 class AbstractSwarm(SwarmState, ABC):
@@ -254,12 +293,12 @@ class AbstractSwarm(SwarmState, ABC):
     @property
     def malformed(self) -> int:
         """Frames heard that were none: wrong length, version or fields."""
-        return int(self.kernel.malformed)
+        return 0
 
     @property
     def foreign(self) -> int:
         """Frames of unknown agents or of another time."""
-        return int(self.kernel.foreign)
+        return 0
 
 
 class SwarmWrapper(AbstractSwarm):
@@ -339,3 +378,13 @@ class SwarmWrapper(AbstractSwarm):
     def rejected(self) -> int:
         """Frames heard that were not authentic."""
         return self.inner.rejected
+
+    @property
+    def malformed(self) -> int:
+        """Frames heard that were none."""
+        return self.inner.malformed
+
+    @property
+    def foreign(self) -> int:
+        """Frames of unknown agents or of another time."""
+        return self.inner.foreign

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from . import _kernel
 from .errors import ConfigError
+from .reference import avoiders
+from .reference.arithmetic import Vector
+from .reference.avoiders import Neighbour, Scene
 from .registry import Registry, check_kernel
 from .settings import REQUIRED, Settings, check, setting, settings_of
 
@@ -115,6 +118,8 @@ class FlightModel(Settings):
         others_position: Array,
         others_velocity: Array,
         age_s: Array | None = None,
+        *,
+        plain: bool = False,
     ) -> Array:
         """Commanded velocity of one agent, (3,), m/s, frame map.
 
@@ -125,7 +130,10 @@ class FlightModel(Settings):
         :param others_position: where it believes everybody is, (3, N), m; whoever is not finite is ignored.
         :param others_velocity: their velocities, (3, N), m/s.
         :param age_s: age of each one's state, (N,), s; None: no margins.
+        :param plain: the avoider of the specification, not the compiled one.
         """
+        if plain:
+            return self._plain_command(self_index, position, velocity, goal, others_position, others_velocity, age_s)
         result = np.empty(3)
         given = (position, velocity, goal, others_position, others_velocity)
         p, v, target, others_p, others_v = (np.ascontiguousarray(a, dtype=np.float64) for a in given)
@@ -133,6 +141,31 @@ class FlightModel(Settings):
         params = self.avoider.to_dict()
         _kernel.avoid_command(self.kind, params, self_index, p, v, target, others_p, others_v, ages, result)
         return result
+
+    def _plain_command(
+        self,
+        own: int,
+        position: Array,
+        velocity: Array,
+        goal: Array,
+        others_p: Array,
+        others_v: Array,
+        age: Array | None,
+    ) -> Array:
+        count = others_p.shape[1]
+        ages = [0.0] * count if age is None else age.tolist()
+        near = [
+            Neighbour(k + 1, _vector(others_p[:, k]), _vector(others_v[:, k]), ages[k])
+            for k in range(count)
+            if k != own
+        ]
+        scene = Scene(own + 1, _vector(position), _vector(velocity), _vector(goal), near)
+        return np.array(avoiders.command(self.avoider_kind, scene, avoiders.Avoidance(**self.avoider.to_dict())))
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)
 
 
 _ORCA = AvoiderParams(v_max=1.5, radius=0.336, horizon=1.0, softness=30.0, bias=0.2)

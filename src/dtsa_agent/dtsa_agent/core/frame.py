@@ -1,11 +1,11 @@
-"""The radio frame: fields and bytes. The codec itself is ``_kernel/frame.c``, the only one there is."""
+"""The radio frame: fields and bytes. The codec is ``_kernel/frame.c``, specified in ``reference/frame.py``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from . import _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
+from .reference.arithmetic import Vector
+from .reference.frame import Frame
 from .registry import PROFILES
 
 PROFILE_PAPER = PROFILES.index("paper")  # id, c_r, slot, position, velocity: 19 bytes
@@ -19,24 +19,12 @@ TAG_LENGTH = 4  # bytes of authentication after a frame, and after what plug-ins
 POSITION_STEP = 0.002  # m, one step of a coordinate at the default extent
 EXTENT_M = 65.534  # m, default extent: 32767 steps, the largest coordinate that a frame can say
 
-Vector = tuple[float, float, float]
+__all__ = [
+    "EXTENT_M", "POSITION_STEP", "PROFILE_EXTENDED", "PROFILE_PAPER", "PROFILE_PAPER_INTENT", "TAG_LENGTH", "Frame",
+    "Vector", "decode_frame", "encode_frame", "named_in", "position_step",
+]  # fmt: skip
 
 _FAULTS = {-1: "wrong length", -2: "unknown version or profile", -3: "field out of range"}
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """What one agent says in one slot (profile ``paper``).
-
-    Values are those of the air after :func:`decode_frame`: quantised (2 mm, 1 cm/s) and saturated, never wrapped.
-    """
-
-    sender: int  # id, 1 .. 65535
-    slot: int  # slot in which the state was sampled
-    c_r: int  # transmission parameter (eq:remaining_t_slots), 0: arrived
-    position: Vector  # m, frame map
-    velocity: Vector  # m/s, frame map
-    intent: Vector | None = None  # m/s, commanded velocity; None: not carried
 
 
 def position_step(extent_m: float) -> float:

@@ -1,45 +1,21 @@
-"""The extended frame: fields and bytes. The codec is ``_kernel/frame_extended.c``; layout in docs/protocol.md."""
+"""The extended frame: fields and bytes. Codec: ``_kernel/frame_extended.c``, specified in ``reference``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from . import _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
-from .frame import _FAULTS, EXTENT_M, Frame, Vector, position_step
+from .frame import _FAULTS, EXTENT_M, Frame, position_step
+from .reference.frame_extended import OPEN, ExtendedFrame, Gossip
 
 EXTENDED_LENGTH = _kernel.EXTENDED_LENGTH  # bytes, and 4 more for the tag of an authenticated frame
 HEAD_LENGTH = (
     _kernel.EXTENDED_HEAD
 )  # bytes that hold the sender's own state: enough for who hears only the beginning of a frame
-OPEN = _kernel.LEASE_OPEN  # lessee of a turn that is open to all who wake
 
-
-@dataclass(frozen=True, slots=True)
-class Gossip:
-    """What the sender of a frame last heard of somebody else."""
-
-    agent: int  # id, 1 .. 254
-    age: int  # slots since the state was sampled, 1 .. 127
-    moving: bool  # its c_r was not 0
-    position: Vector  # m, frame map; 4 mm on the air at the default extent
-    velocity: Vector  # m/s, frame map; 2 cm/s on the air
-
-
-@dataclass(frozen=True, slots=True)
-class ExtendedFrame:
-    """What one agent says in one slot (profile ``extended``).
-
-    ``own.c_r`` is 0 or 1 on the air. Gossip, a section of 11 leases and the relay take one of three places each.
-    """
-
-    own: Frame
-    c_s: int = 0  # consecutive ids before the sender that it thinks dead, 0 .. 253
-    leaving: bool = False  # the sender leaves with this frame; c_s does not count
-    probation: bool = False  # the sender uses its anchors only
-    gossip: tuple[Gossip, ...] = ()
-    leases: bytes = b""  # a byte a turn: 0 none, id of the lessee, OPEN
-    relay: tuple[tuple[int, int], ...] = ()  # (slots ahead, 1 .. 24, ascending; lessee), at most 8
+__all__ = [
+    "EXTENDED_LENGTH", "HEAD_LENGTH", "OPEN", "ExtendedFrame", "Gossip", "decode_extended", "decode_head",
+    "encode_extended",
+]  # fmt: skip
 
 
 def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:

@@ -6,18 +6,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import _kernel
 from .abstract_swarm import PRESENT_LEAVING, AbstractSwarm, Bytes
 from .config import SwarmConfig
-from .errors import ConfigError
 from .flight_models import flight_model
 from .frame import PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, position_step
+from .reference.estimators import decay_table
 from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
-from .scenario import STREAM_POLICY, Scenario, check_extent, generator, make_scenario
-
-DECAY_STEPS = 4096  # intent: beyond this many control periods a vehicle has settled at its command
+from .scenario import STREAM_POLICY, Scenario, generator
 
 
 class Swarm(AbstractSwarm):
@@ -34,6 +31,8 @@ class Swarm(AbstractSwarm):
     :raises ConfigError: for ids that do not exist, or settings that need agents that are not here.
     """
 
+    kernel: _kernel.Swarm
+
     def __init__(
         self,
         config: SwarmConfig,
@@ -42,43 +41,20 @@ class Swarm(AbstractSwarm):
         shared_table: bool = False,
         observers: Sequence[int] | None = None,
     ) -> None:
-        self.config = config
-        self.scenario = make_scenario(config) if scenario is None else scenario
-        check_extent(config, self.scenario)
-        self.ids = tuple(range(1, config.agents + 1) if local is None else local)
-        self._check_ids("local", self.ids)
-        count, agents = len(self.ids), config.agents
-        self.local = np.array(self.ids, dtype=np.int32) - 1
-        seen = observers if observers is not None else ([0] if shared_table else self.ids)
-        self._check_ids("observers", tuple(i for i in seen if i))
-        self.observer = np.array(seen, dtype=np.int32) - 1
-        self.shared = bool(shared_table)
-        self.rows = np.arange(count)
-        if config.estimator_row.needs_everybody and 0 < count < agents:
-            others = ", ".join(row.name for row in ESTIMATORS.rows.values() if not row.needs_everybody)
-            allowed = f"{others}: it needs all agents in one process"
-            raise ConfigError("estimator", config.estimator, allowed)
-        row = config.policy_row
-        if shared_table and row.agent_state:
-            why = f"False: with policy {row.name} every agent knows something of its own"
-            raise ConfigError("shared_table", True, why)
-        lease = _kernel.lease_state_bytes(agents, config.anchor_every) if row.agent_state else 0
-        self._make_tables(len(self.observer), agents)
-        self._make_agents(count, config.steps, lease)
-        self.course = self.scenario.course(self.local)
+        self._begin(config, scenario, local, shared_table, observers)
+        count = len(self.ids)
+        if config.policy_row.agent_state:
+            state = _kernel.lease_state_bytes(config.agents, config.anchor_every)
+            self.lease_state = np.zeros((count, state), dtype=np.uint8)
         parameters = self._parameters(count)
         self._arrays = self._shared_arrays()
         self.kernel = _kernel.Swarm(parameters, self._arrays)
-
-    def _check_ids(self, name: str, ids: tuple[int, ...]) -> None:
-        if list(ids) != sorted(set(ids)) or (ids and not 1 <= ids[0] <= ids[-1] <= self.config.agents):
-            raise ConfigError(name, ids, f"ascending ids from 1 to {self.config.agents}")
 
     def _parameters(self, count: int) -> dict[str, Any]:
         config, model = self.config, flight_model(self.config.avoider, self.config.options)
         key = int(generator(config.seed, STREAM_POLICY).integers(0, 2**63))
         profile = PROFILE_PAPER_INTENT if config.estimator_row.needs_intent else PROFILE_PAPER
-        self._decay = decay_table(model.vehicle.tau, config.slot_s / config.steps)
+        self._decay = np.array(decay_table(model.vehicle.tau, config.slot_s / config.steps))
         return {
             "agents": config.agents, "local_count": count, "table_count": len(self.observer), "steps": config.steps,
             "shared": int(self.shared), "slot_s": config.slot_s, "policy": POLICIES.number(config.policy),
@@ -178,23 +154,12 @@ class Swarm(AbstractSwarm):
     def reason_name(self, local_index: int) -> str:
         return REASONS[self.reason[local_index]]
 
+    @property
+    def malformed(self) -> int:
+        """Frames heard that were none: wrong length, version or fields."""
+        return int(self.kernel.malformed)
 
-def decay_table(tau: float, dt: float) -> NDArray[np.float64]:
-    """How an unsaturated vehicle approaches its command, for estimator ``intent``.
-
-    With q = 1 - dt / tau the velocity after k control periods is ``c + (v - c) q^k`` and the way
-    ``c k dt + (v - c) dt (q + .. + q^k)``: the vehicle's own integrator, by multiplication alone, so that all agents
-    compute the same bits.
-
-    :param tau: time constant of the velocity response, s.
-    :param dt: control period, s.
-    :returns: (2, DECAY_STEPS): q^k (1), and dt times the sum (s).
-    """
-    q = max(0.0, 1.0 - dt / tau)
-    table = np.empty((2, DECAY_STEPS))
-    power, way = 1.0, 0.0
-    for k in range(DECAY_STEPS):
-        table[0, k], table[1, k] = power, way
-        power *= q
-        way += dt * power
-    return table
+    @property
+    def foreign(self) -> int:
+        """Frames of unknown agents or of another time."""
+        return int(self.kernel.foreign)

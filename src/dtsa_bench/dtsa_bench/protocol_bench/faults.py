@@ -46,7 +46,7 @@ def format_groups(groups: list[list[int]]) -> str:
     return " | ".join(",".join(map(str, sorted(group))) for group in groups)
 
 
-def _schedule(random: np.random.Generator, agents: int, slots: int) -> list[dict[str, Any]]:
+def random_schedule(random: np.random.Generator, agents: int, slots: int) -> list[dict[str, Any]]:
     """Jams and partitions, one after the other."""
     entries: list[dict[str, Any]] = []
     slot = 0
@@ -97,7 +97,7 @@ def random_misfortune(seed: int, slots: int, most_agents: int = 16, **settings: 
     channel = ChannelConfig(
         agents=agents, slot_ns=config.slot_ns, seed=seed, loss=loss, loss_matrix=matrix,
         burst_length=float(random.choice([0.0, 10.0, 20.0])) if loss else 0.0,
-        range_m=float(random.choice([0.0, 0.0, 8.0])), schedule=tuple(_schedule(random, agents, slots)),
+        range_m=float(random.choice([0.0, 0.0, 8.0])), schedule=tuple(random_schedule(random, agents, slots)),
     )  # fmt: skip
     movers = tuple(k for k in range(1, agents + 1) if random.random() < 0.5)
     return Misfortune(config, channel, movers, tuple(_events(random, agents, slots)), bool(random.random() < 0.5))

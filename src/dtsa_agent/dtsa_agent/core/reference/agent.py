@@ -1,0 +1,179 @@
+"""One agent in a slot: what it decides, what it says, and what it makes of what it hears.
+
+One slot i goes, everywhere and always, in this order: :meth:`Agent.decide` and :meth:`Agent.frame` from what was heard
+before slot i, then flight, then :func:`hear` once a frame, then :meth:`Agent.end`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from . import gossip, policies
+from .arithmetic import ZERO, Vector, minus, norm
+from .frame import PROFILE_EXTENDED, WRONG_HEADER, Frame, Refused, decode, encode
+from .frame_extended import SECTION_BYTES, SECTIONS, ExtendedFrame, decode_extended, encode_extended
+from .lease.decide import decide as decide_lease
+from .lease.issue import Said, say
+from .lease.listen import end_slot, listen
+from .lease.memory import Memory
+from .policies import NOBODY, Weights
+from .rules import EXTENDED, PAPER, Rules
+from .selection import Choice
+from .table import Table
+
+OFF, ON, LEAVES = 0, 1, 2  # Agent.present
+
+
+@dataclass(slots=True)
+class Agent:
+    """One agent: its own state, its table, and what its policy remembers."""
+
+    index: int  # id - 1
+    rules: Rules
+    table: Table
+    position: Vector = ZERO  # m, frame map, true state
+    velocity: Vector = ZERO  # m/s
+    command: Vector = ZERO  # m/s, commanded velocity
+    goal: Vector = ZERO  # m
+    final: bool = True  # no further goal is scheduled
+    present: int = ON
+    sends: bool = False  # in this slot
+    choice: Choice = NOBODY  # of this slot
+    weights: Weights = field(default_factory=Weights)  # what led to it
+    memory: Memory = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.memory = Memory(self.rules)
+
+    def restart(self) -> None:
+        """Its program starts anew, knowing nothing but its settings; where it is and flies stays."""
+        self.table.reset()
+        self.memory = Memory(self.rules)
+
+    def far_from_goal(self) -> bool:
+        """Whether it has something to say: p_e > r_min (eq:remaining_t_slots)."""
+        return norm(minus(self.goal, self.position)) > self.rules.r_min
+
+    def decide(self, slot: int) -> Choice:
+        """Who sends in a slot, in the agent's eyes; if it is itself, it sends.
+
+        :param slot: the slot that begins.
+        """
+        self.weights = Weights()
+        self.choice = self._decide(slot)
+        self.sends = self.choice.index == self.index and self.present != OFF
+        return self.choice
+
+    def _decide(self, slot: int) -> Choice:
+        if self.rules.policy == "lease":
+            if self.present == OFF:
+                if self.memory.started:
+                    self.restart()  # whatever it knew is gone when it comes back
+                return NOBODY
+            return decide_lease(self.memory, self.index, slot, self.far_from_goal())
+        if self.rules.policy == "aloha":
+            return policies.choose_aloha(self.table, slot, self.index + 1, self.rules)
+        return policies.choose(self.table, slot, self.rules, self.weights)
+
+    def frame(self, slot: int) -> bytes:
+        """The frame that the agent sends in a slot.
+
+        :param slot: the slot.
+        """
+        rules = self.rules
+        c_r = rules.c_r if self.far_from_goal() else 0
+        intent = None if rules.profile == PAPER else self.command
+        own = Frame(self.index + 1, slot & 0xFFFFFFFF, c_r, self.position, self.velocity, intent)
+        if rules.profile != EXTENDED:
+            return encode(own, rules.position_step)
+        said = Said()
+        if rules.policy == "lease":
+            said = say(self.memory, self.index, self.table.rows, slot, self.final, self.present == LEAVES)
+        used = -(-len(said.leases) // SECTION_BYTES) + bool(said.relay)
+        carried = gossip.collect(self.table, self.index, slot, SECTIONS - used, rules) if rules.gossip else ()
+        return encode_extended(
+            ExtendedFrame(own, said.c_s, said.leaving, self.memory.probation, carried, said.leases, said.relay),
+            rules.position_step,
+        )
+
+    def end(self, slot: int) -> None:
+        """The slot is over: counters and silence, after :meth:`remember_own` and all that was heard.
+
+        :param slot: the slot.
+        """
+        if self.rules.policy != "lease":
+            if self.choice.index >= 0:
+                self.table.note_turn(self.choice.index, slot)
+        elif self.present != OFF and self.memory.started:
+            end_slot(self.memory, self.index, slot, self.sends, self.choice.reason)
+            if self.memory.leaving:
+                self.present = OFF
+
+    def remember_own(self, slot: int, sent: bytes) -> None:
+        """A sender knows what it said, whether or not anybody heard it: its own entry is the last sent state.
+
+        :param slot: the slot that is over.
+        :param sent: the agent's own frame in it, empty if it was silent.
+        """
+        if sent and self.table.rows[self.index].sent_slot != slot:
+            self.table.learn(decode(sent, self.rules.position_step), slot)
+
+
+@dataclass(slots=True)
+class Ear:
+    """Who hears: a table, and the agent that it belongs to (None: a table of a mere observer, or a shared one)."""
+
+    table: Table
+    agent: Agent | None = None
+
+
+class Foreign(Exception):
+    """A frame of an unknown agent or of another time."""
+
+
+def parse(data: bytes, slot: int, rules: Rules) -> tuple[Frame | ExtendedFrame, int]:
+    """What the air carried, and the slot in which it was sent: the present one, or the one before.
+
+    :param data: the bytes heard.
+    :param slot: the present slot.
+    :param rules: what all agree on.
+    :raises RemoteProtocolError: if they are no frame of the swarm's kind.
+    :raises Foreign: for a frame of an unknown agent or of another time.
+    """
+    frame: Frame | ExtendedFrame
+    if rules.profile == EXTENDED:
+        frame = decode_extended(data, rules.position_step)
+        own = frame.own
+    else:
+        frame = own = decode(data, rules.position_step)
+        if data[0] & 0xF == PROFILE_EXTENDED:
+            raise Refused(WRONG_HEADER, data)
+    late = (slot - own.slot) & 0xFFFFFFFF
+    sampled = slot - late
+    if late > 1 or own.sender > rules.agents:
+        raise Foreign
+    if isinstance(frame, ExtendedFrame) and not gossip.known(frame, sampled, rules):
+        raise Foreign
+    return frame, sampled
+
+
+def hear(ears: Sequence[Ear], frame: Frame | ExtendedFrame, sampled: int, rules: Rules) -> None:
+    """Some observers take in a frame.
+
+    :param ears: those that received it.
+    :param frame: what it said.
+    :param sampled: the slot in which it was sent, see :func:`parse`.
+    :param rules: what all agree on.
+    """
+    for ear in ears:
+        own = frame.own if isinstance(frame, ExtendedFrame) else frame
+        row = ear.table.rows[own.sender - 1]
+        wakes = not row.in_ap and own.c_r != 0
+        if row.sent_slot < sampled:
+            ear.table.learn(own, sampled)
+        if isinstance(frame, ExtendedFrame) and ear.table.observer != own.sender:
+            for entry in frame.gossip:
+                gossip.learn(ear.table, sampled - entry.age, entry, rules)
+            if rules.policy == "lease" and ear.agent is not None:
+                listen(ear.agent.memory, ear.agent.index, sampled, frame, wakes)

@@ -1,0 +1,185 @@
+"""The extended frame: the paper's state, and three sections about others; the layout is docs/protocol.md's table::
+
+0      version (high nibble), profile 2 (low nibble)
+1      sender's id, 1..254
+2      c_s, 0..253; 255: the sender leaves with this frame
+3      bit 0: c_r is not 0; bit 1: in probation; bits 2-3, 4-5, 6-7: kinds of the three sections
+4-22   slot, position, velocity, commanded velocity as in profile paper with intent
+23-33, 34-44, 45-55   sections: leases first, then a relay, then gossip
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..errors import LocalProtocolError
+from .arithmetic import Vector, quantise, signed
+from .frame import (
+    EXTENDED_HEAD,
+    EXTENDED_SENDER_MAX,
+    PROFILE_EXTENDED,
+    WRONG_FIELD,
+    WRONG_HEADER,
+    Frame,
+    Refused,
+    decode,
+    encode,
+)
+
+SECTIONS, SECTION_BYTES = 3, 11
+KIND_GOSSIP, KIND_LEASES, KIND_RELAY = 0, 1, 2
+RELAY_IDS, RELAY_REACH = 8, 24  # lessees in a relay; slots ahead that it speaks of
+GOSSIP_AGE_MAX = 127  # slots
+LEASE_ROOM = 2 * SECTION_BYTES  # turns that one frame can give away
+C_S_MAX, LEAVING = 253, 255
+OPEN = 255  # lessee of a turn that is open to all who wake
+VELOCITY_STEP = 0.02  # m/s, of gossip
+
+
+@dataclass(frozen=True, slots=True)
+class Gossip:
+    """What the sender of a frame last heard of somebody else."""
+
+    agent: int  # id, 1 .. 254
+    age: int  # slots since the state was sampled, 1 .. 127
+    moving: bool  # its c_r was not 0
+    position: Vector  # m, frame map; 4 mm on the air at the default extent
+    velocity: Vector  # m/s, frame map; 2 cm/s on the air
+
+
+@dataclass(frozen=True, slots=True)
+class ExtendedFrame:
+    """What one agent says in one slot (profile ``extended``).
+
+    ``own.c_r`` is 0 or 1 on the air. Gossip, a section of 11 leases and the relay take one of three places each.
+    """
+
+    own: Frame
+    c_s: int = 0  # consecutive ids before the sender that it thinks dead, 0 .. 253
+    leaving: bool = False  # the sender leaves with this frame; c_s does not count
+    probation: bool = False  # the sender uses its anchors only
+    gossip: tuple[Gossip, ...] = ()
+    leases: bytes = b""  # a byte a turn: 0 none, id of the lessee, OPEN
+    relay: tuple[tuple[int, int], ...] = ()  # (slots ahead, 1 .. 24, ascending; lessee), at most 8
+
+
+def gossip_fits(position: Vector, velocity: Vector, position_step: float) -> bool:
+    """Whether gossip can say a state without saturating: it has two bits less than the sender's own, at twice the step.
+
+    :param position: m.
+    :param velocity: m/s.
+    :param position_step: m, one step of a coordinate in frames.
+    """
+    far = ((1 << 13) - 2) * (2.0 * position_step)
+    fast = ((1 << 9) - 2) * VELOCITY_STEP
+    return all(abs(x) <= far for x in position) and all(abs(x) <= fast for x in velocity)
+
+
+def encode_extended(frame: ExtendedFrame, position_step: float) -> bytes:
+    """The bytes of an extended frame.
+
+    :param frame: its fields; what does not fit saturates.
+    :param position_step: m, one step of a coordinate, as the swarm has agreed.
+    :raises LocalProtocolError: if a field is out of range, or the sections do not fit.
+    """
+    if not _sayable(frame):
+        raise LocalProtocolError(f"not encodable: {frame}")
+    head = bytearray(encode(frame.own, position_step, PROFILE_EXTENDED))
+    sections: list[tuple[int, bytes]] = []
+    for first in range(0, len(frame.leases), SECTION_BYTES):
+        sections.append((KIND_LEASES, frame.leases[first : first + SECTION_BYTES]))
+    if frame.relay:
+        sections.append((KIND_RELAY, _pack_relay(frame.relay)))
+    for entry in frame.gossip:
+        sections.append((KIND_GOSSIP, _pack_gossip(entry, 2.0 * position_step)))
+    if len(sections) > SECTIONS:
+        raise LocalProtocolError(f"not encodable: {frame}")
+    head[2] = LEAVING if frame.leaving else frame.c_s
+    head[3] |= frame.probation << 1
+    for place, (kind, _) in enumerate(sections):
+        head[3] |= kind << (2 + 2 * place)
+    body = b"".join(data.ljust(SECTION_BYTES, b"\0") for _, data in sections)
+    return bytes(head) + body.ljust(SECTIONS * SECTION_BYTES, b"\0")
+
+
+def _sayable(frame: ExtendedFrame) -> bool:
+    ahead = [slots for slots, _ in frame.relay]
+    return (
+        0 <= frame.c_s <= C_S_MAX
+        and len(frame.leases) <= SECTIONS * SECTION_BYTES
+        and len(frame.relay) <= RELAY_IDS
+        and ahead == sorted(set(ahead))
+        and all(1 <= slots <= RELAY_REACH and 1 <= lessee <= 255 for slots, lessee in frame.relay)
+        and all(1 <= g.agent <= EXTENDED_SENDER_MAX and 1 <= g.age <= GOSSIP_AGE_MAX for g in frame.gossip)
+        and all(x == x for g in frame.gossip for x in (*g.position, *g.velocity))
+    )
+
+
+def _pack_relay(relay: tuple[tuple[int, int], ...]) -> bytes:
+    mask = 0
+    for slots, _ in relay:
+        mask |= 1 << (slots - 1)
+    return mask.to_bytes(3, "little") + bytes(lessee for _, lessee in relay)
+
+
+def _pack_gossip(entry: Gossip, step: float) -> bytes:
+    word = 0
+    for axis in range(3):
+        word |= (quantise(entry.position[axis], step, 14) & 0x3FFF) << 14 * axis
+        word |= (quantise(entry.velocity[axis], VELOCITY_STEP, 10) & 0x3FF) << (42 + 10 * axis)
+    return bytes([entry.agent, entry.age << 1 | entry.moving]) + word.to_bytes(9, "little")
+
+
+def decode_extended(data: bytes, position_step: float) -> ExtendedFrame:
+    """The fields of an extended frame.
+
+    :param data: the bytes heard, without a tag.
+    :param position_step: m, one step of a coordinate, as the swarm has agreed.
+    :raises Refused: if they are no frame of profile ``extended``.
+    """
+    own = decode(data, position_step)
+    if data[0] & 0xF != PROFILE_EXTENDED:
+        raise Refused(WRONG_HEADER, data)
+    leaving = data[2] == LEAVING
+    if not leaving and data[2] > C_S_MAX:
+        raise Refused(WRONG_FIELD, data)
+    gossip: list[Gossip] = []
+    relays: list[tuple[tuple[int, int], ...]] = []
+    leases = b""
+    for place in range(SECTIONS):
+        section = data[EXTENDED_HEAD + place * SECTION_BYTES :][:SECTION_BYTES]
+        kind = data[3] >> (2 + 2 * place) & 3
+        if kind == KIND_LEASES:
+            leases += section
+        elif kind == KIND_RELAY and not relays:
+            relays.append(_unpack_relay(section, data))
+        elif kind == KIND_GOSSIP:
+            gossip += _unpack_gossip(section, 2.0 * position_step, data)
+        else:
+            raise Refused(WRONG_FIELD, data)
+    probation = bool(data[3] >> 1 & 1)
+    c_s = 0 if leaving else data[2]
+    return ExtendedFrame(own, c_s, leaving, probation, tuple(gossip), leases, relays[0] if relays else ())
+
+
+def _unpack_relay(section: bytes, data: bytes) -> tuple[tuple[int, int], ...]:
+    mask = int.from_bytes(section[:3], "little")
+    ahead = [d + 1 for d in range(RELAY_REACH) if mask >> d & 1]
+    lessees = section[3:]
+    if len(ahead) > RELAY_IDS or 0 in lessees[: len(ahead)] or any(lessees[len(ahead) :]):
+        raise Refused(WRONG_FIELD, data)
+    return tuple(zip(ahead, lessees, strict=False))
+
+
+def _unpack_gossip(section: bytes, step: float, data: bytes) -> list[Gossip]:
+    agent, age, moving = section[0], section[1] >> 1, bool(section[1] & 1)
+    if not agent:
+        if any(section):
+            raise Refused(WRONG_FIELD, data)
+        return []
+    if agent > EXTENDED_SENDER_MAX or age == 0:
+        raise Refused(WRONG_FIELD, data)
+    word = int.from_bytes(section[2:], "little")
+    x, y, z = (signed(word >> 14 * axis, 14) * step for axis in range(3))
+    vx, vy, vz = (signed(word >> (42 + 10 * axis), 10) * VELOCITY_STEP for axis in range(3))
+    return [Gossip(agent, age, moving, (x, y, z), (vx, vy, vz))]

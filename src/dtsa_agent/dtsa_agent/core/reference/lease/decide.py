@@ -1,0 +1,82 @@
+"""Policy ``lease``: who sends in a slot, as one agent sees it (docs/protocol.md, "Who sends in slot T")."""
+
+from __future__ import annotations
+
+from ..arithmetic import mix64, share_of
+from ..frame_extended import OPEN
+from ..selection import Choice
+from .memory import NEVER, Memory
+
+CROWD = 8.0  # chance of an OPEN turn: 1 / ((1 + CROWD w) 2^a)
+_OPEN_DRAW = 0x4F50454E  # "OPEN": these draws are none of another policy's
+
+
+def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> Choice:
+    """Who is expected to send in a slot; if that is oneself, one sends.
+
+    :param memory: what the agent remembers.
+    :param self_index: its own number, id - 1.
+    :param slot: the slot that begins.
+    :param far_from_goal: it has something to say (eq:remaining_t_slots).
+    """
+    if not memory.started:
+        memory.start(slot)
+    memory.roll(slot)
+    watch_goal(memory, slot, far_from_goal)
+    memory.heard_now = False
+    memory.expected = -1
+    owner = memory.owner(slot)
+    lease = memory.leases.get(slot)
+    if lease is not None and lease.lessee == OPEN:
+        return Choice(self_index if takes_open(memory, self_index, slot) else -1, "open")
+    if lease is not None:
+        adopted = lease.issuer not in (0, owner + 1)
+        memory.expected = lease.lessee - 1
+        # A lease that I hear of while others may think me dead, or I them, may be one of two.
+        mine_but_quiet = memory.expected == self_index and memory.probation
+        return Choice(-1 if mine_but_quiet else memory.expected, "adopted" if adopted else "leased")
+    reason = "anchor" if memory.is_anchor(slot) else "own"
+    if owner == self_index:
+        if memory.probation and not memory.is_anchor(slot):
+            return Choice(-1, "probation")
+        return Choice(self_index, reason)
+    memory.expected = memory.scheduled(slot)
+    if memory.expected < 0:
+        reason = "probation" if memory.quiet[owner] else "absent"
+    return Choice(memory.expected, reason)
+
+
+def watch_goal(memory: Memory, slot: int, far_from_goal: bool) -> None:
+    """Notes since when the agent is idle, or that it wakes."""
+    if not far_from_goal:
+        if memory.idle_since == NEVER:
+            memory.idle_since = slot
+    elif memory.idle_since != NEVER:
+        memory.idle_since = NEVER
+        memory.woke = slot
+        memory.attempts = 0
+    memory.moving = far_from_goal
+
+
+def own_right_is_near(memory: Memory, self_index: int, slot: int) -> bool:
+    """Whether the agent may send by a right of its own within the next N / 2 slots."""
+    for turn in range(slot + 1, slot + memory.rules.agents // 2 + 1):
+        lease = memory.leases.get(turn)
+        if lease is not None and lease.lessee == self_index + 1:
+            return True
+        if memory.owner(turn) == self_index and (memory.is_anchor(turn) or (lease is None and not memory.probation)):
+            return True
+    return False
+
+
+def takes_open(memory: Memory, self_index: int, slot: int) -> bool:
+    """Whether a waking agent uses an OPEN turn: with the chance 1 / ((1 + 8 w) 2^a), a at most 5.
+
+    w agents woke lately; a frames of its own in OPEN turns were not known to be heard. So many that woke together get
+    out of each other's way.
+    """
+    if memory.woke == NEVER or own_right_is_near(memory, self_index, slot):
+        return False
+    chance = 1.0 / ((1.0 + CROWD * memory.wakers) * 2.0 ** min(memory.attempts, 5))
+    draw = mix64(memory.rules.key ^ mix64((slot << 16) + self_index + _OPEN_DRAW))
+    return share_of(draw) < chance

@@ -1,0 +1,150 @@
+"""What an agent remembers under policy ``lease``, and what that says about a turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ..frame_extended import OPEN
+from ..rules import Rules
+
+DEAF = 4  # more silent slots in a row than this, and an agent does not trust its ears
+MISSED = 4  # who missed so many expected turns gets no leases
+GONE = -(2**61)  # in ``heard``: said that it leaves
+NEVER = -1  # in ``heard``, ``woke``, ``idle_since``
+
+
+@dataclass(slots=True)
+class Lease:
+    """A turn that is given away."""
+
+    lessee: int  # id, or OPEN
+    issuer: int  # id of who gave it away, 0: known by a relay only
+
+
+@dataclass(slots=True)
+class Memory:
+    """What one agent remembers since it started; everything is forgotten when it restarts.
+
+    Agents are numbered from 0 in here, but for the ids in leases.
+    """
+
+    rules: Rules
+    started: bool = False
+    born: int = 0  # slot of the first decision
+    now: int = 0  # the present slot
+    leases: dict[int, Lease] = field(default_factory=dict)  # by turn, of turns to come
+    heard: list[int] = field(default_factory=list)  # last slot of which it is known that each lived; NEVER, GONE
+    missed: list[int] = field(default_factory=list)  # expected turns that each missed in a row
+    quiet: list[bool] = field(default_factory=list)  # in probation: sends in anchors only
+    moving: bool = False
+    idle_since: int = NEVER
+    woke: int = NEVER  # slot in which it woke or joined, and since when nobody is known to have heard it
+    attempts: int = 0  # frames in OPEN turns since then
+    wakers: float = 0.0  # w: about so many agents woke in the last N slots
+    silence: int = 0  # own silence: silent slots in a row
+    expected: int = -1  # who was expected in this slot, -1: nobody in particular
+    heard_now: bool = False  # something was heard in this slot
+    probation: bool = False
+    anchored: bool = False  # an own anchor is over since probation began
+    claimed: int = 0  # slot in which probation began or was last confirmed
+    leaving: bool = False  # said in this slot that it leaves
+
+    @property
+    def patience(self) -> int:
+        """Slots without a sign of life after which an agent is thought absent."""
+        return max(1000, 6 * self.rules.anchor_every * self.rules.agents)
+
+    @property
+    def window(self) -> int:
+        """Turns ahead, the present one included, that can be remembered: more than any lease reaches."""
+        return (self.rules.anchor_every + 2) * self.rules.agents
+
+    @property
+    def deaf(self) -> bool:
+        """More silence than can be by chance."""
+        return self.silence > DEAF
+
+    def owner(self, slot: int) -> int:
+        """Whose turn a slot is if nobody gave it away."""
+        return slot % self.rules.agents
+
+    def is_anchor(self, slot: int) -> bool:
+        """Whether a slot is its owner's whatever happens: (R + T mod N) mod M = 0."""
+        n = self.rules.agents
+        return (slot // n + slot % n) % self.rules.anchor_every == 0
+
+    def alive(self, k: int) -> bool:
+        """Whether an agent was heard of lately."""
+        return self.heard[k] >= 0 and self.now - self.heard[k] <= self.patience
+
+    def absent(self, k: int, slot: int) -> bool:
+        """Whether an agent is thought dead: no sign of life for long, or it said that it leaves."""
+        sign = self.born if self.heard[k] == NEVER else self.heard[k]
+        return slot - sign > self.patience
+
+    def scheduled(self, turn: int) -> int:
+        """Who is expected in a turn, -1: nobody in particular."""
+        lease = self.leases.get(turn)
+        if lease is not None:
+            return -1 if lease.lessee == OPEN else lease.lessee - 1
+        owner = self.owner(turn)
+        if self.absent(owner, turn) or (self.quiet[owner] and not self.is_anchor(turn)):
+            return -1
+        return owner
+
+    def note(self, turn: int, lessee: int, issuer: int) -> None:
+        """Takes note of a lease. An entry is never revoked; of two different ones, which adoption alone can cause, the
+
+        smaller id stays, so that all who know both agree.
+
+        :param turn: the slot that is given away.
+        :param lessee: id or OPEN.
+        :param issuer: id of who gave it away, 0: known by a relay only.
+        """
+        if not self.now < turn < self.now + self.window or self.is_anchor(turn):
+            return
+        there = self.leases.get(turn)
+        if there is None or lessee < there.lessee:
+            self.leases[turn] = Lease(lessee, issuer)
+        elif lessee == there.lessee and not there.issuer:
+            there.issuer = issuer
+
+    def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
+        """The turns that the lease bytes of a frame speak of, in order; the same for sender and receiver.
+
+        T + j N - i for j = 1 .. M, and within each j for i = c_s .. 0; anchors are left out, and of the sender's own
+        turns (i = 0) those from its next anchor on.
+
+        :param slot: T, the slot of the frame, the sender's own turn.
+        :param c_s: number of agents before the sender that it gives turns away for.
+        :param room: at most so many.
+        """
+        turns, own = [], True
+        for j in range(1, self.rules.anchor_every + 1):
+            for i in range(c_s, -1, -1):
+                turn = slot + j * self.rules.agents - i
+                if i == 0 and self.is_anchor(turn):
+                    own = False
+                if not self.is_anchor(turn) and (i > 0 or own):
+                    turns.append(turn)
+        return turns[:room]
+
+    def start(self, slot: int) -> None:
+        """The first slot. Whoever begins with slot 0 begins with everybody else; whoever comes later may have lived
+
+        before, and may have given turns away that it knows nothing of.
+        """
+        n = self.rules.agents
+        self.started = True
+        self.born = self.now = self.claimed = slot
+        self.heard, self.missed, self.quiet = [NEVER] * n, [0] * n, [False] * n
+        if slot > 0:
+            self.probation = True
+            self.woke = slot
+
+    def roll(self, slot: int) -> None:
+        """A slot begins: earlier turns are over, and the estimate of how many woke falls by 1 / N."""
+        for turn in [turn for turn in self.leases if turn < slot]:
+            del self.leases[turn]
+        self.now = slot
+        self.wakers -= self.wakers / self.rules.agents

@@ -1,0 +1,44 @@
+"""The settings that all agents of a swarm share, as the protocol sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+PAPER, PAPER_INTENT, EXTENDED = "paper", "paper-intent", "extended"  # profiles of frames
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What all agents of one swarm must agree on."""
+
+    agents: int  # N
+    slot_s: float  # t_s, s
+    steps: int = 1  # control instants in a slot
+    policy: str = "dtsa"
+    estimator: str = "linear"
+    tau: float = 0.25  # s, time constant of the vehicles (estimator intent)
+    # dtsa
+    selection: str = "candidates"
+    epsilon: float = 0.5  # eq:pfs
+    age_cap: float = 1.5
+    boot_round: bool = True
+    return_every: int = 20
+    # frames
+    profile: str = PAPER
+    position_step: float = 0.002  # m
+    r_min: float = 0.3  # m, eq:remaining_t_slots
+    c_r: int = 1  # C, eq:remaining_t_slots
+    targets_known: bool = True  # who has arrived is taken to stand at its target
+    gossip: bool = True
+    key: int = 0  # of the draws
+    # lease
+    anchor_every: int = 5  # M
+    open_every: int = 11  # S, has no factor in common with N; 0: none
+    adoption: bool = True
+    depth_rate: float = 0.1  # c
+    lease_share: float = 1.0
+
+    @property
+    def dt(self) -> float:
+        """Control period, s."""
+        return self.slot_s / self.steps
