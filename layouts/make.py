@@ -14,16 +14,14 @@ from typing import Any
 from xml.etree import ElementTree
 
 HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent / "src" / "dtsa_bench"))
+
+from dtsa_bench.figures.palette import AGENT_COLOURS, COLLIDED, SERIES, agent_colour, rgb  # noqa: E402
+
 AGENTS = 12
-COLOURS = ("#2f74b5", "#d9772b", "#3b9468", "#a4509a", "#b38f17", "#3a97a3", "#cf3f4c", "#7d78c6", "#7a9a3a", "#a3674a")
 PAIRS = 5  # PlotJuggler: distances from cf1 to so many others
 LEGEND = 145  # pixels, width of Foxglove's legends
 SCRIPTS = ("swarm_ages", "swarm_distances", "swarm_odometry")  # one a panel: a second one may miss part of an output
-
-
-def colour(number: int) -> str:
-    """A colour for the n-th curve."""
-    return COLOURS[number % len(COLOURS)]
 
 
 # ---- Foxglove and Lichtblick ----
@@ -96,9 +94,12 @@ def scene(agents: int) -> dict[str, Any]:
 
 
 def user_script(name: str, agents: int) -> str:
-    """A script of the layout, with the odometry of all agents instead of the first one's."""
+    """A script of the layout, with the odometry of all agents instead of the first one's, and their colours."""
     source = (HERE / f"{name}.ts").read_text(encoding="utf-8")
     topics = ", ".join(f'"/cf{k}/odom"' for k in range(1, agents + 1))
+    colours = [[round(part, 3) for part in rgb(colour)] for colour in AGENT_COLOURS]
+    placeholder = "COLOURS = [[0.25, 0.6, 0.45]]; // by agent; make.py puts the palette in"
+    source = source.replace(placeholder, f"COLOURS = {json.dumps(colours)}; // by agent")
     return source.replace('inputs = ["/cf1/odom"]', f"inputs = [{topics}]")
 
 
@@ -110,18 +111,18 @@ def foxglove(agents: int = AGENTS) -> dict[str, Any]:
     ages_of, distances_of = "/studio_script/swarm_ages", "/studio_script/swarm_distances"
     place = "pose.pose.position"
     heights = [
-        {"value": f"/cf{k}/odom.{place}.z", "label": f"cf{k}", "color": colour(k - 1)} for k in range(1, agents + 1)
+        {"value": f"/cf{k}/odom.{place}.z", "label": f"cf{k}", "color": agent_colour(k)} for k in range(1, agents + 1)
     ]
     ages = [
-        {"value": f"{ages_of}.age_mean", "label": "mean", "color": COLOURS[0]},
-        {"value": f"{ages_of}.age_max", "label": "oldest", "color": COLOURS[1]},
+        {"value": f"{ages_of}.age_mean", "label": "mean", "color": SERIES[0]},
+        {"value": f"{ages_of}.age_max", "label": "oldest", "color": SERIES[1]},
     ]
     distances = [
-        {"value": f"{distances_of}.distance_min", "label": "closest pair", "color": COLOURS[0]},
-        {"value": "0.2", "label": "crash", "color": COLOURS[6]},
+        {"value": f"{distances_of}.distance_min", "label": "closest pair", "color": SERIES[0]},
+        {"value": "0.2", "label": "crash", "color": COLLIDED},
     ]
     dots = {"showLine": False, "lineSize": 2}
-    senders = [{"value": "/swarm/reception.sender[:]", "label": "sender", "color": COLOURS[0], **dots}]
+    senders = [{"value": "/swarm/reception.sender[:]", "label": "sender", "color": SERIES[0], **dots}]
     outcome = {"value": "/swarm/reception.outcome", "label": "slots", "timestampMethod": "receiveTime"}
     slots = "Slots"
     return {
@@ -206,19 +207,19 @@ def plotjuggler(agents: int = AGENTS) -> str:
     tabs = ElementTree.SubElement(root, "tabbed_widget", name="Main Window", parent="main_window")
     numbers = range(1, agents + 1)
     outcome, sender, place = "/swarm/reception/outcome", "/swarm/reception/sender[0]", "odom/pose/pose/position"
-    ages = [(f"age of cf{k}", colour(k - 1)) for k in numbers]
+    ages = [(f"age of cf{k}", agent_colour(k)) for k in numbers]
     slots: list[Panel] = [
-        ("Slots: 0 idle, 1 success, 2 collision", [(outcome, COLOURS[0])], "StepsInv", {"min": "-0.1", "max": "2.1"}),
-        ("Who sends (first of the senders)", [(sender, COLOURS[1])], "Dots", {"min": "0"}),
+        ("Slots: 0 idle, 1 success, 2 collision", [(outcome, SERIES[0])], "StepsInv", {"min": "-0.1", "max": "2.1"}),
+        ("Who sends (first of the senders)", [(sender, SERIES[1])], "Dots", {"min": "0"}),
         ("Age (s)", ages, "Lines", {"min": "0"}),
     ]
     _rows(_tab(tabs, "slots"), slots, [0.2, 0.3, 0.5])
     others = range(2, min(agents, PAIRS + 1) + 1)
-    distances = [(f"distance cf1 cf{k}", colour(k - 1)) for k in others]
+    distances = [(f"distance cf1 cf{k}", agent_colour(k)) for k in others]
     flight: list[Panel] = [
         ("Distance from cf1 (m)", distances, "Lines", {"min": "0"}),
         *(
-            (f"Odometry: {axis} (m)", [(f"/cf{k}/{place}/{axis}", colour(k - 1)) for k in numbers], "Lines", {})
+            (f"Odometry: {axis} (m)", [(f"/cf{k}/{place}/{axis}", agent_colour(k)) for k in numbers], "Lines", {})
             for axis in "zxy"
         ),
     ]

@@ -5,6 +5,7 @@ export const inputs = ["/cf1/odom"];
 export const output = "/studio_script/swarm_odometry";
 
 const AHEAD = 0.5; // s, an arrow ends where its agent would be then
+const COLOURS = [[0.25, 0.6, 0.45]]; // by agent; make.py puts the palette in
 const STILL = 0.02; // m/s, below that an agent has no arrow
 
 export default function script(event: Input<"/cf1/odom">): Message<"foxglove.SceneUpdate"> {
@@ -23,6 +24,7 @@ export default function script(event: Input<"/cf1/odom">): Message<"foxglove.Sce
   const orientation =
     size > 1e-6 * speed ? { x: 0, y: -z / size, z: y / size, w: (speed + x) / size } : { x: 0, y: 0, z: 1, w: 0 };
   const length = AHEAD * speed;
+  const [r, g, b] = COLOURS[(parseInt(id.slice(2)) - 1) % COLOURS.length]!;
   const head = Math.min(0.1, length / 2);
   scene.entities.push({
     timestamp,
@@ -38,7 +40,7 @@ export default function script(event: Input<"/cf1/odom">): Message<"foxglove.Sce
         shaft_diameter: 0.03,
         head_length: head,
         head_diameter: 0.08,
-        color: { r: 0.25, g: 0.6, b: 0.45, a: 1 },
+        color: { r: r!, g: g!, b: b!, a: 1 },
       },
     ],
     cubes: [],

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.core.registry import POLICIES
-from dtsa_bench.figures.palette import agent_colour
+from dtsa_bench.figures import palette
 from dtsa_bench.run_config import RunConfig
 
 Array = NDArray[np.float64]
 
-INK, MUTED, RULE, HOVER = "#1f2933", "#66727f", "#dfe4ea", "#aab4be"
+INK, MUTED, RULE = "#1f2933", "#66727f", "#dfe4ea"
+_CRASH = palette.COLLIDED
+_SHAPES = {"circle": "o", "diamond": "D", "square": "s", "triangle": "^"}
 _LABELLED = 24  # agents that get their ids written
 _DPI = 160
 _FONT = {"font.family": "DejaVu Sans", "font.size": 9}
@@ -35,35 +37,67 @@ def paint(axes: Axes, scenario: Scenario, positions: Array, crash: Sequence[int]
     """
     count = positions.shape[2]
     thin = float(np.clip(30.0 / max(count, 1), 0.55, 1.9))
-    shade = [agent_colour(k + 1) for k in range(count)]
     extent = float(np.abs(scenario.start[:2]).max()) if count else 1.0
     for k in np.flatnonzero(~scenario.moving):
-        axes.plot(*positions[-1, :2, k], "o", color=HOVER, markersize=5 + 2 * thin, markeredgecolor="white", zorder=2)
+        axes.plot(
+            *positions[-1, :2, k],
+            "o",
+            color=palette.HOVERING,
+            markersize=5 + 2 * thin,
+            markeredgecolor="white",
+            zorder=2,
+        )
     movers = np.flatnonzero(scenario.moving)
     for k in movers:
-        path = positions[:, :2, k]
+        path, shade, dash = positions[:, :2, k], palette.agent_colour(k + 1), palette.DASHES[palette.agent_turn(k + 1)]
         axes.plot(path[:, 0], path[:, 1], color="white", linewidth=thin + 1.4, solid_capstyle="round", zorder=3)
-        axes.plot(path[:, 0], path[:, 1], color=shade[k], linewidth=thin, solid_capstyle="round", zorder=3)
+        axes.plot(
+            path[:, 0], path[:, 1], color=shade, linewidth=thin, solid_capstyle="round", zorder=3,
+            linestyle=(0, dash) if dash else "-",
+        )  # fmt: skip
     size = 3.2 + 2.2 * thin
     for k in movers:
-        axes.plot(*scenario.start[:2, k], "o", mfc="white", mec=shade[k], mew=1.3, markersize=size, zorder=4)
-        axes.plot(*positions[-1, :2, k], "o", color=shade[k], mec="white", mew=0.7, markersize=size, zorder=5)
+        shade, shape = palette.agent_colour(k + 1), _SHAPES[palette.SHAPES[palette.agent_turn(k + 1)]]
+        axes.plot(*scenario.start[:2, k], shape, mfc="white", mec=shade, mew=1.3, markersize=size, zorder=4)
+        axes.plot(*positions[-1, :2, k], shape, color=shade, mec=INK, mew=0.5, markersize=size, zorder=5)
     if count <= _LABELLED:
         _write_ids(axes, scenario, extent)
     if crash:
-        where = positions[-1][:2, [crash[0] - 1, crash[1] - 1]].mean(axis=1)
-        axes.plot(*where, "o", mfc="none", mec="#c81e1e", mew=1.8, markersize=22, zorder=7)
-        axes.annotate(
-            "crash",
-            where,
-            xytext=(15, 12),
-            textcoords="offset points",
-            color="#c81e1e",
-            fontsize=9,
-            fontweight="bold",
-            zorder=7,
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
-        )
+        _mark_crash(axes, np.concatenate((scenario.start[:2], positions[-1, :2]), axis=1), positions[-1, :2], crash)
+
+
+def _mark_crash(axes: Axes, dots: Array, ends: Array, crash: Sequence[int]) -> None:
+    """A ring around the two that crashed, and the word where no dot is, with a line to the ring.
+
+    :param dots: (2, M) m, frame map: all that must stay visible.
+    :param ends: (2, N) m, frame map: where the agents are at the end.
+    :param crash: ids of the two.
+    """
+    where = ends[:, [crash[0] - 1, crash[1] - 1]].mean(axis=1)
+    reach = max(float(np.abs(dots).max()), 0.5)
+    turns = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    circle = np.array([np.cos(turns), np.sin(turns)])
+    places = where[:, None] + np.concatenate([share * reach * circle for share in (0.3, 0.45, 0.6)], axis=1)
+    inside = np.abs(places).max(axis=0) < 0.95 * reach
+    apart = places[:, :, None] - dots[:, None, :]
+    apart[0] /= 2.0  # a word is wider than high
+    gaps = np.sqrt((apart**2).sum(axis=0)).min(axis=1)
+    text = places[:, int(np.argmax(np.where(inside, gaps, -1.0)))]
+    axes.plot(*where, "o", mfc="none", mec="white", mew=4.0, markersize=22, zorder=7)
+    axes.plot(*where, "o", mfc="none", mec=_CRASH, mew=1.8, markersize=22, zorder=8)
+    axes.annotate(
+        f"crash {crash[0]}\u2013{crash[1]}",
+        where,
+        xytext=(float(text[0]), float(text[1])),
+        ha="center",
+        va="center",
+        color=_CRASH,
+        fontsize=9,
+        fontweight="bold",
+        zorder=8,
+        arrowprops={"arrowstyle": "-", "color": _CRASH, "linewidth": 1.2, "shrinkA": 1, "shrinkB": 11},
+        bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": _CRASH, "linewidth": 0.8},
+    )
 
 
 def _write_ids(axes: Axes, scenario: Scenario, extent: float) -> None:

@@ -11,7 +11,19 @@ from bag_helpers import SECOND, cdr, stamp, typestore
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_bench.bag.cdr import COLOURS, CYLINDER, SPHERE, TEXT, MarkerPacker, OdometryPacker, odometry_cdr
+from dtsa_bench.bag.cdr import (
+    COLLIDED,
+    CYLINDER,
+    NAMES,
+    QUIET,
+    SENDING,
+    SPHERE,
+    TEXT,
+    MarkerPacker,
+    OdometryPacker,
+    odometry_cdr,
+)
+from dtsa_bench.figures import palette
 
 COORDINATES = st.floats(-1e6, 1e6, allow_nan=False)
 # A millimetre where the simulation is exact; nothing is claimed about attitude and body rates, which are not modelled.
@@ -79,7 +91,13 @@ def test_markers_decode_to_spheres_names_and_targets(names: list[str], targets: 
         assert (ball.type, name.type) == (SPHERE, TEXT)
         assert [where.x, where.y, where.z] == position[:, k].tolist()
         assert math.isclose(name.pose.position.z, position[2, k] + 0.15)
-        assert [ball.color.r, ball.color.g, ball.color.b, ball.color.a] == COLOURS[state[k]].tolist()
+        colour = ball.color
+        assert [colour.r, colour.g, colour.b] == pytest.approx(palette.rgb(palette.agent_colour(k + 1)), abs=1e-6)
+        assert colour.a == pytest.approx(0.45 if state[k] == QUIET else 1.0)
+        sends = state[k] in (SENDING, COLLIDED)
+        assert (ball.scale.x, ball.scale.y, ball.scale.z) == pytest.approx((0.32 if sends else 0.2,) * 3)
+        assert [name.color.r, name.color.g, name.color.b, name.color.a] == NAMES[state[k]].tolist()
+        assert name.scale.z == pytest.approx(0.12)
         assert name.text == names[k]
     for k, disc in enumerate(markers[2 * n :]):
         where = disc.pose.position

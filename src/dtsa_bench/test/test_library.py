@@ -174,6 +174,8 @@ def test_plots_are_figures_of_what_they_are_given(flight: dtsa.Flight, swept: dt
     ):
         assert isinstance(figure, Figure)
         assert figure.axes
+    matrix = dtsa.plot_matrix(swept, rows="scheme", columns="loss", y="crashed").axes[0]
+    assert (matrix.get_ylabel(), matrix.get_xlabel()) == ("scheme", "loss")
     with pytest.raises(dtsa.ConfigError, match="x: got 'moving'; allowed: one of the axes loss, scheme"):
         dtsa.plot_bars(swept, x="moving", y="crashed")
     with pytest.raises(dtsa.ConfigError, match="y: got 'height'"):

@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 from flight_helpers import flight_bag
 
+from dtsa_agent.core import REASONS
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.bag.errors import UnusableBag
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.recover import recover
@@ -169,6 +171,33 @@ def test_ages_follow_from_who_was_heard(data: dict[str, Any]) -> None:
     assert sum(row["sent"] for row in rows) == clean["frames"]
 
 
+@pytest.fixture(scope="module")
+def crash(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """A flight in which several pairs crash, and which goes on."""
+    directory = tmp_path_factory.mktemp("crash") / "crash"
+    settings = {"agents": 16, "policy": "tdma", "estimator": "hold", "slot_ms": 20.0, "seed": 1003}
+    flight_bag(directory, slots=120, **settings)
+    return run_data(directory), directory
+
+
+def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], Path]) -> None:
+    data, directory = crash
+    found = data["crashes"]
+    assert found[0]["ids"] == data["summary"]["collided_pair"]
+    assert [one["time_s"] for one in found] == sorted(one["time_s"] for one in found)
+    motion = load_run(directory).motion
+    for one in found:
+        a, b = (motion.position[:, :, number - 1] for number in one["ids"])
+        near = np.flatnonzero(np.linalg.norm(a - b, axis=1) < 0.2)
+        assert (motion.time_ns[near[0]] - 1_000_000_000) / 1e9 == pytest.approx(one["time_s"], abs=1e-3)
+        assert one["place"] == pytest.approx(((a + b) / 2)[near[0]], abs=1e-3)
+    assert len({tuple(one["ids"]) for one in found}) == len(found) > 1
+
+
+def test_flights_without_a_crash_have_none(data: dict[str, Any]) -> None:
+    assert data["clean"]["crashes"] == []
+
+
 class Outside(HTMLParser):
     """Finds everything that a browser would fetch."""
 
@@ -199,7 +228,9 @@ def test_data_in_the_page_is_the_data(data: dict[str, Any]) -> None:
     page = render([data["clean"]])
     match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
     assert match is not None
-    assert json.loads(match[1]) == {"runs": [json.loads(json.dumps(data["clean"]))]}
+    content = json.loads(match[1])
+    assert content["runs"] == [json.loads(json.dumps(data["clean"]))]
+    assert content["reasons"].keys() == set(REASONS)
 
 
 def hostile(data: dict[str, Any]) -> dict[str, Any]:
@@ -304,6 +335,35 @@ def test_chromium_draws_every_part(data: dict[str, Any], tmp_path: Path, names: 
     assert result.stdout.count('<svg class="plot"') == 7 * len(names)
     assert result.stdout.count("<canvas") == 3 * len(names)
     assert "NaN" not in re.sub(r"<script.*?</script>", "", result.stdout, flags=re.S)
+
+
+PLAY = """
+const told = [];
+clock.set(0.5); clock.toggle(); clock.toggle(); told.push(clock.time); clock.toggle();
+setTimeout(() => {
+  clock.toggle(); const stood = clock.time; clock.toggle(); clock.toggle();
+  told.push(stood > 0.5, clock.time === stood);
+  clock.set(DURATION); told.push(document.querySelector(".play").textContent);
+  clock.toggle(); told.push(clock.time); clock.toggle();
+  document.body.append(el("div", {}, "told " + JSON.stringify(told)));
+}, 400);
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_chromium_plays_on_from_where_it_stood_and_marks_crashes(
+    crash: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    data, _ = crash
+    page = tmp_path / "report.html"
+    page.write_text(render([data]).replace("</body>", f"<script>{PLAY}</script></body>"), encoding="utf-8")
+    result = drawn(page, tmp_path / "profile", "--dump-dom")
+    assert complaints(result.stderr) == []
+    assert 'told [0.5,true,true,"↻",0]' in result.stdout
+    assert "A cross in a ring is a crash" in result.stdout
+    assert result.stdout.count('class="mark"') == len(data["crashes"])
+    for name in data["sent_for"]:
+        assert REASON_TEXTS[name] in result.stdout  # explained where they appear
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")

@@ -20,6 +20,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_bench.batch import cluster as dask
 from dtsa_bench.batch import journal, pool
 from dtsa_bench.cli import main
+from dtsa_bench.figures.style import INK
 from dtsa_bench.sweep import spec
 from dtsa_bench.sweep.aggregate import Table, collected
 from dtsa_bench.sweep.work import WORK
@@ -232,6 +233,9 @@ def test_the_command_writes_everything(tmp_path: Path, capsys: pytest.CaptureFix
     assert content["groups"][0]["crashed"]["of"] == 2
     assert content["sweep"]["base"]["timeout_s"] == 0.4
     assert "<svg" in (out / "report.html").read_text()
+    # In the colours of the page, so that a dark one has light lines; files of their own keep theirs.
+    assert "var(--ink)" in (out / "report.html").read_text()
+    assert INK not in (out / "report.html").read_text().split("<figure>", 1)[1]
     assert (out / "figures" / "matrix.png").read_bytes()[:4] == b"\x89PNG"
 
 

@@ -267,7 +267,7 @@ class ReferenceSwarm(AbstractSwarm):
         }
 
     def reason_name(self, local_index: int) -> str:
-        return REASONS[self.reason[local_index]]
+        return REASONS[int(self.reason[local_index])]
 
     @property
     def malformed(self) -> int:

@@ -225,10 +225,29 @@ ESTIMATORS = Registry(
 
 SELECTIONS = ("candidates", "pairwise")  # readings of the selection function
 PROFILES = ("paper", "paper-intent", "extended")  # of frames
-REASONS = (
-    "nobody", "tdma", "boot", "age-cap", "priority", "tie", "oldest", "return", "random", "plugin",
-    "own", "anchor", "leased", "adopted", "open", "absent", "probation",
-)  # fmt: skip
+# Why an agent takes whom it takes for the sender of a slot, and what that means.
+REASON_TEXTS: Mapping[str, str] = MappingProxyType(
+    {
+        "nobody": "nobody moves any more, so nobody has a claim to the slot",
+        "tdma": "the slot's number says whose turn it is: slot modulo N",
+        "boot": "first round: every agent sends once, in the order of ids, so that all know all",
+        "age-cap": "was silent for longer than the age cap allows, whatever its priority",
+        "priority": "has the largest priority g, and no other comes within epsilon of it",
+        "tie": "several priorities are within epsilon of the largest: of these, the longest silent",
+        "oldest": "the longest silent of those that move, because priorities say nothing here or are not used",
+        "return": "slot kept for agents that have arrived, so that they can say that they move again",
+        "random": "a draw decides whether the agent sends",
+        "plugin": "a policy from another package decided",
+        "own": "the owner uses its own turn",
+        "anchor": "the owner's turn that is never given away, so that all hear of it now and then",
+        "leased": "the owner gave this turn to an agent that has more to say",
+        "adopted": "the owner is thought dead; the next one alive gave its turn away",
+        "open": "turn for whoever has just woken or joined; nobody in particular is expected",
+        "absent": "the owner is thought dead, and nobody was given its turn",
+        "probation": "the owner is new or was away, and may send at its anchors only",
+    }
+)
+REASONS: tuple[str, ...] = tuple(REASON_TEXTS)
 
 
 def check_kernel(kind: str, names: tuple[str, ...]) -> None:

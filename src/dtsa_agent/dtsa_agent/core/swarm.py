@@ -152,7 +152,7 @@ class Swarm(AbstractSwarm):
         return self.kernel.lease_status(local_index)
 
     def reason_name(self, local_index: int) -> str:
-        return REASONS[self.reason[local_index]]
+        return REASONS[int(self.reason[local_index])]
 
     @property
     def malformed(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.ros.common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
+from dtsa_bench.figures import palette
 
 HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian
 STAMP = struct.Struct("<iI")
@@ -22,11 +23,14 @@ SECOND = 1_000_000_000
 
 # visualization_msgs/Marker
 SPHERE, CYLINDER, TEXT = 2, 3, 9
-# How the spheres are coloured: RGBA by what the agent's radio does.
+SIZE = 7  # numbers of a pose, which stand before the scale
+# What an agent's radio does in a slot.
 QUIET, WAITING, SENDING, COLLIDED = 0, 1, 2, 3
-COLOURS = np.array(
-    [(0.58, 0.62, 0.68, 1.0), (0.22, 0.53, 0.90, 1.0), (0.95, 0.65, 0.10, 1.0), (0.86, 0.22, 0.27, 1.0)],
-    dtype="<f4",
+# A sphere has its agent's colour; who sends is larger, and its name has the colour of what became of the frame.
+OPACITY = np.array([0.45, 1.0, 1.0, 1.0], dtype="<f4")
+SWELLING = np.array([1.0, 1.0, 1.6, 1.6])
+NAMES = np.array(
+    [(*palette.rgb(colour), 1.0) for colour in ("#737f94", "#737f94", palette.SENT, palette.COLLIDED)], dtype="<f4"
 )
 
 
@@ -139,8 +143,10 @@ class MarkerPacker:
         self._i4 = self._f4.view("<i4")
         self._stamps = np.array(stamps) // 4
         self._places = (np.array(places).reshape(kinds, self._n)[:, :, None] // 8) + np.arange(3)
-        self._colours = np.array(colours[: self._n])[:, None] // 4 + np.arange(4)
-        self._lift = 0.75 * diameter
+        tints = np.array(colours).reshape(kinds, self._n)[:, :, None] // 4 + np.arange(4)
+        self._opacity, self._name_tints = tints[0][:, 3], tints[1]
+        self._sizes = self._places[0][:, :1] + SIZE + np.arange(3)
+        self._diameter, self._lift = diameter, 0.75 * diameter
 
     def pack(
         self,
@@ -153,7 +159,7 @@ class MarkerPacker:
 
         :param stamp_ns: ns, time of the states.
         :param position: m, (3, n), in the frame.
-        :param state: (n,), QUIET, WAITING, SENDING or COLLIDED: gives each sphere its colour.
+        :param state: (n,), QUIET (pale), WAITING, SENDING or COLLIDED.
         :param target: m, (3, n); needed if the targets are drawn.
         """
         seconds, nanoseconds = divmod(stamp_ns, SECOND)
@@ -164,7 +170,9 @@ class MarkerPacker:
         self._f8[self._places[1][:, 2]] += self._lift
         if len(self._places) > 2 and target is not None:
             self._f8[self._places[2]] = target.T
-        self._f4[self._colours] = COLOURS[state]
+        self._f8[self._sizes] = (self._diameter * SWELLING[state])[:, None]
+        self._f4[self._opacity] = OPACITY[state]
+        self._f4[self._name_tints] = NAMES[state]
         return bytes(self._data)
 
     @staticmethod
@@ -173,7 +181,8 @@ class MarkerPacker:
     ) -> tuple[int, int, int]:
         shape = (SPHERE, TEXT, CYLINDER)[kind]
         scale = ((diameter,) * 3, (0.0, 0.0, 0.6 * diameter), (diameter, diameter, 0.02))[kind]
-        colour = ((1.0,) * 4, (0.45, 0.50, 0.58, 1.0), (0.45, 0.50, 0.58, 0.35))[kind]
+        own = palette.rgb(palette.agent_colour(number))
+        colour = ((*own, 1.0), (0.45, 0.50, 0.58, 1.0), (*own, 0.35))[kind]
         stamp = message.stamp(frame)
         message.text(("agent", "name", "target")[kind])
         message.number("i", number, shape, 0)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from ..sweep.aggregate import CRASHED, MEASURES, Group, Table
-from .style import GRID, INK, MARKERS, QUIET, colours, legend_above, panels
+from .style import GRID, INK, MARKERS, ON_DARK, ON_LIGHT, PAPER, QUIET, colours, legend_above, panels
 
 Spec = Mapping[str, Any]
 _GOOD_TO_BAD = LinearSegmentedColormap.from_list("good-bad", ["#e8f4ee", "#f6e3b4", "#dd8a6f", "#a8402b"])
@@ -162,8 +162,8 @@ def matrix(table: Table, spec: Spec) -> Figure:
     wide = max(0.95, 0.095 * max(len(str(column)) for column in columns))
     figure, axes = panels(
         len(facets),
-        width=1.3 + 0.075 * longest + wide * len(columns),
-        height=0.9 + 0.36 * len(rows),
+        width=1.5 + 0.075 * longest + wide * len(columns),
+        height=1.05 + 0.36 * len(rows),
         columns=2,
     )
     finite = [value for g in table.groups if g.rows and math.isfinite(value := point(g, measure)[0])]
@@ -180,7 +180,7 @@ def matrix(table: Table, spec: Spec) -> Figure:
             values[i, j] = point(groups[0], measure)[0]
             dark = (values[i, j] - bottom) / ((top - bottom) or 1.0) > 0.62
             text = _cell_text(groups[0], measure)
-            axis.text(j, i, text, ha="center", va="center", fontsize=8.5, color="white" if dark else INK)
+            axis.text(j, i, text, ha="center", va="center", fontsize=8.5, color=ON_DARK if dark else ON_LIGHT)
         axis.pcolormesh(
             np.arange(len(columns) + 1) - 0.5,
             np.arange(len(rows) + 1) - 0.5,
@@ -188,16 +188,16 @@ def matrix(table: Table, spec: Spec) -> Figure:
             cmap=_GOOD_TO_BAD if measure == CRASHED else _NEUTRAL,
             vmin=bottom,
             vmax=top or 1.0,
-            edgecolors="white",
+            edgecolors=PAPER,
             linewidth=2,
         )
         title = label_of(measure)
         axis.set_title(title if facet is None else f"{title}: {_facet(spec['facets'], facet)}")
-        _dress_matrix(axis, rows, columns, AXIS_LABELS.get(spec["columns"], ""))
+        _dress_matrix(axis, rows, columns, spec)
     return figure
 
 
-def _dress_matrix(axis: Axes, rows: list[Any], columns: list[Any], label: str) -> None:
+def _dress_matrix(axis: Axes, rows: list[Any], columns: list[Any], spec: Spec) -> None:
     axis.invert_yaxis()
     axis.set_xticks(range(len(columns)), [str(column) for column in columns])
     axis.set_yticks(range(len(rows)), [str(row) for row in rows])
@@ -206,7 +206,8 @@ def _dress_matrix(axis: Axes, rows: list[Any], columns: list[Any], label: str) -
     axis.set_facecolor(GRID)
     for side in ("left", "bottom"):
         axis.spines[side].set_visible(False)
-    axis.set_xlabel(label)
+    axis.set_xlabel(AXIS_LABELS.get(spec["columns"]) or spec["columns"])
+    axis.set_ylabel(AXIS_LABELS.get(spec["rows"]) or spec["rows"])
 
 
 def _cell_text(group: Group, measure: str) -> str:

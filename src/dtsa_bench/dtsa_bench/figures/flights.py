@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from ..simulate import Flight, simulate
 from ..sweep.aggregate import Table
+from . import palette
 from .style import CYCLE, INK, QUIET, legend_above, panels
 
 Spec = Mapping[str, Any]
-TRUE, ESTIMATED, RECEIVED = "#2a9d77", INK, "#e0a526"
+TRUE, ESTIMATED, RECEIVED = palette.SERIES[2], INK, palette.SERIES[4]
 
 
 def _flights(table: Table, spec: Spec) -> list[tuple[str, Flight]]:
@@ -51,7 +52,7 @@ def trajectories(table: Table, spec: Spec) -> Figure:
 
 
 def draw_paths(axis: Axes, path: NDArray[np.float64], moving: NDArray[np.bool_], start: NDArray[np.float64]) -> None:
-    """Paths of the movers from above; who hovers is a grey dot.
+    """Paths of the movers from above, in the agents' colours; who hovers is a grey dot.
 
     :param axis: where.
     :param path: (T, 3, N) m, frame map; not a number where a position is not known.
@@ -60,9 +61,9 @@ def draw_paths(axis: Axes, path: NDArray[np.float64], moving: NDArray[np.bool_],
     """
     hovering = np.flatnonzero(~moving)
     axis.plot(*start[:2, hovering], "o", color=QUIET, alpha=0.45, markersize=6, markeredgewidth=0)
-    for number, k in enumerate(np.flatnonzero(moving)):
-        shade = CYCLE[number % len(CYCLE)]
-        axis.plot(path[:, 0, k], path[:, 1, k], color=shade)
+    for k in np.flatnonzero(moving).tolist():
+        shade, dash = palette.agent_colour(k + 1), palette.DASHES[palette.agent_turn(k + 1)]
+        axis.plot(path[:, 0, k], path[:, 1, k], color=shade, linestyle=(0, dash) if dash else "-")
         axis.plot(*path[0, :2, k], "o", color=shade, markersize=6)
         axis.plot(*path[-1, :2, k], "x", color=shade, markersize=7, markeredgewidth=2)
     axis.set_aspect("equal", "datalim")

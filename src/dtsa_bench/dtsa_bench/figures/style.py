@@ -13,14 +13,20 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from . import palette
+
 INK, QUIET, GRID = "#1d2733", "#5b6774", "#dfe4ea"
-# Colours that stay apart for colour-blind readers and in grey print, in the order in which series get them.
-CYCLE = ("#c8553d", "#3d6fa8", "#2a9d77", "#e0a526", "#7a5ba6", "#6b7785", "#b0578d")
+PAPER = "#ffffff"
+# Text on coloured cells, which keep their colours on a dark page.
+ON_LIGHT, ON_DARK = "#1c2632", "#fdfdfd"
+_BLUE, _RED, _GREEN, _PINK, _AMBER, _SKY = palette.SERIES
+# In the order in which series get them.
+CYCLE = (_RED, _BLUE, _GREEN, _AMBER, _PINK, _SKY, "#6b7785")
 # Schemes have the same colour in every figure.
 COLOURS = {
-    "TDMA, hold": "#c8553d", "DTSA, hold": "#e59a7f", "TDMA, linear": "#3d6fa8", "DTSA, linear": "#2a9d77",
-    "TDMA, intent": "#7fa8d6", "age, linear": "#e0a526", "oracle": "#6b7785", "lease": "#7a5ba6",
-    "tdma": "#3d6fa8", "dtsa": "#2a9d77", "age": "#e0a526", "aloha": "#b0578d",
+    "TDMA, hold": _RED, "DTSA, hold": _AMBER, "TDMA, linear": _BLUE, "DTSA, linear": _GREEN,
+    "TDMA, intent": _SKY, "age, linear": _PINK, "oracle": "#6b7785", "lease": _AMBER,
+    "tdma": _BLUE, "dtsa": _GREEN, "age": _PINK, "aloha": _RED,
 }  # fmt: skip
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 
@@ -122,3 +128,10 @@ def unique_ids(svg: str, prefix: str) -> str:
     svg = re.sub(r'\bid="', f'id="{prefix}-', svg)
     svg = re.sub(r'href="#', f'href="#{prefix}-', svg)
     return re.sub(r"url\(#", f"url(#{prefix}-", svg)
+
+
+def themed(svg: str) -> str:
+    """The SVG with the page's own colours for paper, ink and grid, so that it can be read in the dark, too."""
+    for colour, variable in ((PAPER, "paper"), (INK, "ink"), (QUIET, "quiet"), (GRID, "line")):
+        svg = svg.replace(f": {colour}", f": var(--{variable})")
+    return svg.replace("'DejaVu Sans'", "'DejaVu Sans', Verdana, sans-serif")

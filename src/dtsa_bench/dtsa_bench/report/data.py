@@ -20,6 +20,7 @@ from dtsa_bench.report.ages import Ages, follow_run
 BINS = 400  # steps of the charts over time
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
 SCENE_VALUES = 600_000  # most numbers in the replay: longer runs of larger swarms get fewer frames
+CRASHES = 50  # most that are shown
 PAIRS = 5  # closest pairs whose distance is drawn
 BLOCK = 512  # moments whose pair distances are computed at once
 
@@ -34,6 +35,7 @@ class Distances:
     least: Array  # (T,) m, of all pairs
     pairs: list[tuple[int, int]]  # ids, the closest first
     series: list[Array]  # (T,) m, one a pair
+    crashes: list[tuple[int, int, int]]  # ids, and the first moment at which they were too close: index of time_s
 
 
 def run_data(path: str | Path) -> dict[str, Any]:
@@ -47,7 +49,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         version = bag.custom_data.get("version", "")
         recovered = "recovered_from" in bag.custom_data
     notes = ["This bag was recovered: its recorder was killed or its file was damaged."] if recovered else []
-    distances = pair_distances(run)
+    distances = pair_distances(run, _collision_m(run))
     followed = follow_run(run)
     scenario, ages = followed.scenario, followed.ages
     notes += followed.notes
@@ -60,6 +62,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "notes": notes,
         "config": flatten(run.config),
         "agents": run.agents,
+        "crashes": _crashes(distances, run, summary),
         "moving": scenario.moving.tolist() if scenario else [True] * run.agents,
         "slot_s": run.slot_ns / 1e9,
         "duration_s": _duration_s(run),
@@ -68,6 +71,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "slots": _slots(run),
         "channel": _channel(run),
         "decisions": _reasons(run),
+        "sent_for": _sent_for(run),
         "distances": _distances(distances, run),
         "ages": _ages(ages, run),
         "table": _table(run, ages, distances, scenario),
@@ -85,10 +89,11 @@ def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:
     return rows
 
 
-def pair_distances(run: RecordedRun) -> Distances | None:
+def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | None:
     """Distances at the recorded moments; None with fewer than two agents.
 
     :param run: the run.
+    :param collision_m: m, below which two have crashed.
     """
     motion = run.motion
     count = len(motion.ids)
@@ -97,19 +102,58 @@ def pair_distances(run: RecordedRun) -> Distances | None:
     first, second = np.triu_indices(count, 1)
     least = np.empty(len(motion.time_ns))
     closest = np.full(len(first), np.inf)
+    touched = np.full(len(first), -1)
     for start in range(0, len(least), BLOCK):
         place = motion.position[start : start + BLOCK]
         apart = np.sqrt(((place[:, :, first] - place[:, :, second]) ** 2).sum(axis=1))
         apart[np.isnan(apart)] = np.inf
         least[start : start + BLOCK] = apart.min(axis=1)
         np.minimum(closest, apart.min(axis=0), out=closest)
+        near = apart < collision_m
+        new = near.any(axis=0) & (touched < 0)
+        touched[new] = start + near[:, new].argmax(axis=0)
     chosen = [k for k in np.argsort(closest, kind="stable")[:PAIRS] if math.isfinite(closest[k])]
     series = []
     for k in chosen:
         gap = motion.position[:, :, first[k]] - motion.position[:, :, second[k]]
         series.append(np.sqrt((gap**2).sum(axis=1)))
     pairs = [(int(motion.ids[first[k]]), int(motion.ids[second[k]])) for k in chosen]
-    return Distances((motion.time_ns - run.start_ns) / 1e9, least, pairs, series)
+    ids = motion.ids
+    crashes = [(int(ids[first[k]]), int(ids[second[k]]), int(touched[k])) for k in np.flatnonzero(touched >= 0)]
+    crashes.sort(key=lambda crash: crash[2])
+    return Distances((motion.time_ns - run.start_ns) / 1e9, least, pairs, series, crashes)
+
+
+def _collision_m(run: RecordedRun) -> float:
+    """Below this distance two agents have crashed, m."""
+    limits = run.config.get("limits", {})
+    return float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2
+
+
+def _crashes(distances: Distances | None, run: RecordedRun, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Who crashed, when and where; the first ones if there are many."""
+    if distances is None:
+        return []
+    found = list(distances.crashes)
+    pair = tuple(summary.get("collided_pair") or ())
+    motion = run.motion
+    places = {int(number): place for place, number in enumerate(motion.ids)}
+    if not found and len(pair) == 2 and set(pair) <= places.keys():
+        # They crashed within a slot, and only its ends were recorded.
+        gap = motion.position[:, :, places[pair[0]]] - motion.position[:, :, places[pair[1]]]
+        found = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
+    crashes = []
+    for one, other, moment in found[:CRASHES]:
+        a, b = (motion.position[moment, :, places[number]] for number in (one, other))
+        crashes.append(
+            {
+                "ids": [one, other],
+                "time_s": round(float(distances.time_s[moment]), 3),
+                "place": thin((a + b) / 2, 3),
+                "distance_m": round(float(np.linalg.norm(a - b)), 4),
+            }
+        )
+    return crashes
 
 
 def _duration_s(run: RecordedRun) -> float:
@@ -185,6 +229,12 @@ def _sender_reason(run: RecordedRun) -> NDArray[np.int64]:
     return reason
 
 
+def _sent_for(run: RecordedRun) -> list[str]:
+    """Reasons for which something was sent."""
+    codes = np.unique(_sender_reason(run))
+    return [run.decisions.names[code] for code in codes.tolist() if code < len(run.decisions.names)]
+
+
 def _bin_of(run: RecordedRun, slots: NDArray[np.int64]) -> tuple[NDArray[np.int64], int, Array]:
     """Bin of each slot, number of bins, and the time in the middle of each bin, s."""
     first, last = int(run.slots[0]), int(run.slots[-1])
@@ -233,7 +283,6 @@ def _reasons(run: RecordedRun) -> dict[str, Any] | None:
 def _distances(distances: Distances | None, run: RecordedRun) -> dict[str, Any] | None:
     if distances is None:
         return None
-    limits = run.config.get("limits", {})
     return {
         "time": thin(reduce_bins(distances.time_s, np.mean)),
         "least": thin(reduce_bins(distances.least, np.min), 4),
@@ -246,7 +295,7 @@ def _distances(distances: Distances | None, run: RecordedRun) -> dict[str, Any] 
             }
             for pair, series in zip(distances.pairs, distances.series, strict=True)
         ],
-        "collision": float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2,
+        "collision": _collision_m(run),
         "r_min": float(swarm_section(run.config).get("r_min", 0.3) or 0.3),
     }
 

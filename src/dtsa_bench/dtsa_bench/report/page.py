@@ -12,10 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.bag.errors import BagError
+from dtsa_bench.figures import palette
 from dtsa_bench.report.data import run_data
 
 MOST = 6  # runs that are readable side by side
+_PALETTE = {
+    "agents": palette.AGENT_COLOURS,
+    "dashes": palette.DASHES,
+    "shapes": palette.SHAPES,
+    "hovering": palette.HOVERING,
+    "series": palette.SERIES,
+}
 SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js", "page.js")
 
 
@@ -25,7 +34,8 @@ def render(runs: Sequence[dict[str, Any]]) -> str:
     :param runs: what `run_data` gave for each run.
     """
     assets = files("dtsa_bench.report") / "assets"
-    text = json.dumps({"runs": list(runs)}, separators=(",", ":"), allow_nan=False, default=str)
+    content = {"runs": list(runs), "palette": _PALETTE, "reasons": dict(REASON_TEXTS)}
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False, default=str)
     # A "<" could end the script element; as an escape it means the same in JSON.
     data = text.replace("<", "\\u003c")
     page = (assets / "page.html").read_text(encoding="utf-8")

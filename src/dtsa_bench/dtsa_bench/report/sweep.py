@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from ..batch.table import write_whole
 from ..figures import charts, flights
 from ..figures.charts import label_of
-from ..figures.style import save, style
+from ..figures.style import save, style, themed
 from ..statistics import LEVEL, Mean, Share
 from ..sweep.aggregate import MEASURES, Group, Table
 from ..sweep.claims import Claim, claims_of
@@ -45,7 +45,7 @@ def write_report(table: Table, directory: Path, code: str, command: str = "") ->
         f"<p class=lead>{html.escape(sweep.text)}</p>" if sweep.text else "",
         _facts(table, code, command),
         _claims(claims_of(table)),
-        *(f"<figure>{svg}<figcaption>{html.escape(text)}</figcaption></figure>" for svg, text in drawn),
+        *(_figure(svg, text) for svg, text in drawn),
         "<h2>All settings</h2>",
         _groups(table),
         _left_out(table),
@@ -54,12 +54,19 @@ def write_report(table: Table, directory: Path, code: str, command: str = "") ->
     css = (_HERE / "assets" / "sweep.css").read_text(encoding="utf-8")
     page = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>\n{css}</style></head>\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<meta name="color-scheme" content="light dark"><style>\n{css}</style></head>\n'
         f"<body><main>\n{chr(10).join(part for part in parts if part)}\n</main></body></html>\n"
     )
     path = directory / "report.html"
     write_whole(path, page)
     return path
+
+
+def _figure(svg: str, text: str) -> str:
+    """A picture in the page's colours, with its caption; too wide ones can be moved sideways."""
+    caption = f"<figcaption>{html.escape(text)}</figcaption>" if text else ""
+    return f"<figure><div class=wide tabindex=0>{themed(svg)}</div>{caption}</figure>"
 
 
 def _facts(table: Table, code: str, command: str) -> str:
@@ -84,9 +91,9 @@ def _claims(claims: Sequence[Claim]) -> str:
         mark = {"holds": "yes", "does not hold": "no", "not decided": "open", "in part": "open"}.get(claim.verdict, "")
         badge = f'<span class="badge {mark}">{claim.verdict}</span>' if claim.verdict else ""
         rows.append(
-            f"<tr><td>{html.escape(claim.paper) or '<i>beside it</i>'}</td>"
-            f"<td>{html.escape(claim.measured)}</td>"
-            f"<td>{badge}</td><td>{html.escape(claim.why)}</td></tr>"
+            f'<tr><td data-name="The paper says">{html.escape(claim.paper) or "<i>beside it</i>"}</td>'
+            f'<td data-name="We measured">{html.escape(claim.measured)}</td>'
+            f'<td data-name="Holds?">{badge}</td><td data-name="Why">{html.escape(claim.why)}</td></tr>'
         )
     head = "<tr><th>The paper says</th><th>We measured</th><th>Holds?</th><th>Why</th></tr>"
     table = f"<table class=claims>{head}{''.join(rows)}</table>"
@@ -109,7 +116,7 @@ def _groups(table: Table) -> str:
         cells.append(f"<td>{_counted(group)}</td>")
         rows.append(f"<tr>{''.join(cells)}</tr>")
     content = f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
-    return f"<div class=wide><table class=groups>{content}</table></div>"
+    return f'<div class="wide tall" tabindex=0><table class=groups>{content}</table></div>'
 
 
 def _counted(group: Group) -> str:

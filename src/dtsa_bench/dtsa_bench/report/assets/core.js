@@ -1,6 +1,6 @@
 "use strict";
 /* What all parts of the page share: data, time, colours, small helpers. */
-const RUNS = JSON.parse(document.getElementById("data").textContent).runs;
+const DATA = JSON.parse(document.getElementById("data").textContent), RUNS = DATA.runs, PALETTE = DATA.palette;
 
 function bytes(text) {
   const raw = atob(text), out = new Uint8Array(raw.length);
@@ -32,18 +32,23 @@ const theme = {
 };
 theme.set(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 
-/* Reasons have the same colour in all runs. */
-const REASONS = [...new Set(RUNS.flatMap(run => run.decisions ? run.decisions.names : []))];
-const HUES = ["#4878a8", "#e08a3c", "#5ba06c", "#b065a0", "#c9a227", "#4fa7b0", "#a3674a", "#7d78c6", "#d1707f", "#7a9a3a"];
-function reasonColor(name) {
-  if (name === "nobody" || name === undefined) return theme.color("idle");
-  return HUES[REASONS.filter(other => other !== "nobody").indexOf(name) % HUES.length];
-}
-const LINES = ["#2f74b5", "#d9772b", "#3b9468", "#a4509a", "#b38f17", "#3a97a3"];
+/* Reasons have the same colour in all runs; the most frequent ones have those that are farthest apart. */
+const REASONS = (() => {
+  const counts = new Map();
+  for (const run of RUNS) if (run.decisions) run.decisions.names.forEach((name, index) => counts.set(name, (counts.get(name) || 0) + run.decisions.total[index]));
+  return [...counts.keys()].filter(name => name !== "nobody").sort((a, b) => counts.get(b) - counts.get(a));
+})();
+const LINES = PALETTE.series, HUES = [...LINES, ...PALETTE.agents];
+const reasonColor = name => REASONS.includes(name) ? HUES[REASONS.indexOf(name) % HUES.length] : theme.color("idle");
+const reasonText = name => DATA.reasons[name] || "";
 const runColor = index => LINES[index % LINES.length];
-function agentColor(index, count, moving, light) {
-  if (!moving) return theme.dark ? "#7f8b98" : "#98a3af";
-  return `hsl(${(205 + 360 * index / count) % 360} 52% ${light ?? (theme.dark ? 62 : 48)}%)`;
+/* An agent has one colour in page, pictures and layouts, by its id; who hovers is grey. */
+const agentColor = (id, moving) => moving ? PALETTE.agents[(id - 1) % PALETTE.agents.length] : PALETTE.hovering;
+const agentTurn = id => Math.floor((id - 1) / PALETTE.agents.length) % PALETTE.shapes.length;
+/* A colour with some of another one in it, "#rrggbb" both; part: 0 to 1. */
+function mixed(color, other, part) {
+  const of = (text, place) => parseInt(text.slice(place, place + 2), 16);
+  return "#" + [1, 3, 5].map(place => Math.round(of(color, place) * (1 - part) + of(other, place) * part).toString(16).padStart(2, "0")).join("");
 }
 /* From light to strong; dark themes start dark. */
 function heatColor(level) {
@@ -57,18 +62,22 @@ function heatColor(level) {
 /* ---- time: one clock for all runs ---- */
 const DURATION = Math.max(0.001, ...RUNS.map(run => run.duration_s));
 const clock = {
-  time: 0, playing: false, speed: 1, listeners: [],
+  time: 0, playing: false, speed: 1, listeners: [], turn: 0,
   set(time) { this.time = Math.min(DURATION, Math.max(0, time)); this.tell(); },
   tell() { for (const listener of this.listeners) listener(this.time); },
   listen(listener) { this.listeners.push(listener); listener(this.time); },
+  get over() { return this.time >= DURATION - 1e-9; },
+  /* Goes on from where it stands; only from the very end it begins again. */
   toggle() {
     this.playing = !this.playing;
+    const turn = ++this.turn; // ends the loop of an earlier play
     if (!this.playing) { this.tell(); return; }
-    if (this.time >= DURATION) this.time = 0;
+    if (this.over) this.time = 0;
     let before = performance.now();
     const step = now => {
-      if (!this.playing) return;
-      const time = this.time + this.speed * (now - before) / 1000;
+      if (!this.playing || turn !== this.turn) return;
+      // A hidden page is not drawn: then time stands still.
+      const time = this.time + this.speed * Math.min(0.25, Math.max(0, now - before) / 1000);
       before = now;
       if (time >= DURATION) this.playing = false;
       this.set(time);

@@ -66,7 +66,8 @@ root.append(main);
 /* ---- sections ---- */
 const shared = {yaw: -0.9, pitch: 0.62, zoom: 1, paths: true, names: Math.max(...RUNS.map(run => run.agents)) <= 40, targets: true, buttons: {}, scenes: [],
   draw() { this.scenes.forEach(scene => scene.context && scene.draw(clock.time)); }};
-section("Flight", "Drag to turn, wheel to zoom. Rings mark who sends: amber as heard, red as collided. Crosses are targets.",
+const crashed = RUNS.some(run => run.crashes.length), hovers = RUNS.some(run => run.moving.includes(false));
+section("Flight", `Drag to turn, wheel or pinch to zoom. Rings mark who sends: amber as heard, red as collided. Small crosses are targets.${hovers ? " Who hovers is grey." : ""}${crashed ? " A cross in a ring is a crash." : ""}`,
   {has: run => run.scene, draw: run => new Scene(run, shared).node}, "wide");
 section("Distances", "Between all pairs of agents: the smallest of all, and the pairs that came closest.", {
   has: run => run.distances,
@@ -77,7 +78,8 @@ section("Distances", "Between all pairs of agents: the smallest of all, and the 
       high: Math.min(Math.max(span, 1), Math.max(...data.least.filter(value => value !== null), ...data.pairs.flatMap(pair => pair.distance.filter(value => value !== null)))),
       series: [{name: "closest of all", values: data.least.map(value => value !== null && value > span * 1.04 ? null : value), color: () => theme.color("ink"), width: 2.1},
         ...data.pairs.map((pair, index) => ({name: `${pair.ids[0]} – ${pair.ids[1]}`, legend: `${pair.ids[0]} – ${pair.ids[1]}: ${num(pair.least, 3, "m")} at ${num(pair.time, 2, "s")}`,
-          values: pair.distance.map(value => value !== null && value > span * 1.04 ? null : value), color: LINES[(index + 1) % LINES.length], width: 1.3}))],
+          values: pair.distance.map(value => value !== null && value > span * 1.04 ? null : value), color: LINES[index % LINES.length], width: 1.4, dash: ["7 3", "2 2.5", "9 3 2 3", "4 2", "1.5 1.5"][index]}))],
+      marks: run.crashes.map(crash => ({time: crash.time_s, value: crash.distance_m})),
       limits: [{name: `crash (${num(data.collision, 2, "m")})`, value: data.collision, color: "collision"}],
     });
   },
@@ -89,7 +91,7 @@ function shareBars(rows) {
   onRedraw(main, () => bars.replaceChildren(...rows.flatMap(row => {
     const share = row.share ?? row.value / sum;
     return [el("b", {}, row.name), el("div", {}, el("i", {style: `width:${100 * share}%;background:${row.color()}`})),
-      el("em", {}, row.value === undefined ? percent(share) : `${whole(row.value)}, ${percent(share)}`)];
+      el("em", {}, row.value === undefined ? percent(share) : `${whole(row.value)}, ${percent(share)}`), row.text ? el("small", {}, row.text) : null].filter(Boolean);
   })));
   return bars;
 }
@@ -98,11 +100,12 @@ const lines = {reasons: true, lines: []};
 section("Slots", "Who sent in which slot, and why. The strip on top says what became of each slot; pale marks and amber edges are frames that some receivers lost. Click to go there.", {
   has: run => run.slots.count, draw: run => new SlotLine(run, lines).node,
   extra: () => {
-    const legend = el("div", {class: "legend", style: "margin:0 0 10px"});
-    const names = REASONS.filter(name => name !== "nobody");
+    const legend = el("div", {class: "reasons"});
+    const names = REASONS.filter(name => RUNS.some(run => run.sent_for.includes(name)));
     onRedraw(main, () => legend.replaceChildren(
-      ...(lines.reasons && names.length ? names.map(name => [name, reasonColor(name)]) : [["sent", theme.color("success")]]).concat([["collision", theme.color("collision")], ["idle", theme.color("idle")], ["partly lost", theme.color("lost")]])
-        .map(([name, color]) => el("span", {}, el("i", {class: "box", style: `background:${color}`}), name))));
+      ...(lines.reasons && names.length ? names.map(name => [name, reasonColor(name), reasonText(name)]) : [["sent", theme.color("success"), ""]])
+        .concat([["collision", theme.color("collision"), "two or more sent: tall mark in the strip"], ["idle", theme.color("idle"), "nobody sent"], ["partly lost", theme.color("lost"), "some did not receive it"]])
+        .map(([name, color, text]) => el("span", {}, el("i", {class: "box", style: `background:${color}`}), el("b", {}, name), text ? " " + text : ""))));
     return legend;
   },
 });
@@ -120,7 +123,7 @@ section("Decisions", "Why agents took whom they took for the sender: of all agen
   has: run => run.decisions,
   draw: run => {
     const data = run.decisions;
-    const bars = shareBars(data.names.map((name, index) => ({name, value: data.total[index], color: () => reasonColor(name)})).sort((a, b) => b.value - a.value));
+    const bars = shareBars(data.names.map((name, index) => ({name, value: data.total[index], color: () => reasonColor(name), text: reasonText(name)})).sort((a, b) => b.value - a.value));
     return el("div", {}, bars, shareChart({time: data.time, unit: "share of decisions (%)", label: "Reasons over time", height: 180,
       layers: data.names.map((name, index) => ({name, values: data.share[index], color: () => reasonColor(name)}))}),
       el("p", {class: "what", style: "margin:8px 0 0"}, data.disagree ? `In ${whole(data.disagree)} slots agents expected different senders.` : "In every slot all agents that expected a sender expected the same one."));
@@ -177,7 +180,7 @@ const play = el("button", {class: "play", type: "button", "aria-label": "play or
 const speed = el("select", {"aria-label": "speed", onchange: () => { clock.speed = +speed.value; }}, ...[0.1, 0.25, 0.5, 1, 2, 5].map(value => el("option", {value, selected: value === 1 ? "" : null}, `${value}×`)));
 const output = el("output");
 document.body.append(el("div", {class: "player"}, el("div", {}, play, slider, output, speed)));
-clock.listen(time => { slider.value = time; output.textContent = `${num(time, 2)} of ${num(DURATION, 2, "s")}`; play.textContent = clock.playing ? "❚❚" : "▶"; });
+clock.listen(time => { slider.value = time; output.textContent = `${num(time, 2)} of ${num(DURATION, 2, "s")}`; play.textContent = clock.playing ? "❚❚" : clock.over ? "↻" : "▶"; });
 addEventListener("keydown", event => {
   if (event.target instanceof HTMLSelectElement || event.ctrlKey || event.metaKey || event.altKey) return;
   const step = event.shiftKey ? RUNS[0].slot_s : DURATION / 50;
@@ -188,5 +191,7 @@ addEventListener("keydown", event => {
 /* Something to see at once, and in print: the moment of the closest approach. */
 const start = RUNS[0].distances && RUNS[0].distances.pairs.length ? RUNS[0].distances.pairs[0].time : 0;
 clock.set(Number(new URLSearchParams(location.hash.slice(1)).get("t") ?? start) || 0);
+/* A page that is loaded again stands where it stood. */
+addEventListener("pagehide", () => { try { history.replaceState(null, "", `#t=${clock.time.toFixed(3)}`); } catch { /* not allowed here */ } });
 redrawAll();
 document.documentElement.dataset.ready = "";

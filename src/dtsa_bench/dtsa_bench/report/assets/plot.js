@@ -78,8 +78,10 @@ function linePath(times, values, x, y) {
 /* Side by side, charts of one kind have one scale, so that they can be compared; a button undoes that. */
 const scales = {common: true, most: {}, note(key, value) { this.most[key] = Math.max(this.most[key] ?? 0, value); }, of(key, own) { return key && this.common ? this.most[key] : own; }};
 
-/* series: [{name, values, color, width, dash}], limits: [{name, value, color}] */
-function lineChart({time, series, limits = [], unit, label, digits = 3, height = 250, high, suffix = "", scale}) {
+const legendLine = (color, dash) => el("svg", {width: 22, height: 6, "aria-hidden": "true"}, el("line", {x1: 0, x2: 22, y1: 3, y2: 3, stroke: color, "stroke-width": 2.6, "stroke-dasharray": dash}));
+
+/* series: [{name, values, color, width, dash}], limits: [{name, value, color}], marks: crosses, [{time, value}] */
+function lineChart({time, series, limits = [], marks = [], unit, label, digits = 3, height = 250, high, suffix = "", scale}) {
   const most = high ?? Math.max(1e-9, ...series.flatMap(one => one.values.filter(value => value !== null)),
     ...limits.map(limit => limit.value));
   scales.note(scale, most);
@@ -93,6 +95,10 @@ function lineChart({time, series, limits = [], unit, label, digits = 3, height =
         group.append(el("path", {d: linePath(time, one.values, x, y), fill: "none", stroke: typeof one.color === "function" ? one.color() : one.color,
           "stroke-width": one.width || 1.6, "stroke-linejoin": "round", "stroke-dasharray": one.dash, opacity: one.opacity}));
       }
+      for (const mark of marks) {
+        const px = x(mark.time), py = y(mark.value);
+        group.append(el("path", {class: "mark", d: `M${px - 5} ${py - 5}L${px + 5} ${py + 5}M${px + 5} ${py - 5}L${px - 5} ${py + 5}`, stroke: theme.color("collision")}));
+      }
     },
     read(at) {
       const index = nearest(time, at);
@@ -101,7 +107,7 @@ function lineChart({time, series, limits = [], unit, label, digits = 3, height =
   });
   const legend = el("div", {class: "legend"});
   onRedraw(chart, () => legend.replaceChildren(
-    ...series.map(one => el("span", {}, el("i", {style: `background:${typeof one.color === "function" ? one.color() : one.color}`}), one.legend || one.name)),
+    ...series.map(one => el("span", {}, legendLine(typeof one.color === "function" ? one.color() : one.color, one.dash), one.legend || one.name)),
     ...limits.map(limit => el("span", {}, el("i", {style: `background:repeating-linear-gradient(90deg,${theme.color(limit.color)} 0 5px,transparent 5px 8px)`}), limit.name))));
   return el("div", {}, chart, legend);
 }

@@ -13,7 +13,7 @@ class Scene {
     this.outcome = new Uint8Array(bytes(run.slots.outcome));
     this.bounds();
     this.canvas = el("canvas", {tabindex: "0", role: "img", "aria-label": "Flight in three dimensions; drag to turn, wheel to zoom"});
-    this.label = el("div", {class: "clock"});
+    this.label = el("span", {class: "clock"});
     const button = (name, key) => el("button", {type: "button", "aria-pressed": String(shared[key]), onclick: event => {
       shared[key] = !shared[key];
       shared.buttons[key].forEach(node => node.setAttribute("aria-pressed", String(shared[key])));
@@ -26,7 +26,7 @@ class Scene {
     });
     const views = [["3D", -0.9, 0.62], ["top", -Math.PI / 2, Math.PI / 2 - 1e-3], ["side", -Math.PI / 2, 0.04]].map(([name, yaw, pitch]) =>
       el("button", {type: "button", onclick: () => { shared.yaw = yaw; shared.pitch = pitch; shared.zoom = 1; shared.draw(); }}, name));
-    this.node = el("div", {class: "scene"}, this.canvas, this.label, el("div", {class: "options"}, ...views, ...buttons));
+    this.node = el("div", {class: "scene"}, el("div", {class: "bar"}, this.label, el("span", {class: "options"}, ...views), el("span", {class: "options"}, ...buttons)), this.canvas);
     this.steer();
     shared.scenes.push(this);
     onRedraw(this.node, width => {
@@ -131,14 +131,14 @@ class Scene {
       const base = 3 * n * frame + agent;
       return this.project(this.places[base] * this.scale, this.places[base + n] * this.scale, this.places[base + 2 * n] * this.scale);
     };
-    c.lineJoin = c.lineCap = "round";
+    c.lineJoin = "round"; c.lineCap = "butt";
     for (let agent = 0; agent < n; agent++) {
       if (!this.moves(agent)) continue;
       if (this.shared.paths) {
         const stride = Math.max(1, Math.floor(times.length / 220));
         c.beginPath();
         for (let frame = 0; frame < times.length; frame += stride) { const p = point(frame, agent); frame ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1]); }
-        c.strokeStyle = this.color(agent); c.globalAlpha = n > 30 ? 0.14 : 0.24; c.lineWidth = 1; c.stroke();
+        c.setLineDash(this.dash(agent)); c.strokeStyle = this.color(agent); c.globalAlpha = n > 30 ? 0.2 : 0.38; c.lineWidth = 1; c.stroke(); c.setLineDash([]);
       }
       let first = row;
       while (first > 0 && times[first] > time - TRAIL_S) first--;
@@ -148,14 +148,15 @@ class Scene {
         c.beginPath();
         for (let frame = from; frame <= to; frame++) { const p = point(frame, agent); frame > from ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1]); }
         if (k === parts - 1) { const p = this.project(...head); c.lineTo(p[0], p[1]); }
-        c.strokeStyle = this.color(agent); c.globalAlpha = 0.12 + 0.5 * (k + 1) / parts; c.lineWidth = n > 30 ? 1.4 : 2; c.stroke();
+        c.setLineDash(this.dash(agent)); c.strokeStyle = this.color(agent); c.globalAlpha = 0.25 + 0.75 * (k + 1) / parts; c.lineWidth = n > 30 ? 1.5 : 2.2; c.stroke(); c.setLineDash([]);
       }
     }
     c.globalAlpha = 1;
   }
 
   moves(agent) { return this.run.moving[this.ids[agent] - 1] !== false; }
-  color(agent, light) { return agentColor(agent, this.count, this.moves(agent), light); }
+  color(agent) { return agentColor(this.ids[agent], this.moves(agent)); }
+  dash(agent) { return PALETTE.dashes[agentTurn(this.ids[agent])].map(length => 2 * length); }
 
   /* Who sent lately: 1 now, falling to 0 within a few slots; negative for frames that collided. */
   senders(time) {
@@ -194,6 +195,7 @@ class Scene {
     order.sort((a, b) => b[0][2] - a[0][2]);
     for (const [p, agent] of order) this.drawAgent(c, p, agent, radius * p[3], glow.get(this.ids[agent]) || 0);
     if (this.shared.names) for (const [p, agent] of order) this.drawName(c, p, agent, radius * p[3]);
+    this.run.crashes.forEach((crash, index) => this.drawCrash(c, crash, time, radius, index));
     const slot = Math.floor(time / this.run.slot_s + 1e-6);
     this.label.textContent = this.run.slots.count ? `slot ${whole(Math.min(slot, this.run.slots.first + this.run.slots.count - 1))}` : "";
   }
@@ -204,9 +206,44 @@ class Scene {
       c.globalAlpha = Math.abs(level); c.lineWidth = 2.2;
       c.beginPath(); c.arc(p[0], p[1], size * (1.35 + 0.9 * (1 - Math.abs(level))), 0, 7); c.stroke(); c.globalAlpha = 1;
     }
-    const shade = c.createRadialGradient(p[0] - size * 0.35, p[1] - size * 0.4, size * 0.1, p[0], p[1], size);
-    shade.addColorStop(0, this.color(agent, theme.dark ? 80 : 72)); shade.addColorStop(1, this.color(agent, theme.dark ? 50 : 42));
-    c.fillStyle = shade; c.beginPath(); c.arc(p[0], p[1], size, 0, 7); c.fill();
+    const color = this.color(agent), shade = c.createRadialGradient(p[0] - size * 0.35, p[1] - size * 0.4, size * 0.1, p[0], p[1], size);
+    shade.addColorStop(0, mixed(color, "#ffffff", 0.45)); shade.addColorStop(0.55, color); shade.addColorStop(1, mixed(color, "#000000", 0.22));
+    c.fillStyle = shade; this.outline(c, p, size, agentTurn(this.ids[agent])); c.fill();
+    c.strokeStyle = theme.dark ? "#0b0f14" : mixed(color, "#000000", 0.45); c.lineWidth = 0.8; c.stroke();
+  }
+
+  /* Agents whose colours come again have another shape. */
+  outline(c, p, size, turn) {
+    c.beginPath();
+    if (!turn) { c.arc(p[0], p[1], size, 0, 7); return; }
+    const corners = [0, [0, 4, 1.25], [Math.PI / 4, 4, 1.2], [0, 3, 1.3]][turn];
+    for (let k = 0; k < corners[1]; k++) {
+      const angle = corners[0] - Math.PI / 2 + 2 * Math.PI * k / corners[1];
+      c.lineTo(p[0] + corners[2] * size * Math.cos(angle), p[1] + corners[2] * size * Math.sin(angle));
+    }
+    c.closePath();
+  }
+
+  /* A cross in a ring where two have come too close: pale before, with its text from then on. */
+  drawCrash(c, crash, time, radius, index) {
+    const p = this.project(...crash.place), size = Math.max(9, 1.7 * radius * p[3]), past = time >= crash.time_s - 1e-6, arm = size * 0.72;
+    c.globalAlpha = past ? 1 : 0.4;
+    const cross = () => {
+      c.beginPath(); c.arc(p[0], p[1], size, 0, 7); c.stroke();
+      c.beginPath(); c.moveTo(p[0] - arm, p[1] - arm); c.lineTo(p[0] + arm, p[1] + arm); c.moveTo(p[0] + arm, p[1] - arm); c.lineTo(p[0] - arm, p[1] + arm); c.stroke();
+    };
+    c.strokeStyle = theme.color("card"); c.lineWidth = 5; cross();
+    c.strokeStyle = theme.color("collision"); c.lineWidth = 2.2; cross();
+    c.globalAlpha = 1;
+    if (!past || index > 3) return;
+    const text = `crash ${crash.ids.join("–")}, ${num(crash.time_s, 2, "s")}`;
+    c.font = `600 12.5px ${theme.color("sans")}`; c.textBaseline = "middle";
+    // Texts stand above the flight, one below the other: none hides a dot or another one.
+    const wide = c.measureText(text).width + 12, x = 12, y = 20 + 27 * index;
+    c.strokeStyle = theme.color("collision"); c.lineWidth = 1; c.globalAlpha = 0.7;
+    c.beginPath(); c.moveTo(x + wide, y); c.lineTo(p[0] - size * 0.7, p[1] - size * 0.7); c.stroke(); c.globalAlpha = 1;
+    c.fillStyle = theme.color("card"); c.fillRect(x, y - 11, wide, 22); c.strokeRect(x, y - 11, wide, 22);
+    c.fillStyle = theme.color("ink"); c.textAlign = "left"; c.fillText(text, x + 6, y + 0.5);
   }
 
   drawName(c, p, agent, size) {

@@ -50,8 +50,9 @@ class SlotLine {
   describe(slot) {
     const rows = [`slot ${whole(slot)}, ${num(slot * this.run.slot_s, 3, "s")}`];
     for (let i = this.find(slot); i < this.slot.length && this.slot[i] === slot; i++) {
-      const why = this.reason[i] < 255 ? `, ${this.run.decisions.names[this.reason[i]]}` : "";
-      rows.push(`agent ${this.sender[i]}${why}: ${this.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.received[i] / 255, 0)}`);
+      const why = this.reason[i] < 255 ? this.run.decisions.names[this.reason[i]] : "";
+      rows.push(`agent ${this.sender[i]}: ${this.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.received[i] / 255, 0)}`);
+      if (why) rows.push(`  ${why}${reasonText(why) ? ": " + reasonText(why) : ""}`);
     }
     if (rows.length === 1) rows.push("nobody sent");
     return rows.join("\n");
@@ -106,7 +107,8 @@ class SlotLine {
         c.globalAlpha = this.outcome[i] === 2 ? 1 : 0.3 + 0.7 * this.received[i] / 255;
         c.fillRect(x, top + (this.sender[i] - 1) * row, slim, tall);
         c.globalAlpha = 1;
-        c.fillStyle = theme.color(this.outcome[i] === 2 ? "collision" : "success"); c.fillRect(x, 19, slim, 4);
+        if (this.outcome[i] === 2) { c.fillStyle = theme.color("collision"); c.fillRect(x, 15, slim, 8); } // taller: not by colour alone
+        else { c.fillStyle = theme.color("success"); c.fillRect(x, 19, slim, 4); }
         if (this.received[i] < 255 && this.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("lost"); c.fillRect(x, top + (this.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.received[i] / 255), Math.min(3, tall / 3)); }
       }
     }
