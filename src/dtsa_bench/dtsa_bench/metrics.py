@@ -13,17 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm, Scenario, _kernel
+from dtsa_agent.core import AbstractSwarm, Scenario
+from dtsa_agent.core.compiled import COMPILED
+from dtsa_agent.core.compiled import kernel as _kernel
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
+from .plain_sums import ARRIVED as _ARRIVED
+from .plain_sums import CRASHED as _CRASHED
+from .plain_sums import PlainSums
 from .run_config import RunConfig
 
 Array = NDArray[np.float64]
-
-_CRASHED: int = _kernel.METRICS_CRASHED
-_ARRIVED: int = _kernel.METRICS_ARRIVED
 
 # Why a flight ended; an empty text while it goes on. STOPPED: the user, or an error, ended it early.
 COMPLETED, CRASHED, TIMED_OUT, STOPPED = "completed", "crashed", "timed out", "stopped"
@@ -45,9 +47,10 @@ class FlightMetrics:
 
     :param run: the run.
     :param scenario: its scenario.
+    :param core: what moves the swarm whose tables :meth:`update` gets.
     """
 
-    def __init__(self, run: RunConfig, scenario: Scenario) -> None:
+    def __init__(self, run: RunConfig, scenario: Scenario, core: str = COMPILED) -> None:
         swarm, limits = run.swarm, run.limits
         self.run = run
         self.scenario = scenario
@@ -67,7 +70,9 @@ class FlightMetrics:
         start = np.ascontiguousarray(scenario.start, dtype=np.float64)
         target = np.ascontiguousarray(scenario.target, dtype=np.float64)
         moving = np.ascontiguousarray(scenario.moving, dtype=np.uint8)
-        self._kernel = _kernel.Metrics(start, target, moving, swarm.agents, limits.collision_m, swarm.r_min)
+        self._plain = core != COMPILED
+        sums = PlainSums if self._plain else _kernel.Metrics
+        self._kernel: Any = sums(start, target, moving, swarm.agents, limits.collision_m, swarm.r_min)
         self._course = scenario.course(np.arange(swarm.agents, dtype=np.int32))
         if self._course is not None:
             self._course.advance(0, start)
@@ -92,7 +97,7 @@ class FlightMetrics:
             for agent in self.lost:  # its vehicle hovers where it was last known
                 track[:, :, agent - 1] = self._last[:, agent - 1]
         self._last = track[-1].copy()
-        state = self._kernel.update(done, track, None if tables is None else tables.kernel)
+        state = self._kernel.update(done, track, tables if tables is None or self._plain else tables.kernel)
         if self._course is not None:
             self._course.advance(done, self._last)
             if not all(self._course.final[k] for k in range(len(self._course.final)) if k + 1 not in self.lost):

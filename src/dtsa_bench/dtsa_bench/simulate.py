@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm, Scenario, make_scenario
+from dtsa_agent.core.compiled import COMPILED
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim import Channel
@@ -88,6 +89,7 @@ def simulate(
     trace: bool = False,
     observer: int = 1,
     ages: bool = True,
+    core: str = COMPILED,
 ) -> Flight:
     """Flies one run.
 
@@ -96,12 +98,13 @@ def simulate(
     :param trace: keep what happened in every slot.
     :param observer: id whose table the trace follows.
     :param ages: measure ages and estimate errors; without them a run is a little faster.
+    :param core: ``compiled``, or ``reference``: the specification in plain Python, much slower.
     """
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
     shared = may_share(run) if shared_table is None else shared_table
-    swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
-    metrics = FlightMetrics(run, scenario)
+    swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared, core=core))
+    metrics = FlightMetrics(run, scenario, core)
     kept = Trace() if trace else None
     _fly(swarm, Channel(run.air), metrics, kept, observer, ages)
     return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)

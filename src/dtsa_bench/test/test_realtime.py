@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from metronome import flown_again_when_overloaded
 
-from dtsa_agent.core.alignment import ClockAligner
+from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.bag.writer import BagWriter
 from dtsa_bench.fly.clock_statistics import ClockStatistics

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _kernel
+from .compiled import kernel as _kernel
 from .config import SwarmConfig
 from .course import Course
 from .errors import ConfigError
+from .reference import agent, frame
 from .registry import ESTIMATORS
 from .scenario import Scenario, check_extent, make_scenario
 
@@ -25,8 +26,8 @@ Slots = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 Hashes = NDArray[np.uint32]
 
-FRAME_MAX = _kernel.FRAME_MAX  # bytes
-PRESENT_LEAVING = _kernel.PRESENT_LEAVING  # in ``present``: will be switched off after a last frame
+FRAME_MAX = frame.FRAME_MAX  # bytes
+PRESENT_LEAVING = agent.LEAVES  # in ``present``: will be switched off after a last frame
 
 
 class SwarmState:

@@ -8,13 +8,13 @@ takes only what is newer. Frames are not secret, and jamming is not prevented.
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 from itertools import pairwise
 
 from .abstract_swarm import FRAME_MAX, AbstractSwarm, Bytes, SwarmWrapper
 from .errors import ConfigError, LocalProtocolError
 from .frame import TAG_LENGTH
+from .reference.tag import keyed, tag
 
 MIN_KEY, MAX_KEY = 16, 32  # bytes
 
@@ -63,20 +63,12 @@ class Authenticator:
         """
         if not 0 <= session < 2**64:
             raise ConfigError("auth_session", session, "0 to 2**64 - 1")
-        self._keyed = hashlib.blake2s(
-            session.to_bytes(8, "little"), key=self._key, digest_size=TAG_LENGTH, person=b"dtsa v1"
-        )
+        self._keyed = keyed(self._key, session)
 
     @property
     def rejected(self) -> int:
         """Frames rejected so far, for whatever reason."""
         return self.forged + self.truncated
-
-    def _tag(self, data: bytes, slot: int) -> bytes:
-        mac = self._keyed.copy()
-        mac.update(slot.to_bytes(8, "little"))
-        mac.update(data)
-        return mac.digest()
 
     def seal(self, data: bytes, slot: int) -> bytes:
         """A frame with its tag.
@@ -87,7 +79,7 @@ class Authenticator:
         """
         if not 0 < len(data) <= FRAME_MAX - TAG_LENGTH:
             raise LocalProtocolError(f"a frame of {len(data)} bytes cannot be sealed: 1 to {FRAME_MAX - TAG_LENGTH}")
-        return data + self._tag(data, slot)
+        return data + tag(self._keyed, slot, data)
 
     def open(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
         """The frame without its tag, or None (and counted) if it is not authentic.
@@ -99,9 +91,9 @@ class Authenticator:
         if len(data) <= TAG_LENGTH:
             self.truncated += 1
             return None
-        frame, tag = data[:-TAG_LENGTH], data[-TAG_LENGTH:]
+        frame, said = data[:-TAG_LENGTH], data[-TAG_LENGTH:]
         for sent in range(slot, max(-1, slot - late - 1), -1):
-            if hmac.compare_digest(tag, self._tag(frame, sent)):
+            if hmac.compare_digest(said, tag(self._keyed, sent, frame)):
                 return frame
         self.forged += 1
         return None

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from . import _kernel
 from .errors import ConfigError
 from .flight_models import AVOIDERS, flight_model
 from .frame import EXTENT_M, PROFILE_EXTENDED, PROFILE_PAPER_INTENT, TAG_LENGTH
+from .reference.frame import EXTENDED_SENDER_MAX, FRAME_MAX, LENGTHS
 from .registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow
 from .settings import Settings, check, setting
 
@@ -17,7 +17,7 @@ FRAMES = ("auto", "paper", "extended")
 SHAPES = ("circle", "ellipse", "ellipsoid")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
 MAX_AGENTS = 1024
-MAX_EXTENDED_AGENTS = _kernel.EXTENDED_SENDER_MAX  # ids have 8 bits in extended frames
+MAX_EXTENDED_AGENTS = EXTENDED_SENDER_MAX  # ids have 8 bits in extended frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ class SwarmConfig(Settings):
         :raises ConfigError: with the number of bytes that would fit.
         """
         profile = PROFILE_EXTENDED if self.extended else PROFILE_PAPER_INTENT
-        room = _kernel.FRAME_MAX - _kernel.frame_length(profile) - (TAG_LENGTH if self.auth else 0)
+        room = FRAME_MAX - LENGTHS[profile] - (TAG_LENGTH if self.auth else 0)
         if self.own_bytes > room:
             names = " and ".join(row.name for row in (self.policy_row, self.estimator_row) if row.own_bytes)
             raise ConfigError(f"own_bytes of {names}", self.own_bytes, f"0 to {room} with these frames")

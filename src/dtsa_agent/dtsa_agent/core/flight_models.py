@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _kernel
+from .compiled import MISSING
+from .compiled import kernel as _kernel
 from .errors import ConfigError
-from .reference import avoiders
+from .reference import avoiders, vehicle
 from .reference.arithmetic import Vector
 from .reference.avoiders import Neighbour, Scene
 from .registry import Registry, check_kernel
@@ -83,7 +84,12 @@ class VehicleParams(Settings):
         :param velocity: same shape, m/s.
         :param command: commanded velocity, same shape, m/s.
         """
-        _kernel.vehicle_step(self.tau, self.a_max, dt, position, velocity, command)
+        if not MISSING:
+            _kernel.vehicle_step(self.tau, self.a_max, dt, position, velocity, command)
+            return
+        p, v, c = (np.atleast_2d(array.T) for array in (position, velocity, command))
+        moved = [vehicle.step(self.tau, self.a_max, dt, *map(_vector, now)) for now in zip(p, v, c, strict=True)]
+        p[:], v[:] = [place for place, _ in moved], [speed for _, speed in moved]
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +138,7 @@ class FlightModel(Settings):
         :param age_s: age of each one's state, (N,), s; None: no margins.
         :param plain: the avoider of the specification, not the compiled one.
         """
-        if plain:
+        if plain or MISSING:
             return self._plain_command(self_index, position, velocity, goal, others_position, others_velocity, age_s)
         result = np.empty(3)
         given = (position, velocity, goal, others_position, others_velocity)

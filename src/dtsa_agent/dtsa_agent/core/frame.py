@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from . import _kernel
+import dataclasses
+
+from .compiled import MISSING
+from .compiled import kernel as _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
+from .reference import frame as plain
+from .reference import tag
 from .reference.arithmetic import Vector
 from .reference.frame import Frame
 from .registry import PROFILES
@@ -14,7 +19,7 @@ PROFILE_EXTENDED = PROFILES.index("extended")  # 56 bytes
 
 _VERSION = 1
 _HEADER_LENGTH = 8  # bytes up to the end of the slot
-TAG_LENGTH = 4  # bytes of authentication after a frame, and after what plug-ins append to it
+TAG_LENGTH = tag.LENGTH  # bytes of authentication after a frame, and after what plug-ins append to it
 
 POSITION_STEP = 0.002  # m, one step of a coordinate at the default extent
 EXTENT_M = 65.534  # m, default extent: 32767 steps, the largest coordinate that a frame can say
@@ -43,6 +48,8 @@ def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
     :returns: 19 bytes, 23 with intent.
     :raises LocalProtocolError: if a field is not a number or an id is out of range.
     """
+    if MISSING:
+        return plain.encode(frame, position_step(extent_m))
     profile = PROFILE_PAPER if frame.intent is None else PROFILE_PAPER_INTENT
     data: bytes = _kernel.encode(
         profile,
@@ -77,6 +84,9 @@ def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
     :param extent_m: largest coordinate that fits, m, as the swarm has agreed.
     :raises RemoteProtocolError: if they are no frame: sealed ones are opened first.
     """
+    if MISSING:
+        heard = plain.decode(data, position_step(extent_m))
+        return dataclasses.replace(heard, intent=None) if data[0] & 15 == PROFILE_EXTENDED else heard
     fields = _kernel.decode(data, position_step(extent_m))
     if isinstance(fields, int):
         raise RemoteProtocolError(f"{_FAULTS[fields]} ({len(data)} bytes)")

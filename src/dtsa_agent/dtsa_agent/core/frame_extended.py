@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from . import _kernel
+from .compiled import MISSING
+from .compiled import kernel as _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
 from .frame import _FAULTS, EXTENT_M, Frame, position_step
+from .reference import frame_extended as plain
+from .reference.frame import EXTENDED_HEAD, EXTENDED_LENGTH
 from .reference.frame_extended import OPEN, ExtendedFrame, Gossip
 
-EXTENDED_LENGTH = _kernel.EXTENDED_LENGTH  # bytes, and 4 more for the tag of an authenticated frame
-HEAD_LENGTH = (
-    _kernel.EXTENDED_HEAD
-)  # bytes that hold the sender's own state: enough for who hears only the beginning of a frame
+HEAD_LENGTH = EXTENDED_HEAD  # bytes of the sender's own state: enough for who hears only the beginning of a frame
 
 __all__ = [
     "EXTENDED_LENGTH", "HEAD_LENGTH", "OPEN", "ExtendedFrame", "Gossip", "decode_extended", "decode_head",
@@ -27,6 +27,8 @@ def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
     :returns: 56 bytes.
     :raises LocalProtocolError: if a field is out of range, or the sections do not fit.
     """
+    if MISSING:
+        return plain.encode_extended(frame, position_step(extent_m))
     own = frame.own
     data: bytes = _kernel.encode_extended(
         own.sender, own.slot & 0xFFFFFFFF, own.c_r, own.position, own.velocity, own.intent or (0.0, 0.0, 0.0),
@@ -46,6 +48,8 @@ def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
     :param extent_m: largest coordinate that fits, m, as the swarm has agreed.
     :raises RemoteProtocolError: if they are no frame of profile ``extended``.
     """
+    if MISSING:
+        return plain.decode_extended(data, position_step(extent_m))
     fields = _kernel.decode_extended(data, position_step(extent_m))
     if isinstance(fields, int):
         raise RemoteProtocolError(f"{_FAULTS[fields]} ({len(data)} bytes)")

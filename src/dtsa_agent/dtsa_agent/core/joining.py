@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from .abstract_swarm import AbstractSwarm
 from .config import SwarmConfig
 from .errors import ConfigError
+from .reference.timebase import LISTENING, TimeBase
 from .registry import POLICIES
-from .timebase import LISTENING, TimeBase
 
 
 def check_joinable(policy: str) -> None:

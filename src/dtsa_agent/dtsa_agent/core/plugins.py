@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
+from .compiled import COMPILED
 from .config import SwarmConfig
 from .errors import LocalProtocolError
 from .flight_models import AVOIDERS
@@ -155,6 +156,7 @@ def make_swarm(
     local: Sequence[int] | None = None,
     shared_table: bool = False,
     observers: Sequence[int] | None = None,
+    core: str = COMPILED,
 ) -> AbstractSwarm:
     """A :class:`Swarm`, in a :class:`PluginSwarm` if the configuration names plug-ins.
 
@@ -163,8 +165,8 @@ def make_swarm(
     :raises ConfigError: for ids and plug-ins that do not exist.
     """
     if not uses_plugins(config):
-        return Swarm(config, scenario, local, shared_table, observers)
-    return PluginSwarm(Swarm(config, scenario, local, False, observers))
+        return Swarm(config, scenario, local, shared_table, observers, core=core)
+    return PluginSwarm(Swarm(config, scenario, local, False, observers, core=core))
 
 
 class PluginSwarm(SwarmWrapper):

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import _kernel
+from .compiled import MISSING
+from .compiled import kernel as _kernel
 from .errors import ConfigError
-from .registry import SELECTIONS
+from .reference import priority as plain
+from .reference import selection as plain_selection
+from .registry import REASONS, SELECTIONS
 
 
 def priority(position: ArrayLike, velocity: ArrayLike, slot_s: float) -> NDArray[np.float64]:
@@ -25,6 +28,9 @@ def priority(position: ArrayLike, velocity: ArrayLike, slot_s: float) -> NDArray
     v = np.ascontiguousarray(np.asarray(velocity, dtype=np.float64).T)
     if p.ndim != 2 or p.shape[0] != 3 or p.shape != v.shape:
         raise ConfigError("position, velocity", (p.T.shape, v.T.shape), "two arrays of shape (N, 3)")
+    if MISSING:
+        rows = [[(float(x), float(y), float(z)) for x, y, z in array.T] for array in (p, v)]
+        return np.array(plain.priorities(rows[0], rows[1], float(slot_s)))
     g = np.empty(p.shape[1])
     _kernel.priority(p, v, float(slot_s), g, np.empty(7 * len(g)))
     return g
@@ -49,6 +55,14 @@ def select(
         raise ConfigError("selection", selection, ", ".join(SELECTIONS))
     values = np.ascontiguousarray(g, dtype=np.float64)
     candidates = np.zeros(len(values), dtype=np.uint8)
+    if MISSING:
+        members = [int(k) for k in np.flatnonzero(np.asarray(in_ap))]
+        choice = plain_selection.select(
+            values.tolist(), np.asarray(counter).tolist(), np.asarray(in_ap, bool).tolist(), epsilon, selection
+        )
+        if selection == "candidates" and choice.reason in ("priority", "tie"):
+            candidates[plain_selection.candidates(values.tolist(), members, epsilon)] = 1
+        return choice.index, candidates.astype(np.bool_), REASONS.index(choice.reason)
     index, reason = _kernel.select(
         values,
         np.ascontiguousarray(counter, dtype=np.int64),

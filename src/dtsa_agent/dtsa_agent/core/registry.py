@@ -14,7 +14,8 @@ from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar
 
-from . import _kernel
+from .compiled import MISSING
+from .compiled import kernel as _kernel
 from .errors import ConfigError
 
 PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/protocol.md
@@ -257,7 +258,7 @@ def check_kernel(kind: str, names: tuple[str, ...]) -> None:
     :param names: the list as Python has it.
     :raises ImportError: if they differ: kernel and Python are not of the same version.
     """
-    compiled = _kernel.NAMES[kind]
+    compiled = names if MISSING else _kernel.NAMES[kind]
     if compiled != names:
         raise ImportError(f"{kind}: Python has {names}, the compiled kernel has {compiled}; build dtsa_agent again")
 

@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from . import _kernel
 from .abstract_swarm import PRESENT_LEAVING, AbstractSwarm, Bytes
+from .compiled import COMPILED, CORES, MISSING, REFERENCE
+from .compiled import kernel as _kernel
 from .config import SwarmConfig
+from .errors import ConfigError
 from .flight_models import flight_model
 from .frame import PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, position_step
 from .reference.estimators import decay_table
+from .reference_swarm import ReferenceSwarm
 from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
 from .scenario import STREAM_POLICY, Scenario, generator
 
@@ -28,10 +31,16 @@ class Swarm(AbstractSwarm):
     :param local: ids of the agents that live here, ascending; default: all.
     :param shared_table: one table serves all local agents. Right only where all hear the same, i.e. without loss.
     :param observers: with ``local=[]``: ids of the observers whose tables are kept (0: one that hears everything).
-    :raises ConfigError: for ids that do not exist, or settings that need agents that are not here.
+    :param core: ``reference``: a :class:`~dtsa_agent.core.reference_swarm.ReferenceSwarm` comes into being instead.
+    :raises ConfigError: for ids that do not exist, or settings that need agents or a kernel that are not here.
     """
 
     kernel: _kernel.Swarm
+
+    def __new__(cls, *given: Any, core: str = COMPILED, **named: Any) -> Any:
+        if core not in CORES or (core == COMPILED and MISSING):
+            raise ConfigError("core", core, REFERENCE + f": {MISSING}" if MISSING else ", ".join(CORES))
+        return ReferenceSwarm(*given, **named) if core == REFERENCE else super().__new__(cls)
 
     def __init__(
         self,
@@ -40,6 +49,8 @@ class Swarm(AbstractSwarm):
         local: Sequence[int] | None = None,
         shared_table: bool = False,
         observers: Sequence[int] | None = None,
+        *,
+        core: str = COMPILED,
     ) -> None:
         self._begin(config, scenario, local, shared_table, observers)
         count = len(self.ids)

@@ -15,10 +15,10 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING
-from dtsa_agent.core.alignment import ClockAligner
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import Listeners
+from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 
 from .common import names

@@ -92,11 +92,12 @@ def code_digest(own: Sequence[Path]) -> str:
     """
     import dtsa_channel_sim.model
     from dtsa_agent import core
-    from dtsa_agent.core import _kernel
+    from dtsa_agent.core.compiled import MISSING, kernel
 
     digest = hashlib.sha256()
     roots = [Path(str(package.__file__)).parent for package in (core, dtsa_channel_sim.model)]
-    files = [*(file for root in roots for file in sorted(root.rglob("*.py"))), Path(str(_kernel.__file__)), *own]
+    files = [*(file for root in roots for file in sorted(root.rglob("*.py"))), *own]
+    files += [] if MISSING else [Path(str(kernel.__file__))]
     for path in files:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

@@ -21,6 +21,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--out", metavar="DIR", help="directory for summary.json and config.json; default: only printed"
     )
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    parser.add_argument(
+        "--core", metavar="X", default="compiled",
+        help="compiled, or reference: the protocol's specification in plain Python, much slower [compiled]",
+    )  # fmt: skip
     add_run_options(parser)
 
 
@@ -31,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = run_config(args)
     directory = None if args.out is None else new_directory(args.out)
-    summary = simulate(config).summary()
+    summary = simulate(config, core=args.core).summary()
     text = json.dumps(summary, indent=2) + "\n"
     if directory is not None:
         _write(directory, text, json.dumps(config.to_dict(), indent=2) + "\n")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from dtsa_agent.core import Swarm, SwarmConfig, decode_frame
-from dtsa_agent.core.timebase import LISTENING, RESTARTED, TimeBase
+from dtsa_agent.core.reference.timebase import LISTENING, RESTARTED, TimeBase
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 from dtsa_channel_sim.model.clocks import AgentClock
 

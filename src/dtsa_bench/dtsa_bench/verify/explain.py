@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.core import REASONS, RemoteProtocolError, _kernel, decode_frame
+from dtsa_agent.core import REASONS, RemoteProtocolError, decode_frame
 from dtsa_agent.core.frame import EXTENT_M, TAG_LENGTH
 from dtsa_agent.core.frame_extended import EXTENDED_LENGTH, ExtendedFrame, decode_extended
+from dtsa_agent.core.reference.frame import LENGTHS
 from dtsa_bench.bag.errors import BagError
 from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.bag.run import extent_of
@@ -151,7 +152,7 @@ def _in_frames(
 def _frame(data: bytes, extent_m: float = EXTENT_M) -> str:
     """A frame in words, sealed or not."""
     why = ""
-    whole = _kernel.frame_length(data[0] & 15) if data else 0
+    whole = LENGTHS.get(data[0] & 15, 0) if data else 0
     for length, seal in ((len(data), ""), (len(data) - TAG_LENGTH, ", sealed"), (whole, ", and more")):
         try:
             frame = decode_frame(data[:length], extent_m)

@@ -16,8 +16,9 @@ part.
 
 from __future__ import annotations
 
+from ..errors import ConfigError
 from .alignment import ClockAligner
-from .errors import ConfigError
+from .arithmetic import mix64
 
 LISTENING, ALONE, JOINED = "listening", "alone", "joined"
 
@@ -127,9 +128,5 @@ class TimeBase:
 
 
 def _mixed(seed: int, agent: int) -> int:
-    """A number that looks random, of 64 bits (splitmix64)."""
-    mask = 2**64 - 1
-    x = (seed * 0x9E3779B97F4A7C15 + agent * 0xD1B54A32D192ED03) & mask
-    x = ((x ^ x >> 30) * 0xBF58476D1CE4E5B9) & mask
-    x = ((x ^ x >> 27) * 0x94D049BB133111EB) & mask
-    return x ^ x >> 31
+    """A number that looks random, of 64 bits."""
+    return mix64(seed * 0x9E3779B97F4A7C15 + agent * 0xD1B54A32D192ED03 - 0x9E3779B97F4A7C15)
