@@ -23,7 +23,10 @@ if TYPE_CHECKING:
         SlotOutcome,
         SwarmConfig,
     )
+    from dtsa_agent.core.plugins import Table
+    from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.bag.errors import BagError, UnusableBag
+    from dtsa_bench.figures.palette import agent_colour
     from dtsa_bench.run_config import RunConfig, RunLimits
     from dtsa_bench.verify import Difference
     from dtsa_bench.verify import Result as Verification
@@ -31,10 +34,12 @@ if TYPE_CHECKING:
 
     from ._flight import Flight, run_config, simulate
     from ._plots import plot_ages, plot_bars, plot_distances, plot_lines, plot_matrix, plot_trajectories
+    from ._plugins import register
     from ._recording import Recording, read_bag, verify
     from ._sweep import SweepResult, sweep
 
 __all__ = [
+    "REASONS",
     "Agent",
     "BagError",
     "Channel",
@@ -53,10 +58,12 @@ __all__ = [
     "SlotOutcome",
     "SwarmConfig",
     "SweepResult",
+    "Table",
     "UnusableBag",
     "Verdict",
     "Verification",
     "__version__",
+    "agent_colour",
     "plot_ages",
     "plot_bars",
     "plot_distances",
@@ -64,6 +71,7 @@ __all__ = [
     "plot_matrix",
     "plot_trajectories",
     "read_bag",
+    "register",
     "run_config",
     "simulate",
     "sweep",
@@ -73,19 +81,23 @@ __all__ = [
 _HOMES = {
     "dtsa._flight": ("Flight", "run_config", "simulate"),
     "dtsa._plots": ("plot_ages", "plot_bars", "plot_distances", "plot_lines", "plot_matrix", "plot_trajectories"),
+    "dtsa._plugins": ("register",),
     "dtsa._recording": ("Recording", "read_bag", "verify"),
     "dtsa._sweep": ("SweepResult", "sweep"),
     "dtsa_agent.core": (
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "RemoteProtocolError", "SlotOutcome",
         "SwarmConfig",
     ),
+    "dtsa_agent.core.plugins": ("Table",),
+    "dtsa_agent.core.registry": ("REASONS",),
     "dtsa_bench.bag.errors": ("BagError", "UnusableBag"),
+    "dtsa_bench.figures.palette": ("agent_colour",),
     "dtsa_bench.run_config": ("RunConfig", "RunLimits"),
     "dtsa_bench.verify": ("Difference", "Verification"),
     "dtsa_channel_sim": ("Channel", "ChannelConfig", "ClockConfig", "Verdict"),
 }  # fmt: skip
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
-_OTHER_NAMES = {"Verification": "Result"}
+_OTHER_NAMES = {"Verification": "Result", "REASONS": "REASON_TEXTS"}
 
 if not TYPE_CHECKING:  # a type checker takes the names from above, and knows no others
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import REASONS
 from dtsa_bench.run_config import RunConfig
 from dtsa_bench.simulate import Flight as _Flight
 from dtsa_bench.simulate import Trace
@@ -29,6 +30,7 @@ class Flight:
 
     config: RunConfig
     summary: dict[str, Any]  # the results, with the keys of summary.json; units are in the names
+    observer: int  # id of the agent whose table the trace follows
     _flight: _Flight
 
     @property
@@ -75,7 +77,50 @@ class Flight:
         )
 
     @property
-    def positions(self) -> pd.DataFrame:
+    def decisions(self) -> pd.DataFrame:
+        """What the observer decided, a row a slot: slot, time_s (start), agent, chosen (0: nobody), reason, score.
+
+        :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
+        """
+        trace = self._trace
+        slot = np.arange(len(trace.chosen))
+        return data_frame(
+            {
+                "slot": slot,
+                "time_s": slot * self.config.swarm.slot_s,
+                "agent": np.full(len(slot), self.observer),
+                "chosen": trace.chosen,
+                "reason": [REASONS[code] for code in trace.reasons],
+                "score": trace.scores,
+            }
+        )
+
+    @property
+    def ages_by_observer(self) -> pd.DataFrame:
+        """What the observer knew, a row a slot and agent that it had heard: columns as in :class:`Recording`.
+
+        :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
+        """
+        trace, swarm = self._trace, self.config.swarm
+        heard = np.stack(trace.heard_slot)
+        known = heard >= 0
+        known[:, self.observer - 1] = False
+        slot, column = np.nonzero(known)
+        gap = np.stack(trace.estimates) - np.stack([track[-1] for track in trace.tracks])
+        return data_frame(
+            {
+                "slot": slot,
+                "time_s": (slot + 1) * swarm.slot_s,
+                "observer": np.full(len(slot), self.observer),
+                "agent": column + 1,
+                "age_slots": slot - heard[slot, column],
+                "error_m": np.sqrt((gap**2).sum(axis=1))[slot, column],
+                "counted": (np.stack(trace.in_ap) != 0)[slot, column] & self.moving[column],
+            }
+        )
+
+    @property
+    def states(self) -> pd.DataFrame:
         """A row an agent and control instant: time_s, agent (id), position_{x,y,z}_m in frame map.
 
         :raises ConfigError: if the flight was simulated without its trace, or pandas is missing.
@@ -122,4 +167,4 @@ def simulate(config: RunConfig | None = None, *, trace: bool = True, observer: i
     if not 1 <= observer <= run.swarm.agents:
         raise ConfigError("observer", observer, f"1 to {run.swarm.agents}")
     flight = _simulate(run, trace=trace, observer=observer)
-    return Flight(run, flight.summary(), flight)
+    return Flight(run, flight.summary(), observer, flight)

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_bench.bag.export import arrow_table
 from dtsa_bench.bag.place import find_file
 from dtsa_bench.bag.run import RecordedRun, load_run
-from dtsa_bench.report.ages import Followed, follow_run
 from dtsa_bench.run_config import RunConfig
+from dtsa_bench.tables.ages import Followed, follow_run
+from dtsa_bench.tables.export import ages_table, arrow_table
 from dtsa_bench.verify import Result, verify_bag
 
 from ._frames import data_frame, from_arrow
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Recording:
-    """A recorded run. Tables are made when they are first asked for; all but `ages` have the columns of `dtsa export`.
+    """A recorded run. Tables are made when first asked for, with the columns of `dtsa export`: docs/columns.md.
 
     :param path: run directory, bag directory or .mcap file.
     :raises UnusableBag: if it is no bag of this project, or is damaged.
@@ -85,16 +85,21 @@ class Recording:
 
     @cached_property
     def slots(self) -> pd.DataFrame:
-        """A row a slot: slot, time_s (start), outcome, senders (how many).
+        """A row a slot: slot, time_s (start), outcome, senders (how many), sender (id of the first, 0: nobody).
 
         :raises ConfigError: if pandas is missing; likewise below.
         """
         return from_arrow(arrow_table(self._run, "slots"))
 
     @cached_property
-    def receptions(self) -> pd.DataFrame:
+    def frames(self) -> pd.DataFrame:
         """A row a frame: slot, time_s, sender, received, lost, collided (receivers), length, data, and what it said."""
         return from_arrow(arrow_table(self._run, "frames"))
+
+    @cached_property
+    def receptions(self) -> pd.DataFrame:
+        """Who received what, a row a frame and other agent: slot, time_s, sender, receiver, received (or not)."""
+        return from_arrow(arrow_table(self._run, "receptions"))
 
     @cached_property
     def decisions(self) -> pd.DataFrame:
@@ -102,29 +107,25 @@ class Recording:
         return from_arrow(arrow_table(self._run, "decisions"))
 
     @cached_property
-    def positions(self) -> pd.DataFrame:
+    def states(self) -> pd.DataFrame:
         """A row an agent and instant: time_s, agent, position_{x,y,z}_m, velocity_{x,y,z}_mps, frame map."""
         return from_arrow(arrow_table(self._run, "states"))
 
     @cached_property
     def ages(self) -> pd.DataFrame:
-        """A row a slot and agent: slot, time_s (end), agent, age_slots, error_m: means over the agent's observers.
+        """A row a slot and agent: slot, time_s (end), agent, observers, age_slots, error_m: means over its observers.
 
         Not a number where nobody still expects the agent to move; no rows where the bag does not hold enough.
         """
-        ages, agents = self._followed.ages, self._run.agents
-        if ages is None:
-            return data_frame({name: np.zeros(0) for name in ("slot", "time_s", "agent", "age_slots", "error_m")})
-        slot = np.repeat(ages.slot, agents)
-        return data_frame(
-            {
-                "slot": slot,
-                "time_s": self._run.time_s(slot + 1),
-                "agent": np.tile(np.arange(1, agents + 1), len(ages.slot)),
-                "age_slots": ages.age.ravel(),
-                "error_m": ages.error.ravel(),
-            }
-        )
+        return data_frame(ages_table(self._run, self._followed))
+
+    @cached_property
+    def ages_by_observer(self) -> pd.DataFrame:
+        """A row a slot, observer and agent: slot, time_s (end), observer, agent, age_slots, error_m, counted.
+
+        That is slots times agents squared: 5 s of 200 agents are 20 million rows.
+        """
+        return from_arrow(arrow_table(self._run, "ages_by_observer"))
 
 
 def read_bag(path: str | Path) -> Recording:

@@ -13,10 +13,11 @@ from dtsa_bench.batch.journal import Journal
 from dtsa_bench.batch.pool import run_all
 from dtsa_bench.sweep.aggregate import MEASURES, Group, Table, collected, write_table
 from dtsa_bench.sweep.columns import COMMON, VALUES
-from dtsa_bench.sweep.spec import load_preset, make_sweep
+from dtsa_bench.sweep.spec import Sweep, load_preset, make_sweep
 from dtsa_bench.sweep.work import WORK
 
 from ._frames import data_frame
+from ._plugins import registered
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,6 +72,16 @@ def _row(group: Group) -> dict[str, Any]:
     return row
 
 
+def _refuse_registered(plan: Sweep, field: str, value: object) -> None:
+    """Other processes do not know what was registered in this one, and no journal notices when it changes."""
+    for kind, names in registered().items():
+        for cell in plan.cells:
+            name = getattr(cell.run(plan.seeds[0]).swarm, kind)
+            if name in names:
+                allowed = f"{'1' if field == 'jobs' else 'None'} with the registered {kind} {name}"
+                raise ConfigError(field, value, f"{allowed}; or announce it by an entry point (docs/bench.md)")
+
+
 def sweep(
     preset: str | None = None,
     *,
@@ -110,6 +121,9 @@ def sweep(
         chosen = SEEDS if seeds is None else seeds if isinstance(seeds, int) else list(seeds)
         content: dict[str, Any] = {"axes": plain, "base": dict(base or {}), "seeds": chosen}
         plan = make_sweep(content, "sweep", first_seed=first_seed)
+
+    if jobs > 1 or out is not None:
+        _refuse_registered(plan, "jobs" if jobs > 1 else "out", jobs if jobs > 1 else str(out))
 
     def advance(runs: int, cost: float) -> None:
         if progress is not None:

@@ -1,8 +1,9 @@
 """What a flight was worth: the one definition of all results, for `simulate`, `fly`, `sweep` and `verify`.
 
 Times are those of slot ends, counted from the start of slot 0. Distances and paths are true ones, at every control
-instant. Ages and estimate errors are taken at every slot's end after the boot round (from slot N on), over all pairs of
-an observer and a mover that the observer still has in A_p; an agent heard in the slot that just ended has age 0.
+instant. Ages and estimate errors are taken at every slot's end from that of slot N - 1 on, with which a boot round is
+over: over all pairs of an observer and a mover that the observer still has in A_p. An agent heard in the slot that just
+ended has age 0.
 """
 
 from __future__ import annotations

@@ -32,11 +32,14 @@ class Trace:
 
     senders: list[tuple[int, ...]] = field(default_factory=list)  # ids
     outcomes: list[int] = field(default_factory=list)
-    reasons: list[int] = field(default_factory=list)  # index into REASONS, of the first table
+    reasons: list[int] = field(default_factory=list)  # index into REASONS, of ``observer``
+    chosen: list[int] = field(default_factory=list)  # id that ``observer`` took for the sender, 0: nobody
+    scores: list[float] = field(default_factory=list)  # priority g of that one, 0 without one
     tracks: list[Array] = field(default_factory=list)  # (S, 3, N) m, frame map, true positions
     estimates: list[Array] = field(default_factory=list)  # (3, N) m, of ``observer`` for the start of the next slot
     heard: list[Array] = field(default_factory=list)  # (3, N) m, last received positions of ``observer``
-    heard_slot: list[NDArray[np.int64]] = field(default_factory=list)  # (N,) the slots they are from
+    heard_slot: list[NDArray[np.int64]] = field(default_factory=list)  # (N,) the slots they are from, -1: never
+    in_ap: list[NDArray[np.uint8]] = field(default_factory=list)  # (N,) A_p of ``observer``
 
     def positions(self) -> Array:
         """True positions at all control instants, (T, 3, N), m, frame map."""
@@ -148,8 +151,11 @@ def _keep(kept: Trace, swarm: AbstractSwarm, slot: int, senders: tuple[int, ...]
     kept.senders.append(senders)
     kept.outcomes.append(outcome)
     kept.reasons.append(int(swarm.reason[table]))
+    kept.chosen.append(int(swarm.chosen[table]))
+    kept.scores.append(float(swarm.score[table]))
     kept.tracks.append(swarm.track.copy())
     swarm.estimate(slot + 1)
     kept.estimates.append(swarm.estimate_position[table].copy())
     kept.heard.append(swarm.sent_position[table].copy())
     kept.heard_slot.append(swarm.sent_slot[table].copy())
+    kept.in_ap.append(swarm.in_ap[table].copy())

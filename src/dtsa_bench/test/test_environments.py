@@ -94,7 +94,7 @@ def test_a_waiting_set_up_does_not_use_the_environment(checkout: Path) -> None:
 def test_what_is_missing_is_said_before_anything_is_removed(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DISTRO", "jazzy")
     monkeypatch.setattr(checks, "check", lambda: None)
-    monkeypatch.setattr(wheels, "system_distributions", lambda python: {"numpy", "pyyaml"})
+    monkeypatch.setattr(wheels, "system_distributions", lambda python: {"numpy", "pandas", "pyyaml"})
     kept = layout.VENV / "kept"
     kept.parent.mkdir()
     kept.touch()

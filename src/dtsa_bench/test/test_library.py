@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from flight_helpers import flight_bag
 
@@ -83,7 +84,7 @@ def test_simulate_is_the_flight_of_the_command(flight: dtsa.Flight) -> None:
 
 
 def test_tables_of_a_flight_have_a_row_a_slot_and_a_row_an_agent_and_instant(flight: dtsa.Flight) -> None:
-    slots, positions = flight.slots, flight.positions
+    slots, positions = flight.slots, flight.states
     assert len(slots) == flight.summary["slots"]["total"]
     assert slots["outcome"].value_counts().to_dict() == {
         name: count for name, count in flight.summary["slots"].items() if name != "total" and count
@@ -109,16 +110,79 @@ def test_a_recording_has_its_configuration_and_tables(run: Path) -> None:
     assert (recording.name, recording.config.swarm.policy, recording.config.swarm.seed) == ("a", "lease", 3)
     assert len(recording.slots) == 200
     assert len(recording.decisions) == 200 * 6
-    assert len(recording.receptions) == recording.slots["senders"].sum()
-    assert set(recording.positions["agent"]) == {1, 2, 3, 4, 5, 6}
+    assert len(recording.frames) == recording.slots["senders"].sum()
+    assert len(recording.receptions) == 5 * len(recording.frames)
+    assert recording.receptions["received"].sum() == recording.frames["received"].sum()
+    assert set(recording.states["agent"]) == {1, 2, 3, 4, 5, 6}
     assert recording.path.shape == (len(recording.time_s), 3, 6)
-    assert len(recording.positions) == 6 * len(recording.time_s)
+    assert len(recording.states) == 6 * len(recording.time_s)
     counted = recording.ages.dropna()
     assert counted["age_slots"].mean() == pytest.approx(recording.summary["age_mean_slots"], rel=0.1)
     assert recording.summary["slots"]["total"] == 200
     assert dtsa.verify(run).mode == "lockstep"
     with pytest.raises(dtsa.UnusableBag, match="no such file"):
         dtsa.read_bag(run / "nothing")
+
+
+def test_what_one_agent_knew_is_the_same_simulated_and_recorded(run: Path) -> None:
+    """Losses are drawn otherwise in the recorded one: the first round alone is the same."""
+    recording = dtsa.read_bag(run)
+    for observer in (1, 4):
+        recorded = recording.ages_by_observer.query("observer == @observer")
+        chosen = recording.decisions.query("agent == @observer")
+        flight = dtsa.simulate(recording.config, observer=observer)
+        simulated, decisions = flight.ages_by_observer, flight.decisions
+        assert simulated.columns.tolist() == recorded.columns.tolist()
+        assert set(decisions.columns) <= set(chosen.columns)
+        for table in (simulated, recorded):
+            assert (table["agent"] != observer).all()
+            assert (table["age_slots"] >= 0).all()
+            assert (table["error_m"] >= 0).all()
+        assert decisions["chosen"].head(6).tolist() == chosen["chosen"].head(6).tolist()
+        assert decisions["reason"].head(6).tolist() == chosen["reason"].head(6).tolist()
+        assert set(decisions["reason"]) <= set(dtsa.REASONS)
+
+
+def test_ages_of_a_simulated_flight_sum_up_to_its_results() -> None:
+    agents = 6
+    config = dtsa.run_config(agents=agents, policy="lease", loss=0.1, seed=3)
+    flights = [dtsa.simulate(config, observer=observer) for observer in range(1, agents + 1)]
+    known = pd.concat([flight.ages_by_observer for flight in flights])
+    counted = known[known["counted"] & (known["slot"] >= agents - 1)]
+    summary = flights[0].summary
+    assert counted["age_slots"].mean() == pytest.approx(summary["age_mean_slots"], rel=1e-12)
+    assert counted["age_slots"].max() == summary["age_max_slots"]
+    assert counted["error_m"].mean() == pytest.approx(summary["estimate_error_mean_m"], rel=1e-9)
+
+
+class Backwards:
+    """Policy: slot modulo N, from the last agent to the first."""
+
+    def __init__(self, config: dtsa.SwarmConfig, agent: int) -> None:
+        self.agents = config.agents
+
+    def choose(self, table: dtsa.Table, slot: int) -> int:
+        return self.agents - slot % self.agents
+
+
+def test_a_registered_policy_flies_in_this_process_and_is_refused_elsewhere(tmp_path: Path) -> None:
+    dtsa.register("policy", "backwards", Backwards)
+    assert dtsa.simulate(agents=4, policy="backwards", timeout_s=0.2).slots["sender"].head(5).tolist() == [
+        4,
+        3,
+        2,
+        1,
+        4,
+    ]
+    axes, base = {"policy": ["backwards"]}, {"agents": 4, "timeout_s": 0.2}
+    assert len(dtsa.sweep(axes=axes, base=base, seeds=2).runs()) == 2
+    for more, field in (({"jobs": 2}, "jobs"), ({"out": tmp_path / "s"}, "out")):
+        with pytest.raises(dtsa.ConfigError, match="registered policy backwards") as caught:
+            dtsa.sweep(axes=axes, base=base, seeds=2, **more)  # type: ignore[arg-type]
+        assert caught.value.field == field
+    for words in (("policy", "tdma", Backwards), ("colour", "x", Backwards), ("policy", "x", 3)):
+        with pytest.raises(dtsa.ConfigError):
+            dtsa.register(*words)
 
 
 def test_a_sweep_has_a_row_a_combination_and_a_row_a_flight(swept: dtsa.SweepResult, tmp_path: Path) -> None:

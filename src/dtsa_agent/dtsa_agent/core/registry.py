@@ -97,6 +97,7 @@ class Registry(Generic[Row]):
         self.rows: Mapping[str, Row] = MappingProxyType({row.name: row for row in rows})
         self._plug_in_row = plug_in_row
         self._plug_ins: dict[str, tuple[Any, Row]] = {}  # looking for them takes milliseconds
+        self.registered: set[str] = set()  # names of plug-ins that only this process knows
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -125,6 +126,20 @@ class Registry(Generic[Row]):
         :raises ConfigError: if there is none, or it cannot be used.
         """
         return self._plug_in(name)[0]
+
+    def register(self, name: str, factory: Any) -> None:
+        """Makes a plug-in known to this process, under a name that no built-in row has; an older one is replaced.
+
+        :param name: what the setting calls it.
+        :param factory: called as ``factory(config, agent)`` for every observer.
+        :raises ConfigError: for a name or a factory that cannot be used.
+        """
+        if not isinstance(name, str) or not name or name in self.rows:
+            raise ConfigError(self.kind, name, f"another name: {', '.join(self.rows)} are built in")
+        if not callable(factory):
+            raise ConfigError(name, factory, "a class, or a function of the configuration and an agent's id")
+        self._plug_ins[name] = factory, self._plug_in_row(name, factory)
+        self.registered.add(name)
 
     def plug_ins(self) -> dict[str, EntryPoint]:
         """The plug-ins installed on this machine, by name.

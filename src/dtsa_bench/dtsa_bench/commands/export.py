@@ -6,9 +6,11 @@ import argparse
 
 from dtsa_bench.registry import RECORDED_RUN
 
+TABLES = ("slots", "frames", "receptions", "decisions", "states", "ages", "ages_by_observer")
 DESCRIPTION = """\
-Writes a recorded run as tables for pandas and polars: slots, frames, decisions and states, one file each, and
-columns.md, which says what each column holds and in which unit."""
+Writes a recorded run as tables for pandas and polars: slots, frames, who received them, decisions, states, ages and
+errors (of each agent; of each agent in the eyes of each observer), one file each, and columns.md, which says what each
+column holds and in which unit."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,13 +19,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("bag", help=RECORDED_RUN)
     parser.add_argument("--to", default="parquet", metavar="FORMAT", help="parquet (default) or csv")
     parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_tables beside the bag)")
-    parser.add_argument("--tables", nargs="+", metavar="TABLE", help="only these: slots frames decisions states")
+    parser.add_argument("--tables", nargs="+", metavar="TABLE", help=f"only these: {' '.join(TABLES)}")
 
 
 def run(args: argparse.Namespace) -> int:
     """Export the bag."""
-    from dtsa_bench.bag.export import export
     from dtsa_bench.bag.place import bag_of
+    from dtsa_bench.tables.export import export
 
     bag = bag_of(args.bag).resolve()
     target = args.out or bag.with_name(f"{bag.name if bag.is_dir() else bag.stem}_tables")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core import Scenario
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.run import OUTCOMES, RecordedRun, load_run, swarm_section
-from dtsa_bench.report.ages import Ages, follow_run
+from dtsa_bench.tables.ages import Ages, follow_run
 
 BINS = 400  # steps of the charts over time
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second

@@ -16,48 +16,11 @@ from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_frame
 from dtsa_bench.bag.errors import BagError
 from dtsa_bench.bag.run import OUTCOMES, RecordedRun, extent_of, load_run
+from dtsa_bench.tables.ages import Followed, follow_run, observed
+from dtsa_bench.tables.columns import AXES, COLUMNS, describe
 
 FORMATS = ("parquet", "csv")
 ROWS = 65536  # rows that are in memory as a table at once
-AXES = "xyz"
-
-# Columns by table: name, unit, meaning. Also written beside the tables and to the Parquet files' own metadata.
-COLUMNS: dict[str, list[tuple[str, str, str]]] = {
-    "slots": [
-        ("slot", "1", "number of the slot, from 0"),
-        ("time_s", "s", "start of the slot, counted from the start of slot 0"),
-        ("outcome", "", "the channel's verdict: idle, success or collision"),
-        ("senders", "1", "agents that sent"),
-    ],
-    "frames": [
-        ("slot", "1", "slot in which the frame was sent"),
-        ("time_s", "s", "start of that slot"),
-        ("sender", "", "id of the agent that sent it"),
-        ("received", "1", "agents that received it"),
-        ("lost", "1", "agents that lost it to noise"),
-        ("collided", "1", "agents at which it collided with another frame"),
-        ("length", "byte", "length of the frame"),
-        ("data", "", "the frame, hexadecimal"),
-        ("c_r", "1", "transmission parameter in the frame; 0: arrived; empty if the frame cannot be decoded"),
-        *((f"position_{axis}_m", "m", f"position {axis} in the frame, frame map") for axis in AXES),
-        *((f"velocity_{axis}_mps", "m/s", f"velocity {axis} in the frame") for axis in AXES),
-    ],
-    "decisions": [
-        ("slot", "1", "slot that was decided about"),
-        ("time_s", "s", "start of that slot"),
-        ("agent", "", "id of the agent that decided"),
-        ("chosen", "", "id of the agent that it takes for the sender; 0: nobody"),
-        ("reason", "", "why, by name"),
-        ("score", "1", "priority value g of the chosen agent, 0 where the policy has none"),
-        ("digest", "", "digest of the agent's table: equal digests, equal tables"),
-    ],
-    "states": [
-        ("time_s", "s", "time of the state, counted from the start of slot 0"),
-        ("agent", "", "id"),
-        *((f"position_{axis}_m", "m", f"true position {axis}, frame map") for axis in AXES),
-        *((f"velocity_{axis}_mps", "m/s", f"true velocity {axis}") for axis in AXES),
-    ],
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,15 +73,6 @@ def export(
     return written
 
 
-def describe() -> str:
-    """The columns of all tables as Markdown."""
-    parts = ["# Columns of the exported tables\n"]
-    for table, columns in COLUMNS.items():
-        parts.append(f"\n## {table}\n\n| column | unit | meaning |\n|---|---|---|\n")
-        parts.extend(f"| `{name}` | {unit} | {meaning} |\n" for name, unit, meaning in columns)
-    return "".join(parts)
-
-
 def arrow_table(run: RecordedRun, name: str) -> pa.Table:
     """One table of a run in memory.
 
@@ -161,7 +115,10 @@ def _pieces(count: int, width: int = 1) -> Iterator[slice]:
 def _slots(run: RecordedRun) -> Iterator[dict[str, Any]]:
     counts = np.zeros(len(run.slots), np.int64)
     places = np.searchsorted(run.slots, run.frames.slot)
-    np.add.at(counts, places[places < len(counts)], 1)
+    known = places < len(counts)
+    np.add.at(counts, places[known], 1)
+    first = np.zeros(len(run.slots), np.int64)
+    first[places[known][::-1]] = run.frames.sender[known][::-1]  # the first of several is written last
     names = np.array(OUTCOMES)
     for piece in _pieces(len(run.slots)):
         yield {
@@ -169,6 +126,7 @@ def _slots(run: RecordedRun) -> Iterator[dict[str, Any]]:
             "time_s": run.time_s(run.slots[piece]),
             "outcome": pa.array(names[run.outcome[piece]].tolist(), pa.string()),
             "senders": counts[piece],
+            "sender": first[piece],
         }
 
 
@@ -191,6 +149,21 @@ def _frames(run: RecordedRun) -> Iterator[dict[str, Any]]:
         for index, name in enumerate(names, 1):
             batch[name] = pa.array([values[index] for values in decoded], pa.float64())
         yield batch
+
+
+def _receptions(run: RecordedRun) -> Iterator[dict[str, Any]]:
+    frames, ids = run.frames, np.arange(1, run.agents + 1)
+    for piece in _pieces(len(frames.slot), run.agents):
+        other = ids[None, :] != frames.sender[piece][:, None]  # (F, N)
+        row, column = np.nonzero(other)
+        slots = frames.slot[piece][row]
+        yield {
+            "slot": slots,
+            "time_s": run.time_s(slots),
+            "sender": frames.sender[piece][row],
+            "receiver": ids[column],
+            "received": frames.received[piece][row, column],
+        }
 
 
 def _decode(data: bytes, extent_m: float) -> tuple[Any, ...]:
@@ -231,9 +204,62 @@ def _states(run: RecordedRun) -> Iterator[dict[str, Any]]:
         yield batch
 
 
+def ages_table(run: RecordedRun, followed: Followed) -> dict[str, Any]:
+    """Columns of the table `ages`; no rows where the bag does not hold enough.
+
+    :param run: the run.
+    :param followed: what came of following it.
+    """
+    ages = followed.ages
+    slot = np.zeros(0, np.int64) if ages is None else np.repeat(ages.slot, run.agents)
+    none = np.zeros(0)
+    return {
+        "slot": slot,
+        "time_s": run.time_s(slot + 1),
+        "agent": np.tile(np.arange(1, run.agents + 1), len(slot) // run.agents),
+        "observers": np.zeros(0, np.int64) if ages is None else ages.observers.ravel(),
+        "age_slots": none if ages is None else ages.age.ravel(),
+        "error_m": none if ages is None else ages.error.ravel(),
+    }
+
+
+def _ages(run: RecordedRun) -> Iterator[dict[str, Any]]:
+    columns = ages_table(run, follow_run(run))
+    for piece in _pieces(len(columns["slot"])):
+        batch = {name: values[piece] for name, values in columns.items()}
+        for name in ("age_slots", "error_m"):
+            batch[name] = pa.array(batch[name], pa.float64(), from_pandas=True)  # not a number: empty
+        yield batch
+
+
+def _ages_by_observer(run: RecordedRun) -> Iterator[dict[str, Any]]:
+    names = ("slot", "observer", "agent", "age_slots", "error_m", "counted")
+    kinds = (np.int64, np.int64, np.int64, np.int64, np.float64, np.bool_)
+    waiting: list[list[Any]] = [[np.zeros(0, kind)] for kind in kinds]
+    rows, done = 0, False
+
+    def batch() -> dict[str, Any]:
+        columns = dict(zip(names, (np.concatenate(parts) for parts in waiting), strict=True))
+        return {"slot": columns.pop("slot"), "time_s": run.time_s(np.concatenate(waiting[0]) + 1), **columns}
+
+    for seen in observed(run):
+        values = (np.full(len(seen.agent), seen.slot), seen.observer, seen.agent, seen.age, seen.error, seen.counted)
+        for parts, column in zip(waiting, values, strict=True):
+            parts.append(column)
+        rows += len(seen.agent)
+        if rows >= ROWS:
+            yield batch()
+            waiting, rows, done = [[np.zeros(0, kind)] for kind in kinds], 0, True
+    if rows or not done:
+        yield batch()
+
+
 _TABLES: dict[str, Callable[[RecordedRun], Iterator[dict[str, Any]]]] = {
     "slots": _slots,
     "frames": _frames,
+    "receptions": _receptions,
     "decisions": _decisions,
     "states": _states,
+    "ages": _ages,
+    "ages_by_observer": _ages_by_observer,
 }

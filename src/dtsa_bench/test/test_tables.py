@@ -12,12 +12,14 @@ from flight_helpers import flight_bag
 
 from dtsa_agent.core import decode_frame
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.bag import export as module
 from dtsa_bench.bag.errors import BagError, UnusableBag
-from dtsa_bench.bag.export import COLUMNS, export
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.run import load_run
 from dtsa_bench.bag.writer import BagWriter
+from dtsa_bench.commands.export import TABLES
+from dtsa_bench.tables import export as module
+from dtsa_bench.tables.columns import COLUMNS, describe
+from dtsa_bench.tables.export import export
 
 SLOTS, AGENTS = 120, 6
 
@@ -83,6 +85,52 @@ def test_tables_have_the_documented_columns_and_the_bag_s_values(flight: Path, t
         assert [row["position_x_m"], row["position_y_m"], row["position_z_m"]] == pytest.approx(track, abs=1e-9)
 
 
+def test_who_received_what_and_who_knew_what(flight: Path, tmp_path: Path) -> None:
+    export(flight, tmp_path / "tables", tables=["frames", "receptions", "ages", "ages_by_observer"])
+    tables, run = read(tmp_path / "tables", "parquet"), load_run(flight)
+    by_frame = tables["receptions"].groupby(["slot", "sender"])["received"]
+    assert by_frame.sum().tolist() == tables["frames"].sort_values(["slot", "sender"])["received"].tolist()
+    assert set(by_frame.count()) == {AGENTS - 1}
+    for slot, sender, receiver, received in tables["receptions"][["slot", "sender", "receiver", "received"]].to_numpy():
+        row = np.flatnonzero((run.frames.slot == slot) & (run.frames.sender == sender))[0]
+        assert run.frames.received[row, receiver - 1] == received
+
+    # Age by hand: slots since the last frame of the agent that the observer received.
+    heard = tables["receptions"].query("received")
+    known = tables["ages_by_observer"].set_index(["slot", "observer", "agent"])
+    for observer, agent in ((1, 2), (3, 6), (5, 1)):
+        times = heard.query("receiver == @observer and sender == @agent")["slot"].to_numpy()
+        for slot in (times[0], times[0] + 1, times[-1], SLOTS - 1):
+            assert known.loc[(slot, observer, agent), "age_slots"] == slot - times[times <= slot].max()
+        assert (times[0] - 1, observer, agent) not in known.index
+    counted = known[known["counted"]].groupby(["slot", "agent"])
+    means = tables["ages"].dropna().set_index(["slot", "agent"])
+    assert np.allclose(counted["age_slots"].mean(), means["age_slots"])
+    assert np.allclose(counted["error_m"].mean(), means["error_m"])
+    assert (counted.size() == means["observers"]).all()
+
+
+def test_pairs_of_a_flight_without_losses_have_all_observers(tmp_path: Path) -> None:
+    """One table stands for all agents there."""
+    flight_bag(tmp_path / "bag", slots=40, agents=4, moving=2, policy="tdma", seed=1)
+    run = load_run(tmp_path / "bag")
+    known = module.arrow_table(run, "ages_by_observer").to_pandas()
+    last = known[known["slot"] == 39]
+    assert len(last) == 4 * 3
+    assert last.groupby("agent")["age_slots"].nunique().tolist() == [1] * 4
+    assert last.groupby("agent")["counted"].sum().isin([0, 3]).all()
+    ages = module.arrow_table(run, "ages").to_pandas().query("slot == 39")
+    assert sorted(ages["observers"]) == [0, 0, 3, 3]
+
+
+def test_the_document_of_columns_is_made_from_them() -> None:
+    document = Path(__file__).resolve().parents[3] / "docs" / "columns.md"
+    if not document.exists():
+        pytest.skip("not in the source tree")
+    assert document.read_text(encoding="utf-8") == describe()
+    assert tuple(COLUMNS) == TABLES
+
+
 def test_units_are_in_the_parquet_files(flight: Path, tmp_path: Path) -> None:
     export(flight, tmp_path / "tables", tables=["states"])
     assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["columns.md", "states.parquet"]
@@ -131,7 +179,7 @@ def module_definition(topic: object) -> object:
 def test_bad_input_is_refused(flight: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="parquet or csv"):
         export(flight, tmp_path / "a", "xlsx")
-    with pytest.raises(ConfigError, match="slots, frames, decisions, states"):
+    with pytest.raises(ConfigError, match="slots, frames, receptions, decisions, states, ages, ages_by_observer"):
         export(flight, tmp_path / "a", tables=["slot"])
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="empty or does not exist"):

@@ -1,0 +1,1 @@
+"""A recorded run as tables: for the report, for data frames, and as files."""

@@ -1,0 +1,177 @@
+"""How old the agents' knowledge of each other was, and how wrong their estimates, slot by slot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import AbstractSwarm, Scenario, make_scenario
+from dtsa_agent.core.errors import DtsaError
+from dtsa_bench.bag.run import RecordedRun
+from dtsa_bench.metrics import FlightMetrics, metrics_tables
+from dtsa_bench.run_config import RunConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Ages:
+    """By slot and agent: means over all observers that still have that agent in A_p; NaN without any."""
+
+    slot: NDArray[np.int64]  # (M,)
+    age: NDArray[np.float64]  # slots, (M, N)
+    error: NDArray[np.float64]  # m, (M, N)
+    observers: NDArray[np.int64]  # (M, N)
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """What each observer knew of each other agent that it had heard, at the end of one slot: P pairs."""
+
+    slot: int
+    observer: NDArray[np.int64]  # (P,) ids
+    agent: NDArray[np.int64]  # (P,) ids
+    age: NDArray[np.int64]  # slots, (P,)
+    error: NDArray[np.float64]  # m, (P,)
+    counted: NDArray[np.bool_]  # (P,) the observer still has it in A_p, and it moves
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """What a recorded run gives when it is followed slot by slot; nothing where the bag does not hold enough."""
+
+    scenario: Scenario | None
+    ages: Ages | None
+    summary: dict[str, Any]  # as in summary.json
+    notes: list[str]  # what is left out, and why
+
+
+@dataclass(frozen=True, slots=True)
+class _Usable:
+    """A run that can be followed, or why it cannot."""
+
+    config: RunConfig | None
+    scenario: Scenario | None
+    why_not: str = ""
+
+
+def _usable(run: RecordedRun) -> _Usable:
+    try:
+        config = RunConfig.from_dict(run.config if "swarm" in run.config else {"swarm": run.config})
+        scenario = make_scenario(config.swarm)
+    except (DtsaError, TypeError, ValueError) as error:
+        note = f"Ages, estimates and results are left out: the configuration cannot be used ({error})."
+        return _Usable(None, None, note)
+    complete = len(run.slots) and np.array_equal(run.slots, np.arange(len(run.slots)))
+    everyone = np.array_equal(run.motion.ids, np.arange(1, run.agents + 1))
+    if not complete or not everyone or run.agents != config.swarm.agents:
+        note = "Ages, estimates and results are left out: slots or agents are missing in the bag."
+        return _Usable(None, scenario, note)
+    if not any(run.frames.data):
+        return _Usable(None, scenario, "Ages and estimates are left out: the bag holds no frames.")
+    return _Usable(config, scenario)
+
+
+def follow_run(run: RecordedRun) -> Followed:
+    """What the agents knew of each other, and the results, by the one definition of `FlightMetrics`.
+
+    :param run: the recorded run.
+    """
+    usable = _usable(run)
+    if usable.config is None or usable.scenario is None:
+        return Followed(usable.scenario, None, {}, [usable.why_not])
+    config, scenario = usable.config, usable.scenario
+    metrics = FlightMetrics(config, scenario)
+    ages = _means(run, _tables(run, config, scenario), metrics, scenario.moving)
+    notes = []
+    if config.swarm.steps > 1 and len(run.motion.time_ns) < config.swarm.steps * len(run.slots):
+        notes.append("Distances are those at the ends of slots; within a slot agents may have been closer.")
+    return Followed(scenario, ages, metrics.summary(), notes)
+
+
+def observed(run: RecordedRun) -> Iterator[Observed]:
+    """What each observer knew, slot by slot; nothing where the bag does not hold enough.
+
+    :param run: the recorded run.
+    """
+    usable = _usable(run)
+    if usable.config is None or usable.scenario is None:
+        return
+    tables, moving, agents = _tables(run, usable.config, usable.scenario), usable.scenario.moving, run.agents
+    others = ~np.eye(agents, dtype=bool)
+    for slot, truth in _steps(run, tables, None):
+        heard = np.broadcast_to(tables.sent_slot, (agents, agents))  # one table may stand for all
+        row, column = np.nonzero(others & (heard >= 0))
+        gap = np.sqrt(((tables.estimate_position - truth) ** 2).sum(axis=1))
+        yield Observed(
+            slot,
+            row + 1,
+            column + 1,
+            slot - heard[row, column],
+            np.broadcast_to(gap, (agents, agents))[row, column],
+            np.broadcast_to((tables.in_ap != 0) & moving, (agents, agents))[row, column],
+        )
+
+
+def _tables(run: RecordedRun, config: RunConfig, scenario: Scenario) -> AbstractSwarm:
+    """Tables like those of the agents: one that hears everything, or one an agent."""
+    heard_by_all = run.frames.lost.sum() == 0 and run.frames.collided.sum() == 0
+    return metrics_tables(config, scenario, everyone=not heard_by_all)
+
+
+def _steps(
+    run: RecordedRun, tables: AbstractSwarm, metrics: FlightMetrics | None
+) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Feed the recorded frames to the tables, and the metrics with what they then know.
+
+    :param run: a run whose slots are complete from 0 on and that has odometry of all agents.
+    :param tables: tables only; their estimates are those for the end of the slot.
+    :param metrics: updated slot by slot, if there are any.
+    :returns: each slot, and where the agents truly were at its end, (3, N) m, frame map.
+    """
+    count = len(run.slots)
+    starts = np.searchsorted(run.frames.slot, np.arange(count + 1))
+    # Control instants of a slot: after its start, up to its end.
+    edges = run.start_ns + np.arange(count + 1) * run.slot_ns
+    moments = np.searchsorted(run.motion.time_ns, edges, side="right")
+    shared = len(tables.observer) == 1 and tables.observer[0] < 0
+    for slot in range(count):
+        for index in range(starts[slot], starts[slot + 1]):
+            mask = None
+            if not shared:
+                mask = run.frames.received[index].astype(np.uint8)
+                mask[run.frames.sender[index] - 1] = 1  # who sends knows what it said
+            if run.frames.data[index]:
+                tables.hear(slot, run.frames.data[index], mask)
+        tables.end(slot)
+        last = max(1, moments[slot + 1])
+        track = np.ascontiguousarray(run.motion.position[min(moments[slot], last - 1) : last])
+        if metrics is not None:
+            metrics.update(slot, track, tables, int(run.outcome[slot]))
+        tables.estimate(slot + 1)
+        yield slot, track[-1]
+
+
+def _means(run: RecordedRun, tables: AbstractSwarm, metrics: FlightMetrics, moving: NDArray[np.bool_]) -> Ages:
+    """Follow a run; means over the observers."""
+    count, agents = len(run.slots), run.agents
+    age = np.full((count, agents), np.nan)
+    error = np.full((count, agents), np.nan)
+    watching = np.zeros((count, agents), np.int64)
+    shared = len(tables.observer) == 1 and tables.observer[0] < 0
+    own = np.zeros((len(tables.observer), agents), dtype=bool)
+    if not shared:
+        own[np.arange(len(own)), tables.observer] = True
+    for slot, truth in _steps(run, tables, metrics):
+        counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & moving & ~own
+        observers = counted.sum(axis=0)
+        some = observers > 0
+        old = np.where(counted, slot - tables.sent_slot, 0).sum(axis=0)
+        gap = tables.estimate_position - truth
+        wrong = np.where(counted, np.sqrt(np.einsum("vik,vik->vk", gap, gap)), 0).sum(axis=0)
+        age[slot, some] = old[some] / observers[some]
+        error[slot, some] = wrong[some] / observers[some]
+        watching[slot] = observers * (agents - 1 if shared else 1)
+    return Ages(run.slots, age, error, watching)
