@@ -1,9 +1,21 @@
-"""Settings of all tests: no property depends on the machine's speed, and CI looks at the same examples each time."""
+"""Settings of all tests: no property depends on the machine's speed, and CI looks at the same examples each time.
+
+With several workers (`-n`) the tests marked `alone` still have the machine for themselves.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import signal
+import tempfile
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -14,3 +26,85 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],  # says something about the machine only
 )
 settings.load_profile("dtsa")
+
+_LOCKS = "dtsa_locks"  # what workers are told about: the directory of their locks
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Workers begin with the files that start nodes, which take long; those with tests marked `alone` come last."""
+    if _worker_input(config) is None:
+        return
+    alone = {item.path for item in items if _is_alone(item)}
+    nodes = {item.path for item in items if item.get_closest_marker("ros") or item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (item.path in alone, item.path not in nodes))
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """A worker's test waits until the machine is free for it; its timeout begins afterwards."""
+    worker = _worker_input(item.config)
+    if worker is None:
+        return (yield)
+    with machine(Path(worker[_LOCKS]), alone=_is_alone(item)):
+        return (yield)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Tells a worker of pytest-xdist where the locks are."""
+    node.workerinput[_LOCKS] = _lock_directory(node.config)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """A worker that is interrupted tidies up, and has ended two seconds later whatever it does."""
+    if _worker_input(config) is not None:
+        signal.signal(signal.SIGINT, _interrupted)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_keyboard_interrupt(excinfo: pytest.ExceptionInfo[BaseException]) -> None:
+    """Where Ctrl-C found a test is said at once; each worker would take a second to write down how it came there."""
+    excinfo.traceback = excinfo.traceback[-1:]
+
+
+def _interrupted(number: int, frame: FrameType | None) -> None:
+    signal.alarm(2)
+    signal.default_int_handler(number, frame)
+
+
+@contextmanager
+def machine(locks: Path, alone: bool) -> Iterator[None]:
+    """The machine for one test alone, or together with those of other workers that do not mind.
+
+    :param locks: directory of the workers' locks. Who waits at the door lets nobody past, so that each gets its turn.
+    :param alone: whether no other test may run meanwhile.
+    """
+    with (locks / "room").open("w") as room:
+        with (locks / "door").open("w") as door:
+            fcntl.flock(door, fcntl.LOCK_EX)
+            fcntl.flock(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+        try:
+            yield
+        finally:
+            fcntl.flock(room, fcntl.LOCK_UN)  # also for processes that were forked meanwhile
+
+
+def _is_alone(item: pytest.Item) -> bool:
+    return item.get_closest_marker("alone") is not None
+
+
+def _worker_input(config: pytest.Config) -> dict[str, Any] | None:
+    """What a worker of pytest-xdist was told; None: not a worker."""
+    return getattr(config, "workerinput", None)
+
+
+def _lock_directory(config: pytest.Config) -> str:
+    """The directory of a run's locks; it is removed when the run ends."""
+    if _LOCK_DIRECTORY not in config.stash:
+        directory = tempfile.TemporaryDirectory(prefix="dtsa-test-")
+        config.add_cleanup(directory.cleanup)
+        config.stash[_LOCK_DIRECTORY] = directory.name
+    return config.stash[_LOCK_DIRECTORY]
+
+
+_LOCK_DIRECTORY = pytest.StashKey[str]()

@@ -25,8 +25,9 @@ USAGE = {
 Opens a shell in which the workspace is sourced; `tools/dtsa shell -c COMMAND` runs one command in it.""",
     "test": """usage: tools/dtsa test [PYTEST ARGUMENTS]
 
-Installs what the tests need and runs them: all, or those that pytest's arguments choose.
+Installs what the tests need and runs them: all of them on several cores, or what pytest's arguments say.
   tools/dtsa test -k frame -x                        tests with `frame` in their names, until one fails
+  tools/dtsa test -n 0                               all, one after the other
   tools/dtsa test src/dtsa_agent/test/test_frame.py  one file
   tools/dtsa shell -c 'python3 -m pytest --help'     pytest's own help""",
     "clean": """usage: tools/dtsa clean [--all]
@@ -34,6 +35,9 @@ Installs what the tests need and runs them: all, or those that pytest's argument
 Removes what the build made for this kind of machine and this Python; what processes use stays.
   --all   the virtual environment, too""",
 }
+# Tests wait more than they compute, so that one core has work for two; a file's tests share what it flies.
+SIDE_BY_SIDE = ("--dist", "loadfile", "--no-loadscope-reorder")
+MOST_WORKERS = 4
 TEST_EXTRAS = {"test", "dev", "cflib", "benchmark", "cluster"}
 BENCH = layout.SOURCES / "dtsa_bench"
 
@@ -143,7 +147,12 @@ def run_test(arguments: list[str]) -> int:
     """`tools/dtsa test [PYTEST ARGUMENTS]`."""
     prepare.prepare(TEST_EXTRAS)
     os.chdir(layout.ROOT)
-    return start(python(), ["-m", "pytest", *arguments])
+    return start(python(), ["-m", "pytest", *(arguments or ["-n", str(workers()), *SIDE_BY_SIDE])])
+
+
+def workers() -> int:
+    """Tests that run side by side when all are run: as many as there are cores, 2 to `MOST_WORKERS`."""
+    return min(max(len(os.sched_getaffinity(0)), 2), MOST_WORKERS)
 
 
 def run_shell(arguments: list[str]) -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import os
-from functools import lru_cache
+from contextlib import ExitStack
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from dtsa_bench.bag import schema
 from dtsa_bench.bag.cdr import MarkerPacker, OdometryPacker
 from dtsa_bench.bag.errors import BagError
 from dtsa_bench.bag.writer import BagWriter
+from dtsa_bench.fly.domain import ros_domain
 
 MESSAGES = Path(__file__).parents[2] / "dtsa_msgs" / "msg"
 RUN = 0x1234  # id of all synthetic runs
@@ -169,11 +172,21 @@ def synthetic_bag(directory: Path, slots: int = 100, **options: Any) -> Syntheti
     return run
 
 
+_HELD = ExitStack()
+atexit.register(_HELD.close)
+
+
+@cache
+def _own_domain() -> int:
+    """A ROS domain that is this process's as long as it runs."""
+    return _HELD.enter_context(ros_domain())
+
+
 def ros_environment() -> dict[str, str]:
     """Environment for nodes that hear nobody else."""
     return {
         **os.environ,
-        "ROS_DOMAIN_ID": str(os.getpid() % 90 + 10),
+        "ROS_DOMAIN_ID": str(_own_domain()),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "PYTHONUNBUFFERED": "1",
     }

@@ -30,7 +30,6 @@ def has_ros2_bag() -> bool:
 pytestmark = pytest.mark.skipif(
     not has_ros2_bag(), reason="no `ros2 bag` on this machine: it comes with an installation of ROS 2"
 )
-ENVIRONMENT = ros_environment()
 
 
 def ros2(*words: str, timeout: float = 60) -> str:
@@ -41,7 +40,7 @@ def ros2(*words: str, timeout: float = 60) -> str:
         capture_output=True,
         text=True,
         timeout=timeout,
-        env=ENVIRONMENT,
+        env=ros_environment(),
         check=False,
     )
     text = result.stdout + result.stderr
@@ -131,7 +130,7 @@ def heard(run: SyntheticRun, *options: str) -> tuple[dict[str, list[str]], list[
     with Bag(run.writer.directory) as bag:
         topics = [(topic.name, topic.type, topic.profiles[0]["reliability"]) for topic in bag.topics.values()]
     listener = subprocess.Popen(
-        [sys.executable, "-c", LISTENER, json.dumps(topics)], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
+        [sys.executable, "-c", LISTENER, json.dumps(topics)], stdout=subprocess.PIPE, text=True, env=ros_environment()
     )
     try:
         ros2("play", str(run.writer.directory), "--start-paused", "--clock", "100", *options)
@@ -148,6 +147,7 @@ def expected(run: SyntheticRun, topic: str, start_ns: int = 0) -> list[str]:
 
 
 @pytest.mark.ros
+@pytest.mark.alone
 @flown_again_when_overloaded
 @pytest.mark.parametrize(
     ("options", "start_ns"), [((), 0), (("--rate", "2", "--start-offset", "0.4"), SECOND + 400_000_000)]

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.fake_crazyflie import Fleet, FleetConfig, cli, crtp, layout, toc
+from dtsa_bench.fake_crazyflie.ports import free_base_port
 from dtsa_bench.fake_crazyflie.truth import read_truth
 
 
@@ -97,26 +98,9 @@ def test_parameters() -> None:
 
 
 # -- fleet ------------------------------------------------------------------------------------------------------------
-def base_port(count: int) -> int:
-    """Ports that are free now."""
-    for base in range(31000, 60000, 50):
-        sockets = []
-        try:
-            for port in range(base - 1, base + count):
-                sockets.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                sockets[-1].bind(("127.0.0.1", port))
-        except OSError:
-            continue
-        finally:
-            for sock in sockets:
-                sock.close()
-        return base
-    raise RuntimeError("no free ports")
-
-
 def hop(seed: int, truth: Path | None = None, **fault: Any) -> Fleet:
     """Two Crazyflies take off and land again, driven tick by tick."""
-    fleet = Fleet(FleetConfig(count=2, base_port=base_port(2), seed=seed, truth=truth))
+    fleet = Fleet(FleetConfig(count=2, base_port=free_base_port(2), seed=seed, truth=truth))
     for firmware in fleet.firmware:
         firmware.supervisor.request_arming(True)
     for tick in range(500):
@@ -161,7 +145,7 @@ def test_tumbling_falls_and_the_other_one_does_not() -> None:
 
 def test_two_that_meet_fall() -> None:
     start = np.array([[0.0, 0.4], [0.0, 0.0], [0.0, 0.0]])
-    fleet = Fleet(FleetConfig(count=2, base_port=base_port(2), start=start))
+    fleet = Fleet(FleetConfig(count=2, base_port=free_base_port(2), start=start))
     for firmware in fleet.firmware:
         firmware.supervisor.request_arming(True)
     for tick in range(400):
@@ -187,7 +171,7 @@ def test_two_that_meet_fall() -> None:
     ],
 )
 def test_bad_faults_are_refused(request_: dict[str, Any], field: str) -> None:
-    fleet = Fleet(FleetConfig(count=2, base_port=base_port(2)))
+    fleet = Fleet(FleetConfig(count=2, base_port=free_base_port(2)))
     try:
         with pytest.raises(ConfigError) as error:
             fleet.fault(request_)
@@ -218,7 +202,7 @@ def test_layouts_keep_their_distance(name: str) -> None:
 
 
 def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
-    port = base_port(1)
+    port = free_base_port(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
         busy.bind(("127.0.0.1", port))
         assert cli.main(["--count", "1", "--base-port", str(port)]) == 2
@@ -229,7 +213,7 @@ def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_running_fleet_answers_and_ends_with_ctrl_c(tmp_path: Path) -> None:
-    port, truth = base_port(2), tmp_path / "truth.jsonl"
+    port, truth = free_base_port(2), tmp_path / "truth.jsonl"
     command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--count", "2", "--base-port", str(port)]
     with subprocess.Popen([*command, "--truth", str(truth)], stdout=subprocess.PIPE, text=True) as process:
         try:
