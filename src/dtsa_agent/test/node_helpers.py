@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dtsa_bench.fly.domain import ros_domain
+from dtsa_bench.soak.nodes import node_command, node_environment
 
 PATIENCE_S = 120.0
 
@@ -36,8 +36,7 @@ class Graph:
 
         :param logs: whether the node's log goes to standard error, beside its own last line.
         """
-        quiet = [] if logs else ["--disable-stdout-logs"]
-        command = [sys.executable, "-m", module, "--ros-args", *quiet, *arguments]
+        command = node_command(module, *arguments, logs=logs)
         process = subprocess.Popen(
             command, env=self.environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
         )
@@ -81,7 +80,7 @@ def ros_graph(logs: Path) -> Iterator[Graph]:
 def graph_in(domain: int, logs: Path) -> Iterator[Graph]:
     """A node in a domain in which there may be others; all processes started in it end with it."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs)}
+    environment = node_environment(domain, logs)
     context = Context()
     rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     node = Node("test", context=context, enable_rosout=False, start_parameter_services=False)

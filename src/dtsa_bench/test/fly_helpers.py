@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -16,11 +13,10 @@ from typing import Any
 
 from dtsa_agent.ros.common.wire import split_frames
 from dtsa_bench.bag.reader import Bag
+from dtsa_bench.soak.flights import end_all, process_with
 from dtsa_bench.verify import verify_bag
 
 PATIENCE_S = 120.0
-# Long enough to be interrupted, whatever the machine.
-ENDLESS = ("--agents", "3", "--moving", "2", "--tail-s", "3600", "--no-picture")
 
 
 def command(*words: str) -> list[str]:
@@ -46,21 +42,6 @@ def frames(out: Path) -> list[tuple[int, int, bytes]]:
     return sorted(sent)
 
 
-def children(supervisor: int) -> list[int]:
-    """Processes that a flight has started and that are still there, whoever their parent is by now."""
-    mark = f"DTSA_SUPERVISOR={supervisor}".encode()
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            with contextlib.suppress(OSError):
-                if (
-                    mark in (entry / "environ").read_bytes().split(b"\0")
-                    and b") Z " not in (entry / "stat").read_bytes()
-                ):
-                    found.append(int(entry.name))
-    return found
-
-
 def until(condition: Callable[[], object]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
@@ -79,19 +60,12 @@ def flying(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
         until(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 20_000))
         yield process
     finally:
-        left = children(process.pid)
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
-        for pid in left:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        end_all(process)
 
 
 def pid_of(supervisor: int, agent: int) -> int:
     """Process of one agent."""
-    name = f"__ns:=/cf{agent}".encode()
-    return next(pid for pid in children(supervisor) if name in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
+    return process_with(supervisor, f"__ns:=/cf{agent}")
 
 
 def readable(out: Path) -> int:

@@ -224,6 +224,7 @@ def filled(data: bytes) -> str:
 
 
 @pytest.mark.ros
+@pytest.mark.alone
 @flown_again_when_overloaded
 def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun) -> None:
     need_ros()

@@ -10,13 +10,12 @@ import signal
 import subprocess
 import time
 from array import array
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import PATIENCE_S, children, command, fly, frames, until
+from fly_helpers import PATIENCE_S, command, fly, frames, until
 from node_helpers import Graph, end_of, graph_in, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
@@ -27,6 +26,7 @@ from rclpy.serialization import serialize_message
 
 from dtsa_agent.ros.common import names
 from dtsa_bench.bag.reader import Bag
+from dtsa_bench.soak.flights import children, end_all
 from dtsa_bench.verify import verify_bag
 
 pytestmark = pytest.mark.ros
@@ -133,12 +133,7 @@ def disturbed(tmp_path: Path, disturb: Any, *words: str) -> dict[str, Any]:
             disturb(Stranger(graph), process)
             _, said = process.communicate(timeout=PATIENCE_S)
     finally:
-        left = children(process.pid)
-        process.kill()
-        process.communicate()
-        for pid in left:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        end_all(process)
     assert process.returncode == 0, said
     assert "Traceback" not in said
     result = verify_bag(out)

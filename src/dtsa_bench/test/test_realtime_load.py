@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import children, command, until
+from fly_helpers import command, until
 from metronome import flown_again_when_overloaded
 
 from dtsa_bench.commands.fly import describe
 from dtsa_bench.fly.ending import EarlyEnd, wall_limit_s
+from dtsa_bench.soak.flights import children, end_all
 from dtsa_bench.verify import verify_bag
 from dtsa_channel_sim.model.delays import Delays
 from dtsa_channel_sim.ros.pace import Pace
@@ -37,11 +38,7 @@ def flight(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
         until(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 10_000))
         yield process
     finally:
-        left = children(process.pid)
-        process.kill()
-        process.communicate()
-        for pid in left:
-            os.kill(pid, signal.SIGKILL)
+        end_all(process)
 
 
 def summary_of(out: Path) -> dict[str, Any]:
@@ -85,6 +82,7 @@ def test_a_signal_is_obeyed_at_any_load(tmp_path: Path, number: int) -> None:
 
 
 @pytest.mark.ros
+@pytest.mark.alone
 @flown_again_when_overloaded
 def test_a_channel_that_stood_still_shows_in_what_the_agents_knew_and_makes_nobody_lost(tmp_path: Path) -> None:
     out = tmp_path / "flight"

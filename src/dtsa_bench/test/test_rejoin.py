@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
@@ -23,6 +22,7 @@ from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.metrics import COMPLETED, CRASHED, FlightMetrics
 from dtsa_bench.run_config import RunConfig, RunLimits
+from dtsa_bench.soak.flights import children, end_all, process_with
 from dtsa_bench.verify import verify_bag
 from dtsa_channel_sim.model.verdict import SUCCESS
 
@@ -67,27 +67,16 @@ class Flight:
         time.sleep(slots * 0.01)
         assert self.process.poll() is None, self.said
 
-    def children(self) -> dict[int, list[str]]:
-        """Command lines of the agents' processes that are alive."""
-        mark, found = f"DTSA_SUPERVISOR={self.process.pid}".encode(), {}
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdigit():
-                with contextlib.suppress(OSError):
-                    alive = b") Z " not in (entry / "stat").read_bytes()
-                    if alive and mark in (entry / "environ").read_bytes().split(b"\0"):
-                        found[int(entry.name)] = (entry / "cmdline").read_text().split("\0")
-        return found
-
     def pid(self, argument: str) -> int:
         """The process that was started with an argument."""
-        return next(pid for pid, words in self.children().items() if argument in words)
+        return process_with(self.process.pid, argument)
 
     def land(self) -> dict[str, object]:
         """Ends the flight; its summary."""
         self.process.send_signal(signal.SIGINT)
         self.process.wait(PATIENCE_S)
         assert self.process.returncode == 130, self.said
-        assert self.children() == {}
+        assert children(self.process.pid) == []
         result = verify_bag(self.out)
         assert result.ok, result.difference
         self.safety = result.safety
@@ -101,12 +90,7 @@ def flying(out: Path, *words: str) -> Iterator[Flight]:
         flight.until(lambda: flight.under_way)
         yield flight
     finally:
-        left = flight.children()
-        flight.process.kill()
-        flight.process.wait()
-        for pid in left:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        end_all(flight.process)
 
 
 @dataclass
@@ -161,6 +145,7 @@ def first_turn(found: list[Report], agent: int) -> Report:
         ("__ns:=/cf2", [2], ("--policy", "tdma", "--frame", "extended")),
     ],
 )
+@pytest.mark.alone
 @flown_again_when_overloaded
 def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
     tmp_path: Path, argument: str, agents: list[int], words: tuple[str, ...]
@@ -189,6 +174,7 @@ def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
 
 
 @pytest.mark.ros
+@pytest.mark.alone
 @flown_again_when_overloaded
 def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, *LEASE) as flight:
@@ -209,6 +195,7 @@ def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None
 
 
 @pytest.mark.ros
+@pytest.mark.alone
 @flown_again_when_overloaded
 def test_sigterm_lets_an_agent_say_farewell_and_a_second_one_does_not_wait(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, "--policy", "lease", "--respawn", "0") as flight:
@@ -255,6 +242,7 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
 
 
 @pytest.mark.ros
+@pytest.mark.alone
 @flown_again_when_overloaded
 def test_an_agent_may_come_late(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, *LEASE, "--late", "cf3=0.5") as flight:
@@ -273,6 +261,7 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
+@pytest.mark.alone
 @flown_again_when_overloaded
 def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) -> None:
     few = (

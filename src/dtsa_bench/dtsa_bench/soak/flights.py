@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from .item import NotMet
 
@@ -73,6 +74,35 @@ def children(supervisor: int) -> list[int]:
     return sorted(found)
 
 
+def process_with(supervisor: int, argument: str) -> int:
+    """The process of a flight that was started with an argument.
+
+    :param supervisor: process of `dtsa fly`.
+    :param argument: the whole word.
+    :raises NotMet: there is none.
+    """
+    for pid in children(supervisor):
+        with contextlib.suppress(OSError):
+            if argument.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                return pid
+    raise NotMet(f"no process of the flight was started with {argument}")
+
+
+def end_all(process: subprocess.Popen[Any]) -> None:
+    """Kills a flight and all that it has started.
+
+    :param process: that of `dtsa fly`.
+    """
+    left = children(process.pid)
+    if process.poll() is None:
+        process.kill()
+    process.wait()
+    for pid in {*left, *children(process.pid)}:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    process.communicate()  # the pipes end with the last of them
+
+
 @dataclass(slots=True)
 class Running:
     """A flight under way."""
@@ -99,11 +129,7 @@ class Running:
 
     def pid_of(self, agent: int) -> int:
         """Process of one agent, in flights with a process each."""
-        name = f"__ns:=/cf{agent}".encode()
-        for pid in children(self.process.pid):
-            if name in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
-                return pid
-        raise NotMet(f"cf{agent} has no process")
+        return process_with(self.process.pid, f"__ns:=/cf{agent}")
 
     def environment(self, pid: int) -> dict[str, str]:
         """Environment variables of a process of the flight."""
@@ -162,10 +188,4 @@ def flying(directory: Path, *words: str, begun: bool = True, files_bytes: int = 
             flight.known = children(process.pid)
         yield flight
     finally:
-        left = children(process.pid)
-        if process.poll() is None:
-            process.kill()
-        process.wait()
-        for pid in {*left, *children(process.pid)}:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        end_all(process)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +11,7 @@ from pathlib import Path
 from dtsa_bench.soak.checks import met
 from dtsa_bench.soak.flights import PATIENCE_S, until
 from dtsa_bench.soak.item import NotMet
+from dtsa_bench.soak.nodes import node_command, node_environment
 
 from .fault import Fault
 
@@ -39,13 +38,10 @@ class Nodes:
         :param module: its module.
         :param words: its ROS arguments.
         """
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain), "ROS_LOG_DIR": str(self.directory)}
+        environment = node_environment(self.domain, self.directory)
         with (self.directory / f"{len(self.all)}.txt").open("wb") as said:
             process = subprocess.Popen(
-                [sys.executable, "-m", module, "--ros-args", "--disable-stdout-logs", *words],
-                env=environment,
-                stderr=said,
-                stdout=subprocess.DEVNULL,
+                node_command(module, *words), env=environment, stderr=said, stdout=subprocess.DEVNULL
             )
         self.all.append(process)
         return process
@@ -78,7 +74,6 @@ def nodes(directory: Path) -> Iterator[Nodes]:
     """Node processes; none of them is left afterwards."""
     from dtsa_bench.fly.domain import ros_domain
 
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with ros_domain() as domain:
         found = Nodes(directory, domain)
         try:
@@ -136,13 +131,7 @@ def _ticks(pid: int) -> int:
 
 
 def _wrong(module: str, *words: str, says: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", module, "--ros-args", "--disable-stdout-logs", *words],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    done = subprocess.run(node_command(module, *words), capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     said = done.stderr.strip()
     met(done.returncode == 2, f"exit code {done.returncode}: {said[-300:]}")
     met(says in said.splitlines()[-1] and "Traceback" not in said, f"it does not say {says!r}: {said[-300:]}")
@@ -170,8 +159,8 @@ FAULTS = (
     Fault("an agent is never started", "an agent is missing at the start",
           "the channel names it and ends with code 1; the agents end", _agent_missing),
     Fault("channel killed, by hand", "SIGKILL to a channel whose agents were started by hand, lockstep",
-          "the agents say that it has gone and end with code 1", _channel_killed, True),
+          "the agents say that it has gone and end with code 1", _channel_killed),
     Fault("unknown policy", "an agent's parameter `policy` is unknown", _LINE, _unknown_policy, True),
     Fault("id too large", "an agent's `id` is larger than `agents`", _LINE, _id_too_large, True),
-    Fault("impossible loss", "the channel's parameter `loss` is 2", _LINE, _impossible_loss),
+    Fault("impossible loss", "the channel's parameter `loss` is 2", _LINE, _impossible_loss, True),
 )  # fmt: skip

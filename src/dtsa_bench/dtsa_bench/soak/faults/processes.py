@@ -194,12 +194,12 @@ _STOPS = "the flight ends with code 130; no process stays; the bag is complete a
 _RECOVERS = "the agents end, too; `recover` saves the bag, which verifies up to where it breaks off"
 
 FAULTS = (
-    Fault("agent killed, lockstep", "SIGKILL to an agent's process, lockstep", _ENDS, _agent_killed),
+    Fault("agent killed, lockstep", "SIGKILL to an agent's process, lockstep", _ENDS, _agent_killed, True),
     Fault("agent asked to end, lockstep", "SIGTERM to an agent's process, lockstep", _ENDS, _agent_asked_to_end),
     Fault("all agents killed, lockstep", "SIGKILL to all agents' processes, lockstep", _ENDS, _all_agents_killed),
-    Fault("host killed, lockstep", "SIGKILL to a process with several agents, lockstep", _ENDS, _host_killed, True),
+    Fault("host killed, lockstep", "SIGKILL to a process with several agents, lockstep", _ENDS, _host_killed),
     Fault("agent hangs, lockstep", "SIGSTOP to an agent's process, lockstep",
-          "after `--answer-s` " + _ENDS, _agent_hangs),
+          "after `--answer-s` " + _ENDS, _agent_hangs, True),
     Fault("agent paused, lockstep", "SIGSTOP and, 1 s later, SIGCONT to an agent, lockstep",
           "all wait, then fly on; the bag verifies", _agent_paused, True),
     Fault("channel paused, lockstep", "SIGSTOP and, 1 s later, SIGCONT to the channel, lockstep",
@@ -219,11 +219,12 @@ FAULTS = (
           _all_agents_killed_in_real_time),
     Fault("agent stopped, real time", "SIGSTOP to an agent's process until it is missed, then SIGCONT, real time",
           "the flight says so and goes on; the agent takes part again; the bag verifies", _agent_stopped_in_real_time),
-    Fault("SIGINT, lockstep", "SIGINT (Ctrl-C) in flight, lockstep", _STOPS, _signalled(signal.SIGINT, LOCKSTEP)),
+    Fault("SIGINT, lockstep", "SIGINT (Ctrl-C) in flight, lockstep", _STOPS, _signalled(signal.SIGINT, LOCKSTEP),
+          True),
     Fault("SIGTERM, real time", "SIGTERM in flight, real time", _STOPS, _signalled(signal.SIGTERM, REALTIME), True),
     Fault("SIGHUP, lockstep", "SIGHUP (a closed terminal) in flight, lockstep", _STOPS,
           _signalled(signal.SIGHUP, LOCKSTEP)),
     Fault("SIGINT during the start", "SIGINT before all agents have answered", "code 130; no process stays",
-          _signal_during_the_start),
+          _signal_during_the_start, True),
     Fault("three SIGINT", "SIGINT three times within 0.1 s", _STOPS, _three_signals, True),
 )  # fmt: skip
