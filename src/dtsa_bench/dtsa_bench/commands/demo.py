@@ -1,44 +1,48 @@
-"""`demo`: the same exchange of places three times: TDMA, TDMA with extrapolation, DTSA; recorded and compared."""
+"""`demo`: eight flights that tell in four steps what this software is about; one page, one picture."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from dtsa_bench.batch.table import aligned
+from dtsa_bench.browser import open_page
 from dtsa_bench.options import new_directory, whole_number
 
+if TYPE_CHECKING:
+    from dtsa_bench.demo.flown import Flights
+    from dtsa_bench.demo.flying import Landed
+    from dtsa_bench.demo.story import Step
+
 INTERRUPTED = 130
-VARIANTS = (("tdma", "hold"), ("tdma", "linear"), ("dtsa", "linear"))
-_TABLE: tuple[tuple[str, str, str], ...] = (
-    ("end", "end", "{}"),
-    ("completion", "completion_time_s", "{:.2f} s"),
-    ("closest", "min_distance_m", "{:.3f} m"),
-    ("efficiency", "efficiency_mean", "{:.3f}"),
-    ("mean age", "age_mean_slots", "{:.2f} slots"),
-    ("oldest", "age_max_slots", "{} slots"),
-    ("error of estimate", "estimate_error_mean_m", "{:.4f} m"),
-    ("real-time factor", "realtime_factor", "{:.2f}"),
-)
 
 
 def add_parser(subparsers: Any) -> None:
     """Adds the command's parser."""
     parser = subparsers.add_parser(
         "demo",
-        help="three flights of twelve quadcopters, recorded and compared, in a few minutes",
-        description="Twelve quadcopters, each a ROS 2 node of its own, change places on a circle: with TDMA, where all "
-        "others stand where they were last heard; with TDMA and extrapolation; with DTSA and extrapolation.",
+        help="who speaks next, in eight recorded flights, a page and a picture; under a minute",
+        description="Eight flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a "
+        "channel that quadcopters share, and what goes wrong when messages are lost. They become one page and one "
+        "picture. The first seven are the same on every machine; in the last one, in real time, a process is killed "
+        "and comes back.",
     )
     parser.add_argument(
         "--out", metavar="DIR", default=None, help="new directory for everything [runs/demo-1, -2, ...]"
     )
-    parser.add_argument("--agents", metavar="N", default="12", help="number of quadcopters [12]")
     parser.add_argument("--seed", metavar="N", default="1", help="seed of the flights [1]")
+    parser.add_argument(
+        "--animation", action="store_true", help="make demo.gif, too, a moving picture of steps 2 and 3"
+    )
+    parser.add_argument(
+        "--open",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="open the page in a browser [where there is a display, but not over ssh or in CI]",
+    )
     parser.set_defaults(run=run)
 
 
@@ -52,83 +56,95 @@ def _directory(wanted: str | None) -> Path:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Flies, checks, compares.
+    """Flies, checks, draws.
 
     :returns: 0; 1 if a bag's check failed; 130 when interrupted.
     """
-    from dtsa_agent.core import SwarmConfig
-    from dtsa_bench.run_config import RunConfig
-
-    agents = whole_number(args.agents, "agents", 2, 1024)
     seed = whole_number(args.seed, "seed", 0, 2**63 - 1)
-    configs = [
-        RunConfig(SwarmConfig(agents=agents, policy=policy, estimator=estimator, seed=seed))
-        for policy, estimator in VARIANTS
-    ]
     directory = _directory(args.out)
 
     from dtsa_agent.ros.common.loop import Stop
-    from dtsa_bench.fly.flight import Flight, fly
-    from dtsa_bench.trajectories import draw_flights
+    from dtsa_bench.demo.flying import fly_all
+    from dtsa_bench.demo.story import story
 
     begin = time.monotonic()
-    print(
-        f"{len(configs)} flights of {agents} quadcopters, {agents} ROS 2 nodes each, recorded to {directory}",
-        flush=True,
-    )
-    flights: list[Flight] = []
+    steps = story(seed)
+    count = sum(len(step.takes) for step in steps)
+    print(f"{count} flights of ROS 2 nodes, recorded to {directory}", flush=True)
     with Stop() as stop:
-        for number, config in enumerate(configs, 1):
-            swarm = config.swarm
-            label = f"[{number}/{len(configs)}] {swarm.policy}, {swarm.estimator}"
-            flights.append(fly(config, directory / f"{swarm.policy}-{swarm.estimator}", stop=stop, label=label))
-            if stop:
-                print(f"dtsa: the demo was interrupted; what was flown is in {directory}", file=sys.stderr)
-                return INTERRUPTED
-    picture = directory / "comparison.png"
-    drawn = [(flight.scenario, flight.positions, flight.summary) for flight in flights]
-    draw_flights(picture, drawn, f"{agents} quadcopters change places")
-    print("\n" + table([flight.summary for flight in flights]) + "\n")
-    checks = [_check(flight.bag) for flight in flights]
-    _tell(directory, picture, flights)
-    print(f"\n{time.monotonic() - begin:.0f} s in all")
+        landed = fly_all(steps, directory, stop, sys.stderr)
+    if stop:
+        print(f"dtsa: the demo was interrupted; what was flown is in {directory}", file=sys.stderr)
+        return INTERRUPTED
+    checks = [_check(key, entry.flight.bag) for key, entry in landed.items()]
+    page = _show(steps, landed, directory, args.animation)
+    print(f"\n{time.monotonic() - begin:.0f} s in all. The page:", flush=True)
+    open_page(page, args.open)
+    print(page)
     return 0 if all(checks) else 1
 
 
-def table(summaries: Sequence[dict[str, Any]]) -> str:
-    """The flights' results, a row a flight."""
-    rows = [["", *(title for title, _, _ in _TABLE)]]
-    for summary in summaries:
-        cells = [f"{summary['policy'].upper()}, {summary['estimator']}"]
-        cells += ["-" if summary[key] is None else form.format(summary[key]) for _, key, form in _TABLE]
-        rows.append(cells)
-    return aligned(rows, rule=True)
-
-
-def _check(bag: Path) -> bool:
+def _check(key: str, bag: Path) -> bool:
     """Verifies a bag and says in a line what was found."""
     from dtsa_bench.verify import verify_bag
 
     found = verify_bag(bag)
     if found.ok:
-        crowded, alike = found.safety.get("slots_with_two_senders"), found.safety.get("all_agents_chose_alike")
-        print(
-            f"verified  {bag}: {sum(found.checked.values())} messages are what the protocol gives; "
-            f"slots with two senders: {crowded}; all agents chose alike: {'yes' if alike else 'no'}"
-        )
+        print(f"verified  {key:14} {sum(found.checked.values()):6} checks: all is what the protocol gives", flush=True)
     else:
-        print(f"NOT GOOD  {bag}: {found.difference}")
+        print(f"NOT GOOD  {key}: {found.difference}")
     return found.ok
 
 
-def _tell(directory: Path, picture: Path, flights: Sequence[Any]) -> None:
-    """Says where everything is and how to open it."""
-    first = flights[0].bag
-    print("\nWhere things are, and how to open them:")
-    print(f"  {picture}: the three flights side by side (any image viewer)")
-    for flight in flights:
-        print(f"  {flight.bag.parent}: bag/ (the recording), trajectories.png, summary.json")
-    print(f"  play a bag again:       tools/dtsa replay {first}   (or: ros2 bag play {first})")
-    print(f"  look into a bag:        open {first / 'bag_0.mcap'} in Foxglove or PlotJuggler")
-    print(f"  as tables:              tools/dtsa export {first}")
-    print("  as a page:              tools/dtsa report " + " ".join(str(flight.bag) for flight in flights))
+def _show(steps: tuple[Step, ...], landed: dict[str, Landed], directory: Path, animation: bool) -> Path:
+    """Writes everything that is to be looked at.
+
+    :returns: the page.
+    """
+    from dtsa_bench.demo.flown import read
+    from dtsa_bench.demo.page import write_page
+    from dtsa_bench.demo.picture import draw_demo
+    from dtsa_bench.demo.table import for_terminal
+
+    flights = {}
+    for take in (take for step in steps for take in step.takes):
+        flight, times = landed[take.key].flight, landed[take.key].times
+        flights[take.key] = read(take, flight.bag, flight.summary, flight.positions, times)
+    _progress("drawing the picture and the page")
+    picture, page = directory / "demo.png", directory / "demo.html"
+    draw_demo(picture, steps, flights)
+    write_page(page, steps, flights, _commands(directory))
+    if animation:
+        from dtsa_bench.demo.animation import draw_animation
+
+        _progress("drawing the animation")
+        draw_animation(directory / "demo.gif", flights)
+    print("\n" + for_terminal(steps, flights) + "\n")
+    _tell(directory, picture, flights)
+    return page
+
+
+def _progress(text: str) -> None:
+    print(f"{text} ...", file=sys.stderr, flush=True)
+
+
+def _commands(directory: Path) -> list[tuple[str, str]]:
+    """What to do with the recordings."""
+    return [
+        ("a flight with everything in it, as a page", f"tools/dtsa report {directory}/two-tdma {directory}/two-dtsa"),
+        ("was every decision what the protocol says?", f"tools/dtsa verify {directory}/two-lease"),
+        ("play a recording into the ROS graph", f"tools/dtsa replay {directory}/two-lease"),
+        ("as tables", f"tools/dtsa export {directory}/two-lease"),
+        ("look inside with Foxglove or PlotJuggler", f"{directory}/two-lease/bag/bag_0.mcap"),
+        ("the same without ROS, in milliseconds", "tools/dtsa simulate --agents 12 --moving 2 --policy lease"),
+        ("thousands of flights", "tools/dtsa sweep --preset loss"),
+    ]
+
+
+def _tell(directory: Path, picture: Path, flights: Flights) -> None:
+    """Says where everything is and how to go on."""
+    print(f"picture    {picture}\nflights    {directory}/{{{','.join(flights)}}}")
+    for text, command in _commands(directory):
+        print(f"{text:44} {command}")
+    numbers = {key: dict(flown.summary) for key, flown in flights.items()}
+    (directory / "demo.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")

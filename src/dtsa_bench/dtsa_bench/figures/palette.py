@@ -11,7 +11,7 @@ from __future__ import annotations
 # greys, which would be taken for agents that hover; and the four colours that a search found farthest from these and
 # from each other.
 AGENT_COLOURS = (
-    "#3f90da", "#ffa90e", "#bd1f01", "#832db6", "#a96b59", "#e76300", "#b9ac70", "#92dadd",
+    "#3f90da", "#ffa90e", "#bd1f01", "#832db6", "#92dadd", "#e76300", "#b9ac70", "#a96b59",
     "#4b00f0", "#960069", "#d25a96", "#964bff",
 )  # fmt: skip
 # From the 13th agent on colours come again, with another dash and another shape.

@@ -31,6 +31,7 @@ from dtsa_bench.simulate import may_share
 from dtsa_channel_sim.ros.answers import named
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
+from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .agent_parameters import CHANNEL_NICE, clock_parameters
@@ -116,6 +117,8 @@ def fly(
     stop: Stop | None = None,
     label: str = "fly",
     started: Callable[[Children], None] | None = None,
+    observers: Sequence[ChannelObserver] = (),
+    progress: ProgressLine | None = None,
 ) -> Flight:
     """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
 
@@ -125,6 +128,8 @@ def fly(
     :param stop: a flag that ends the flight early.
     :param label: what stands in front of the progress line.
     :param started: is told the processes once they are started.
+    :param observers: are told what happens on the channel, after all others.
+    :param progress: shows how it goes; None: a line on standard error.
     :returns: its results, which are also in ``out``.
     :raises ConfigError: for options that are not usable; nothing has been started then.
     :raises DtsaError: when a node dies, hangs or sends garbage; the message names it.
@@ -137,14 +142,14 @@ def fly(
         (directory / "log").mkdir()
         context = Context()
         children = Children(directory / "log", run_environment(domain, directory / "log"))
-        progress = ProgressLine(label)
+        progress = progress or ProgressLine(label)
         # Started first: the interpreter of each process needs longer than all that follows here.
         late = _start_agents(children, run, options, directory)
         try:
             rclpy.init(args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
             if started:
                 started(children)
-            return _fly(context, run, directory, children, progress, options, stop, late)
+            return _fly(context, run, directory, children, progress, options, stop, late, observers)
         finally:
             children.stop()
             context.try_shutdown()
@@ -159,6 +164,7 @@ def _fly(
     options: FlightOptions,
     stop: Stop,
     late: Sequence[LateStart],
+    observers: Sequence[ChannelObserver],
 ) -> Flight:
     node = Node("channel", namespace=names.SWARM, context=context)
     try:
@@ -171,7 +177,7 @@ def _fly(
             channel.observe(RealtimeSupervisor(children, channel, measurement, progress.say, again, late))
         else:
             channel.observe(Supervisor(children))
-        channel.observe(shown)
+        channel.observe(shown, *observers)
         limit_s = wall_limit_s(options.wall_timeout_s, run.limits.timeout_s)
         ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
         failure: DtsaError | None = None
