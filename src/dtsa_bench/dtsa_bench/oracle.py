@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.core import AbstractSwarm, Swarm, SwarmConfig, make_scenario
+from dtsa_agent.core import REASONS, AbstractSwarm, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.reference_swarm import ReferenceSwarm
 from dtsa_channel_sim import Channel, ChannelConfig
@@ -19,6 +19,7 @@ POLICIES = ("tdma", "dtsa", "age", "aloha", "lease", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
 AVOIDERS = ("orca", "potential", "bvc", "none", "crazyflie", "jerky", "bvc-firmware")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
+SHORT, LONG = 300, 1700  # slots
 FAULTS = ("die", "join", "join", "restart", "leave")
 
 # What a swarm is compared by after every slot, besides senders and frames.
@@ -59,36 +60,45 @@ class Setting:
         return f"{s.policy} {s.estimator} {s.avoider} {s.scenario} N={s.agents} {loss}"
 
 
-def random_setting(seed: int, slots: int = 300, most_agents: int = 9, policy: str | None = None) -> Setting:
+def random_setting(seed: int, policy: str | None = None, *, lasts: bool | None = None) -> Setting:
     """A flight with a random policy, estimator, avoider, scenario, channel and random misfortune.
 
     :param seed: of all of it.
-    :param slots: length of the flight.
-    :param most_agents: largest swarm.
     :param policy: a policy instead of a random one.
+    :param lasts: with policy ``lease``: so long, with so few agents, that the dead are adopted and some come back;
+        default: now and then.
     """
     random = np.random.default_rng([seed, 13])
     pick = random.choice
-    agents = int(random.integers(2, most_agents + 1))
     policy = str(pick(POLICIES)) if policy is None else policy
-    few = {"slot_ms": float(pick([10.0, 10.0, 20.0, 25.0])), "seed": seed}
+    lasts = policy == "lease" and (bool(random.random() < 0.25) if lasts is None else lasts)
+    agents, slots = int(random.integers(2, 6 if lasts else 10)), LONG if lasts else SHORT
+    kind: dict[str, Any]
+    if lasts:  # far enough to fly all the time
+        kind = {"avoider": "none", "axis_x_m": 20.0, "adoption": True, "anchor_every": int(random.integers(2, 6))}
+    else:
+        kind = {
+            "avoider": str(pick(AVOIDERS)), "axis_x_m": float(pick([0.0, 1.2])),
+            "anchor_every": int(random.integers(1, 8)), "adoption": bool(random.random() < 0.7),
+            "extent_m": float(pick([65.534, 20.0, 200.0])),
+        }  # fmt: skip
     swarm = SwarmConfig(
-        agents=agents, moving=int(random.integers(0, agents + 1)), policy=policy, estimator=str(pick(ESTIMATORS)),
-        avoider=str(pick(AVOIDERS)), scenario=str(pick(SCENARIOS)), selection=str(pick(["candidates", "pairwise"])),
-        epsilon=float(pick([0.0, 0.1, 0.5, 1.0])), boot_round=bool(random.random() < 0.7),
-        age_cap=float(pick([0.0, 1.0, 1.5, 10.0])), return_every=int(pick([0, 1, 20])), c_r=int(pick([1, 7, 255])),
-        targets_known=bool(random.random() < 0.7), gossip=bool(random.random() < 0.8),
-        frame="extended" if random.random() < 0.3 else "auto", extent_m=float(pick([65.534, 20.0, 200.0])),
-        anchor_every=int(random.integers(1, 8)), open_every=int(pick([0, 3, 11])), adoption=bool(random.random() < 0.7),
-        depth_rate=float(pick([0.1, 1.0, 5.0])), lease_share=float(pick([0.75, 1.0])), stops=3,
-        stagger_slots=int(pick([5, 60])), pause_slots=int(pick([5, 40])), announce=bool(random.random() < 0.7),
-        options={"margin_rate": 0.1} if random.random() < 0.3 else {}, axis_x_m=float(pick([0.0, 1.2])), **few,
+        agents=agents, moving=int(random.integers(2 if lasts else 0, agents + 1)), policy=policy, seed=seed,
+        estimator=str(pick(ESTIMATORS)), scenario=str(pick(SCENARIOS)), slot_ms=float(pick([10.0, 10.0, 20.0, 25.0])),
+        selection=str(pick(["candidates", "pairwise"])), epsilon=float(pick([0.0, 0.1, 0.5, 1.0])),
+        boot_round=bool(random.random() < 0.7), age_cap=float(pick([0.0, 1.0, 1.5, 10.0])),
+        return_every=int(pick([0, 1, 20])), c_r=int(pick([1, 7, 255])), targets_known=bool(random.random() < 0.7),
+        gossip=bool(random.random() < 0.8), frame="extended" if random.random() < 0.3 else "auto",
+        open_every=int(pick([0, 3, 11])), depth_rate=float(pick([0.1, 1.0, 5.0])),
+        lease_share=float(pick([0.75, 1.0])), stops=3, stagger_slots=int(pick([5, 60])),
+        pause_slots=int(pick([5, 40])), announce=bool(random.random() < 0.7),
+        options={"margin_rate": 0.1} if random.random() < 0.3 else {}, **kind,
     )  # fmt: skip
     return Setting(
         swarm,
         _random_channel(random, swarm, slots),
         slots,
-        tuple(_random_faults(random, swarm, slots)),
+        tuple(_deaths_and_returns(random, swarm) if lasts else _random_faults(random, swarm, slots)),
         shared=policy != "lease" and bool(random.random() < 0.15),
     )
 
@@ -102,7 +112,8 @@ def _random_channel(random: np.random.Generator, swarm: SwarmConfig, slots: int)
         matrix = tuple(tuple(float(x) for x in row) for row in links)
     return ChannelConfig(
         agents=agents, slot_ns=swarm.slot_ns, seed=swarm.seed, loss=loss, loss_matrix=matrix,
-        burst_length=float(random.choice([0.0, 10.0])) if loss else 0.0, range_m=float(random.choice([0.0, 0.0, 3.0])),
+        burst_length=float(random.choice([0.0, 10.0])) if loss else 0.0,
+        range_m=0.0 if slots == LONG else float(random.choice([0.0, 0.0, 3.0])),
         schedule=tuple(random_schedule(random, agents, slots)) if random.random() < 0.3 else (),
     )  # fmt: skip
 
@@ -113,6 +124,17 @@ def _random_faults(random: np.random.Generator, swarm: SwarmConfig, slots: int) 
     for slot in range(1, slots):
         if random.random() < 0.02:
             yield Fault(slot, FAULTS[random.integers(len(FAULTS))], int(random.integers(1, swarm.agents + 1)))
+
+
+def _deaths_and_returns(random: np.random.Generator, swarm: SwarmConfig) -> Iterator[Fault]:
+    """Some die early, and come back after the others have adopted their turns; one restarts or leaves."""
+    for agent in range(1, swarm.agents + 1):
+        chance = random.random()
+        if chance < 0.5 and agent > 1:
+            yield Fault(int(random.integers(1, 60)), "die", agent)
+            yield Fault(int(random.integers(LONG - 400, LONG)), "join", agent)
+        elif chance < 0.8:
+            yield Fault(int(random.integers(100, LONG)), FAULTS[random.integers(3, 5)], agent)
 
 
 def happen(fault: Fault, swarm: AbstractSwarm) -> None:
@@ -136,7 +158,7 @@ def fly_both(setting: Setting) -> Mapping[str, Any]:
     """Flies a setting on the compiled core and on the specification, side by side.
 
     :param setting: the flight.
-    :returns: figures: slots, frames, frames heard, collisions.
+    :returns: figures: slots, frames, frames heard, collisions, decisions by reason.
     :raises Differs: at the first difference.
     """
     scenario = make_scenario(setting.swarm)
@@ -149,13 +171,15 @@ def fly_both(setting: Setting) -> Mapping[str, Any]:
     for fault in setting.faults:
         faults.setdefault(fault.slot, []).append(fault)
     figures = {"slots": setting.slots, "frames": 0, "heard": 0, "collisions": 0}
+    reasons = np.zeros(len(REASONS), dtype=np.int64)
     for slot in range(setting.slots):
         for fault in faults.get(slot, ()):
             for swarm in pair:
                 happen(fault, swarm)
         pair = _fly_slot(pair, channel, slot, figures)
         _compare(pair, slot)
-    return figures
+        reasons += np.bincount(pair[0].reason, minlength=len(REASONS))
+    return {**figures, "reasons": {name: int(n) for name, n in zip(REASONS, reasons, strict=True) if n}}
 
 
 def _fly_slot(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import subprocess
 import sys
@@ -10,27 +9,40 @@ import sys
 import pytest
 
 from dtsa_agent.core import AbstractSwarm, ConfigError, Swarm, SwarmConfig
-from dtsa_agent.core.reference.lease import issue, memory
+from dtsa_agent.core.reference.lease import issue, listen
 from dtsa_agent.core.reference_swarm import ReferenceSwarm
 from dtsa_bench.oracle import Differs, fly_both, random_setting
 
-SAMPLE = 12
+SAMPLE = 10  # settings; `dtsa soak reference` has 200
 
 
 @pytest.mark.parametrize("seed", range(1, SAMPLE + 1))
 def test_flights_are_equal(seed: int) -> None:
-    setting = random_setting(seed)
+    setting = random_setting(seed, lasts=False)
     assert fly_both(setting)["slots"] == setting.slots
 
 
-def test_a_rule_that_differs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oracle itself: one rule of the specification changed by a hair."""
-    setting = dataclasses.replace(random_setting(2, policy="lease"), faults=())
-    fly_both(setting)
-    monkeypatch.setattr(issue, "RELAY_IDS", 7)
-    monkeypatch.setattr(memory, "MISSED", 3)
+@pytest.mark.parametrize("seed", [10, 24])
+def test_flights_are_equal_in_which_the_dead_are_adopted_and_some_come_back(seed: int) -> None:
+    figures = fly_both(random_setting(seed, "lease", lasts=True))
+    assert figures["reasons"]["adopted"] > 100
+    assert {"own", "anchor", "leased", "absent"} <= set(figures["reasons"])
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "value"),
+    [
+        (issue, "MISSED", 1),
+        (issue, "RELAY_IDS", 1),
+        (listen, "DEAF", 0),
+        (issue, "LEASE_ROOM", 2),
+    ],
+)
+def test_a_rule_that_differs_is_found(monkeypatch: pytest.MonkeyPatch, module: object, name: str, value: float) -> None:
+    """The oracle itself: one constant of the specification changed."""
+    monkeypatch.setattr(module, name, value)
     with pytest.raises(Differs, match="slot"):
-        fly_both(setting)
+        fly_both(random_setting(24, "lease", lasts=True))
 
 
 FLIGHT = (

@@ -25,6 +25,8 @@ class Weights:
 def choose(table: Table, slot: int, rules: Rules, weights: Weights | None = None) -> Choice:
     """Whose turn a slot is in the eyes of one table: the same for all agents whose tables are the same.
 
+    ``tdma`` gives all the same update time (eq:update_time_tdma), ``age`` all of A_p (eq:update_time_NA).
+
     :param table: what is known before the slot.
     :param slot: the slot that begins.
     :param rules: what all agree on; policies ``tdma``, ``dtsa``, ``age``.
