@@ -18,6 +18,7 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_bench.bag.cdr import MarkerPacker
 from dtsa_bench.figures.palette import (
     AGENT_COLOURS,
+    COLLIDED,
     DASHES,
     SERIES,
     SHAPES,
@@ -61,7 +62,7 @@ def test_any_two_agents_are_told_apart(sight: str) -> None:
 
 @pytest.mark.parametrize("sight", SIGHT)
 def test_any_two_series_are_told_apart(sight: str) -> None:
-    for first, second in combinations(SERIES, 2):
+    for first, second in combinations((*SERIES, COLLIDED), 2):
         apart = np.linalg.norm(lab(first, sight) - lab(second, sight))
         assert apart > 16.0, f"{first} and {second}: {apart:.1f}"
 

@@ -21,7 +21,7 @@ HOVERING = "#98a3af"
 # Lines, bars and areas that are no agents: Okabe and Ito ("Color Universal Design", 2008).
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 # What becomes of a slot or a frame.
-SENT, COLLIDED = "#e69f00", "#c4314b"
+SENT, COLLIDED = "#e69f00", "#dc183c"
 
 
 def agent_colour(agent: int) -> str:

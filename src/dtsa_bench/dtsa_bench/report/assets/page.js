@@ -67,7 +67,7 @@ root.append(main);
 const shared = {yaw: -0.9, pitch: 0.62, zoom: 1, paths: true, names: Math.max(...RUNS.map(run => run.agents)) <= 40, targets: true, buttons: {}, scenes: [],
   draw() { this.scenes.forEach(scene => scene.context && scene.draw(clock.time)); }};
 const crashed = RUNS.some(run => run.crashes.length), hovers = RUNS.some(run => run.moving.includes(false));
-section("Flight", `Drag to turn, wheel or pinch to zoom. Rings mark who sends: amber as heard, red as collided. Small crosses are targets.${hovers ? " Who hovers is grey." : ""}${crashed ? " A cross in a ring is a crash." : ""}`,
+section("Flight", `Drag to turn, wheel or pinch to zoom. Rings mark who sends: amber if it was heard, red and dotted if it collided. Small crosses are targets.${hovers ? " Who hovers is grey." : ""}${crashed ? " A cross in a ring is a crash." : ""}`,
   {has: run => run.scene, draw: run => new Scene(run, shared).node}, "wide");
 section("Distances", "Between all pairs of agents: the smallest of all, and the pairs that came closest.", {
   has: run => run.distances,
@@ -97,14 +97,14 @@ function shareBars(rows) {
 }
 
 const lines = {reasons: true, lines: []};
-section("Slots", "Who sent in which slot, and why. The strip on top says what became of each slot; pale marks and amber edges are frames that some receivers lost. Click to go there.", {
+section("Slots", "Who sent in which slot, and why. The strip on top says what became of each slot. Click to go there.", {
   has: run => run.slots.count, draw: run => new SlotLine(run, lines).node,
   extra: () => {
     const legend = el("div", {class: "reasons"});
     const names = REASONS.filter(name => RUNS.some(run => run.sent_for.includes(name)));
     onRedraw(main, () => legend.replaceChildren(
       ...(lines.reasons && names.length ? names.map(name => [name, reasonColor(name), reasonText(name)]) : [["sent", theme.color("success"), ""]])
-        .concat([["collision", theme.color("collision"), "two or more sent: tall mark in the strip"], ["idle", theme.color("idle"), "nobody sent"], ["partly lost", theme.color("lost"), "some did not receive it"]])
+        .concat([["collision", theme.color("collision"), "two or more sent: tall in the strip"], ["idle", theme.color("idle"), "nobody sent"], ["partly lost", "linear-gradient(var(--line) 60%, var(--ink) 60%)", "paler, with an edge: some did not receive it"]])
         .map(([name, color, text]) => el("span", {}, el("i", {class: "box", style: `background:${color}`}), el("b", {}, name), text ? " " + text : ""))));
     return legend;
   },

@@ -203,8 +203,8 @@ class Scene {
   drawAgent(c, p, agent, size, level) {
     if (level) {
       c.strokeStyle = level > 0 ? theme.color("lost") : theme.color("collision");
-      c.globalAlpha = Math.abs(level); c.lineWidth = 2.2;
-      c.beginPath(); c.arc(p[0], p[1], size * (1.35 + 0.9 * (1 - Math.abs(level))), 0, 7); c.stroke(); c.globalAlpha = 1;
+      c.globalAlpha = Math.abs(level); c.lineWidth = level > 0 ? 2.2 : 3.2; c.setLineDash(level > 0 ? [] : [3, 3]);
+      c.beginPath(); c.arc(p[0], p[1], size * (1.35 + 0.9 * (1 - Math.abs(level))), 0, 7); c.stroke(); c.globalAlpha = 1; c.setLineDash([]);
     }
     const color = this.color(agent), shade = c.createRadialGradient(p[0] - size * 0.35, p[1] - size * 0.4, size * 0.1, p[0], p[1], size);
     shade.addColorStop(0, mixed(color, "#ffffff", 0.45)); shade.addColorStop(0.55, color); shade.addColorStop(1, mixed(color, "#000000", 0.22));

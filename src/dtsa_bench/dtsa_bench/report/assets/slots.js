@@ -60,7 +60,7 @@ class SlotLine {
 
   draw(time) {
     const current = Math.min(this.first + this.count - 1, Math.floor(time / this.run.slot_s + 1e-6));
-    this.shown = Math.min(this.count, WINDOW);
+    this.shown = Math.min(this.count, WINDOW, Math.max(30, Math.floor((this.width - LEFT - RIGHT) / 5.5))); // fewer on a phone
     this.from = Math.max(this.first, Math.min(this.first + this.count - this.shown, current - Math.floor(this.shown / 2)));
     this.drawWhole(current); this.drawPart(current);
   }
@@ -106,10 +106,15 @@ class SlotLine {
         c.fillStyle = this.color(i);
         c.globalAlpha = this.outcome[i] === 2 ? 1 : 0.3 + 0.7 * this.received[i] / 255;
         c.fillRect(x, top + (this.sender[i] - 1) * row, slim, tall);
+        if (this.outcome[i] === 2 && slim > 6) { // a cross: not by colour alone
+          const y = top + (this.sender[i] - 1) * row;
+          c.strokeStyle = theme.color("card"); c.lineWidth = 0.9;
+          c.beginPath(); c.moveTo(x + 1, y + 1); c.lineTo(x + slim - 1, y + tall - 1); c.moveTo(x + slim - 1, y + 1); c.lineTo(x + 1, y + tall - 1); c.stroke();
+        }
         c.globalAlpha = 1;
         if (this.outcome[i] === 2) { c.fillStyle = theme.color("collision"); c.fillRect(x, 15, slim, 8); } // taller: not by colour alone
         else { c.fillStyle = theme.color("success"); c.fillRect(x, 19, slim, 4); }
-        if (this.received[i] < 255 && this.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("lost"); c.fillRect(x, top + (this.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.received[i] / 255), Math.min(3, tall / 3)); }
+        if (this.received[i] < 255 && this.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("ink"); c.fillRect(x, top + (this.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.received[i] / 255), Math.min(3, tall / 3)); }
       }
     }
     c.fillStyle = theme.color("soft"); c.textAlign = "right"; c.textBaseline = "middle";
