@@ -20,7 +20,14 @@ COMPILE_FLAGS = [
     "-Wno-psabi",  # vectors are passed between inlined functions only
 ]
 
-KERNEL = "dtsa_agent/core/_kernel"
+LIBRARY, SIMULATOR, BINDING = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/core/_kernel"
+
+
+def files(suffix: str) -> list[str]:
+    """Sources of the compiled core with a suffix: one agent, many agents, Python's door."""
+    folders = (LIBRARY, SIMULATOR, BINDING)
+    return [path for folder in folders for path in sorted(glob(f"{folder}/**/*{suffix}", recursive=True))]
+
 
 setup(
     name=NAME,
@@ -29,14 +36,14 @@ setup(
     ext_modules=[
         Extension(
             "dtsa_agent.core._kernel",
-            sources=sorted(glob(f"{KERNEL}/*.c")),
-            depends=[*sorted(glob(f"{KERNEL}/*.h")), "setup.py"],
-            include_dirs=[KERNEL],
+            sources=files(".c"),
+            depends=[*files(".h"), "setup.py"],
+            include_dirs=[f"{LIBRARY}/include", LIBRARY, SIMULATOR, BINDING],
             extra_compile_args=COMPILE_FLAGS,
             libraries=["m"],
         )
     ],
-    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml"]},
+    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml", "libdtsa*/**/*.[ch]"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm, Scenario
 from dtsa_agent.core.compiled import COMPILED
-from dtsa_agent.core.compiled import kernel as _kernel
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
+from .kernel_sums import KernelSums
 from .plain_sums import ARRIVED as _ARRIVED
 from .plain_sums import CRASHED as _CRASHED
 from .plain_sums import PlainSums
@@ -72,7 +72,7 @@ class FlightMetrics:
         target = np.ascontiguousarray(scenario.target, dtype=np.float64)
         moving = np.ascontiguousarray(scenario.moving, dtype=np.uint8)
         self._plain = core != COMPILED
-        sums = PlainSums if self._plain else _kernel.Metrics
+        sums = PlainSums if self._plain else KernelSums
         self._kernel: Any = sums(start, target, moving, swarm.agents, limits.collision_m, swarm.r_min)
         self._course = scenario.course(np.arange(swarm.agents, dtype=np.int32))
         if self._course is not None:
@@ -98,7 +98,7 @@ class FlightMetrics:
             for agent in self.lost:  # its vehicle hovers where it was last known
                 track[:, :, agent - 1] = self._last[:, agent - 1]
         self._last = track[-1].copy()
-        state = self._kernel.update(done, track, tables if tables is None or self._plain else tables.kernel)
+        state = self._kernel.update(done, track, tables)
         if self._course is not None:
             self._course.advance(done, self._last)
             if not all(self._course.final[k] for k in range(len(self._course.final)) if k + 1 not in self.lost):

@@ -62,7 +62,7 @@ def test_only_changed_packages_are_built(checkout: Path) -> None:
     message.write_text(message.read_text() + "uint8 more\n")
     assert workspace.changed_packages() == ["dtsa_msgs"]
 
-    next((checkout / "src" / "dtsa_agent" / "dtsa_agent" / "core" / "_kernel").glob("*.h")).write_text("/* new */")
+    next((checkout / "src" / "dtsa_agent" / "dtsa_agent" / "libdtsa").glob("*.h")).write_text("/* new */")
     (checkout / "src" / "dtsa_bench" / "setup.py").write_text("# new")
     assert workspace.changed_packages() == ["dtsa_msgs", "dtsa_agent", "dtsa_bench"]
 

@@ -24,7 +24,7 @@ from .settings import REQUIRED, Settings, check, setting, settings_of
 
 Array = NDArray[np.float64]
 
-# Numbers of the avoiders in the compiled kernel (avoider.h).
+# Numbers of the avoiders in libdtsa (dtsa.h).
 KINDS = ("orca", "potential", "bvc", "none")
 check_kernel("avoiders", KINDS)
 

@@ -1,8 +1,9 @@
-"""The radio frame: fields and bytes. The codec is ``_kernel/frame.c``, specified in ``reference/frame.py``."""
+"""The radio frame: fields and bytes. The codec is ``libdtsa/frame.c``, specified in ``reference/frame.py``."""
 
 from __future__ import annotations
 
 import dataclasses
+import struct
 
 from .compiled import MISSING
 from .compiled import kernel as _kernel
@@ -29,6 +30,11 @@ __all__ = [
     "Vector", "decode_frame", "encode_frame", "named_in", "position_step",
 ]  # fmt: skip
 
+# The structure of libdtsa/frame.h: profile, sender, slot, c_r; position, velocity, intent.
+RECORD = struct.Struct("=iiIi9d")
+if not MISSING and RECORD.size != _kernel.FRAME_RECORD:
+    raise ImportError("the compiled kernel is of another version; build dtsa_agent again")
+
 _FAULTS = {-1: "wrong length", -2: "unknown version or profile", -3: "field out of range"}
 
 
@@ -51,19 +57,49 @@ def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
     if MISSING:
         return plain.encode(frame, position_step(extent_m))
     profile = PROFILE_PAPER if frame.intent is None else PROFILE_PAPER_INTENT
-    data: bytes = _kernel.encode(
-        profile,
-        frame.sender,
-        frame.slot & 0xFFFFFFFF,
-        frame.c_r,
-        frame.position,
-        frame.velocity,
-        frame.intent or (0.0, 0.0, 0.0),
-        position_step(extent_m),
-    )
+    data = encode_record(record_of(frame, profile), extent_m)
     if not data:
         raise LocalProtocolError(f"not encodable: {frame}")
     return data
+
+
+def record_of(frame: Frame, profile: int) -> bytes:
+    """A frame's own fields as the kernel's structure.
+
+    :param frame: its fields.
+    :param profile: number of the profile.
+    :raises LocalProtocolError: if a field does not fit.
+    """
+    slot, intent = frame.slot & 0xFFFFFFFF, frame.intent or (0.0, 0.0, 0.0)
+    try:
+        return RECORD.pack(profile, frame.sender, slot, frame.c_r, *frame.position, *frame.velocity, *intent)
+    except struct.error as error:
+        raise LocalProtocolError(f"not encodable: {frame} ({error})") from error
+
+
+def encode_record(record: bytes, extent_m: float) -> bytes:
+    """The bytes of a frame from the kernel's structure; none if it is not encodable.
+
+    :param record: the structure.
+    :param extent_m: largest coordinate that fits, m.
+    """
+    data = bytearray(_kernel.FRAME_MAX)
+    return bytes(data[: _kernel.encode(record, position_step(extent_m), data)])
+
+
+def decode_record(data: bytes, extent_m: float, size: int) -> bytearray:
+    """The kernel's structure from the bytes of a frame.
+
+    :param data: the bytes heard.
+    :param extent_m: largest coordinate that fits, m.
+    :param size: of the structure: that of all profiles, or that of extended frames.
+    :raises RemoteProtocolError: if they are no frame.
+    """
+    record = bytearray(size)
+    fault = _kernel.decode(data, position_step(extent_m), record)
+    if fault:
+        raise RemoteProtocolError(f"{_FAULTS[fault]} ({len(data)} bytes)")
+    return record
 
 
 def named_in(data: bytes) -> tuple[int, int] | None:
@@ -87,8 +123,6 @@ def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
     if MISSING:
         heard = plain.decode(data, position_step(extent_m))
         return dataclasses.replace(heard, intent=None) if data[0] & 15 == PROFILE_EXTENDED else heard
-    fields = _kernel.decode(data, position_step(extent_m))
-    if isinstance(fields, int):
-        raise RemoteProtocolError(f"{_FAULTS[fields]} ({len(data)} bytes)")
-    profile, sender, slot, c_r, position, velocity, intent = fields
-    return Frame(sender, slot, c_r, position, velocity, intent if profile == PROFILE_PAPER_INTENT else None)
+    profile, sender, slot, c_r, *v = RECORD.unpack(decode_record(data, extent_m, RECORD.size))
+    intent = (v[6], v[7], v[8]) if profile == PROFILE_PAPER_INTENT else None
+    return Frame(sender, slot, c_r, (v[0], v[1], v[2]), (v[3], v[4], v[5]), intent)

@@ -1,11 +1,23 @@
-"""The extended frame: fields and bytes. Codec: ``_kernel/frame_extended.c``, specified in ``reference``."""
+"""The extended frame: fields and bytes. Codec: ``libdtsa/frame_extended.c``, specified in ``reference``."""
 
 from __future__ import annotations
+
+import struct
 
 from .compiled import MISSING
 from .compiled import kernel as _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
-from .frame import _FAULTS, EXTENT_M, Frame, position_step
+from .frame import (
+    _FAULTS,
+    EXTENT_M,
+    PROFILE_EXTENDED,
+    RECORD,
+    Frame,
+    decode_record,
+    encode_record,
+    position_step,
+    record_of,
+)
 from .reference import frame_extended as plain
 from .reference.frame import EXTENDED_HEAD, EXTENDED_LENGTH
 from .reference.frame_extended import OPEN, ExtendedFrame, Gossip
@@ -16,6 +28,30 @@ __all__ = [
     "EXTENDED_LENGTH", "HEAD_LENGTH", "OPEN", "ExtendedFrame", "Gossip", "decode_extended", "decode_head",
     "encode_extended",
 ]  # fmt: skip
+
+# The structure of libdtsa/frame.h after the sender's own fields: c_s, leaving, probation, numbers of gossip and leases,
+# mask of the relay; three entries of gossip (id, age, c_r, position, velocity); leases; the relay's lessees.
+_REST = struct.Struct("=5iI" + 3 * "3i4x6d" + "33s8s7x")
+_ENTRY = 9  # values of one entry
+if not MISSING and RECORD.size + _REST.size != _kernel.EXTENDED_RECORD:
+    raise ImportError("the compiled kernel is of another version; build dtsa_agent again")
+
+
+def _rest_of(frame: ExtendedFrame) -> bytes:
+    """What an extended frame says of others, as the kernel's structure; none if it does not fit."""
+    mask, lessees = 0, [lessee for _, lessee in frame.relay]
+    for ahead, _ in frame.relay:
+        if not 1 <= ahead <= 24 or mask >> (ahead - 1):
+            return b""
+        mask |= 1 << (ahead - 1)
+    if len(lessees) > 8 or not all(0 < lessee < 256 for lessee in lessees) or len(frame.gossip) > 3:
+        return b""
+    entries: list[float] = []
+    for g in frame.gossip:
+        entries += (g.agent, g.age, int(g.moving), *g.position, *g.velocity)
+    entries += [0] * (3 * _ENTRY - len(entries))
+    numbers = (frame.c_s, frame.leaving, frame.probation, len(frame.gossip), len(frame.leases), mask)
+    return _REST.pack(*numbers, *entries, frame.leases, bytes(lessees))
 
 
 def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
@@ -29,13 +65,11 @@ def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
     """
     if MISSING:
         return plain.encode_extended(frame, position_step(extent_m))
-    own = frame.own
-    data: bytes = _kernel.encode_extended(
-        own.sender, own.slot & 0xFFFFFFFF, own.c_r, own.position, own.velocity, own.intent or (0.0, 0.0, 0.0),
-        frame.c_s, frame.leaving, frame.probation,
-        tuple((g.agent, g.age, int(g.moving), g.position, g.velocity) for g in frame.gossip), frame.leases, frame.relay,
-        position_step(extent_m),
-    )  # fmt: skip
+    try:
+        rest = _rest_of(frame)
+    except struct.error as error:
+        raise LocalProtocolError(f"not encodable: {frame} ({error})") from error
+    data = encode_record(record_of(frame.own, PROFILE_EXTENDED) + rest, extent_m) if rest else b""
     if not data:
         raise LocalProtocolError(f"not encodable: {frame}")
     return data
@@ -50,16 +84,17 @@ def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
     """
     if MISSING:
         return plain.decode_extended(data, position_step(extent_m))
-    fields = _kernel.decode_extended(data, position_step(extent_m))
-    if isinstance(fields, int):
-        raise RemoteProtocolError(f"{_FAULTS[fields]} ({len(data)} bytes)")
-    own = Frame(
-        fields["sender"], fields["slot"], fields["c_r"], fields["position"], fields["velocity"], fields["intent"]
-    )
-    gossip = tuple(Gossip(agent, age, bool(c_r), p, v) for agent, age, c_r, p, v in fields["gossip"])
-    return ExtendedFrame(
-        own, fields["c_s"], fields["leaving"], fields["probation"], gossip, fields["leases"], tuple(fields["relay"])
-    )
+    record = decode_record(data, extent_m, _kernel.EXTENDED_RECORD)
+    _, sender, slot, c_r, *v = RECORD.unpack_from(record)
+    c_s, leaving, probation, gossips, given, mask, *rest = _REST.unpack_from(record, RECORD.size)
+    gossip = []
+    for at in range(0, gossips * _ENTRY, _ENTRY):
+        agent, age, moving, *state = rest[at : at + _ENTRY]
+        gossip.append(Gossip(agent, age, bool(moving), (state[0], state[1], state[2]), (state[3], state[4], state[5])))
+    leases, relayed = rest[-2:]
+    relay = tuple(zip((d for d in range(1, 25) if mask >> (d - 1) & 1), relayed, strict=False))
+    own = Frame(sender, slot, c_r, (v[0], v[1], v[2]), (v[3], v[4], v[5]), (v[6], v[7], v[8]))
+    return ExtendedFrame(own, c_s, bool(leaving), bool(probation), tuple(gossip), leases[:given], relay)
 
 
 def decode_head(data: bytes, extent_m: float = EXTENT_M) -> Frame:

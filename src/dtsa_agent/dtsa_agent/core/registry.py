@@ -3,7 +3,7 @@
 Avoiders and their vehicles are rows as well: :data:`dtsa_agent.core.flight_models.AVOIDERS`. Rows are in the order of
 the kernel's numbers, which is checked when this module is imported. Plug-ins get their rows from what they declare.
 
-A built-in policy is a row here, a C function in ``_kernel`` and its name in ``_kernel/names.c``.
+A built-in policy is a row here, a file in ``libdtsa/policy``, and its number and name in ``libdtsa``.
 """
 
 from __future__ import annotations

@@ -19,6 +19,8 @@ from .reference_swarm import ReferenceSwarm
 from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
 from .scenario import STREAM_POLICY, Scenario, generator
 
+LEASE_STATUS = ("probation", "deaf", "woke", "alive", "absent", "silent_slots")
+
 
 class Swarm(AbstractSwarm):
     """Some or all agents of one swarm, on the compiled core.
@@ -57,9 +59,10 @@ class Swarm(AbstractSwarm):
         if config.policy_row.agent_state:
             state = _kernel.lease_state_bytes(config.agents, config.anchor_every)
             self.lease_state = np.zeros((count, state), dtype=np.uint8)
+        self._rejects = np.zeros(2, dtype=np.uint64)  # frames heard that were malformed, foreign
         parameters = self._parameters(count)
         self._arrays = self._shared_arrays()
-        self.kernel = _kernel.Swarm(parameters, self._arrays)
+        self.kernel = _kernel.swarm(parameters, self._arrays)
 
     def _parameters(self, count: int) -> dict[str, Any]:
         config, model = self.config, flight_model(self.config.avoider, self.config.options)
@@ -76,10 +79,10 @@ class Swarm(AbstractSwarm):
             "targets_known": int(config.targets_known and self.scenario.goals_known),
             "profile": PROFILE_EXTENDED if config.extended else profile, "key": key,
             "decay_len": self._decay.shape[1], "tau": model.vehicle.tau, "a_max": model.vehicle.a_max,
-            "avoid": model.avoider.to_dict(), "gossip": int(config.gossip),
+            "gossip": int(config.gossip), **model.avoider.to_dict(),
             "position_step": position_step(config.extent_m), "anchor_every": config.anchor_every,
             "open_every": config.open_period, "adoption": int(config.adoption), "depth_rate": float(config.depth_rate),
-            "share": float(config.lease_share),
+            "share": float(config.lease_share), "patience": 0,
         }  # fmt: skip
 
     def _shared_arrays(self) -> dict[str, Any]:
@@ -96,40 +99,40 @@ class Swarm(AbstractSwarm):
             "goal": self.goal, "track": self.track, "active": self.active, "final": self.final, "present": self.present,
             "chosen": self.chosen, "reason": self.reason, "digest": self.digest, "score": self.score,
             "sends": self.sends, "frame_len": self.frame_length, "frames": self.frames, "decay": self._decay,
-            "lease_state": self.lease_state,
+            "lease_state": self.lease_state, "rejects": self._rejects,
         }  # fmt: skip
 
     # The steps are documented in AbstractSwarm.
 
     def decide(self, slot: int) -> None:
-        self.kernel.decide(slot)
+        _kernel.decide(self.kernel, slot)
 
     def emit(self, slot: int) -> tuple[int, ...]:
-        return self.kernel.emit(slot)
+        return _kernel.emit(self.kernel, slot)
 
     def begin(self, slot: int) -> tuple[int, ...]:
-        return self.kernel.begin(slot)
+        return _kernel.begin(self.kernel, slot)
 
     def frame(self, local_index: int) -> bytes:
-        return self.kernel.frame(local_index)
+        return _kernel.frame(self.kernel, local_index)
 
     def fly(self, slot: int) -> None:
-        self.kernel.fly(slot)
+        _kernel.fly(self.kernel, slot)
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
-        self.kernel.steer(slot, step, estimate)
+        _kernel.steer(self.kernel, slot, step, estimate)
 
     def move(self, step: int) -> None:
-        self.kernel.move(step)
+        _kernel.move(self.kernel, step)
 
     def hear(self, slot: int, data: bytes, mask: Bytes | None = None) -> bool:
-        return self.kernel.hear(slot, data, mask)
+        return _kernel.hear(self.kernel, slot, data, mask)
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
-        self.kernel.end(slot)
+        _kernel.end(self.kernel, slot)
 
     def estimate(self, slot: int, step: int = 0) -> None:
-        self.kernel.estimate(slot, step)
+        _kernel.estimate(self.kernel, slot, step)
 
     def unseal(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
         return data
@@ -139,10 +142,10 @@ class Swarm(AbstractSwarm):
         self.final[:] = 1
         if self.course is not None:
             self.course.reset()
-        self.kernel.reset()
+        _kernel.reset(self.kernel)
 
     def restart(self, local_index: int) -> None:
-        self.kernel.restart(local_index)
+        _kernel.restart(self.kernel, local_index)
 
     def leave(self, local_index: int) -> None:
         if self.present[local_index]:
@@ -160,7 +163,7 @@ class Swarm(AbstractSwarm):
         return swarm
 
     def lease_status(self, local_index: int) -> dict[str, Any]:
-        return self.kernel.lease_status(local_index)
+        return dict(zip(LEASE_STATUS, _kernel.lease_status(self.kernel, local_index), strict=True))
 
     def reason_name(self, local_index: int) -> str:
         return REASONS[int(self.reason[local_index])]
@@ -168,9 +171,9 @@ class Swarm(AbstractSwarm):
     @property
     def malformed(self) -> int:
         """Frames heard that were none: wrong length, version or fields."""
-        return int(self.kernel.malformed)
+        return int(self._rejects[0])
 
     @property
     def foreign(self) -> int:
         """Frames of unknown agents or of another time."""
-        return int(self.kernel.foreign)
+        return int(self._rejects[1])

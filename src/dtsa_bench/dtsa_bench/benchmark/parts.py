@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core import Swarm, SwarmConfig, _kernel
-from dtsa_agent.core.frame import POSITION_STEP, PROFILE_PAPER
+from dtsa_agent.core.frame import Frame, decode_frame, encode_frame
 
 from ..simulate import simulate
 from ..sweep.spec import run_config
@@ -54,10 +54,10 @@ def seconds(call: Callable[[], object], least_s: float = 0.1) -> float:
 def kernels() -> Iterator[Row]:
     """The priorities g of all agents, and the frame's codec."""
     yield from map(_priorities, SIZES)
-    fields = (PROFILE_PAPER, 7, 1234, 1, (1.0, -2.0, 0.5), (0.3, 0.2, -0.1), (0.0, 0.0, 0.0), POSITION_STEP)
-    frame = _kernel.encode(*fields)
-    yield {"what": "frame encoded", "ours_us": 1e6 * seconds(lambda: _kernel.encode(*fields))}
-    yield {"what": "frame decoded", "ours_us": 1e6 * seconds(lambda: _kernel.decode(frame, POSITION_STEP))}
+    frame = Frame(7, 1234, 1, (1.0, -2.0, 0.5), (0.3, 0.2, -0.1))
+    data = encode_frame(frame)
+    yield {"what": "frame encoded", "ours_us": 1e6 * seconds(lambda: encode_frame(frame))}
+    yield {"what": "frame decoded", "ours_us": 1e6 * seconds(lambda: decode_frame(data))}
 
 
 def _priorities(agents: int) -> Row:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dtsa_agent.core import _kernel
-from dtsa_agent.core.frame import POSITION_STEP
+from dtsa_agent.core.errors import RemoteProtocolError
+from dtsa_agent.core.frame_extended import decode_extended
 
 OPEN = 255
 
@@ -85,14 +85,15 @@ class Ledger:
             self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(lessees)}")
 
     def _read(self, slot: int, sender: int, data: bytes) -> None:
-        fields = _kernel.decode_extended(data, POSITION_STEP)
-        if isinstance(fields, int):
-            self.broken.append(f"slot {slot}: agent {sender} sent a frame that is none ({fields})")
+        try:
+            frame = decode_extended(data)
+        except RemoteProtocolError as error:
+            self.broken.append(f"slot {slot}: agent {sender} sent a frame that is none: {error}")
             return
-        leases = fields["leases"]
+        leases = frame.leases
         if leases and slot % self.agents != sender - 1:
             self.broken.append(f"slot {slot}: agent {sender} gives turns away in somebody else's turn")
-        for turn, lessee in zip(self.turns(slot, fields["c_s"], len(leases)), leases, strict=False):
+        for turn, lessee in zip(self.turns(slot, frame.c_s, len(leases)), leases, strict=False):
             if not lessee:
                 continue
             owner = turn % self.agents + 1

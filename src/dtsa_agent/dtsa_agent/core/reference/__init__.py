@@ -1,6 +1,6 @@
 """The protocol as a specification that runs: plain Python, to be read beside the paper and docs/protocol.md.
 
-Everything that agents must agree on stands here once, and once more in C (``core/_kernel``), which is what flies. Both
+Everything that agents must agree on stands here once, and once more in C (``libdtsa``), which is what flies. Both
 give the same frames, tables, decisions, digests and times, bit for bit; tests hold them together. docs/equations.md
 leads from an equation to both.
 

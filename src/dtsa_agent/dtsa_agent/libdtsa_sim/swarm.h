@@ -1,0 +1,65 @@
+/* Many agents and tables at once, with vehicles: what simulator, nodes and verifier hold. Arrays are the caller's. */
+#ifndef DTSA_SWARM_H
+#define DTSA_SWARM_H
+
+#include "core.h"
+#include "policy/policy.h"
+#include "vehicle.h"
+
+typedef struct swarm {
+    dtsa_config config;
+    int local_count, table_count;
+    int shared; /* one table serves every agent */
+    vehicle_params vehicle;
+
+    /* Borrowed: v = table_count, l = local_count, n = agents. */
+    const int32_t *local;              /* (l) 0-based agent of each local slot */
+    const int32_t *observer;           /* (v) 0-based agent of each table, -1: serves all */
+    double *sent_p, *sent_v, *sent_c;  /* (v, 3, n) tables: see core.h */
+    int64_t *sent_slot, *last;         /* (v, n) */
+    uint8_t *in_ap;                    /* (v, n) */
+    uint32_t *entry_hash;              /* (v, n) */
+    uint32_t *table_hash;              /* (v) */
+    double *est_p, *est_v;             /* (v, 3, n) */
+    double *g;                         /* (v, n) */
+    int64_t *h;                        /* (v, n) */
+    double *pos, *vel, *cmd, *goal;    /* (3, l) */
+    double *track;                     /* (steps, 3, l) */
+    uint8_t *active, *final, *present; /* (l) see core.h */
+    uint16_t *chosen;                  /* (l) */
+    uint8_t *reason;                   /* (l) */
+    uint32_t *digest;                  /* (l) */
+    double *score;                     /* (l) */
+    uint8_t *sends;                    /* (l) */
+    uint8_t *frame_len;                /* (l) */
+    uint8_t *frames;                   /* (l, DTSA_FRAME_MAX) */
+    uint8_t *lease_state;              /* (l, bytes of the policy) */
+    uint64_t *rejects;                 /* (2) frames heard that were malformed, foreign */
+
+    /* Owned. */
+    dtsa_table *tables; /* (v) */
+    dtsa_agent *agents; /* (l) */
+    double *scratch, *ages;
+    int32_t *senders; /* (l) */
+    int sender_count;
+} swarm;
+
+size_t swarm_policy_bytes(const dtsa_config *config); /* of an agent's own state, 0: none */
+/* After configuration and arrays are filled in; -> what is wrong, or NULL. */
+const char *swarm_open(swarm *s);
+void swarm_close(swarm *s);
+
+void swarm_reset(swarm *s);
+void swarm_restart(swarm *s, int l); /* knows nothing but the settings */
+void swarm_decide(swarm *s, int64_t slot);
+/* Encodes the frames of all whose `sends` is set; lists them in senders. */
+void swarm_emit(swarm *s, int64_t slot);
+/* mask (v): which tables hear it; NULL: all. -> whether it was a frame of this swarm and time. */
+int swarm_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const uint8_t *mask);
+void swarm_end(swarm *s, int64_t slot);
+void swarm_estimate(swarm *s, int table, int64_t slot, int step);
+void swarm_steer(swarm *s, int64_t slot, int step, int estimate);
+void swarm_move(swarm *s, int step);
+void swarm_fly(swarm *s, int64_t slot);
+
+#endif
