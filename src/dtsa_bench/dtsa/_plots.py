@@ -1,7 +1,12 @@
-"""Figures. Each function returns a new `matplotlib.figure.Figure`; nothing is shown or saved."""
+"""Figures. Each function returns a new `matplotlib.figure.Figure`; nothing is shown or saved.
+
+In a notebook a cell that ends with a figure shows it.
+"""
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +24,25 @@ from ._recording import Recording
 from ._sweep import SweepResult
 
 Flown = Flight | Recording
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _show_in_notebooks() -> None:
+    """Notebooks show figures that pyplot has made; ours are made without it, so IPython has to be told."""
+    ipython: Any = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    if shell is not None:
+        formatter = shell.display_formatter.formatters["image/png"]
+        if Figure not in formatter.type_printers:  # somebody else did, perhaps with settings
+            formatter.for_type(Figure, _png)
+
+
+_show_in_notebooks()
 
 
 def plot_trajectories(*flights: Flown, titles: Sequence[str] | None = None) -> Figure:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import ast
 import json
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from flight_helpers import flight_bag
 from matplotlib.figure import Figure
+
+from dtsa import _plots
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
@@ -34,6 +38,20 @@ def run_cells(path: Path) -> tuple[dict[str, Any], list[Any]]:
             assert isinstance(last, ast.Expr)
             shown.append(eval(compile(ast.Expression(last.value), f"{path.name}, cell {number}", "eval"), names))
     return names, shown
+
+
+def test_notebooks_show_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """IPython is told once how to show a figure, and nothing is taken from who told it before."""
+    known: dict[type, Any] = {}
+    formatter = SimpleNamespace(type_printers=known, for_type=known.__setitem__)
+    shell = SimpleNamespace(display_formatter=SimpleNamespace(formatters={"image/png": formatter}))
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell, version_info=(9, 0)))
+    _plots._show_in_notebooks()
+    first = known[Figure]
+    assert first(Figure()).startswith(b"\x89PNG")
+    known[Figure] = "their own"
+    _plots._show_in_notebooks()
+    assert known[Figure] == "their own"
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
