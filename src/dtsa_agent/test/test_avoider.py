@@ -1,4 +1,4 @@
-"""The compiled avoiders against slow, plain versions of their formulas, and what every avoider promises."""
+"""The compiled avoiders against the specification, and what every avoider promises."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from dtsa_agent.core import _kernel
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, flight_model
+from dtsa_agent.core.reference import avoiders
+from dtsa_agent.core.reference.avoiders import Avoidance, Neighbour, Scene
 
 MODELS = tuple(FLIGHT_MODELS)
 
@@ -49,118 +51,17 @@ def command(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np
     return model.command(i, case.position[:, i], case.velocity[:, i], case.goal, case.position, case.velocity, age)
 
 
-# --- plain references -----------------------------------------------------------------------------
+def scene_of(case: Case, age: np.ndarray | None = None) -> Scene:
+    """The same question to the specification."""
+    ages = np.zeros(len(case.age)) if age is None else age
+    places, speeds = (list(map(tuple, array.T.tolist())) for array in (case.position, case.velocity))
+    others = [Neighbour(j + 1, places[j], speeds[j], float(ages[j])) for j in range(len(places)) if j != case.index]
+    return Scene(case.index + 1, places[case.index], speeds[case.index], tuple(case.goal.tolist()), others)
 
 
-def limited(vector: np.ndarray, largest: float) -> np.ndarray:
-    norm = float(np.linalg.norm(vector))
-    return vector if norm <= largest else vector * (largest / norm)
-
-
-def preferred(params: AvoiderParams, case: Case) -> np.ndarray:
-    to_goal = case.goal - case.position[:, case.index]
-    distance = float(np.linalg.norm(to_goal))
-    return to_goal / distance * min(params.v_max, params.gain * distance) if distance else np.zeros(3)
-
-
-def margin(params: AvoiderParams, age: np.ndarray | None, j: int) -> float:
-    return 0.0 if age is None else min(params.margin_max, params.margin_rate * age[j])
-
-
-def half_planes(params: AvoiderParams, case: Case, age: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """n (m, 3) and b (m,), in the words of RVO2-3D."""
-    i = case.index
-    normals, bounds = [], []
-    for j in range(case.position.shape[1]):
-        r = case.position[:, j] - case.position[:, i]
-        radius = params.radius + margin(params, age, j)
-        if j == i or not float(np.linalg.norm(r)) < radius + 2 * params.v_max * params.horizon:
-            continue
-        relative = case.velocity[:, i] - case.velocity[:, j]
-        distance2 = float(r @ r)
-        if distance2 <= radius**2:
-            w = relative - r / params.period
-            depth = radius / params.period - np.linalg.norm(w)
-        else:
-            w = relative - r / params.horizon
-            if w @ r < 0 and (w @ r) ** 2 > radius**2 * (w @ w):
-                depth = radius / params.horizon - np.linalg.norm(w)
-            else:
-                b = float(r @ relative)
-                cross = np.cross(r, relative)
-                c = float(relative @ relative) - float(cross @ cross) / (distance2 - radius**2)
-                t = (b + math.sqrt(max(0.0, b * b - distance2 * c))) / distance2
-                w = relative - t * r
-                depth = radius * t - np.linalg.norm(w)
-        n = w / np.linalg.norm(w)
-        normals.append(n)
-        bounds.append(n @ (case.velocity[:, i] + depth * n / 2))
-    return np.array(normals).reshape(-1, 3), np.array(bounds)
-
-
-def soft_gradient(v: np.ndarray, wish: np.ndarray, n: np.ndarray, b: np.ndarray, rho: float) -> np.ndarray:
-    return (v - wish) - rho * (np.maximum(0.0, b - n @ v) @ n if len(b) else 0.0)
-
-
-def soft_minimum(wish: np.ndarray, n: np.ndarray, b: np.ndarray, rho: float) -> np.ndarray:
-    """Minimiser of |v - wish|^2 / 2 + rho / 2 sum max(0, b - n.v)^2 by damped Newton steps.
-
-    The function is strongly convex with modulus 1, so its gradient bounds the distance to the minimiser.
-    """
-
-    def value(v: np.ndarray) -> float:
-        return float((v - wish) @ (v - wish) / 2 + rho / 2 * np.sum(np.maximum(0.0, b - n @ v) ** 2))
-
-    v = wish.copy()
-    for _ in range(300):
-        gradient = soft_gradient(v, wish, n, b, rho)
-        if np.linalg.norm(gradient) < 1e-12 * (1 + rho):
-            break
-        active = n[b - n @ v > 0]
-        step = np.linalg.solve(np.eye(3) + rho * active.T @ active, -gradient)
-        t = 1.0
-        while value(v + t * step) > value(v) + 1e-4 * t * float(gradient @ step) and t > 1e-12:
-            t /= 2
-        v = v + t * step
-    return v
-
-
-def orca_reference(params: AvoiderParams, case: Case, age: np.ndarray | None) -> np.ndarray:
-    x, y, z = preferred(params, case)
-    wish = limited(np.array([x + params.bias * y, y - params.bias * x, z]), params.v_max)
-    n, b = half_planes(params, case, age)
-    best = soft_minimum(wish, n, b, params.softness)
-    assert np.linalg.norm(soft_gradient(best, wish, n, b, params.softness)) < 1e-9
-    return limited(best, params.v_max)
-
-
-def potential_reference(params: AvoiderParams, case: Case, age: np.ndarray | None) -> np.ndarray:
-    result = preferred(params, case)
-    for j in range(case.position.shape[1]):
-        away = case.position[:, case.index] - case.position[:, j]
-        d = float(np.linalg.norm(away))
-        reach, core = params.influence + margin(params, age, j), params.core + margin(params, age, j)
-        if j == case.index or d >= reach:
-            continue
-        f = min(params.strength * (1 / max(d - core, 0.02) - 1 / (reach - core)), 4 * params.v_max)
-        e = away / d
-        result = result + f * (e + params.tangential * np.array([-e[1], e[0], 0.0]))
-    return limited(result, params.v_max)
-
-
-def bvc_walls(params: AvoiderParams, case: Case) -> tuple[np.ndarray, np.ndarray]:
-    """Outward unit normals a (m, 3) and c (m,): the cell is a.x <= c around the agent, the box included."""
-    radii = params.radius * np.array([1.0, 1.0, params.stretch_z])
-    normals = [sign * np.eye(3)[axis] for axis in range(3) for sign in (-1, 1)]
-    bounds = [params.horizon * params.v_max] * 6
-    for j in range(case.position.shape[1]):
-        if j == case.index:
-            continue
-        q = (case.position[:, j] - case.position[:, case.index]) / radii
-        a = q / radii / np.linalg.norm(q)
-        normals.append(a / np.linalg.norm(a))
-        bounds.append(float((np.linalg.norm(q) / 2 - 1) / np.linalg.norm(a)))
-    return np.array(normals), np.array(bounds)
+def plain(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np.ndarray:
+    params = Avoidance(**model.avoider.to_dict())
+    return np.array(avoiders.command(model.avoider_kind, scene_of(case, age), params))
 
 
 # --- the compiled kernel computes what the formulas say -------------------------------------------
@@ -183,26 +84,29 @@ def test_orca_minimises_the_soft_problem(case: Case, params: AvoiderParams, aged
     for j in range(case.position.shape[1]):
         # the cone is badly conditioned where the neighbour's sphere just touches
         gap = np.linalg.norm(case.position[:, j] - case.position[:, case.index]) - params.radius
-        assume(j == case.index or abs(gap - margin(params, age, j)) > 1e-4)
-    expected = orca_reference(params, case, age)
-    assert command(model, case, age) == pytest.approx(expected, abs=1e-9)
+        wider = 0.0 if age is None else min(params.margin_max, params.margin_rate * age[j])
+        assume(j == case.index or abs(gap - wider) > 1e-4)
+    assert command(model, case, age) == pytest.approx(plain(model, case, age), abs=1e-9)
 
 
 def test_orca_agrees_with_hildreth_sweeps() -> None:
+    """Another way to the same minimum: coordinate ascent of the dual."""
     model = FLIGHT_MODELS["orca"]
-    rho = model.avoider.softness
+    rho, params = model.avoider.softness, Avoidance(**model.avoider.to_dict())
     for seed in range(20):
         case = make_case(seed, 12, 1.2)
-        x, y, z = preferred(model.avoider, case)
-        v = limited(np.array([x + model.avoider.bias * y, y - model.avoider.bias * x, z]), model.avoider.v_max)
-        n, b = half_planes(model.avoider, case, None)
-        dual = np.zeros(len(b))
+        scene = scene_of(case)
+        x, y, z = avoiders.preferred(scene, params)
+        v = np.array(avoiders.limited((x + params.bias * y, y - params.bias * x, z), params.v_max))
+        spaces = [avoiders.orca_half_space(scene, other, params) for other in scene.neighbours]
+        normals, dual = [np.array(space.normal) for space in spaces], np.zeros(len(spaces))
         for _ in range(3000):
-            for j in range(len(b)):
-                new = max(0.0, dual[j] + (b[j] - n[j] @ v - dual[j] / rho) / (1 + 1 / rho))
-                v = v + (new - dual[j]) * n[j]
+            for j, space in enumerate(spaces):
+                n = normals[j]
+                new = max(0.0, dual[j] + (space.bound - n @ v - dual[j] / rho) / (1 + 1 / rho))
+                v = v + (new - dual[j]) * n
                 dual[j] = new
-        assert command(model, case) == pytest.approx(limited(v, model.avoider.v_max), abs=1e-6)
+        assert command(model, case) == pytest.approx(avoiders.limited(tuple(v), params.v_max), abs=1e-6)
 
 
 @pytest.mark.parametrize("name", ["potential", "jerky"])
@@ -211,7 +115,7 @@ def test_orca_agrees_with_hildreth_sweeps() -> None:
 def test_potential_adds_the_forces(name: str, case: Case, aged: bool, rate: float) -> None:
     model = flight_model(name, {"margin_rate": rate})
     age = case.age if aged else None
-    assert command(model, case, age) == pytest.approx(potential_reference(model.avoider, case, age), abs=1e-9)
+    assert command(model, case, age) == pytest.approx(plain(model, case, age), abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ["bvc", "bvc-firmware"])
@@ -220,7 +124,9 @@ def test_potential_adds_the_forces(name: str, case: Case, aged: bool, rate: floa
 def test_bvc_flies_to_the_nearest_point_of_its_cell(name: str, case: Case) -> None:
     params = dataclasses.replace(FLIGHT_MODELS[name].avoider, gain=0.05, sidestep=1e-6)
     model = dataclasses.replace(FLIGHT_MODELS[name], avoider=params)
-    a, c = bvc_walls(params, case)
+    same = Avoidance(**params.to_dict())
+    walls = [*avoiders.bvc_walls(scene_of(case), same), *avoiders.bvc_box(same)]
+    a, c = -np.array([wall.normal for wall in walls]), -np.array([wall.bound for wall in walls])
     goal = case.goal - case.position[:, case.index]
     target = command(model, case) / params.gain  # the gain is so small that no speed limit acts
     assume(np.all(c > 1e-3))  # in its own cell: the cell is not empty
@@ -253,7 +159,7 @@ def test_bvc_steps_to_its_right_in_front_of_a_wall() -> None:
 @given(case=cases)
 def test_none_flies_straight(case: Case) -> None:
     model = FLIGHT_MODELS["none"]
-    assert command(model, case) == pytest.approx(preferred(model.avoider, case), abs=1e-12)
+    assert command(model, case) == pytest.approx(plain(model, case), abs=1e-12)
 
 
 # --- what all avoiders promise --------------------------------------------------------------------

@@ -26,7 +26,7 @@ from dtsa_agent.core import (
 from dtsa_agent.core.flight_models import FLIGHT_MODELS, flight_model
 from dtsa_agent.core.frame import position_step
 from dtsa_agent.core.frame_extended import ExtendedFrame, Gossip, decode_extended, encode_extended
-from dtsa_agent.core.reference import arithmetic, frame, frame_extended, selection, vehicle
+from dtsa_agent.core.reference import arithmetic, frame, frame_extended, selection
 from dtsa_agent.core.reference import priority as plain_priority
 from dtsa_agent.core.reference_swarm import ReferenceSwarm
 from dtsa_agent.core.registry import REASONS
@@ -180,15 +180,6 @@ def random_frame(random: np.random.Generator, agents: int, slot: int, whole: boo
     )
     c_s, probation = int(random.choice([0, 0, 1, agents - 1])), bool(random.random() < 0.2)
     return encode_extended(ExtendedFrame(own, c_s, bool(random.random() < 0.05), probation, others[:2], leases))
-
-
-@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(FLIGHT_MODELS)))
-def test_vehicles_move_alike(seed: int, name: str) -> None:
-    params = FLIGHT_MODELS[name].vehicle
-    p, v, c = np.random.default_rng(seed).normal(size=(3, 3))
-    expected = vehicle.step(params.tau, params.a_max, 0.01, *(tuple(x.tolist()) for x in (p, v, c)))
-    params.step(0.01, p, v, c)
-    assert (tuple(p.tolist()), tuple(v.tolist())) == expected
 
 
 @settings(max_examples=250)
