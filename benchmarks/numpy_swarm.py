@@ -1,4 +1,4 @@
-"""The same flights in plain vectorised NumPy: baseline and second opinion for the compiled core.
+"""The same flights in vectorised NumPy: the baseline for the speed of the compiled core, and nothing else.
 
 Everything a loss-free slot consists of is here once more, without the compiled kernel: who sends (tdma,
 age, dtsa), the quantised frame, the table that all agents share, extrapolation, reciprocal avoidance of all
@@ -6,7 +6,6 @@ agents at once, physics. Only pairs within reach are computed, sums over neighbo
 soft problems of all agents are solved together.
 
     python benchmarks/numpy_swarm.py --agents 18 70 --policy dtsa
-    python benchmarks/numpy_swarm.py --agents 18 --policy dtsa --check    # does the core agree?
 """
 
 from __future__ import annotations
@@ -209,17 +208,6 @@ def both(config: SwarmConfig) -> tuple[Swarm, NumpySwarm]:
     return core, NumpySwarm(config, scenario)
 
 
-def compare(config: SwarmConfig, slots: int) -> tuple[int, float]:
-    """Flies both side by side: slots until senders differ, largest difference until then, m."""
-    core, plain = both(config)
-    largest = 0.0
-    for slot in range(slots):
-        if core_slot(core, slot) != plain.slot(slot):
-            return slot, largest
-        largest = max(largest, float(np.abs(core.position - plain.position).max()))
-    return slots, largest
-
-
 def flight_slots(config: SwarmConfig) -> int:
     """Slots of a whole flight: until about the time all agents have arrived."""
     model = flight_model(config.avoider, config.options)
@@ -233,7 +221,6 @@ def measure(
     slot_ms: float = 10.0,
     seed: int = 1,
     slots: int | None = None,
-    check: bool = False,
 ) -> dict[str, float | int | str]:
     """Time of a slot of both, averaged over a flight with all agents moving.
 
@@ -242,7 +229,6 @@ def measure(
     :param slot_ms: length of a slot, ms.
     :param seed: seed of the scenario.
     :param slots: slots to fly; None: until all have about arrived.
-    :param check: fly both once more, side by side, and say how far they agree.
     """
     config = SwarmConfig(agents=agents, policy=policy, estimator="linear", avoider="orca", slot_ms=slot_ms, seed=seed)
     slots = slots or flight_slots(config)
@@ -263,26 +249,19 @@ def measure(
         "numpy_us": numpy_s * 1e6,
         "ratio": numpy_s / core_s,
     }
-    if check:
-        row["same_senders_until"], row["largest_difference_m"] = compare(config, slots)
     return row
 
 
 def main() -> int:
-    """Prints a table or JSON; with --check exit code 1 if the two disagree."""
+    """Prints a table or JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--agents", type=int, nargs="+", default=[18, 70])
     parser.add_argument("--policy", choices=POLICIES, nargs="+", default=["tdma", "dtsa"])
     parser.add_argument("--slots", type=int, default=None, help="slots to fly (default: a whole flight)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--check", action="store_true", help="fail unless senders and positions agree")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    rows = [
-        measure(n, policy, seed=args.seed, slots=args.slots, check=args.check)
-        for n in args.agents
-        for policy in args.policy
-    ]
+    rows = [measure(n, policy, seed=args.seed, slots=args.slots) for n in args.agents for policy in args.policy]
     if args.json:
         print(json.dumps(rows, indent=2))
     else:
@@ -290,12 +269,8 @@ def main() -> int:
         for row in rows:
             line = f"{row['agents']:6d} {row['policy']:>6} {row['slots']:6d} {row['core_us']:9.1f}"
             line += f" {row['numpy_us']:9.0f} {row['ratio']:6.0f}"
-            if args.check:
-                line += f"  agree for {row['same_senders_until']} slots"
-                line += f" within {row['largest_difference_m']:.1e} m"
             print(line)
-    bad = args.check and any(r["same_senders_until"] < r["slots"] or r["largest_difference_m"] > 1e-6 for r in rows)
-    return 1 if bad else 0
+    return 0
 
 
 if __name__ == "__main__":
