@@ -64,7 +64,8 @@ def main(arguments: list[str]) -> int:
             return dict(zip(OWN_COMMANDS, own, strict=True))[command](rest)
         known = bench_commands()
         if command not in known:
-            raise SetupError(f"command: got {command!r}; allowed: {', '.join([*known, *OWN_COMMANDS])}", code=2)
+            words = [*known, *OWN_COMMANDS]
+            raise SetupError(f"command: got {command!r}; allowed: {', '.join(words)}{_hint(command, words)}", code=2)
         prepare.prepare(set())
         return start(python(), ["-m", "dtsa_bench", command, *rest])
     except SetupError as error:
@@ -81,6 +82,13 @@ def bench_commands() -> dict[str, str]:
     from dtsa_bench.registry import available  # type: ignore[import-not-found, unused-ignore]
 
     return dict(available())
+
+
+def _hint(word: str, words: list[str]) -> str:
+    """What may have been meant; nothing has to be installed for that."""
+    from dtsa_bench.nearest import hint  # type: ignore[import-not-found, unused-ignore]
+
+    return str(hint(word, words))
 
 
 def version() -> str:

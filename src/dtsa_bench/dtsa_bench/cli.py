@@ -8,24 +8,66 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from dtsa_bench import __version__
+from dtsa_bench.examples import epilog
 from dtsa_bench.missing import say_missing
+from dtsa_bench.nearest import hint, words_of
 from dtsa_bench.registry import available, module_name
 
 PROGRAM = "dtsa"
 INTERRUPTED = 128 + signal.SIGINT
 
 
+class HelpText(argparse.HelpFormatter):
+    """Fills paragraphs, but leaves examples as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if text.startswith("examples:") else super()._fill_text(text, width, indent)
+
+
 class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage text around it."""
+    """Says what is wrong in one line, without the usage text around it; takes no abbreviations."""
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **{"allow_abbrev": False, "formatter_class": HelpText, **more})
+
+        self._words: list[str] = []
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does; keeps the words for what `error` says."""
+        self._words = [] if args is None else list(args)
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{PROGRAM}: error: {message}\n")
+        if message.startswith("the following arguments are required"):
+            known = {option for action in self._actions for option in action.option_strings}
+            wrong = [word for word in self._words if word.startswith("--") and word.partition("=")[0] not in known]
+            message += "".join(f"; {_unknown([word], self)}" for word in wrong[:1])
+        self.exit(2, f"{PROGRAM}: error: {message}{_meant(message)}\n")
+
+
+def _meant(message: str) -> str:
+    """What may have been meant where argparse refuses a word."""
+    found = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+    return hint(found[1], re.findall(r"[\w.-]+", found[2])) if found else ""
+
+
+def _unknown(words: Sequence[str], parser: argparse.ArgumentParser) -> str:
+    """What to say about words that a command does not know.
+
+    :param words: the words.
+    :param parser: the command's parser.
+    """
+    options = [option for action in parser._actions for option in action.option_strings]
+    wrong = next((word for word in words if word.startswith("-")), words[0])
+    what = "option" if wrong.startswith("-") else "argument"
+    return f"{what} {wrong}: unknown{hint(wrong.partition('=')[0], options)}"
 
 
 def build_parser(command: str | None) -> tuple[argparse.ArgumentParser, object | None]:
@@ -44,9 +86,28 @@ def build_parser(command: str | None) -> tuple[argparse.ArgumentParser, object |
         if name == command:
             chosen = importlib.import_module(f"dtsa_bench.commands.{module_name(name)}")
             chosen.add_parser(subparsers)
+            subparsers.choices[name].epilog = epilog(name)
         else:
             subparsers.add_parser(name, help=text)
     return parser, chosen
+
+
+def raise_wrong_command(parser: argparse.ArgumentParser, command: str, known: Sequence[str]) -> NoReturn:
+    """Ends with one line about a command that does not exist."""
+    parser.error(f"command: got {command!r}; allowed: {', '.join(known)}{hint(command, known)}")
+
+
+def command_parser(parser: argparse.ArgumentParser, command: str | None) -> argparse.ArgumentParser:
+    """The parser of one command.
+
+    :param parser: of the whole command line.
+    :param command: its name; None: the parser of the whole command line.
+    """
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction) and command in action.choices:
+            found: argparse.ArgumentParser = action.choices[command]
+            return found
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,7 +120,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command = words[0] if words and not words[0].startswith("-") else None
         parser, chosen = build_parser(command)
-        args = parser.parse_args(words)
+        if command is not None and chosen is None:
+            known = [name for name, _ in available()]
+            raise_wrong_command(parser, command, known)
+        args, unknown = parser.parse_known_args(words)
+        if unknown:
+            parser.error(_unknown(unknown, command_parser(parser, command)))
         return int(chosen.run(args) or 0)  # type: ignore[union-attr, attr-defined]
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -81,7 +147,8 @@ def report(error: Exception) -> int:
     from dtsa_agent.core.errors import ConfigError, DtsaError
 
     if isinstance(error, DtsaError):
-        print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        near = hint(str(error.value), words_of(error.allowed)) if isinstance(error, ConfigError) else ""
+        print(f"{PROGRAM}: error: {' '.join(str(error).split())}{near}", file=sys.stderr)
         return 2 if isinstance(error, ConfigError) else 1
     raise error
 

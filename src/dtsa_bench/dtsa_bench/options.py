@@ -29,8 +29,11 @@ def add_run_options(parser: argparse.ArgumentParser, skip: Iterable[str] = ()) -
     """
     left_out = tuple(skip)
     for section, cls, derived in _SECTIONS:
-        group = parser.add_argument_group(_TITLES[section])
-        add_options(group, cls, section, skip=(*derived, *left_out))
+        groups: dict[str, Any] = {}
+        for setting in settings_of(cls):
+            title = setting.group.lower() or _TITLES[section]
+            group = groups.get(title) or groups.setdefault(title, parser.add_argument_group(title))
+            _offer(group, setting, section, "", (*derived, *left_out))
         if section == "channel":
             group.add_argument(
                 "--channel",
@@ -41,14 +44,16 @@ def add_run_options(parser: argparse.ArgumentParser, skip: Iterable[str] = ()) -
             )
 
 
-def add_mode_options(parser: argparse.ArgumentParser) -> None:
+def add_mode_options(parser: argparse.ArgumentParser) -> Any:
     """Adds the options of flights in real time.
 
     :param parser: the command's parser.
+    :returns: their group, for further options.
     """
     group = parser.add_argument_group("real time")
     add_options(group, RunConfig, "run")
     add_options(group, ClockConfig, "clocks", "clock-", skip=("seed",))
+    return group
 
 
 def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "", skip: Iterable[str] = ()) -> None:
@@ -60,9 +65,15 @@ def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "",
     :param prefix: stands before the setting's name in the option's.
     :param skip: settings that become no option.
     """
+    left_out = tuple(skip)
     for setting in settings_of(cls):
-        if setting.kind not in ("structure", "vector") and setting.name not in skip:
-            _add(group, setting, section, prefix)
+        _offer(group, setting, section, prefix, left_out)
+
+
+def _offer(group: Any, setting: Setting, section: str, prefix: str, skip: tuple[str, ...]) -> None:
+    """Adds an option for a setting that fits into one and is not left out."""
+    if setting.kind not in ("structure", "vector") and setting.name not in skip:
+        _add(group, setting, section, prefix)
 
 
 def given(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
@@ -93,7 +104,8 @@ def _add(group: Any, setting: Setting, section: str, prefix: str) -> None:
     metavar = {"int": "N", "float": "X", "values": "NAME=X,..."}.get(
         setting.kind, "NAME" if setting.choices else "TEXT"
     )
-    group.add_argument(option, dest=where, metavar=metavar, default=None, help=text)
+    action = group.add_argument(option, dest=where, metavar=metavar, default=None, help=text)
+    action.words = tuple(str(word) for word in setting.choices)  # for completion; plug-ins have names of their own
 
 
 def _shown(value: object) -> str:

@@ -19,6 +19,7 @@ COMMANDS = {
     "export": "a bag's contents as CSV or Parquet",
     "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
     "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
+    "completion": "a script that completes commands, options and their values in bash or zsh",
 }
 
 RECORDED_RUN = "run directory, bag directory or .mcap file"  # what commands take that read one

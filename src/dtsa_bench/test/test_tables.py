@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -189,3 +191,23 @@ def test_bad_input_is_refused(flight: Path, tmp_path: Path) -> None:
     with pytest.raises((BagError, ConfigError)):
         export(flight, tmp_path / "file" / "below")
     assert not (tmp_path / "a").exists()
+
+
+SMALL_DISK = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, -1))  # no file gets larger, as on a disk that is full
+from dtsa_bench.cli import main
+sys.exit(main(["export", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv"])
+def test_a_full_disk_leaves_no_half_table(flight: Path, tmp_path: Path, kind: str) -> None:
+    (tmp_path / "mine").mkdir()
+    for place in ("mine", "new"):
+        words = [sys.executable, "-c", SMALL_DISK, str(flight), "--to", kind, "--out", str(tmp_path / place)]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert done.returncode == 1
+        assert done.stderr.startswith(f"dtsa: error: cannot export to {tmp_path / place}: ")
+        assert done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine"]  # was there before, and is empty as before

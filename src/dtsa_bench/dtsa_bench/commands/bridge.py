@@ -22,7 +22,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "bridge",
         help="connect the swarm to real or simulated Crazyflies",
         description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--config", type=Path, required=True, help="swarm.yaml: robots, types, defaults, station")
     parser.add_argument(

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from dtsa_bench.demo.story import Step
 
 INTERRUPTED = 130
+NUMBERS = "demo.json"
 
 
 def add_parser(subparsers: Any) -> None:
@@ -37,6 +39,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--animation", action="store_true", help="make demo.gif, too, a moving picture of steps 2 and 3"
     )
+    parser.add_argument("--json", action="store_true", help="print demo.json; everything else goes to standard error")
     parser.add_argument(
         "--open",
         action=argparse.BooleanOptionalAction,
@@ -60,6 +63,16 @@ def run(args: argparse.Namespace) -> int:
 
     :returns: 0; 1 if a bag's check failed; 130 when interrupted.
     """
+    if args.json:
+        with redirect_stdout(sys.stderr):
+            code, directory = _run(args)
+        if code != INTERRUPTED:
+            print((directory / NUMBERS).read_text(encoding="utf-8"), end="")
+        return code
+    return _run(args)[0]
+
+
+def _run(args: argparse.Namespace) -> tuple[int, Path]:
     seed = whole_number(args.seed, "seed", 0, 2**63 - 1)
     directory = _directory(args.out)
 
@@ -75,13 +88,13 @@ def run(args: argparse.Namespace) -> int:
         landed = fly_all(steps, directory, stop, sys.stderr)
     if stop:
         print(f"dtsa: the demo was interrupted; what was flown is in {directory}", file=sys.stderr)
-        return INTERRUPTED
+        return INTERRUPTED, directory
     checks = [_check(key, entry.flight.bag) for key, entry in landed.items()]
     page = _show(steps, landed, directory, args.animation)
     print(f"\n{time.monotonic() - begin:.0f} s in all. The page:", flush=True)
     open_page(page, args.open)
     print(page)
-    return 0 if all(checks) else 1
+    return 0 if all(checks) else 1, directory
 
 
 def _check(key: str, bag: Path) -> bool:
@@ -147,4 +160,4 @@ def _tell(directory: Path, picture: Path, flights: Flights) -> None:
     for text, command in _commands(directory):
         print(f"{text:44} {command}")
     numbers = {key: dict(flown.summary) for key, flown in flights.items()}
-    (directory / "demo.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    (directory / NUMBERS).write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")

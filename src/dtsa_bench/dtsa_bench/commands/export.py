@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 
 from dtsa_bench.registry import RECORDED_RUN
 
@@ -20,6 +21,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--to", default="parquet", metavar="FORMAT", help="parquet (default) or csv")
     parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_tables beside the bag)")
     parser.add_argument("--tables", nargs="+", metavar="TABLE", help=f"only these: {' '.join(TABLES)}")
+    parser.add_argument("--json", action="store_true", help="print the files and their rows as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -29,6 +31,10 @@ def run(args: argparse.Namespace) -> int:
 
     bag = bag_of(args.bag).resolve()
     target = args.out or bag.with_name(f"{bag.name if bag.is_dir() else bag.stem}_tables")
-    for table in export(args.bag, target, args.to, args.tables):
+    written = export(args.bag, target, args.to, args.tables)
+    if args.json:
+        print(json.dumps([{"path": str(table.path), "rows": table.rows} for table in written], indent=2))
+        return 0
+    for table in written:
         print(f"{table.path}: {table.rows} rows")
     return 0

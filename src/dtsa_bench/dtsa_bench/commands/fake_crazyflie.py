@@ -13,7 +13,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "fake-crazyflie",
         help="simulated Crazyflies over UDP that cflib connects to",
         description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_arguments(parser)
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.core.settings import settings_of
 from dtsa_bench.fly.options import FlightOptions
 from dtsa_bench.options import add_mode_options, add_options, add_run_options, given, run_config, whole_number
 
 INTERRUPTED = 130
+_LATER = ("respawn",)  # options of a flight that concern real time alone
 
 
 def add_parser(subparsers: Any) -> None:
@@ -21,35 +24,41 @@ def add_parser(subparsers: Any) -> None:
         help="one flight with real ROS 2 nodes, recorded to a bag",
         description="Starts the channel and the agents as ROS 2 nodes, records the flight, and ends them all.",
     )
-    parser.add_argument(
+    parser.usage = "%(prog)s --out DIR [OPTIONS]"
+    group = parser.add_argument_group("the flight")
+    group.add_argument(
         "--out", metavar="DIR", required=True, help="new directory for the bag, summary.json and trajectories.png"
     )
-    parser.add_argument(
+    group.add_argument(
         "--processes",
         metavar="per-agent|K",
         default="per-agent",
         help="one process an agent, or all agents in K processes [per-agent]",
     )
-    parser.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the flight [a free one]")
-    parser.add_argument(
+    group.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the flight [a free one]")
+    group.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
+    group.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
+    crazyflies = parser.add_argument_group("Crazyflies")
+    crazyflies.add_argument(
         "--backend",
         choices=("sim", "cflib"),
         default="sim",
         help="cflib: the Crazyflies of --config, in real time [sim]",
     )
-    parser.add_argument(
+    crazyflies.add_argument(
         "--config", metavar="FILE", default=None, help="swarm.yaml of the Crazyflies, for --backend cflib"
     )
-    add_options(parser, FlightOptions, "flight", skip=("startup_s", "processes", "domain", "pictures"))
-    parser.add_argument(
+    add_run_options(parser)
+    clocks = add_mode_options(parser)
+    kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
+    add_options(clocks, FlightOptions, "flight", skip=kept)
+    clocks.add_argument(
         "--late",
         metavar="cfK=S,...",
         default=None,
         help="real time: agents whose processes are started S seconds after slot 0 only [none]",
     )
-    parser.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
-    add_mode_options(parser)
-    add_run_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -87,12 +96,11 @@ def run(args: argparse.Namespace) -> int:
     )
     with Stop() as stop:
         flight = fly(config, directory, options, stop)
-    print(describe(flight.summary))
-    print(f"bag:     {flight.bag}\nresults: {directory / 'summary.json'}")
+    _tell(args, flight)
     if flight.summary.get("warning"):
         print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
     cut_short = flight.summary.get("cut_short")
-    if args.picture and not stop and not cut_short:
+    if args.picture and not stop and not cut_short and not args.json:
         print(f"picture: {directory / 'trajectories.png'}")
     if stop:
         print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
@@ -145,12 +153,20 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     options = FlightOptions(domain=domain, pictures=args.picture)
     with Stop() as stop:
         flight, cut_short = fly_crazyflies(config, settings, path, args.out, options, stop)
-    print(describe(flight.summary))
-    print(f"bag:     {flight.bag}\nresults: {Path(args.out) / 'summary.json'}")
+    _tell(args, flight)
     if cut_short:
         print(f"dtsa: the exchange was cut short: {cut_short}; all have landed", file=sys.stderr)
         return 1
     return INTERRUPTED if stop else 0
+
+
+def _tell(args: argparse.Namespace, flight: Any) -> None:
+    """Prints what came of a flight."""
+    if args.json:
+        print(json.dumps(flight.summary, indent=2))
+        return
+    print(describe(flight.summary))
+    print(f"bag:     {flight.bag}\nresults: {Path(args.out) / 'summary.json'}")
 
 
 def describe(summary: dict[str, Any]) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import sys
 
 from dtsa_bench.registry import RECORDED_RUN
@@ -22,6 +24,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action="store_true",
         help="keep what can be read of chunks with a wrong checksum, too",
     )
+    parser.add_argument("--json", action="store_true", help="print what was saved as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,6 +39,9 @@ def run(args: argparse.Namespace) -> int:
     result = recover(args.bag, args.out, args.keep_damaged, progress if live else None)
     if live:
         sys.stderr.write("\r")
+    if args.json:
+        print(json.dumps(dataclasses.asdict(result), indent=2, default=str))
+        return 0
     width = max(len(topic) for topic in result.saved)
     for topic, count in result.saved.items():
         expected = result.expected.get(topic, count)

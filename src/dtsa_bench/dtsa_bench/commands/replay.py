@@ -30,7 +30,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "replay",
         help="play a recorded run on the ROS graph",
         description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bag", help=RECORDED_RUN)
     parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed, 1 is real time (default 1)")

@@ -21,7 +21,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "report",
         help="HTML page about one recorded run, or several side by side",
         description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{RECORDED_RUN}; up to 6")
     parser.add_argument("--out", metavar="FILE", help="the page (default: report.html beside the first bag)")

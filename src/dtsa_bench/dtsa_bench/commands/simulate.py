@@ -17,6 +17,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     from dtsa_bench.options import add_run_options
 
     parser = subparsers.add_parser("simulate", help="one flight without ROS", description=DESCRIPTION)
+    parser.usage = "%(prog)s [OPTIONS]"
     parser.add_argument(
         "--out", metavar="DIR", help="directory for summary.json and config.json; default: only printed"
     )
@@ -30,10 +31,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Fly and print what came of it."""
+    from dtsa_agent.core import make_scenario
+    from dtsa_agent.keys import check_key
     from dtsa_bench.options import new_directory, run_config
     from dtsa_bench.simulate import simulate
 
     config = run_config(args)
+    check_key(config.swarm)  # before anything is made
+    make_scenario(config.swarm)
     directory = None if args.out is None else new_directory(args.out)
     summary = simulate(config, core=args.core).summary()
     text = json.dumps(summary, indent=2) + "\n"

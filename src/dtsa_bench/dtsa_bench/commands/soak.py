@@ -22,6 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--sample", action="store_true", help="a few minutes' part of it only")
     parser.add_argument("--minutes", metavar="X", default="90", help="nothing begins later than this [90]")
     parser.add_argument("--out", metavar="DIR", help="where finished items are kept [runs/soak/NAME]")
+    parser.add_argument("--json", action="store_true", help="print the record as JSON instead of lines")
     parser.add_argument("--evidence", metavar="FILE", help="the record [docs/evidence/NAME.json; none with --sample]")
 
 
@@ -43,7 +44,11 @@ def run(args: argparse.Namespace) -> int:
     if args.evidence or not args.sample:
         path = Path(args.evidence) if args.evidence else Path("docs") / "evidence" / f"{name}.json"
         write_record(path, record)
-        print(f"record: {path}")
+        if not args.json:
+            print(f"record: {path}")
+    if args.json:
+        print(json.dumps(record, indent=1))
+        return 1 if record["failures"] else 0
     left = record["items"] - record["finished"]
     print(f"{name}: {record['finished']} of {record['items']} done, {len(record['failures'])} failed")
     print(json.dumps(record["figures"], indent=1))

@@ -38,6 +38,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting of the base")
     parser.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
     parser.add_argument("--no-report", action="store_true", help="only results.csv and results.json")
+    parser.add_argument("--json", action="store_true", help="print the contents of results.json instead of tables")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -63,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError("show", args.show, ", ".join((*spec.preset_names(), PROTOCOL)))
         print((spec.PRESETS / f"{args.show}.yaml").read_text(encoding="utf-8"), end="")
         return 0
+    if args.json and args.preset and "," in args.preset:
+        raise ConfigError("json", args.preset, "one preset at a time: what is printed is one JSON document")
     sweeps = _sweeps(args)
     base = Path(args.out) if args.out else Path("runs")
     code = 0
@@ -78,6 +81,8 @@ def _protocol(args: argparse.Namespace) -> int:
     from dtsa_bench.options import whole_number
     from dtsa_bench.protocol_bench import plan, table
 
+    if args.json:
+        raise ConfigError("json", True, f"nothing with --preset {PROTOCOL}, which writes results.json")
     changed = _base(args.set)
     slots = changed.pop("slots", plan.SLOTS)
     for name in changed:
@@ -142,15 +147,20 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     table = Table(sweep, rows)
     write_table(directory, table, WORK.code())
     flown = time.monotonic() - begun
-    print(table_text(table))
-    if claims := claims_text(table):
-        print(f"\n{claims}\n")
+    if args.json:
+        print((directory / "results.json").read_text(encoding="utf-8"), end="")
+    else:
+        print(table_text(table))
+        if claims := claims_text(table):
+            print(f"\n{claims}\n")
     if not args.no_report:
         from dtsa_bench.report.sweep import write_report
 
         path = write_report(table, directory, WORK.code(), f"tools/dtsa {shlex.join(sys.argv[1:])}")
-        print(f"report: {path}")
-    print(f"{sweep.name}: {len(rows)} runs in {flown:.1f} s, {time.monotonic() - begun:.1f} s with the report")
+        if not args.json:
+            print(f"report: {path}")
+    if not args.json:
+        print(f"{sweep.name}: {len(rows)} runs in {flown:.1f} s, {time.monotonic() - begun:.1f} s with the report")
     failed = sum(row["status"] == "failed" for row in rows)
     if failed:
         print(

@@ -19,7 +19,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "verify",
         help="check a bag: was every decision what the protocol says?",
         description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bag", nargs="+", help=RECORDED_RUN)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")

@@ -156,7 +156,10 @@ def _show_status(fleet: Fleet) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the executable."""
     parser = argparse.ArgumentParser(
-        prog="fake_crazyflie", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="fake_crazyflie",
+        description=DESCRIPTION,
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_arguments(parser)
     try:

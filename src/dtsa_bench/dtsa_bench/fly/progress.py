@@ -60,8 +60,8 @@ class ProgressLine:
 def flight_text(slot: int, simulated_s: float, wall_s: float, closest_m: float, pair: tuple[int, int]) -> str:
     """The line of a flight under way."""
     factor = simulated_s / wall_s if wall_s > 0.0 else 0.0
-    near = f"closest cf{pair[0]} cf{pair[1]} {closest_m:.3f} m" if pair[0] else "closest: one agent alone"
-    return f"slot {slot}  simulated {simulated_s:.2f} s  wall {wall_s:.1f} s  real-time factor {factor:.2f}  {near}"
+    near = f"  closest cf{pair[0]} cf{pair[1]} {closest_m:.3f} m" if pair[0] else ""  # no slot is over, or one agent
+    return f"slot {slot}  simulated {simulated_s:.2f} s  wall {wall_s:.1f} s  real-time factor {factor:.2f}{near}"
 
 
 class FlightProgress(ChannelObserver):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,19 +58,27 @@ def export(
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ConfigError("out", str(directory), "a directory that is empty or does not exist yet")
     run = load_run(path)
+    # Written to a directory of its own, and moved to their places when all are whole.
+    new, part = not target.exists(), target / ".part"
     written = []
     try:
-        target.mkdir(parents=True, exist_ok=True)
+        part.mkdir(parents=True)
         for name, rows in _TABLES.items():
             if tables is not None and name not in tables:
                 continue
             if progress:
                 progress(name)
-            file = target / f"{name}.{kind}"
-            written.append(Exported(file, _write(file, kind, name, rows(run))))
-        (target / "columns.md").write_text(describe(), encoding="utf-8")
+            file = f"{name}.{kind}"
+            written.append(Exported(target / file, _write(part / file, kind, name, rows(run))))
+        (part / "columns.md").write_text(describe(), encoding="utf-8")
+        for whole in sorted(part.iterdir()):
+            whole.replace(target / whole.name)
+        part.rmdir()
     except OSError as error:
         raise BagError(f"cannot export to {target}: {error.strerror or error}") from error
+    finally:
+        if part.exists():
+            shutil.rmtree(target if new else part, ignore_errors=True)
     return written
 
 

@@ -1,0 +1,58 @@
+"""Examples of each command: they stand at the end of its help, and a test reads them as the command does."""
+
+from __future__ import annotations
+
+EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
+    "demo": (
+        ("", "everything, into runs/demo-1, and the page in a browser"),
+        ("--animation --no-open --out story", "with a moving picture; no browser"),
+    ),
+    "fly": (
+        ("--out runs/a", "twelve agents, a process each, as in the paper"),
+        ("--out runs/b --agents 18 --policy lease --loss 0.1 --processes 2", "lost frames, two processes"),
+        ("--out runs/c --mode realtime --policy lease --respawn 1", "clocks of their own; the dead come back"),
+        ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
+    ),
+    "simulate": (
+        ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),
+        ("--moving 2 --policy lease --json", "the same as JSON"),
+    ),
+    "sweep": (
+        ("--list", "what comes with the package"),
+        ("--preset paper-12,paper-18 --seeds 30", "the paper's experiments"),
+        ("--preset loss --set slot_ms=20 --out runs/slow", "with a setting changed"),
+        ("--file own.yaml --json", "a sweep of your own, its groups as JSON"),
+    ),
+    "soak": (("--list", "what there is"), ("kill --sample", "a few minutes' part of one")),
+    "benchmark": (("--json", "all parts, as JSON"),),
+    "replay": (
+        ("runs/a", "in real time"),
+        ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),
+    ),
+    "verify": (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON")),
+    "recover": (("runs/a", "into runs/a/bag_recovered"),),
+    "report": (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side")),
+    "export": (
+        ("runs/a", "all tables as Parquet"),
+        ("runs/a --to csv --tables slots frames --out tables", "two of them as CSV"),
+    ),
+    "bridge": (
+        ("--config swarm.yaml --check", "is the file good, is the radio fast enough?"),
+        ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
+    ),
+    "fake-crazyflie": (("--count 12", "twelve vehicles for the official library"),),
+    "completion": (
+        ("bash > ~/.dtsa-completion.bash", "then, in ~/.bashrc: . ~/.dtsa-completion.bash"),
+        ("zsh > ~/.dtsa-completion.zsh", "then, in ~/.zshrc: . ~/.dtsa-completion.zsh"),
+    ),
+}
+
+
+def epilog(command: str, program: str = "tools/dtsa") -> str:
+    """The examples of a command as its help shows them; empty if it has none.
+
+    :param command: its name.
+    :param program: what stands in front.
+    """
+    lines = [f"  {program} {command} {words}".rstrip() + f"\n      {text}" for words, text in EXAMPLES.get(command, ())]
+    return "\n".join(["examples:", *lines]) if lines else ""
