@@ -132,9 +132,9 @@ def test_slots_that_cannot_be_under_way_and_forged_ends_change_nothing(tmp_path:
             channel.publisher.publish(strange)
             graph.executor.spin_once(timeout_sec=0.05)
         assert channel.ask(1).slot == 1
+        graph.until(lambda: sum(channel.processes[-1].dropped) >= 9)
         channel.end(2)
         assert end_of(agent)[0] == 0
-        graph.until(lambda: sum(channel.processes[-1].dropped) >= 9)
         told = channel.processes[-1]
         counts = dict(zip(told.dropped_reason, told.dropped, strict=True))
         assert counts == {"slot": 2, "forged end": 2, "sizes": 2, "range": 1, "other run": 2}

@@ -103,6 +103,7 @@ def host_agents(
         logger.error(f"ends after slot {agents.slot}: {error}")
         raise
     finally:
+        agents.membership.close()
         agents.loop.close()
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from dtsa_msgs.msg import Process, Slot
+from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Header
 
@@ -34,6 +35,7 @@ _GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
 _TELL_S = 0.5  # counts are told that often at most
 _REFUSED_S = 10.0  # who has taken part for so long is not sent away any more
 _MOST_CALLERS = 16
+_DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last counts
 
 
 class _Caller:
@@ -181,6 +183,10 @@ class Membership:
         if left_over or (self.run and counts != self._told):
             self._told, self._told_s = counts, now
             self._publisher.publish(self._message(self.run))
+
+    def close(self) -> None:
+        """Lets the last counts arrive before this process ends: what it has published goes with it."""
+        self._publisher.wait_for_all_acked(_DELIVERY)
 
     def _message(self, run: int) -> Process:
         counts = self.counts()
