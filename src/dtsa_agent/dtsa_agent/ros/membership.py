@@ -97,10 +97,10 @@ class Membership:
 
     def _check(self, message: Slot, number: int | None) -> None:
         check_slot(message, self._agents)
-        run = message.run
-        calls = message.phase in (Slot.PREPARE, Slot.START)
+        run, phase = message.run, message.phase
+        calls = phase in (Slot.PREPARE, Slot.START)
         if self.run and run != self.run:
-            if message.phase == Slot.PREPARE:
+            if phase == Slot.PREPARE:
                 self._following = run
                 self._tell(left_over=True)
             raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}; this one is {run_text(self.run)}")
@@ -109,7 +109,7 @@ class Membership:
             if not calls:
                 raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}, which has not called this process")
             caller = self._meet(run, bytes(message.data))
-        if message.phase == Slot.END:
+        if phase == Slot.END:
             if not caller.call.ended_by(bytes(message.data)):
                 raise Unusable(FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
             self._told_s = 0.0
@@ -118,9 +118,9 @@ class Membership:
         self._plausible(message)
         if not caller.publisher.admits(number, time.monotonic()):
             raise Unusable(OTHER_SENDER, f"slot message {number} of run {run_text(run)}, not of its channel's series")
-        if message.phase == Slot.REFUSE:
+        if phase == Slot.REFUSE:
             self._refused(bytes(message.data))
-        if message.phase == Slot.PREPARE or (calls and not caller.knows_settings):
+        if phase == Slot.PREPARE or (calls and not caller.knows_settings):
             caller.knows_settings = True
             self._introduce(run)
 

@@ -56,28 +56,28 @@ def check_slot(message: Slot, agents: int) -> None:
     :param agents: number of agents N.
     :raises Unusable: if they do not.
     """
-    count = len(message.sender)
-    if message.phase > Slot.REFUSE:
-        raise Unusable(RANGE, f"slot message of phase {message.phase}")
-    if max(message.slot, message.heard_slot) > LARGEST_SLOT:
+    phase, senders, lengths, received = message.phase, message.sender, message.length, message.received
+    count = len(senders)
+    if phase > Slot.REFUSE:
+        raise Unusable(RANGE, f"slot message of phase {phase}")
+    if message.slot > LARGEST_SLOT or message.heard_slot > LARGEST_SLOT:
         raise Unusable(SLOT, f"slot message for slot {message.slot}")
-    if message.phase != Slot.RUN:
-        if count or len(message.length) or len(message.received):
-            raise Unusable(SIZES, f"slot message of phase {message.phase} with frames")
+    if phase != Slot.RUN:
+        if count or len(lengths) or len(received):
+            raise Unusable(SIZES, f"slot message of phase {phase} with frames")
         return
     if count == 0:
-        if len(message.length) or len(message.data) or len(message.received):
+        if len(lengths) or len(message.data) or len(received):
             raise Unusable(SIZES, "slot message with frames of nobody")
         return
-    if len(message.length) != count or len(message.received) != count * ((agents + 7) // 8):
+    if len(lengths) != count or len(received) != count * ((agents + 7) // 8):
         raise Unusable(
-            SIZES,
-            f"slot message: {count} senders, {len(message.length)} lengths, {len(message.received)} bytes of receivers",
+            SIZES, f"slot message: {count} senders, {len(lengths)} lengths, {len(received)} bytes of receivers"
         )
-    check_frames(message.length, message.data)
-    if not all(message.length):
+    check_frames(lengths, message.data)
+    if not all(lengths):
         raise Unusable(SIZES, "slot message with an empty frame")
-    check_ids(message.sender, agents, ascending=False)
+    check_ids(senders, agents, ascending=False)
 
 
 def check_frames(lengths: Sequence[int], data: Any) -> None:
@@ -104,7 +104,7 @@ def check_ids(ids: Sequence[int], agents: int, ascending: bool = True) -> None:
     count = len(ids)
     if not count or count > agents or min(ids) < 1 or max(ids) > agents:
         raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}; allowed: 1 to {agents}")
-    if len(set(ids)) != count or (ascending and any(a >= b for a, b in itertools.pairwise(ids))):
+    if count > 1 and (len(set(ids)) != count or (ascending and any(a >= b for a, b in itertools.pairwise(ids)))):
         raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}, twice or out of order")
 
 
