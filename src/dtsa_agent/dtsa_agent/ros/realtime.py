@@ -34,8 +34,10 @@ _LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
-_LEAD = 0.25  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time,
-_LATEST_LEAD = 0.06  # or, while it misses the frame of the slot before, this long
+_LEAD = 0.7  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time,
+_LATEST_LEAD = 0.06  # or, while it misses the frame of the slot before, this long;
+# with a policy that needs all tables equal it waits beyond the start, as long as its frame still counts as on time.
+_LATEST, _LATEST_NS = 0.09, 900_000
 _BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
 _MOST_EARLY = 64  # frames of slots that are still to come here
 
@@ -93,12 +95,15 @@ class RealtimeNode(SwarmNode):
         count = len(self.swarm.ids)
         self.slot_ns = self.config.slot_ns
         self._lead_ns, self._latest_lead_ns = round(_LEAD * self.slot_ns), round(_LATEST_LEAD * self.slot_ns)
+        if not self.config.policy_row.may_join:
+            self._latest_lead_ns = -min(_LATEST_NS, round(_LATEST * self.slot_ns))
         self._own_or_nobody = {0, *self.swarm.ids}
         self._awaits = False  # somebody here takes another one for the slot's sender, and has not heard it yet
         self.unsent = 0  # frames that would have left half a slot late or more
         self._offset: NDArray[np.int64] = np.array(offset_ns, dtype=np.int64)
         self._drift: NDArray[np.int64] = np.array(drift_ppb, dtype=np.int64)
         self._shift: NDArray[np.int64] = np.zeros(count, dtype=np.int64)  # ns, what each has learned to wait
+        self._starts: tuple[int, NDArray[np.int64]] = -1, self._shift  # of the slot asked for last
         self._aligners = [ClockAligner() for _ in range(count)] if align else []
         self._jitter_ns = jitter_ns
         self._random = [generator(self.config.seed, STREAM_CLOCKS, agent) for agent in self.swarm.ids]
@@ -129,7 +134,18 @@ class RealtimeNode(SwarmNode):
 
         :param slot: its number.
         """
-        return slot_starts(slot * self.slot_ns, self._offset, self._drift) + self._shift
+        if slot != self._starts[0]:
+            self._starts = slot, slot_starts(slot * self.slot_ns, self._offset, self._drift) + self._shift
+        return self._starts[1]
+
+    def _move(self, index: int | np.intp, by_ns: int) -> None:
+        """Moves the slots of an agent.
+
+        :param index: position in ``swarm.ids``.
+        :param by_ns: ns, positive: later.
+        """
+        self._shift[index] += by_ns
+        self._starts = -1, self._shift
 
     def local_ns(self, time_ns: int) -> NDArray[np.int64]:
         """What each agent's clock shows, ns.
@@ -288,7 +304,9 @@ class RealtimeNode(SwarmNode):
                     self.agents.restart(index, self.slot + 1)
             elif self._aligners:
                 aligner = self._aligners[index]
-                self._shift[index] += aligner.hear(int(late[index]))
+                moved = aligner.hear(int(late[index]))
+                if moved:
+                    self._move(index, moved)
                 # The frame that a newcomer took its time from may have left late.
                 self._timeless[index] = not self._called and aligner.ignored_in_a_row >= _DOUBTS
 
@@ -305,7 +323,7 @@ class RealtimeNode(SwarmNode):
                 self._take_time(index, late)
 
     def _take_time(self, index: np.intp, late: NDArray[np.int64]) -> None:
-        self._shift[index] += late[index]
+        self._move(index, int(late[index]))
         self._timeless[index] = False
         if self._aligners:
             self._aligners[index].reset()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import numpy as np
@@ -146,18 +147,27 @@ def fly(
         # Started first: the interpreter of each process needs longer than all that follows here.
         late = _start_agents(children, run, options, directory)
         try:
-            rclpy.init(args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-            if started:
-                started(children)
-            return _fly(context, run, directory, children, progress, options, stop, late, observers)
+            with stop.at_once():
+                rclpy.init(
+                    args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+                )
+                if started:
+                    started(children)
+                node = Node("channel", namespace=names.SWARM, context=context)
+                declare_channel(node, run.air)
+                flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)
+            return _fly(flight, node, directory, children, progress, options, stop, late, observers)
+        except KeyboardInterrupt:  # before anything was recorded
+            rmtree(directory / BAG, ignore_errors=True)
+            raise
         finally:
-            children.stop()
+            children.stop(hurry=bool(stop))
             context.try_shutdown()
 
 
 def _fly(
-    context: Context,
-    run: RunConfig,
+    flight: RecordedFlight,
+    node: Node,
     directory: Path,
     children: Children,
     progress: ProgressLine,
@@ -166,10 +176,7 @@ def _fly(
     late: Sequence[LateStart],
     observers: Sequence[ChannelObserver],
 ) -> Flight:
-    node = Node("channel", namespace=names.SWARM, context=context)
     try:
-        declare_channel(node, run.air)
-        flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)
         channel, measurement = flight.channel, flight.measurement
         shown = FlightProgress(progress, measurement, channel)
         if isinstance(channel, RealtimeChannel):
@@ -178,7 +185,7 @@ def _fly(
         else:
             channel.observe(Supervisor(children))
         channel.observe(shown, *observers)
-        limit_s = wall_limit_s(options.wall_timeout_s, run.limits.timeout_s)
+        limit_s = wall_limit_s(options.wall_timeout_s, flight.run_config.limits.timeout_s)
         ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
         failure: DtsaError | None = None
         try:

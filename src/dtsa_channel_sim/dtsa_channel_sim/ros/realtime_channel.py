@@ -46,7 +46,6 @@ _AFTERLIFE = 10  # slots: a report for a later one was made after its agent had 
 _KEEP_NS = 10 * _NS  # an agent may tell so late that it took in a frame
 # What one pass of the loop does at most: frames, reports. Then it looks at the clock and at signals again.
 _FRAMES, _REPORTS = 64, 2
-_QUIET_NS = 1_000_000  # no account is closed this shortly before a frame has to be delivered
 _TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
 
 _Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
@@ -97,6 +96,7 @@ class RealtimeChannel(RosChannel):
         self._frames: dict[_Sent, bytes] = {}
         self._ends: list[int] = []  # ns, when frames that have no verdict yet leave the air: a heap
         self._settled_ns = -(2**63)
+        self._leisure_ns = -(2**63)  # when there was time for all that is not the air
         self._settled: dict[int, list[FrameVerdict[_Sent]]] = {}
         self._heard_ns = np.zeros(self.agents, dtype=np.int64)
         self._recovered_ns = 0  # when all that was sent during the last stall should have come
@@ -231,16 +231,25 @@ class RealtimeChannel(RosChannel):
                 data = self.loop.take()
             now = self._now()
             self._settle(now)
-            more = self._take_reports()
-            if self._spare_ns(now) > _QUIET_NS and self._due(now):
-                if not self._close_slot():
-                    return
-                more = more or self._due(now)
-            if time.monotonic() - self._told > _TELL_S:
-                self._tell_start()
-            self._housekeeping()
+            more = False
+            if self._at_leisure(now):
+                more = self._take_reports()
+                if self._due(now):
+                    if not self._close_slot():
+                        return
+                    more = more or self._due(now)
+                if time.monotonic() - self._told > _TELL_S:
+                    self._tell_start()
+                self._housekeeping()
             if self._falls_behind(now):
                 return
+
+    def _at_leisure(self, now: int) -> bool:
+        """Whether there is time for the rest: no frame waits for its delivery, or the rest has waited for a slot."""
+        if self._ends and now - self._leisure_ns < self.slot_ns:
+            return False
+        self._leisure_ns = now
+        return True
 
     def _resume(self, now: int) -> None:
         """After a stall: what was handed over meanwhile is too late for the air, and nobody is to blame for silence."""

@@ -10,8 +10,8 @@ from __future__ import annotations
 import gc
 import signal
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any
 
@@ -40,6 +40,7 @@ class Stop:
     def __init__(self) -> None:
         self.signal = 0  # the first one; 0: none yet
         self.count = 0  # how many have come
+        self._raises = False
         self._old: dict[int, Any] = {}
 
     def __enter__(self) -> Stop:
@@ -54,9 +55,26 @@ class Stop:
     def __bool__(self) -> bool:
         return self.signal != 0
 
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """What is done within looks at no flag, and ends by an exception: imports, the making of nodes.
+
+        :raises KeyboardInterrupt: on a signal, or if there was one before.
+        """
+        if self:
+            raise KeyboardInterrupt
+        self._raises = True
+        try:
+            yield
+        finally:
+            self._raises = False
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.signal = self.signal or number
         self.count += 1
+        if self._raises:
+            self._raises = False
+            raise KeyboardInterrupt
 
 
 class _OwnHands(CallbackGroup):
