@@ -34,8 +34,10 @@ _LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
-_LEAD = 0.7  # of a slot: an agent decides this long before its slot starts, so that its frame leaves on time,
-_LATEST_LEAD = 0.06  # or, while it misses the frame of the slot before, this long;
+# Of a slot: an agent that has heard all it waits for decides this long before its slot starts, mostly as soon as it has
+# heard: one wake-up of its process less, and its frame leaves on time.
+_LEAD = 0.7
+_LATEST_LEAD = 0.06  # while it misses the frame of the slot before, only this long;
 # with a policy that needs all tables equal it waits beyond the start, as long as its frame still counts as on time.
 _LATEST, _LATEST_NS = 0.09, 900_000
 _BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
