@@ -147,19 +147,20 @@ def fly(
         # Started first: the interpreter of each process needs longer than all that follows here.
         late = _start_agents(children, run, options, directory)
         try:
-            with stop.at_once():
-                rclpy.init(
-                    args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
-                )
-                if started:
-                    started(children)
-                node = Node("channel", namespace=names.SWARM, context=context)
-                declare_channel(node, run.air)
-                flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)
+            try:
+                with stop.at_once():
+                    rclpy.init(
+                        args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+                    )
+                    if started:
+                        started(children)
+                    node = Node("channel", namespace=names.SWARM, context=context)
+                    declare_channel(node, run.air)
+                    flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)
+            except KeyboardInterrupt:
+                rmtree(directory / BAG, ignore_errors=True)  # there is nothing in it yet
+                raise
             return _fly(flight, node, directory, children, progress, options, stop, late, observers)
-        except KeyboardInterrupt:  # before anything was recorded
-            rmtree(directory / BAG, ignore_errors=True)
-            raise
         finally:
             children.stop(hurry=bool(stop))
             context.try_shutdown()
