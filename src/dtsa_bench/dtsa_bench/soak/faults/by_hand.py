@@ -112,16 +112,63 @@ def _agent_missing(directory: Path) -> None:
         graph.end(agent, 0)
 
 
+def _begun(graph: Nodes) -> tuple[subprocess.Popen[bytes], list[subprocess.Popen[bytes]]]:
+    """A channel and two agents in a run without an end; they are at work."""
+    channel = graph.start(CHANNEL, *_TWO)
+    agents = [graph.start(AGENT, "-r", f"__ns:=/cf{k}", "-p", f"id:={k}", *_TWO) for k in (1, 2)]
+    busy = [_ticks(process.pid) for process in agents]
+    until(lambda: all(_ticks(p.pid) > b + 100 for p, b in zip(agents, busy, strict=True)), "the run begins")
+    time.sleep(3.0)
+    return channel, agents
+
+
 def _channel_killed(directory: Path) -> None:
     with nodes(directory) as graph:
-        channel = graph.start(CHANNEL, *_TWO)
-        agents = [graph.start(AGENT, "-p", f"id:={k}", *_TWO) for k in (1, 2)]
-        busy = [_ticks(process.pid) for process in agents]
-        until(lambda: all(_ticks(p.pid) > b + 100 for p, b in zip(agents, busy, strict=True)), "the run begins")
-        time.sleep(3.0)
+        channel, agents = _begun(graph)
         channel.kill()
         for process in agents:
             graph.end(process, 1, "the channel has gone", patience_s=30.0)
+
+
+def _channel_restarted(directory: Path) -> None:
+    with nodes(directory) as graph:
+        channel, agents = _begun(graph)
+        channel.kill()
+        second = graph.start(CHANNEL, *_TWO, *_SLOTS)
+        for process in agents:
+            graph.end(process, 1, "the channel has gone", patience_s=30.0)
+        if second.poll() is None:
+            fresh = [graph.start(AGENT, "-p", f"id:={k}", *_TWO) for k in (1, 2)]
+            for process in (second, *fresh):
+                graph.end(process, 0)
+        else:  # it began while the old agents were still there
+            graph.end(second, 2, "no process of another run")
+
+
+def _second_channel(directory: Path) -> None:
+    with nodes(directory) as graph:
+        channel, agents = _begun(graph)
+        graph.end(graph.start(CHANNEL, "-r", "__node:=second", *_TWO), 2, "allowed: no")
+        time.sleep(2.0)
+        met(all(process.poll() is None for process in (channel, *agents)), "the first run has ended")
+        channel.terminate()
+        for process in (channel, *agents):
+            graph.end(process, 0)
+
+
+def _refused(directory: Path, second: tuple[str, ...], says: str) -> None:
+    with nodes(directory) as graph:
+        graph.start(AGENT, "-r", "__ns:=/cf1", "-p", "id:=1", *_TWO)
+        graph.start(AGENT, "-r", "__ns:=/cf2", *second, *_TWO)
+        graph.end(graph.start(CHANNEL, *_TWO), 2, says, "got", "allowed")
+
+
+def _other_seed(directory: Path) -> None:
+    _refused(directory, ("-p", "id:=2", "-p", "seed:=7"), "seed of /cf")
+
+
+def _same_id(directory: Path) -> None:
+    _refused(directory, ("-p", "id:=1"), "agents of no other process")
 
 
 def _ticks(pid: int) -> int:
@@ -160,6 +207,15 @@ FAULTS = (
           "the channel names it and ends with code 1; the agents end", _agent_missing),
     Fault("channel killed, by hand", "SIGKILL to a channel whose agents were started by hand, lockstep",
           "the agents say that it has gone and end with code 1", _channel_killed),
+    Fault("channel restarted, by hand", "the same, and a new channel is started at once",
+          "the agents say that theirs has gone and end; the new one waits for others, or refuses the old ones by name",
+          _channel_restarted),
+    Fault("second channel", "a second channel is started beside a run under way",
+          "it names the first, or its agents, and ends with code 2; the run goes on", _second_channel),
+    Fault("other seed", "an agent has another seed than the others",
+          "the channel refuses the run before slot 0, with setting, both values and node, and code 2", _other_seed),
+    Fault("the same id twice", "two processes have the same agent",
+          "the channel refuses the run before slot 0, names both, and ends with code 2", _same_id),
     Fault("unknown policy", "an agent's parameter `policy` is unknown", _LINE, _unknown_policy, True),
     Fault("id too large", "an agent's `id` is larger than `agents`", _LINE, _id_too_large, True),
     Fault("impossible loss", "the channel's parameter `loss` is 2", _LINE, _impossible_loss, True),
