@@ -155,3 +155,9 @@ def test_an_argument_that_is_too_many_is_named(capsys: pytest.CaptureFixture[str
 def test_every_parser_is_of_the_kind_that_is_checked_here() -> None:
     for command in COMMANDS:
         assert type(command_parser(build_parser(command)[0], command)) is cli.OneLineParser
+
+
+def test_what_prints_results_prints_them_as_json() -> None:
+    for command in ("demo", "fly", "simulate", "sweep", "soak", "benchmark", "verify", "recover", "export"):
+        parser = command_parser(build_parser(command)[0], command)
+        assert any("--json" in action.option_strings for action in parser._actions), command

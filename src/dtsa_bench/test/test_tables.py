@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,7 @@ from dtsa_bench.bag.errors import BagError, UnusableBag
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.run import load_run
 from dtsa_bench.bag.writer import BagWriter
+from dtsa_bench.cli import main
 from dtsa_bench.commands.export import TABLES
 from dtsa_bench.tables import export as module
 from dtsa_bench.tables.columns import COLUMNS, describe
@@ -211,3 +213,12 @@ def test_a_full_disk_leaves_no_half_table(flight: Path, tmp_path: Path, kind: st
         assert done.stderr.startswith(f"dtsa: error: cannot export to {tmp_path / place}: ")
         assert done.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.rglob("*")] == ["mine"]  # was there before, and is empty as before
+
+
+def test_json_says_what_was_written(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(flight), "--tables", "slots", "--json", "--out", str(tmp_path / "a")]) == 0
+    assert json.loads(capsys.readouterr().out) == [{"path": str(tmp_path / "a" / "slots.parquet"), "rows": SLOTS}]
+    assert main(["recover", str(flight), "--json", "--out", str(tmp_path / "b")]) == 0
+    saved = json.loads(capsys.readouterr().out)
+    assert saved["saved"]["/swarm/reception"] == SLOTS
+    assert saved["directory"] == str(tmp_path / "b")
