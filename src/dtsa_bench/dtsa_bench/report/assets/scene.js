@@ -208,7 +208,7 @@ class Scene {
     }
     const color = this.color(agent), shade = c.createRadialGradient(p[0] - size * 0.35, p[1] - size * 0.4, size * 0.1, p[0], p[1], size);
     shade.addColorStop(0, mixed(color, "#ffffff", 0.45)); shade.addColorStop(0.55, color); shade.addColorStop(1, mixed(color, "#000000", 0.22));
-    c.fillStyle = shade; this.outline(c, p, size, agentTurn(this.ids[agent])); c.fill();
+    c.fillStyle = shade; this.outline(c, p, size, this.moves(agent) ? agentTurn(this.ids[agent]) : 0); c.fill();
     c.strokeStyle = theme.dark ? "#0b0f14" : mixed(color, "#000000", 0.45); c.lineWidth = 0.8; c.stroke();
   }
 
