@@ -17,7 +17,7 @@ from .flown import Flights, Flown
 from .strips import HOVER
 from .text import age, error
 
-WIDTH, ROW, TOP = 880, 142, 46  # pixels
+WIDTH, ROW, TOP = 880, 142, 66  # pixels
 FIRST, SLOTS = 100, 132  # the slots that are shown, one a frame
 FRAME_MS, LAST_MS = 90, 3500
 _FINE = 2  # drawn so many times as large, then reduced
@@ -41,13 +41,13 @@ def _rows(flights: Flights) -> list[_Row]:
     two, lost = "two-{}".format, "loss-{}".format
     return [
         _Row(two("tdma"), "TDMA", "All speak in turn, also the ten that hover and have nothing new to say.",
-             f"state is {age(flights[two('tdma')])} old"),
+             f"positions are {age(flights[two('tdma')])} old"),
         _Row(two("dtsa"), "DTSA", "All compute whose state is most urgent: the two that fly speak.",
-             f"state is {age(flights[two('dtsa')])} old"),
+             f"positions are {age(flights[two('dtsa')])} old"),
         _Row(lost("dtsa"), "DTSA, 1 message in 10 lost", "They no longer know the same: two speak at once, or nobody.",
-             f"wrong by {error(flights[lost('dtsa')])}"),
+             f"positions are wrong by {error(flights[lost('dtsa')])}"),
         _Row(lost("lease"), "lease, 1 message in 10 lost", "Who hovers lends its turns, so only one can speak.",
-             f"wrong by {error(flights[lost('lease')])}"),
+             f"positions are wrong by {error(flights[lost('lease')])}"),
     ]  # fmt: skip
 
 
@@ -160,6 +160,8 @@ def _palette() -> NDArray[np.int64]:
 def _ground(pen: _Pen, rows: list[_Row]) -> None:
     """What does not move."""
     pen.text(14, 14, "Twelve quadcopters, one radio channel: who speaks next?", 18, _INK, bold=True)
+    reading = "A cell is a slot of 10 ms, its number says who sends in it. Grey: that one hovers. White: nobody sends."
+    pen.text(14, 40, reading, 12, _MUTED)
     for index, row in enumerate(rows):
         top = TOP + ROW * index
         pen.box(14, top, WIDTH - 28, 1, _RULE)
