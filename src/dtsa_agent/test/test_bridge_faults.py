@@ -174,6 +174,7 @@ def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> 
         assert fleet.state_event(3, "locked")["reason"] == "emergency stop"
 
 
+@flown_again_when_overloaded
 @pytest.mark.parametrize("protocol", ["10"])
 def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, protocol: str) -> None:
     with fake_fleet(tmp_path, 4, "--protocol", protocol) as fleet:
@@ -199,6 +200,7 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, prot
             wait_for(lambda: any(e["state"] == "locked" for e in fleet.events(4, "state")), 3)
 
 
+@flown_again_when_overloaded
 def test_a_lossy_link_still_connects(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2) as fleet:
         with flight(settings(fleet)) as pilot:  # fills the cache of tables

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from metronome import flown_again_when_overloaded
 
 from dtsa_agent.crazyflie.paths import PEAK, shortest_s, too_short
 
@@ -35,6 +36,7 @@ def test_why_a_duration_is_too_short() -> None:
 
 
 @pytest.mark.slow
+@flown_again_when_overloaded
 def test_in_flight(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
     from bridge_helpers import fake_fleet, flight, settings, wait_for
@@ -75,6 +77,7 @@ def test_in_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@flown_again_when_overloaded
 def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
     from bridge_helpers import fake_fleet, flight, settings, wait_for

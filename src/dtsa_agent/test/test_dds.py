@@ -84,8 +84,7 @@ def test_only_what_nobody_has_locked_and_is_not_young_is_removed(tmp_path: Path)
             os.utime(file, (time.time() - age_s,) * 2)
         return tmp_path / name
 
-    dead, young, held = make(f"fastrtps_{1:016x}"), make(f"fastrtps_{2:016x}", 0.0), make(f"fastrtps_{3:016x}")
-    port, fresh_port = make("fastrtps_port7000", locks=()), make("fastrtps_port7001", 1.0, ())
+    dead, held, port = make(f"fastrtps_{1:016x}"), make(f"fastrtps_{3:016x}"), make("fastrtps_port7000", locks=())
     other = make("something_else")
     mutex = tmp_path / f"sem.{port.name}_mutex"
     mutex.write_bytes(b"")
@@ -100,6 +99,7 @@ def test_only_what_nobody_has_locked_and_is_not_young_is_removed(tmp_path: Path)
                 except OSError:
                     break
                 time.sleep(0.02)
+        young, fresh_port = make(f"fastrtps_{2:016x}", 0.0), make("fastrtps_port7001", 1.0, ())
         assert sorted(clean_shared_memory(tmp_path)) == [dead.name, port.name]
     finally:
         os.killpg(holder.pid, signal.SIGKILL)

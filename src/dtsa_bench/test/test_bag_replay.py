@@ -92,6 +92,8 @@ def test_topics_start_and_loop(run: SyntheticRun) -> None:
     assert slots[:200] == 2 * [SECOND + k * 10_000_000 for k in range(100)]
 
 
+@pytest.mark.alone
+@flown_again_when_overloaded
 @pytest.mark.parametrize("rate", [1.0, 4.0])
 def test_messages_keep_their_time(run: SyntheticRun, rate: float) -> None:
     with steady_timing():

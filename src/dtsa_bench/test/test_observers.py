@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from fly_helpers import readable
+from metronome import flown_again_when_overloaded
 from node_helpers import end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
@@ -197,6 +198,7 @@ class LateSender(ChannelObserver):
 
 
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
         node = Node("channel", context=graph.node.context, enable_rosout=False)
