@@ -35,7 +35,7 @@ Installs what the tests need and runs them: all of them on several cores, or wha
 Removes what the build made for this kind of machine and this Python; what processes use stays.
   --all   the virtual environment, too""",
 }
-# Tests wait more than they compute, so that one core has work for two; a file's tests share what it flies.
+# A file's tests share what it flies.
 SIDE_BY_SIDE = ("--dist", "loadfile", "--no-loadscope-reorder")
 MOST_WORKERS = 4
 TEST_EXTRAS = {"test", "dev", "cflib", "benchmark", "cluster"}
@@ -159,8 +159,8 @@ def run_test(arguments: list[str]) -> int:
 
 
 def workers() -> int:
-    """Tests that run side by side when all are run: as many as there are cores, 2 to `MOST_WORKERS`."""
-    return min(max(len(os.sched_getaffinity(0)), 2), MOST_WORKERS)
+    """Tests that run side by side when all are run: one more than there are cores, since tests often wait."""
+    return min(len(os.sched_getaffinity(0)) + 1, MOST_WORKERS)
 
 
 def run_shell(arguments: list[str]) -> int:

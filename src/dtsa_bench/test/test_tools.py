@@ -308,6 +308,19 @@ def test_help_of_a_command_does_nothing_else(
     assert capsys.readouterr().out.startswith(f"usage: tools/dtsa {command} ")
 
 
+def test_all_tests_run_side_by_side_and_chosen_ones_as_pytest_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[list[str]] = []
+    monkeypatch.setattr(prepare, "prepare", lambda extras: None)
+    monkeypatch.setattr(os, "chdir", lambda place: None)
+    monkeypatch.setattr(main, "start", lambda program, words: started.append(words) or 0)
+    for cores, workers in ((1, "2"), (2, "3"), (64, "4")):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda process, cores=cores: set(range(cores)))
+        assert main.main(["test"]) == 0
+        assert started.pop() == ["-m", "pytest", "-n", workers, "--dist", "loadfile", "--no-loadscope-reorder"]
+    assert main.main(["test", "-k", "frame", "-x"]) == 0
+    assert started == [["-m", "pytest", "-k", "frame", "-x"]]
+
+
 def test_all_parts_have_one_version() -> None:
     assert call("--version").stdout == f"dtsa {dtsa_bench.__version__}\n"
     found = {}
