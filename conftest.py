@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import pytest
@@ -55,21 +54,15 @@ def pytest_configure_node(node: Any) -> None:
     node.workerinput[_LOCKS] = _lock_directory(node.config)
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """A worker that is interrupted tidies up, and has ended two seconds later whatever it does."""
-    if _worker_input(config) is not None:
-        signal.signal(signal.SIGINT, _interrupted)
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_keyboard_interrupt(excinfo: pytest.ExceptionInfo[BaseException]) -> None:
-    """Where Ctrl-C found a test is said at once; each worker would take a second to write down how it came there."""
+    """Where Ctrl-C found a test is said at once; each worker would take a second to write down how it came there.
+
+    A worker ends what it has started, and has itself ended two seconds later whatever it does.
+    """
     excinfo.traceback = excinfo.traceback[-1:]
-
-
-def _interrupted(number: int, frame: FrameType | None) -> None:
-    signal.alarm(2)
-    signal.default_int_handler(number, frame)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        signal.alarm(2)
 
 
 @contextmanager

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from dtsa_agent.core.errors import DtsaError
+
 STILL_S = 0.25  # a machine that stands still for longer cannot fly in real time,
 LOAD = 2.0  # nor one with so many threads a core that want to run
 ATTEMPTS = 4
@@ -73,7 +75,7 @@ def flown_again_when_overloaded(test: Callable[..., None]) -> Callable[..., None
                 try:
                     test(**fixtures)
                     return
-                except (AssertionError, subprocess.TimeoutExpired) as error:
+                except (AssertionError, DtsaError, subprocess.TimeoutExpired) as error:
                     if not metronome.overloaded:
                         raise
                     why = str(error).partition("\n")[0]

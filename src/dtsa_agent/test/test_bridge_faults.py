@@ -213,7 +213,7 @@ def test_a_lossy_link_still_connects(tmp_path: Path) -> None:
 def test_min_connected(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2) as fleet:
         fleet.fault("close", 1)
-        with flight(settings(fleet, {"min_connected": 2}, connect_attempts=1)) as pilot:
+        with flight(settings(fleet, {"min_connected": 2})) as pilot:
             assert pilot.bridge.connect() == ["cf1"]
             assert "min_connected is 2" in pilot.bridge.enough()
 

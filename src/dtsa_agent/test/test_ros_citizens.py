@@ -12,7 +12,7 @@ from node_helpers import Graph, end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_msgs.msg import Configuration, RunStatus, Transmission
+from dtsa_msgs.msg import Configuration, RunStatus, Slot, Transmission
 from rcl_interfaces.msg import Log
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -101,7 +101,10 @@ def test_late_subscribers_get_settings_and_status(graph: Graph) -> None:
     graph.until(lambda: graph.node.get_publishers_info_by_topic("/north/status"))
     graph.node.create_subscription(Configuration, "/north/configuration", settings.append, names.latched_qos())
     graph.node.create_subscription(RunStatus, "/north/status", status.append, names.latched_qos())
+    slots: list[Slot] = []
+    graph.node.create_subscription(Slot, "/north/slot", slots.append, names.lockstep_qos(64))
     graph.until(lambda: settings and status and status[-1].phase == RunStatus.FLYING)
+    graph.until(lambda: slots and slots[-1].slot > 2)
     channel.send_signal(signal.SIGINT)
     graph.until(lambda: status[-1].phase == RunStatus.ENDED)
     assert settings[0].run == status[-1].run != 0

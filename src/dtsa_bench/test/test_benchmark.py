@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from metronome import flown_again_when_overloaded
 
 from dtsa_bench.benchmark import baselines, crazyflie, parts
 from dtsa_bench.cli import main
@@ -117,6 +118,7 @@ def test_rate_and_latency_of_commands() -> None:
 
 @pytest.mark.slow
 @pytest.mark.ros
+@flown_again_when_overloaded
 def test_the_bridge_is_measured_in_flight() -> None:
     pytest.importorskip("cflib")
     pytest.importorskip("dtsa_msgs.srv")

@@ -108,8 +108,15 @@ class Stranger:
             self.last = message
 
     def listen(self, slot: int, process: subprocess.Popen[str]) -> None:
-        """Waits until a slot has begun."""
-        self.graph.until(lambda: (self.last.run and self.last.slot >= slot) or process.poll() is not None)
+        """Waits until a slot has begun, and all that listen to the topics of a run would hear what is published."""
+        count = self.graph.node.count_subscribers
+
+        def heard() -> bool:
+            found = {topic: count(f"/swarm/{topic}") for topic in self.publishers}
+            agents = found[names.SLOT] > 1  # and not this node alone
+            return agents and all(p.get_subscription_count() >= found[t] for t, p in self.publishers.items())
+
+        self.graph.until(lambda: (self.last.run and self.last.slot >= slot and heard()) or process.poll() is not None)
 
 
 @pytest.fixture(scope="module")
