@@ -16,7 +16,7 @@ from dtsa_bench.sweep.claims import FAILS, HOLDS, OPEN, PARTLY, claims_of, clean
 from dtsa_bench.sweep.work import fly_one
 
 NAMED = (
-    *("paper-12", "paper-18", "limits", "grid", "idle", "epsilon", "loss"),
+    *("paper-12", "paper-18", "limits", "grid", "idle", "epsilon", "loss", "loss-idle"),
     *("estimate", "trajectories", "scenarios"),
 )
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
 from ..sweep.aggregate import CRASHED, MEASURES, Group, Table
 from .style import GRID, INK, MARKERS, ON_DARK, ON_LIGHT, PAPER, QUIET, colours, legend_above, panels
@@ -99,7 +99,7 @@ def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
     if measure == "min_distance_m":
         axis.axhline(COLLISION_M, color=QUIET, linewidth=1, linestyle=":")
     if measure in spec.get("log", ()):
-        axis.set_yscale("log")
+        _logarithmic(axis)
     elif measure == "efficiency_mean":
         # Bars of a ratio near 1 differ in the upper part alone; the axis says where it begins.
         low = min((p.get_height() for p in axis.patches if math.isfinite(p.get_height())), default=0.0)
@@ -145,9 +145,17 @@ def lines(table: Table, spec: Spec) -> Figure:
             axis.set_ylim(-0.03, 1.03)
             axis.yaxis.set_major_formatter(PercentFormatter(1.0))
         if measure in spec.get("log", ()):
-            axis.set_yscale("log")
+            _logarithmic(axis)
     legend_above(figure, handles, series)
     return figure
+
+
+def _logarithmic(axis: Axes) -> None:
+    """A logarithmic axis with plain numbers."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _facet(axis: str, value: object) -> str:
