@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import math
 from collections.abc import Callable
@@ -23,10 +24,11 @@ from dtsa_agent.core import (
     priority,
     select,
 )
+from dtsa_agent.core.compiled import MISSING, kernel
 from dtsa_agent.core.flight_models import FLIGHT_MODELS, flight_model
 from dtsa_agent.core.frame import position_step
 from dtsa_agent.core.frame_extended import ExtendedFrame, Gossip, decode_extended, encode_extended
-from dtsa_agent.core.reference import arithmetic, frame, frame_extended, selection
+from dtsa_agent.core.reference import arithmetic, frame, frame_extended, selection, tag, timebase
 from dtsa_agent.core.reference import priority as plain_priority
 from dtsa_agent.core.reference_swarm import ReferenceSwarm
 from dtsa_agent.core.registry import REASONS
@@ -219,3 +221,54 @@ def test_a_swarm_of_the_specification_is_reset_and_copied() -> None:
     assert swarm.table_hash == digest
     with pytest.raises(ValueError, match="share"):
         swarm.restart(0)
+
+
+OUTCOMES = (timebase.ALIGNED, timebase.RESTARTED, timebase.FOREIGN)
+
+
+@pytest.fixture(scope="module")
+def library() -> ctypes.CDLL:
+    """The functions of libdtsa that the compiled kernel does not use itself."""
+    assert not MISSING
+    found = ctypes.CDLL(str(kernel.__file__))
+    for name in ("dtsa_timebase_start", "dtsa_timebase_slot", "dtsa_timebase_slot_start"):
+        getattr(found, name).restype = ctypes.c_int64
+    return found
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1))
+def test_the_same_is_heard_at_the_same_times_in_the_same_slots(library: ctypes.CDLL, seed: int) -> None:
+    """Time base and alignment: random frames of one's own time and of others, on a clock that runs on."""
+    random = np.random.default_rng(seed)
+    agents, every, slot_ns = (
+        int(random.integers(1, 255)),
+        int(random.integers(1, 16)),
+        int(random.choice([10**6, 10**7])),
+    )
+    agent, now, long = int(random.integers(1, agents + 1)), int(random.integers(0, 10**15)), ctypes.c_int64
+    plain = timebase.TimeBase(agents=agents, anchor_every=every, slot_ns=slot_ns, agent=agent, seed=seed)
+    compiled = ctypes.byref(ctypes.create_string_buffer(1024))
+    assert library.dtsa_timebase_init(compiled, agents, every, long(slot_ns), agent, ctypes.c_uint64(seed)) == 1
+    deadline = plain.start(now)
+    assert library.dtsa_timebase_start(compiled, long(now)) == deadline
+    if random.random() < 0.4:
+        now = deadline + int(random.integers(-1, 2))
+        assert library.dtsa_timebase_wake(compiled, long(now)) == plain.wake(now)
+    for _ in range(40):
+        now += int(random.integers(0, 3 * slot_ns))
+        expected = plain.slot(now)
+        slot = int(random.integers(0, 10**6)) if expected is None or random.random() < 0.05 else expected
+        late = int(random.choice([-(10**6) - 1, -400_000, 3, 250_001, 10**6, slot_ns // 2, 3 * slot_ns]))
+        start = now if expected is None else plain.slot_start_ns(slot) + late + int(random.integers(-9, 10))
+        assert OUTCOMES[library.dtsa_timebase_hear(compiled, long(slot), long(start))] == plain.hear(slot, start)
+        assert library.dtsa_timebase_slot(compiled, long(now)) == plain.slot(now)
+        assert library.dtsa_timebase_slot_start(compiled, long(slot)) == plain.slot_start_ns(slot)
+
+
+@given(st.binary(min_size=16, max_size=32), st.integers(0, 2**64 - 1), st.integers(0, 2**40), st.binary(max_size=300))
+def test_frames_get_the_same_tags(library: ctypes.CDLL, key: bytes, session: int, slot: int, data: bytes) -> None:
+    said = ctypes.create_string_buffer(tag.LENGTH)
+    session_c, slot_c, length = ctypes.c_uint64(session), ctypes.c_uint64(slot), ctypes.c_long(len(data))
+    library.dtsa_tag(key, len(key), session_c, slot_c, data, length, said)
+    assert said.raw == tag.tag(tag.keyed(key, session), slot, data)
