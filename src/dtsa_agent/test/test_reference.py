@@ -168,9 +168,11 @@ def test_random_tables_lead_to_the_same_decisions(seed: int) -> None:
 
 
 def random_frame(random: np.random.Generator, agents: int, slot: int, whole: bool) -> bytes:
-    """A frame of somebody for a slot or the one before; now and then one of nobody or of another time."""
+    """A frame of somebody for a slot or the one before; now and then one of nobody, of another time, or none."""
     sender = int(random.integers(1, agents + 2)) if random.random() < 0.7 else slot % agents + 1
     sent = max(0, slot - int(random.choice([0, 0, 0, 1, 2])))
+    if random.random() < 0.05:
+        return random.bytes(int(random.integers(0, 60)))
     p, v, c = (tuple(random.uniform(-5, 5, 3).tolist()) for _ in range(3))
     own = Frame(sender, sent, int(random.integers(0, 2)), p, v, c if whole or random.random() < 0.5 else None)
     if not whole:

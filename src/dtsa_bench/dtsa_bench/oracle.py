@@ -19,6 +19,7 @@ POLICIES = ("tdma", "dtsa", "age", "aloha", "lease", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
 AVOIDERS = ("orca", "potential", "bvc", "none", "crazyflie", "jerky", "bvc-firmware")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
+GOALS, FAR = ("go", "go", "stop", "rest"), 30.0  # m
 SHORT, LONG = 300, 1700  # slots
 FAULTS = ("die", "join", "join", "restart", "leave")
 
@@ -36,7 +37,11 @@ class Differs(DtsaError):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that befalls an agent before a slot: ``die``, ``join``, ``restart`` or ``leave``."""
+    """Something that befalls an agent before a slot.
+
+    ``die``, ``join``, ``restart``, ``leave``; ``go``: gets a far goal; ``stop``, ``rest``: its goal is where it is, and
+    it may get another one, or knows that it will not.
+    """
 
     slot: int
     kind: str
@@ -72,7 +77,7 @@ def random_setting(seed: int, policy: str | None = None, *, lasts: bool | None =
     pick = random.choice
     policy = str(pick(POLICIES)) if policy is None else policy
     lasts = policy == "lease" and (bool(random.random() < 0.25) if lasts is None else lasts)
-    agents, slots = int(random.integers(2, 6 if lasts else 10)), LONG if lasts else SHORT
+    agents, slots = int(random.integers(2, 12 if lasts else 10)), LONG if lasts else SHORT
     kind: dict[str, Any]
     if lasts:  # far enough to fly all the time
         kind = {"avoider": "none", "axis_x_m": 20.0, "adoption": True, "anchor_every": int(random.integers(2, 6))}
@@ -127,7 +132,7 @@ def _random_faults(random: np.random.Generator, swarm: SwarmConfig, slots: int) 
 
 
 def _deaths_and_returns(random: np.random.Generator, swarm: SwarmConfig) -> Iterator[Fault]:
-    """Some die early, and come back after the others have adopted their turns; one restarts or leaves."""
+    """Some die early and come back after the others have adopted their turns; all get goals, and lose them."""
     for agent in range(1, swarm.agents + 1):
         chance = random.random()
         if chance < 0.5 and agent > 1:
@@ -135,6 +140,9 @@ def _deaths_and_returns(random: np.random.Generator, swarm: SwarmConfig) -> Iter
             yield Fault(int(random.integers(LONG - 400, LONG)), "join", agent)
         elif chance < 0.8:
             yield Fault(int(random.integers(100, LONG)), FAULTS[random.integers(3, 5)], agent)
+        slot, pace = 0, int(random.choice([60, 300, LONG]))
+        while (slot := slot + int(random.integers(1, pace))) < LONG:
+            yield Fault(slot, GOALS[random.integers(len(GOALS))], agent)
 
 
 def happen(fault: Fault, swarm: AbstractSwarm) -> None:
@@ -150,6 +158,10 @@ def happen(fault: Fault, swarm: AbstractSwarm) -> None:
         swarm.present[k] = 1
     elif fault.kind == "leave":
         swarm.leave(k)
+    elif fault.kind in GOALS:
+        swarm.goal[:, k] = swarm.position[:, k]
+        swarm.goal[0, k] += FAR if fault.kind == "go" else 0.0
+        swarm.final[k] = fault.kind == "rest"
     elif fault.kind == "restart" and swarm.present[k] and not swarm.shared:
         swarm.restart(k)
 
