@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 COMMANDS = {
-    "demo": "who speaks next, in eight recorded flights, a page and a picture; under a minute",
+    "demo": "who speaks next, in nine recorded flights, a page and a picture; under a minute",
     "fly": "one flight with real ROS 2 nodes, recorded to a bag",
     "simulate": "one or many flights without ROS, as fast as the machine allows",
     "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",

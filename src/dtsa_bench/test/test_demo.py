@@ -84,6 +84,7 @@ def test_the_story_is_true(flights: dict[str, Flown]) -> None:
     assert value["loss-dtsa"]["agreement_share"] < 0.1
     assert value["loss-dtsa"]["slots"]["collision"] > 40
     assert value["loss-lease"]["slots"]["collision"] == 0
+    assert value["loss-lease"]["estimate_error_mean_m"] < 0.5 * value["loss-tdma"]["estimate_error_mean_m"]
     assert value["loss-lease"]["estimate_error_mean_m"] < 0.05 * value["loss-dtsa"]["estimate_error_mean_m"]
 
 
@@ -138,7 +139,7 @@ def test_animation_is_small_and_moves(flights: dict[str, Flown], tmp_path: Path)
 
 
 def test_table_has_a_row_a_flight(flights: dict[str, Flown]) -> None:
-    assert len(for_terminal(STEPS, flights).splitlines()) == 2 + 7
+    assert len(for_terminal(STEPS, flights).splitlines()) == 2 + 8
 
 
 def test_the_agent_is_killed_once_and_the_flight_ends_when_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,7 +219,7 @@ def test_the_whole_demo(tmp_path: Path, flights: dict[str, Flown]) -> None:
     words = [sys.executable, "-m", "dtsa_bench", "demo", "--out", str(out)]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("verified ") == 8
+    assert done.stdout.count("verified ") == 9
     assert for_terminal(STEPS, flights) in done.stdout  # the nodes fly what the simulation flies
     assert done.stdout.splitlines()[-1] == str(out / "demo.html")
     assert (out / "demo.png").exists()

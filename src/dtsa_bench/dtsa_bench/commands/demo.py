@@ -1,4 +1,4 @@
-"""`demo`: eight flights that tell in four steps what this software is about; one page, one picture."""
+"""`demo`: nine flights that tell in four steps what this software is about; one page, one picture."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def add_parser(subparsers: Any) -> None:
     """Adds the command's parser."""
     parser = subparsers.add_parser(
         "demo",
-        help="who speaks next, in eight recorded flights, a page and a picture; under a minute",
-        description="Eight flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a "
+        help="who speaks next, in nine recorded flights, a page and a picture; under a minute",
+        description="Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a "
         "channel that quadcopters share, and what goes wrong when messages are lost. They become one page and one "
-        "picture. The first seven are the same on every machine; in the last one, in real time, a process is killed "
+        "picture. The first eight are the same on every machine; in the last one, in real time, a process is killed "
         "and comes back.",
     )
     parser.add_argument(

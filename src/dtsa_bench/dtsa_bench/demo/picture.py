@@ -29,6 +29,7 @@ AFTER, BEFORE = SERIES[:2]  # two lines of one chart
 WIDTH, DPI = 8.6, 220  # inches
 _LEFT, _RIGHT = 0.42, 0.36  # margins, inches
 _LABEL_X, _STRIP_X, _STRIP_W = 1.98, 3.32, 4.12  # of all strips, inches
+_HEIGHTS = (1.95, 1.93, 1.98, 1.5)  # inches, of each step without its text
 _FONT = {"font.family": "sans-serif", "font.sans-serif": ["DejaVu Sans"], "font.size": 8.5, "text.color": INK}
 
 
@@ -68,16 +69,16 @@ def draw_demo(path: Path, steps: Sequence[Step], flights: Flights) -> None:
     :param flights: its flights.
     """
     with mpl.rc_context(_FONT):
-        sheet = _Sheet(12.03)
+        said = [textwrap.wrap(sentence(step, flights), 122) for step in steps]
+        heights = [rows + 0.5 + 0.155 * len(text) for rows, text in zip(_HEIGHTS, said, strict=True)]
+        sheet = _Sheet(1.22 + sum(heights) + 0.36)
         sheet.text(_LEFT, 0.3, TITLE, 15.5, fontweight="bold")
         sheet.text(_LEFT, 0.68, textwrap.fill(INTRO, 118), 9, color=MUTED)
         sheet.y = 1.22
-        for step, draw, height in zip(
-            steps, (_paths, _strips, _strips, _killing), (1.95, 1.93, 1.64, 1.5), strict=True
-        ):
+        for step, text, draw, height in zip(steps, said, _DRAW, heights, strict=True):
             sheet.rule(sheet.y)
-            _heading(sheet, step, flights)
-            draw(sheet, sheet.y, step, flights)
+            _heading(sheet, step, text)
+            draw(sheet, sheet.y + height - _HEIGHTS[step.number - 1], step, flights)
             sheet.y += height
         swarm = steps[0].takes[0].run.swarm
         note = (
@@ -94,12 +95,10 @@ def draw_demo(path: Path, steps: Sequence[Step], flights: Flights) -> None:
         few.save(path, optimize=True, dpi=(DPI, DPI))
 
 
-def _heading(sheet: _Sheet, step: Step, flights: Flights) -> None:
+def _heading(sheet: _Sheet, step: Step, text: Sequence[str]) -> None:
     sheet.text(_LEFT, sheet.y + 0.1, f"{step.number}", 12, fontweight="bold", color=AFTER)
     sheet.text(_LEFT + 0.22, sheet.y + 0.1, step.title, 11.5, fontweight="bold")
-    said = textwrap.wrap(sentence(step, flights), 122)
-    sheet.text(_LEFT + 0.22, sheet.y + 0.36, "\n".join(said), 8.3, color=INK)
-    sheet.y += 0.5 + 0.155 * len(said)
+    sheet.text(_LEFT + 0.22, sheet.y + 0.36, "\n".join(text), 8.3, color=INK)
 
 
 def _bare(axes: Axes) -> None:
@@ -305,3 +304,6 @@ def _killing(sheet: _Sheet, top: float, step: Step, flights: Flights) -> None:
             )
         x += width * part.rounds + gap
     sheet.text(_LEFT + 0.22, top + 1.22, LIVE_NOTE, 7, color=MUTED)
+
+
+_DRAW = (_paths, _strips, _strips, _killing)

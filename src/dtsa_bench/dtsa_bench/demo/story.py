@@ -85,6 +85,7 @@ def story(seed: int) -> tuple[Step, ...]:
             "c",
             "Lose one message in ten, and DTSA falls apart.",
             (
+                _take("loss-tdma", "TDMA", "tdma", 4, seed, loss=LOSS),
                 _take("loss-dtsa", "DTSA", "dtsa", 4, seed, loss=LOSS),
                 _take("loss-lease", "lease", "lease", 4, seed, loss=LOSS),
             ),

@@ -66,6 +66,7 @@ _LINES = {
     "two-tdma": lambda f: Line("TDMA", "everybody in turn", age(f), _AGE),
     "two-dtsa": lambda f: Line("DTSA", "whose state is most urgent", age(f), _AGE),
     "two-lease": lambda f: Line("lease", "who hovers lends its turns", age(f), _AGE),
+    "loss-tdma": lambda f: Line("TDMA", "everybody in turn", error(f), _ERROR),
     "loss-dtsa": lambda f: Line("DTSA", "all must choose alike", error(f), _ERROR),
     "loss-lease": lambda f: Line("lease", "each owner decides alone", error(f), _ERROR),
     "killed-lease": lambda f: Line("lease", "the next one alive takes over", "", ""),
@@ -93,9 +94,10 @@ def _urgent(flights: Flights) -> str:
 def _lost(flights: Flights) -> str:
     dtsa, lease = flights["loss-dtsa"], flights["loss-lease"]
     return (
-        f"With DTSA all must know the same to choose the same. After the first lost message they do not: all agree in "
-        f"{agreement(dtsa)} of the slots, {_at_once(dtsa)} or nobody does, and positions are wrong by {error(dtsa)}. "
-        f"With lease only the owner of a turn gives it away, in its own message: {_at_once(lease)}, {error(lease)}."
+        f"DTSA works as long as all know the same. After the first lost message they do not: all agree in "
+        f"{agreement(dtsa)} of the slots, {_at_once(dtsa)} or nobody does, positions are wrong by {error(dtsa)}. With "
+        f"lease only a turn's owner gives it away, in its own message: {_at_once(lease)}, {error(lease)}. Round robin "
+        f"does not mind losses, but is slow: {error(flights['loss-tdma'])}."
     )
 
 
