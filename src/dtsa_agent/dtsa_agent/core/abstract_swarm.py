@@ -17,7 +17,7 @@ from .compiled import kernel as _kernel
 from .config import SwarmConfig
 from .course import Course
 from .errors import ConfigError
-from .reference import agent, frame
+from .reference import frame, rules
 from .registry import ESTIMATORS
 from .scenario import Scenario, check_extent, make_scenario
 
@@ -27,7 +27,7 @@ Bytes = NDArray[np.uint8]
 Hashes = NDArray[np.uint32]
 
 FRAME_MAX = frame.FRAME_MAX  # bytes
-PRESENT_LEAVING = agent.LEAVES  # in ``present``: will be switched off after a last frame
+PRESENT_LEAVING = rules.LEAVES  # in ``present``: will be switched off after a last frame
 
 
 class SwarmState:

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from .compiled import MISSING
 from .compiled import kernel as _kernel
 from .errors import ConfigError
-from .reference import avoiders, vehicle
 from .reference.arithmetic import Vector
-from .reference.avoiders import Neighbour, Scene
 from .registry import Registry, check_kernel
 from .settings import REQUIRED, Settings, check, setting, settings_of
 
@@ -87,6 +85,8 @@ class VehicleParams(Settings):
         if not MISSING:
             _kernel.vehicle_step(self.tau, self.a_max, dt, position, velocity, command)
             return
+        from .reference import vehicle  # nodes start without it
+
         p, v, c = (np.atleast_2d(array.T) for array in (position, velocity, command))
         moved = [vehicle.step(self.tau, self.a_max, dt, *map(_vector, now)) for now in zip(p, v, c, strict=True)]
         p[:], v[:] = [place for place, _ in moved], [speed for _, speed in moved]
@@ -158,14 +158,16 @@ class FlightModel(Settings):
         others_v: Array,
         age: Array | None,
     ) -> Array:
+        from .reference import avoiders
+
         count = others_p.shape[1]
         ages = [0.0] * count if age is None else age.tolist()
         near = [
-            Neighbour(k + 1, _vector(others_p[:, k]), _vector(others_v[:, k]), ages[k])
+            avoiders.Neighbour(k + 1, _vector(others_p[:, k]), _vector(others_v[:, k]), ages[k])
             for k in range(count)
             if k != own
         ]
-        scene = Scene(own + 1, _vector(position), _vector(velocity), _vector(goal), near)
+        scene = avoiders.Scene(own + 1, _vector(position), _vector(velocity), _vector(goal), near)
         return np.array(avoiders.command(self.avoider_kind, scene, avoiders.Avoidance(**self.avoider.to_dict())))
 
 

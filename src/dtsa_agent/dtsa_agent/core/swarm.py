@@ -15,7 +15,6 @@ from .errors import ConfigError
 from .flight_models import flight_model
 from .frame import PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, position_step
 from .reference.estimators import decay_table
-from .reference_swarm import ReferenceSwarm
 from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
 from .scenario import STREAM_POLICY, Scenario, generator
 
@@ -42,7 +41,11 @@ class Swarm(AbstractSwarm):
     def __new__(cls, *given: Any, core: str = COMPILED, **named: Any) -> Any:
         if core not in CORES or (core == COMPILED and MISSING):
             raise ConfigError("core", core, REFERENCE + f": {MISSING}" if MISSING else ", ".join(CORES))
-        return ReferenceSwarm(*given, **named) if core == REFERENCE else super().__new__(cls)
+        if core == COMPILED:
+            return super().__new__(cls)
+        from .reference_swarm import ReferenceSwarm  # nodes start without it
+
+        return ReferenceSwarm(*given, **named)
 
     def __init__(
         self,

@@ -18,11 +18,9 @@ from .lease.issue import Said, say
 from .lease.listen import end_slot, listen
 from .lease.memory import Memory
 from .policies import NOBODY, Weights
-from .rules import EXTENDED, PAPER, Rules
+from .rules import EXTENDED, LEAVES, OFF, ON, PAPER, Rules
 from .selection import Choice
 from .table import Table
-
-OFF, ON, LEAVES = 0, 1, 2  # Agent.present
 
 
 @dataclass(slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+OFF, ON, LEAVES = 0, 1, 2  # of an agent: not there, there, about to be switched off
 PAPER, PAPER_INTENT, EXTENDED = "paper", "paper-intent", "extended"  # profiles of frames
 
 
