@@ -11,7 +11,10 @@ setup(
     name=NAME,
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={NAME: ["py.typed", *(f"**/*.{suffix}" for suffix in ASSETS)], "dtsa": ["py.typed"]},
+    package_data={
+        NAME: ["py.typed", *(f"**/*.{suffix}" for suffix in ASSETS), "native/*.[chl]*"],
+        "dtsa": ["py.typed"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -11,6 +11,8 @@ COMMANDS = {
     "simulate": "one or many flights without ROS, as fast as the machine allows",
     "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
     "soak": "what is too long for the tests: kills, faults, load and memory over hours",
+    "prove": "policy lease explored state by state, for all patterns of loss",
+    "embedded": "the protocol on a simulated microcontroller: the same bits, and what it costs",
     "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
     "replay": "play a bag back into the ROS graph",
     "verify": "check a bag: was every decision what the protocol says?",

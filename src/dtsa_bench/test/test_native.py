@@ -1,0 +1,66 @@
+"""libdtsa outside of Python: fuzzed, and on a microcontroller."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dtsa_bench.native.embedded import fly_here, fly_on_cortex
+from dtsa_bench.native.fuzz import Found, build, fuzz
+from dtsa_bench.native.library import LIBRARY, NotHere
+from dtsa_bench.native.prove import MUTANTS, World, explore, mutate
+from dtsa_bench.native.prove import build as build_prover
+
+
+@pytest.mark.parametrize(("target", "seconds"), [("frames", 2), ("agents", 5)])
+def test_fuzzing_finds_nothing(target: str, seconds: float, tmp_path: Path) -> None:
+    try:
+        program = build(target, tmp_path)
+    except NotHere as error:
+        pytest.skip(str(error))
+    done = fuzz(program, seconds, tmp_path / "corpus", seed=1)
+    assert done.runs > 300
+    assert done.covered > 50  # it got past the first checks
+
+
+def test_fuzzing_finds_a_missing_check(tmp_path: Path) -> None:
+    broken = shutil.copytree(LIBRARY, tmp_path / "libdtsa")
+    source, check = broken / "frame_extended.c", "if (count > RELAY_IDS) return FRAME_BAD_FIELD;"
+    assert check in source.read_text()
+    source.write_text(
+        source.read_text()
+        .replace(check, "")
+        .replace("i < RELAY_IDS; i++) {\n        e->relay", "i < count; i++) {\n        e->relay")
+    )
+    try:
+        program = build("frames", tmp_path, broken)
+    except NotHere as error:
+        pytest.skip(str(error))
+    with pytest.raises(Found, match=r"overflow|out of bounds|ABRT|deadly"):
+        fuzz(program, 20, tmp_path / "corpus", seed=1)
+
+
+def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
+    try:
+        cortex = fly_on_cortex(tmp_path, slots=30, metered=False)
+    except NotHere as error:
+        pytest.skip(str(error))
+    here = fly_here(tmp_path, slots=30)
+    assert [(flight.policy, flight.agents) for flight in here] == [
+        (policy, agents) for policy in ("tdma", "dtsa", "lease") for agents in (12, 18)
+    ]
+    assert [flight.digest for flight in cortex] == [flight.digest for flight in here]
+    assert len({flight.digest for flight in here}) == 6
+    assert all(flight.memory < 8192 for flight in cortex)
+
+
+def test_every_state_of_two_agents_keeps_the_rules_and_broken_rules_are_found(tmp_path: Path) -> None:
+    whole = explore(build_prover(tmp_path), World("two agents", 2))
+    assert whole.closed
+    assert not whole.broken
+    assert whole.states > 10_000
+    found = {mutant.rule: explore(mutate(mutant, tmp_path), mutant.world).broken for mutant in MUTANTS}
+    assert all(found.values()), [rule for rule, broken in found.items() if not broken]
+    assert len({mutant.right for mutant in MUTANTS}) >= 8
