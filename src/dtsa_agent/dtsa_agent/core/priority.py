@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 from .compiled import MISSING
 from .compiled import kernel as _kernel
 from .errors import ConfigError
-from .reference import priority as plain
-from .reference import selection as plain_selection
 from .registry import REASONS, SELECTIONS
 
 
@@ -29,6 +27,8 @@ def priority(position: ArrayLike, velocity: ArrayLike, slot_s: float) -> NDArray
     if p.ndim != 2 or p.shape[0] != 3 or p.shape != v.shape:
         raise ConfigError("position, velocity", (p.T.shape, v.T.shape), "two arrays of shape (N, 3)")
     if MISSING:
+        from .reference import priority as plain  # hardly ever wanted: start-up does without
+
         rows = [[(float(x), float(y), float(z)) for x, y, z in array.T] for array in (p, v)]
         return np.array(plain.priorities(rows[0], rows[1], float(slot_s)))
     g = np.empty(p.shape[1])
@@ -56,6 +56,8 @@ def select(
     values = np.ascontiguousarray(g, dtype=np.float64)
     candidates = np.zeros(len(values), dtype=np.uint8)
     if MISSING:
+        from .reference import selection as plain_selection
+
         members = [int(k) for k in np.flatnonzero(np.asarray(in_ap))]
         choice = plain_selection.select(
             values.tolist(), np.asarray(counter).tolist(), np.asarray(in_ap, bool).tolist(), epsilon, selection

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 from .arithmetic import Vector
-from .rules import Rules
-from .table import Row
+
+if TYPE_CHECKING:
+    from .rules import Rules
+    from .table import Row
 
 DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at its command
 
