@@ -17,6 +17,8 @@ from dtsa_agent.core.frame_extended import (
     decode_extended,
     encode_extended,
 )
+from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.reference.rules import Rules
 
 FAR = 1e6
 OWN = {"position": (0.0, 0.0, 0.0), "velocity": (0.0, 0.0, 0.0), "intent": (0.0, 0.0, 0.0)}
@@ -70,7 +72,7 @@ class Air:
 
 
 def is_anchor(slot: int, agents: int, every: int = 5) -> bool:
-    return (slot // agents + slot % agents) % every == 0
+    return Memory(Rules(agents=agents, slot_s=0.01, anchor_every=every)).is_anchor(slot)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])

@@ -1,7 +1,7 @@
 """An outside observer that reads every frame of policy ``lease`` and holds the agents to the protocol's rules.
 
-It knows what was sent, not what was heard, and shares no code with the agents: the order of a frame's lease bytes is
-written down here a second time, on purpose.
+It knows what was sent, not what was heard, and shares no code with the agents that run: what an anchor is, and which
+turns a frame's lease bytes speak of, it asks the specification.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.reference.rules import Rules
 
 OPEN = 255
 
@@ -32,25 +34,10 @@ class Ledger:
     adopted_slots: int = 0
     leased_slots: int = 0
     broken: list[str] = field(default_factory=list)  # rules that were broken, in words
+    _rules: Memory = field(init=False, compare=False, repr=False)
 
-    def is_anchor(self, slot: int) -> bool:
-        """Whether a slot belongs to its owner whatever happens."""
-        return (slot // self.agents + slot % self.agents) % self.anchor_every == 0
-
-    def turns(self, slot: int, c_s: int, count: int) -> list[int]:
-        """The turns that the lease bytes of a frame speak of.
-
-        :param slot: slot of the frame.
-        :param c_s: its c_s.
-        :param count: number of lease bytes.
-        """
-        own = [slot + j * self.agents for j in range(1, self.anchor_every + 1)]
-        end = next((turn for turn in own if self.is_anchor(turn)), own[-1] + 1)
-        result: list[int] = []
-        for first in own:
-            ahead = [turn for turn in range(first - c_s, first) if not self.is_anchor(turn)]
-            result += [*ahead, first] if first < end else ahead
-        return result[:count]
+    def __post_init__(self) -> None:
+        self._rules = Memory(Rules(agents=self.agents, slot_s=1.0, anchor_every=self.anchor_every))
 
     def slot(self, slot: int, frames: dict[int, bytes]) -> None:
         """Takes in one slot.
@@ -93,11 +80,11 @@ class Ledger:
         leases = frame.leases
         if leases and slot % self.agents != sender - 1:
             self.broken.append(f"slot {slot}: agent {sender} gives turns away in somebody else's turn")
-        for turn, lessee in zip(self.turns(slot, frame.c_s, len(leases)), leases, strict=False):
+        for turn, lessee in zip(self._rules.turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
             if not lessee:
                 continue
             owner = turn % self.agents + 1
-            if self.is_anchor(turn) or turn <= slot:
+            if self._rules.is_anchor(turn) or turn <= slot:
                 self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
             entries = self.issued.setdefault(turn, [])
             if sender == owner and any(i == owner and other != lessee for i, other in entries):
