@@ -44,6 +44,11 @@ class FakeFleet:
         found = read_truth(self.truth)[2]
         return [e for e in found if (cf is None or e["cf"] == cf) and (name is None or e["event"] == name)]
 
+    def flown(self, cf: int) -> list[str]:
+        """What its supervisor went through, from when it was ready for its first flight."""
+        states = [e["state"] for e in self.events(cf, "state")]
+        return states[states.index("flying") - 1 :] if "flying" in states else states
+
     def state_event(self, cf: int, state: str) -> dict[str, Any]:
         """The first time that a supervisor entered a state."""
         return next(e for e in self.events(cf, "state") if e["state"] == state)

@@ -90,7 +90,7 @@ class Graph:
 
 @contextmanager
 def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
-    with ros_domain() as domain, fake_fleet(tmp_path, COUNT) as fleet:
+    with ros_domain() as domain, fake_fleet(tmp_path, COUNT, "--arming", "mixed") as fleet:
         config = tmp_path / "swarm.yaml"
         config.write_text(yaml.safe_dump(settings(fleet, PATIENT)))
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -169,7 +169,7 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         assert "landing" in output
         for k in (1, 2, 3):
             assert fleet.events(k, "land")
-            assert [e["state"] for e in fleet.events(k, "state")][2] == "landed"
+            assert fleet.flown(k)[2] == "landed"
         assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
 
 

@@ -151,6 +151,27 @@ def test_a_flight_goes_through_all_states() -> None:
     assert seen == [1, 2, 3, 4, 5, 3, 2]
 
 
+def test_one_that_arms_itself_is_ready_until_it_is_told_and_again_once_it_has_landed() -> None:
+    m = machine(sm.AUTO_ARM | sm.IS_ARMED)
+    on_ground, in_air = sm.AUTO_ARM | sm.IS_ARMED, sm.AUTO_ARM | sm.IS_ARMED | sm.IS_FLYING
+    assert m.state is State.READY
+    m.arm(True)
+    m.observe(sm.AUTO_ARM)  # its pre-flight check begins anew every 30 s: it is not armed for a moment
+    assert m.state is State.ARMED
+    m.observe(in_air)
+    m.land("down")
+    m.observe(in_air)
+    assert m.state is State.LANDING
+    m.observe(on_ground)
+    m.observe(on_ground)
+    assert m.state is State.READY
+    m.arm(True)
+    m.observe(on_ground)
+    m.arm(False)
+    m.observe(on_ground)
+    assert m.state is State.READY
+
+
 @pytest.mark.parametrize("bit", [sm.IS_LOCKED, sm.IS_TUMBLED, sm.IS_CRASHED])
 def test_trouble_in_the_air_is_an_emergency_until_reconnected(bit: int) -> None:
     m = machine(sm.IS_ARMED | sm.IS_FLYING, bit)

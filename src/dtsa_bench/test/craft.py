@@ -16,9 +16,11 @@ from dtsa_bench.fake_crazyflie.peer import Peer
 class Craft:
     """Firmware of one Crazyflie on a test stand that follows every command at once."""
 
-    def __init__(self, protocol: int = 12) -> None:
+    def __init__(self, protocol: int = 12, *, auto_arming: bool = False) -> None:
         self.events: list[tuple[str, dict[str, Any]]] = []
-        self.firmware = Firmware(lambda name, **details: self.events.append((name, details)), tau=0.0)
+        self.firmware = Firmware(
+            lambda name, **details: self.events.append((name, details)), tau=0.0, auto_arming=auto_arming
+        )
         self.estimate = Estimate()
         self.peer = Peer(self.firmware, self.estimate, protocol)
         self.t = 0.0

@@ -129,7 +129,7 @@ def test_same_seed_same_flight_and_its_record(tmp_path: Path) -> None:
     assert np.allclose(np.diff(times), 0.01)
     assert a[225, 2] == pytest.approx([0.8, 0.8], abs=0.03)
     assert a[-1, 2] == pytest.approx([0.0, 0.0], abs=1e-9)
-    assert [e["event"] for e in events if e["cf"] == 1 and e["event"] != "state"][:3] == ["armed", "takeoff", "land"]
+    assert [e["event"] for e in events if e["cf"] == 1 and e["event"] != "state"][:2] == ["takeoff", "land"]
     with (tmp_path / "a.jsonl").open("a") as record:
         record.write('{"t": 5.0')  # cut off by a crash
     assert len(read_truth(tmp_path / "a.jsonl")[0]) == 500

@@ -32,6 +32,9 @@ COUNT = 4
 FLY = [sys.executable, "-m", "dtsa_bench", "fly", "--backend", "cflib", "--no-picture", "--slot-ms", "20"]
 
 
+MIXED = ("--arming", "mixed")  # stock ones, which arm themselves, beside those that wait to be told
+
+
 def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
     """The swarm's YAML, everybody on its place of the ellipse."""
     data: dict[str, Any] = settings(fleet, {"safety": safety})
@@ -45,7 +48,7 @@ def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
 
 @flown_again_when_overloaded
 def test_take_off_exchange_landing(tmp_path: Path) -> None:
-    with fake_fleet(tmp_path, COUNT) as fleet:
+    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         config, out = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45), tmp_path / "out"
         command = [*FLY, "--config", str(config), "--out", str(out), "--policy", "lease"]
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
@@ -61,7 +64,7 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
         goal = track[0][:2, [2, 3, 0, 1]]
         assert np.linalg.norm(track[-1][:2] - goal, axis=0).max() < 0.5
         for k in range(1, COUNT + 1):
-            assert [e["state"] for e in fleet.events(k, "state")][:3] == ["ready to fly", "flying", "landed"]
+            assert fleet.flown(k)[:3] == ["ready to fly", "flying", "landed"]
         # What the bag's metrics say about the closest approach is what truly happened, within the sensors' noise.
         begin = max(
             next(e["t"] for e in events if e["cf"] == k and e["event"] == "streaming") for k in range(1, COUNT + 1)
@@ -74,7 +77,7 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
 
 @flown_again_when_overloaded
 def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -> None:
-    with fake_fleet(tmp_path, COUNT) as fleet:
+    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out"), "--tail-s", "60"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
@@ -90,7 +93,7 @@ def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -
         assert process.returncode == 1
         assert "cut short: cf2 is lost" in errors
         for k in (1, 3, 4):
-            assert [e["state"] for e in fleet.events(k, "state")][:3] == ["ready to fly", "flying", "landed"]
+            assert fleet.flown(k)[:3] == ["ready to fly", "flying", "landed"]
         assert fleet.state_event(2, "level out")
         assert not [e for e in fleet.events() if e["event"] in ("collision", "crash") and e["cf"] != 2]
 
@@ -124,7 +127,7 @@ def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyP
 
 @flown_again_when_overloaded
 def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
-    with fake_fleet(tmp_path, 2) as fleet:
+    with fake_fleet(tmp_path, 2, *MIXED) as fleet:
         data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
         data["robots"]["cf1"]["initial_position"] = [1.2, 0.0, 0.0]
         data["robots"]["cf2"]["initial_position"] = [-1.2, 0.0, 0.0]

@@ -175,6 +175,25 @@ def test_arming_needs_a_crazyflie_that_may_fly() -> None:
     assert not craft.firmware.supervisor.armed
 
 
+def test_one_that_arms_itself_does_so_after_power_on_after_a_landing_and_after_its_timeout() -> None:
+    craft = Craft(auto_arming=True)
+    craft.fly(0.02)
+    assert (craft.state, craft.firmware.supervisor.armed) == ("ready to fly", True)
+    info = craft.ask(9, 0, b"\x0c")
+    assert info is not None
+    assert info[1] & 0b1110 == 0b1110  # armed, by itself, may fly
+    craft.take_off()
+    craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 1.0))
+    craft.fly(1.0 + 2.0 + 3.0 + 0.2)
+    again = ["landed", "pre-flight checks not passed", "pre-flight checks passed", "ready to fly"]
+    assert [e["state"] for name, e in craft.events if name == "state"] == ["ready to fly", "flying", *again]
+    craft.fly(30.1)
+    assert [e["state"] for name, e in craft.events if name == "state"][-3:] == again[1:]
+    assert craft.ask(9, 1, b"\x01\x00") == b"\x81\x01\x00"  # disarmed ...
+    craft.fly(0.05)
+    assert craft.firmware.supervisor.armed  # ... for a moment
+
+
 def test_full_state_setpoints_and_yaw() -> None:
     craft = Craft()
     craft.take_off()

@@ -5,7 +5,8 @@
                                       +----------+---------+-----------+--> lost       (silent for too long)
                                       +----------+---------+-----------+--> emergency  (motors stopped for good)
 
-What the firmware's supervisor reports decides between ready, armed and flying; orders decide about landing. `lost`
+What the firmware's supervisor reports decides between ready, armed and flying; orders decide about landing. A Crazyflie
+that arms itself (2.1, 2.1+) is ready until the ground station orders to arm it, and again once it has landed. `lost`
 ends when the Crazyflie is heard again, `emergency` only with a new connection.
 """
 
@@ -58,6 +59,8 @@ class StateMachine:
         self.state = S.DISCONNECTED
         self.reason = "not connected yet"
         self._changed = changed
+        self.arms_itself = False  # the firmware says so
+        self._wanted = False  # the ground station wants it armed: of one that arms itself nothing else can tell
         self._landing = False  # a landing was ordered and is not over
         self._stopped = False  # an emergency stop was sent
 
@@ -72,8 +75,12 @@ class StateMachine:
             raise LocalProtocolError(f"no way from {self.state.name} to {state.name}")
         before, self.state, self.reason = self.state, state, reason
         if state in (S.CONNECTING, S.DISCONNECTED):
-            self._landing = self._stopped = False
+            self._landing = self._stopped = self._wanted = False
         self._changed(before, state, reason)
+
+    def arm(self, wanted: bool) -> None:
+        """Arming or disarming was ordered."""
+        self._wanted = wanted
 
     def takeoff(self, reason: str) -> None:
         """A take-off was ordered: an earlier landing is over."""
@@ -114,6 +121,7 @@ class StateMachine:
         if self._stopped:
             self.go(S.EMERGENCY, self.reason)
             return
+        self.arms_itself = bool(info & AUTO_ARM)
         back = "heard again" if self.state == S.LOST else ""
         if info & IS_FLYING:
             if not self._landing:
@@ -123,8 +131,10 @@ class StateMachine:
             return
         if self.state == S.LANDING or (self.state == S.LOST and self._landing):
             back = "landed"
+        if self.state in IN_AIR or self._landing:
+            self._wanted = False
         self._landing = False
-        if info & IS_ARMED:
+        if self._wanted if self.arms_itself else info & IS_ARMED:
             self.go(S.ARMED, back or "armed")
         else:
             self.go(S.READY, back or "motors locked")

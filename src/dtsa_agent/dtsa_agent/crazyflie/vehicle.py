@@ -85,6 +85,7 @@ class Vehicle:
         self._log_times: deque[float] = deque(maxlen=200)
         self._command_time: float | None = None
         self._streaming = False  # the firmware follows streamed commands, not the high-level commander
+        self._moved = False  # something that makes it fly was sent since it was armed
         self._held = False  # the stream of commands broke off and the place is being held
         self._brake: tuple[float, Callable[[], None]] | None = None  # until when to brake, and what comes then
         self._guard_until = 0.0  # a take-off or go-to is flown to its end before streamed commands count again
@@ -155,6 +156,7 @@ class Vehicle:
                 self.refused += 1
                 return False
             self._command_time = setpoint.stamp
+            self._moved = True
             if self._held:
                 self._log("info", f"{self.name}: commands again")
             self._streaming, self._held, self._brake = True, False, None
@@ -187,7 +189,10 @@ class Vehicle:
             if self.state not in (State.READY, State.ARMED):
                 return f"{self.name} is {self.state.name.lower()}"
             self.action = "arming" if arm else "disarming"
-            self.link.order(lambda cf: cf.supervisor.send_arming_request(arm))
+            self.machine.arm(arm)
+            self._moved = False
+            if not self.machine.arms_itself:  # disarmed, it would arm itself again at once
+                self.link.order(lambda cf: cf.supervisor.send_arming_request(arm))
             return ""
 
     def takeoff(self, height: float, duration: float) -> str:
@@ -202,7 +207,7 @@ class Vehicle:
             z = 0.0 if self.last is None else max(self.last.position[2], 0.0)
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
-            self._deaf = False
+            self._deaf, self._moved = False, True
             on_ground = self.state == State.ARMED
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
@@ -284,6 +289,8 @@ class Vehicle:
             height = height if math.isfinite(height) else 0.0
             if self.state not in (State.ARMED, State.FLYING, State.LANDING, State.LOST):
                 return f"{self.name} is {self.state.name.lower()}"
+            if self.state == State.ARMED and not self._moved:
+                return self.arm(False)  # a landing would start the motors
             self._deaf = True
             if self.state == State.LANDING:
                 return ""

@@ -96,16 +96,18 @@ class Firmware:
 
     :param report: called with the name of each event and details, for the record.
     :param tau: s, lag of the vehicle's velocity, which wanted accelerations make up for.
+    :param auto_arming: it arms itself.
     """
 
-    def __init__(self, report: Callable[..., None], tau: float) -> None:
+    def __init__(self, report: Callable[..., None], tau: float, *, auto_arming: bool = False) -> None:
         self._report = report
         self._tau = tau
+        self._auto_arming = auto_arming
         self.reset()
 
     def reset(self) -> None:
         """Power on."""
-        self.supervisor = Supervisor(self._report)
+        self.supervisor = Supervisor(self._report, auto_arming=self._auto_arming)
         self.planner = Planner()
         self.battery = Battery()
         self.setpoint: Setpoint | None = None

@@ -50,6 +50,12 @@ class FleetConfig(Settings):
     start: Any = field(default=None, compare=False)
     seed: int = setting(1, "seed of noise and loss", minimum=0, maximum=2**63 - 1)
     protocol: int = setting(12, "version of the protocol told to the host", choices=PROTOCOLS)
+    arming: str = setting(
+        "auto",
+        "how they are armed: by themselves (Crazyflie 2.1, 2.1+), as required by the ground station (2.1 brushless, "
+        "Bolt), or every second one so",
+        choices=("auto", "required", "mixed"),
+    )
     noise: bool = setting(True, "sensors have noise")
     model: str = setting("orca", "flight model whose vehicle they are", choices=AVOIDERS.names, open_choices=True)
     collision_m: float = setting(
@@ -69,6 +75,10 @@ class FleetConfig(Settings):
             raise ConfigError("start", np.shape(self.start), f"an array of shape (3, {self.count})")
         if not self.control_port:
             object.__setattr__(self, "control_port", self.base_port - 1)
+
+    def arms_itself(self, index: int) -> bool:
+        """Whether the vehicle with this index does not wait to be armed."""
+        return self.arming == "auto" or (self.arming == "mixed" and index % 2 == 0)
 
     @property
     def uris(self) -> list[str]:
@@ -116,7 +126,10 @@ class Fleet:
         self.tick = 0
         vehicle = flight_model(config.model).vehicle
         self.vehicles = Vehicles(config.start, vehicle)
-        self.firmware = [Firmware(partial(self._report, k), vehicle.tau) for k in range(config.count)]
+        self.firmware = [
+            Firmware(partial(self._report, k), vehicle.tau, auto_arming=config.arms_itself(k))
+            for k in range(config.count)
+        ]
         self.estimates = [Estimate() for _ in range(config.count)]
         self.peers = [Peer(f, e, config.protocol) for f, e in zip(self.firmware, self.estimates, strict=True)]
         streams = np.random.SeedSequence(config.seed).spawn(2)

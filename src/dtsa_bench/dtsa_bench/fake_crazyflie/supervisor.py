@@ -36,12 +36,14 @@ class Supervisor:
     """State machine of one Crazyflie.
 
     :param report: called with the name of each event and details, for the record.
+    :param auto_arming: it arms itself, as a Crazyflie 2.1 or 2.1+ does; a 2.1 brushless or a Bolt waits to be told.
     """
 
-    def __init__(self, report: Callable[..., None]) -> None:
+    def __init__(self, report: Callable[..., None], *, auto_arming: bool = False) -> None:
         self._report = report
+        self.auto_arming = auto_arming
         self.state = CHECKED
-        self.armed = False
+        self.armed = auto_arming
         self.tumbled = False
         self.refuse_arming = False
         self.crashed = False  # until somebody asks for recovery
@@ -149,11 +151,14 @@ class Supervisor:
         if state not in MOTORS_ALLOWED and self.armed:
             self.armed = False
             self._report("disarmed")
+        if self.auto_arming and state == CHECKED:
+            self.request_arming(True)
 
     def info(self, *, planner_active: bool, trajectory_finished: bool) -> int:
         """The bit field `supervisor.info`."""
         bits = IS_ARMED if self.armed else 0
         bits |= CAN_BE_ARMED if self.state == CHECKED and not self.refuse_arming else 0
+        bits |= AUTO_ARM if self.auto_arming else 0
         bits |= CAN_FLY if self.motors_allowed else 0
         bits |= IS_FLYING if self.flying else 0
         bits |= IS_TUMBLED if self.tumbled else 0
