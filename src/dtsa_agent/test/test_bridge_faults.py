@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -193,6 +194,7 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, prot
             wait_for(lambda: pilot.state(4) is State.ARMED)
             pilot.bridge.land_all("armed, but still on the ground: there is nothing to land")
             wait_for(lambda: pilot.state(4) is State.READY)
+            wait_for(lambda: fleet.events(4, "state")[-1]["state"] == "pre-flight checks passed")
             assert not fleet.events(4, "land")
             pilot.bridge.each(["cf4"], lambda v: v.arm(True))
             wait_for(lambda: pilot.state(4) is State.ARMED)
@@ -207,6 +209,29 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, prot
             wait_for(lambda: pilot.state(2) is State.READY)
             pilot.bridge.vehicles["cf4"].stop("test")
             wait_for(lambda: any(e["state"] == "locked" for e in fleet.events(4, "state")), 3)
+
+
+@flown_again_when_overloaded
+def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_control(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 6, "--arming", "mixed") as fleet, flight(settings(fleet)) as pilot:
+        assert pilot.bridge.connect() == []
+        climbing = threading.Timer(1.5, lambda: fleet.fault("freeze", 1, seconds=0.65))
+        climbing.start()
+        pilot.take_off()
+        climbing.join()
+        pilot.velocity["cf4"] = (0.0, 0.4, 0.0)
+        pilot.bridge.vehicles["cf6"].land("before the gap")
+        time.sleep(0.7)
+        for cf, gap in ((2, 0.3), (3, 0.55), (4, 0.6), (5, 0.65), (6, 0.65)):
+            fleet.fault("freeze", cf, seconds=gap)
+        down = (State.READY, State.ARMED)
+        wait_for(lambda: all(pilot.state(cf) in down for cf in (1, 3, 4, 5, 6)))
+        assert pilot.state(2) is State.FLYING
+        for cf in (1, 3, 4, 5, 6):
+            pilot.logged(f"cf{cf}: (flying|landing) -> lost")
+            assert fleet.flown(cf)[-1] != "locked"
+            assert len(fleet.events(cf, "land")) == 1 or cf != 6  # it landed by itself all the while
+        assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
 
 
 @flown_again_when_overloaded

@@ -57,6 +57,7 @@ class Link:
     :param cache: folder for the tables of variables.
     :param on_state: called with each decoded log packet and its time (s, monotonic), in a thread of cflib's.
     :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
+    :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Link:
         cache: Path,
         on_state: Callable[[VehicleState, float], None],
         on_broken: Callable[[str], None],
+        on_answer: Callable[[int, int], None],
     ) -> None:
         self.robot = robot
         self.mailbox = Mailbox()
@@ -78,6 +80,7 @@ class Link:
         self._cache = cache
         self._on_state = on_state
         self._on_broken = on_broken
+        self._on_answer = on_answer
         self._cf: Any = None
         self._thread = threading.Thread(target=self._work, name=f"{robot.name}-worker", daemon=True)
         self._thread.start()
@@ -142,6 +145,7 @@ class Link:
 
     def _connect(self) -> None:
         from cflib.crazyflie import Crazyflie
+        from cflib.crtp.crtpstack import CRTPPort
 
         self._drop()
         deadline = time.monotonic() + self.robot.connect_timeout_s
@@ -159,6 +163,7 @@ class Link:
 
         cf.connection_failed.add_callback(broken)
         cf.connection_lost.add_callback(broken)
+        cf.add_port_callback(CRTPPort.SETPOINT_HL, self._answer)
         cf.link_statistics.link_quality_updated.add_callback(self._quality)
         cf.link_statistics.uplink_rssi_updated.add_callback(self._rssi)
         self._cf = cf
@@ -176,6 +181,10 @@ class Link:
             self._reset_estimator(cf)
         self._start_log(cf, max(deadline, time.monotonic() + 2.0))
         self.connected = True
+
+    def _answer(self, packet: Any) -> None:
+        if len(packet.data) > 3:
+            self._on_answer(packet.data[0], packet.data[3])
 
     def _quality(self, percent: float) -> None:
         self.radio_quality = percent / 100

@@ -19,6 +19,7 @@ from dtsa_agent.core.errors import LocalProtocolError
 
 CAN_BE_ARMED, IS_ARMED, AUTO_ARM, CAN_FLY, IS_FLYING = 1, 2, 4, 8, 16
 IS_TUMBLED, IS_LOCKED, IS_CRASHED = 32, 64, 128
+HL_ACTIVE = 256  # the high-level commander has something to fly
 
 
 class State(enum.IntEnum):

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
+from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, Delivery
 from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.paths import shortest_s, too_short
 from dtsa_agent.crazyflie.safety import Watched
-from dtsa_agent.crazyflie.state_machine import State, StateMachine
+from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 from dtsa_agent.crazyflie.units import Setpoint, VehicleState, to_map, velocity_world, yaw_of
 
 # A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
@@ -27,6 +28,7 @@ MIN_LAND_S = 1.0
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
 BLIND_REPEATS = 3
 BLIND_LAND_S = 2.0
+LOW_M = 0.1  # this close to the floor there is nothing left to land from
 QUALITY_WINDOW_S = 1.0
 WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
 ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
@@ -91,7 +93,8 @@ class Vehicle:
         self._guard_until = 0.0  # a take-off or go-to is flown to its end before streamed commands count again
         self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
         self._blind: list[float] = []  # when to repeat a landing that may not have been heard
-        self.link = Link(robot, cache, self._received, self._broken)
+        self._delivery = Delivery()
+        self.link = Link(robot, cache, self._received, self._broken, self._answered)
 
     # -- what comes in ----------------------------------------------------------------------------------------------
     def _changed(self, before: State, state: State, reason: str) -> None:
@@ -106,11 +109,34 @@ class Vehicle:
             self.last = state
             self._log_times.append(now)
             if self.machine.state not in (State.DISCONNECTED, State.CONNECTING):
+                before = self.machine.state
                 self.machine.observe(state.info)
-                if self._blind and self.machine.state != State.LOST:
-                    self._blind.clear()
+                if before == State.LOST != self.machine.state:
+                    self._heard_again(state)
         if self._publish is not None:
             self._publish(self, state)
+
+    def _heard_again(self, state: VehicleState) -> None:
+        """The end of a gap: the orders that were given in it may have been lost."""
+        self._blind.clear()
+        if self.guarded:  # its watchdog has not much time left
+            self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
+        if self.state != State.LANDING:
+            return
+        drifts = math.hypot(*state.velocity[:2]) > SLOW_MPS
+        if state.position[2] < LOW_M and not state.info & HL_ACTIVE:
+            self._delivery.cancel()  # down, or about to be: with nothing to fly the end of the stream stops the motors
+            self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop())
+        elif drifts or not self._delivery.landing:
+            self._log("info", f"{self.name}: heard again: brakes and lands")
+            self._streaming = True
+            self._brake_then(self._sink)
+
+    def _answered(self, code: int, result: int) -> None:
+        with self.lock:
+            problem = self._delivery.answered(code, result)
+        if problem:
+            self._log("warn", f"{self.name}: {problem}")
 
     def _broken(self, reason: str) -> None:
         with self.lock:
@@ -123,6 +149,8 @@ class Vehicle:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
             self._streaming = self._held = self._deaf = self.guarded = False
             self._command_time = None
+            self._blind.clear()
+            self._delivery.cancel()
 
         def finished(reason: str) -> None:
             try:
@@ -157,31 +185,39 @@ class Vehicle:
                 return False
             self._command_time = setpoint.stamp
             self._moved = True
+            self._delivery.cancel()  # the stream is in charge now
             if self._held:
                 self._log("info", f"{self.name}: commands again")
             self._streaming, self._held, self._brake = True, False, None
             self.link.mailbox.put_setpoint(setpoint)
             return True
 
-    def _high_level(self, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
+    def _high_level(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
         """An order to the high-level commander, and only then the end of the stream of setpoints.
 
         The other way round the high-level commander would have nothing to fly for a moment, and would stop the motors.
 
-        :param again: if a stream ends, the order is given once more: the first one might have got lost.
+        :param kind: `TAKEOFF`, `LAND` or `GO_TO`.
+        :param again: the order may be given more than once: it is, until the firmware has answered.
         """
         streaming, self._streaming, self._held = self._streaming, False, False
         self._guard_until = time.monotonic() + duration
         self._brake = None
 
+        def end(cf: Any) -> None:
+            cf.commander.send_notify_setpoint_stop()
+
         def run(cf: Any) -> None:
             action(cf)
             if streaming:
-                cf.commander.send_notify_setpoint_stop()
+                end(cf)
                 if again:
                     action(cf)
 
         self.link.order(run)
+        self._delivery.cancel()
+        if again:
+            self._delivery.begin(kind, run, end if streaming else None, time.monotonic())
 
     def arm(self, arm: bool) -> str:
         """Let the motors run, or lock them; why not, or an empty text."""
@@ -212,11 +248,13 @@ class Vehicle:
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
             if on_ground or self.last is None:
-                self._high_level(lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration)
+                self._high_level(
+                    TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration
+                )
             else:  # the firmware takes off from the ground only
                 x, y, _ = self.last.position
                 yaw = yaw_of(self.last.orientation)
-                self._high_level(lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
+                self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
             return ""
 
     def go_to(self, place: tuple[float, float, float], yaw: float, duration: float, relative: bool) -> str:
@@ -230,7 +268,10 @@ class Vehicle:
             self.action = "go_to"
             x, y, z = place
             self._high_level(
-                lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative), duration, again=not relative
+                GO_TO,
+                lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative),
+                duration,
+                again=not relative,
             )
             return ""
 
@@ -249,7 +290,7 @@ class Vehicle:
                     return
                 x, y, z = self.last.position
                 z, yaw = max(z, 0.1), yaw_of(self.last.orientation)
-                self._high_level(lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
+                self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
                 self._held = stale
 
             self._held = stale
@@ -260,6 +301,7 @@ class Vehicle:
         if self.last is None or self.state not in (State.FLYING, State.LANDING):
             action()
         else:
+            self._delivery.cancel()
             self._brake = (time.monotonic() + BRAKE_LIMIT_S, action)
             self._slow_down(time.monotonic())
 
@@ -306,13 +348,12 @@ class Vehicle:
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)
-
-            def sink() -> None:
-                seconds = self._landing_s(height, duration)
-                self._high_level(lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
-
-            self._brake_then(sink)
+            self._brake_then(lambda: self._sink(height, duration))
             return ""
+
+    def _sink(self, height: float = 0.0, duration: float = 0.0) -> None:
+        seconds = self._landing_s(height, duration)
+        self._high_level(LAND, lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
 
     def _height(self) -> float:
         """Last known height above the floor, m."""
@@ -332,6 +373,7 @@ class Vehicle:
             self.action = f"emergency stop: {reason}"
             self._deaf = True
             self._brake = None
+            self._delivery.cancel()
 
             def run(cf: Any) -> None:
                 for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
@@ -349,23 +391,28 @@ class Vehicle:
                 self.hold("the stream of commands was declared over")  # tells the firmware, too
             else:
                 self._streaming = False
+                self._delivery.cancel()
                 self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop(remain_ms))
             return ""
 
     def lose(self, reason: str, now: float) -> None:
-        """It is silent. Nothing may be heard, but a landing is ordered all the same."""
+        """It is silent. Nothing may be heard, but a landing is ordered all the same, unless it is known to land."""
         with self.lock:
-            was_in_air = self.state in (State.FLYING, State.LANDING)
+            was_in_air = self.state in IN_AIR
             self.machine.silent(reason)
-            if was_in_air and self.link.connected:
+            if not was_in_air:
+                self._delivery.cancel()  # a take-off that comes late takes nobody by surprise
+            elif self.link.connected and not self._delivery.landing:
                 self.land(reason)
                 self._blind = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
 
     def tick(self, now: float) -> None:
-        """Called 50 times a second: goes on braking."""
+        """Called 50 times a second: goes on braking, and sends again what has not been answered."""
         with self.lock:
             if self._brake is not None:
                 self._slow_down(now)
+            if self.state in WATCHED_OVER and (order := self._delivery.due(now)) is not None:
+                self.link.order(order)
 
     def keep_alive(self, now: float, watchdog: bool) -> None:
         """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
@@ -374,7 +421,7 @@ class Vehicle:
                 self._blind.pop(0)
                 self._streaming = True
                 seconds = self._landing_s(0.0, BLIND_LAND_S)
-                self._high_level(lambda cf: cf.high_level_commander.land(0.0, seconds, yaw=None), math.inf)
+                self._high_level(LAND, lambda cf: cf.high_level_commander.land(0.0, seconds, yaw=None), math.inf)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
             self.guarded |= watchdog and self.state in WATCHED_OVER
             if self.guarded and self.state not in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY):
