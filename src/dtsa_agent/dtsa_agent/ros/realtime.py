@@ -105,7 +105,7 @@ class RealtimeNode(SwarmNode):
         self._offset: NDArray[np.int64] = np.array(offset_ns, dtype=np.int64)
         self._drift: NDArray[np.int64] = np.array(drift_ppb, dtype=np.int64)
         self._shift: NDArray[np.int64] = np.zeros(count, dtype=np.int64)  # ns, what each has learned to wait
-        self._starts: tuple[int, NDArray[np.int64]] = -1, self._shift  # of the slot asked for last
+        self._starts: tuple[int | None, NDArray[np.int64]] = None, self._shift  # of the slot asked for last
         self._aligners = [ClockAligner() for _ in range(count)] if align else []
         self._jitter_ns = jitter_ns
         self._random = [generator(self.config.seed, STREAM_CLOCKS, agent) for agent in self.swarm.ids]
@@ -147,7 +147,7 @@ class RealtimeNode(SwarmNode):
         :param by_ns: ns, positive: later.
         """
         self._shift[index] += by_ns
-        self._starts = -1, self._shift
+        self._starts = None, self._shift
 
     def local_ns(self, time_ns: int) -> NDArray[np.int64]:
         """What each agent's clock shows, ns.
