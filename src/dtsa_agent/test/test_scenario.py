@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.scenario import half_axes
 
 
@@ -66,6 +67,11 @@ def test_ids_are_dealt_out_at_random_unless_told_otherwise() -> None:
     assert (np.diff(angle) > 0).all()
     shuffled = make_scenario(SwarmConfig(agents=12, jitter_m=0)).start
     assert not np.array_equal(ordered, shuffled)
+    told = make_scenario(SwarmConfig(agents=12, jitter_m=0, places="12,11,10,9,8,7 6 5 4 3 2 1")).start
+    assert np.array_equal(told, ordered[:, ::-1])
+    for places in ("1 2 3", "1 1 " + " ".join(map(str, range(3, 13))), "one"):
+        with pytest.raises(ConfigError, match="1 to 12, each once"):
+            SwarmConfig(agents=12, places=places)
 
 
 @settings(max_examples=50, deadline=None)

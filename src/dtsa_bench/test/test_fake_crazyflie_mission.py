@@ -23,9 +23,12 @@ pytest.importorskip("dtsa_msgs.srv")
 from bridge_helpers import FakeFleet, fake_fleet, settings, wait_for
 from metronome import flown_again_when_overloaded
 
+from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_bench.fake_crazyflie.truth import read_truth
+from dtsa_bench.fly.places import MissionError, assign_places, check_ways
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 COUNT = 4
@@ -46,10 +49,32 @@ def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
     return path
 
 
+def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
+    config = SwarmConfig(agents=12, permute=False, shape="ellipse", axis_x_m=1.2, axis_y_m=2.0)
+    names = [f"cf{k}" for k in range(1, 13)]
+    fence = SafetySettings()
+    start = make_scenario(config).start
+    assert assign_places(config, names, start) is config
+    measured = np.roll(start, 5, axis=1) + np.random.default_rng(1).uniform(-0.15, 0.15, (3, 12))
+    found = assign_places(config, names, measured)
+    assert found.place_numbers == np.roll(np.arange(1, 13), 5).tolist()
+    check_ways(make_scenario(found), names, measured, fence)
+    with pytest.raises(MissionError, match=r"cf1 and cf7 would pass at 0\.\d\d m"):
+        check_ways(make_scenario(config), names, np.roll(start, 6, axis=1), fence)  # all through the middle
+    with pytest.raises(MissionError, match=r"let.* begin: cf1 by \d\.\d\d m, cf2 by"):
+        assign_places(found, names, start)
+    measured = start.copy()
+    measured[:2, 3] = measured[:2, 4] + (0.1, 0.0)
+    measured[0, 0] = 2.5
+    with pytest.raises(MissionError, match=r"cf1 stands 1\.00 m outside .*; cf4 and cf5 stand 0\.10 m apart"):
+        check_ways(make_scenario(config), names, measured, fence)
+
+
 @flown_again_when_overloaded
 def test_take_off_exchange_landing(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
-        config, out = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45), tmp_path / "out"
+        patient = {"link_age_s": 3.0, "command_age_s": 0.45, "emergency_watchdog": False}  # it would lock them
+        config, out = swarm_yaml(fleet, tmp_path, **patient), tmp_path / "out"
         command = [*FLY, "--config", str(config), "--out", str(out), "--policy", "lease"]
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         assert result.returncode == 0, result.stderr
@@ -73,6 +98,14 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
         during = track[(times >= begin) & (times <= end)]
         gap = np.linalg.norm(during[:, :, :, None] - during[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
         assert summary["min_distance_m"] == pytest.approx(gap.min(), abs=0.05)
+        # Once more from where they stand now: at each other's places.
+        command[command.index(str(out))] = str(tmp_path / "again")
+        result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert result.returncode == 0, result.stderr
+        assert "exchange of roles, places 3 4 1 2" in result.stderr
+        _, track, events = read_truth(fleet.truth)
+        assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
+        assert np.linalg.norm(track[-1][:2] - track[0][:2], axis=0).max() < 0.5
 
 
 @flown_again_when_overloaded

@@ -124,6 +124,9 @@ class SwarmConfig(Settings):
         0.05, "starts are moved at random by up to this in x, y and z", unit="m", minimum=0, maximum=1
     )
     permute: bool = setting(True, "ids are dealt out at random around the shape")
+    places: str = setting(
+        "", "who begins where: for each agent, by id, the number of a place around the shape; empty: see permute"
+    )
     stagger_slots: int = setting(100, "staggered: slots between the starts of two pairs", minimum=0, maximum=100000)
     stops: int = setting(2, "waypoints, stop-and-go: goals on the way to the last one", minimum=1, maximum=100)
     pause_slots: int = setting(50, "waypoints, stop-and-go: slots of rest at each of them", minimum=0, maximum=1000000)
@@ -143,6 +146,8 @@ class SwarmConfig(Settings):
         if self.policy_row.extended and self.frame == "paper":
             raise ConfigError("frame", self.frame, f"auto or extended with policy {self.policy}")
         self._check_agents()
+        if self.places and sorted(self.place_numbers) != list(range(1, self.agents + 1)):
+            raise ConfigError("places", self.places, f"the numbers 1 to {self.agents}, each once, in any order")
         self._check_own_bytes()
 
     def _check_agents(self) -> None:
@@ -169,6 +174,12 @@ class SwarmConfig(Settings):
         if self.own_bytes > room:
             names = " and ".join(row.name for row in (self.policy_row, self.estimator_row) if row.own_bytes)
             raise ConfigError(f"own_bytes of {names}", self.own_bytes, f"0 to {room} with these frames")
+
+    @property
+    def place_numbers(self) -> list[int]:
+        """Numbers (from 1) of the places at which the agents begin, by id; empty: not said."""
+        words = self.places.replace(",", " ").split()
+        return [int(word) if word.isascii() and word.isdigit() else 0 for word in words]
 
     @property
     def own_bytes(self) -> int:

@@ -102,6 +102,8 @@ def make_scenario(config: SwarmConfig) -> Scenario:
     places, partner = (_streams if config.scenario == "streams" else _places)(config)
     count = config.agents
     order = random.permutation(count) if config.permute else np.arange(count)
+    if config.places:
+        order = np.array(config.place_numbers) - 1
     places = places + random.uniform(-config.jitter_m, config.jitter_m, (3, count))
     pairs = [(a, int(b)) for a, b in enumerate(partner) if a < b]
     chosen = random.permutation(len(pairs))

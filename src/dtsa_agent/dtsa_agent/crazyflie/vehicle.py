@@ -248,6 +248,7 @@ class Vehicle:
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
             if on_ground or self.last is None:
+                self._streaming = True  # the zero setpoint that closed the link before may still be in force
                 self._high_level(
                     TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration
                 )

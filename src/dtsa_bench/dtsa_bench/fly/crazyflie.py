@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import signal
 import subprocess
 import threading
@@ -27,11 +29,10 @@ from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.paths import shortest_s
-from dtsa_agent.crazyflie.units import to_map
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
@@ -46,20 +47,16 @@ from .children import Child, Children, describe_end
 from .domain import ros_domain
 from .flight import END_S, QUIET, Flight, run_environment
 from .options import FlightOptions
+from .places import MissionError, assign_places, check_places, check_ways
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import RealtimeSupervisor, Supervisor
 
-PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
 ARRIVED_M = 0.12  # m: at its start when this close
 CLIMB_MPS = 0.4
 SHIFT_MPS = 0.3
 BRIDGE_S = 60.0  # s, for the connections
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
-
-
-class MissionError(DtsaError):
-    """The mission cannot go on; everybody is landed."""
 
 
 def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -74,27 +71,6 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
     room = {"shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
     defaults = {"agents": len(settings.robots), "avoider": "crazyflie"} | room
     return {name: value for name, value in defaults.items() if given.get(name) is None}
-
-
-def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
-    """The scenario, once it is sure that everybody stands where it begins.
-
-    :raises ConfigError: ids are missing, or a vehicle's place is not where the scenario wants it.
-    """
-    ids = [robot.id for robot in settings.robots]
-    if ids != list(range(1, config.agents + 1)):
-        raise ConfigError("robots", ids, f"the ids 1 to {config.agents}, one for each agent")
-    scenario = make_scenario(config)
-    origin = settings.station.room_origin_in_world
-    for robot, start in zip(settings.robots, scenario.start.T, strict=True):
-        x, y, _ = to_map(robot.initial_position, origin)
-        if np.hypot(x - start[0], y - start[1]) > PLACE_M:
-            raise ConfigError(
-                f"robots.{robot.name}.initial_position", list(robot.initial_position),
-                f"a place within {PLACE_M} m of ({start[0] + origin[0]:.2f}, {start[1] + origin[1]:.2f}), "
-                "where this scenario begins",
-            )  # fmt: skip
-    return scenario
 
 
 @dataclass(slots=True)
@@ -219,12 +195,34 @@ class Mission:
     def _all(self, *states: int) -> bool:
         return len(self.status) == len(self.settings.robots) and all(s.state in states for s in self.status.values())
 
-    def take_off(self) -> None:
-        """Bridge up, arm, climb to the middle of the room, go to the start."""
+    def connect(self) -> None:
+        """Bridge up, everybody ready, and it is known where each stands."""
         emergency = self._clients["/all/emergency"]
         self.wait("the bridge's start", emergency.service_is_ready, BRIDGE_S)
         self._beating.set()
-        self.wait("the connection", lambda: self._all(Status.STATE_READY), 10.0)
+        self.wait("the connection", self._all_ready, 10.0)
+        self.wait("odometry", lambda: len(self.place) == len(self.settings.robots), 5.0)
+
+    def _all_ready(self) -> bool:
+        locked = [f"{n} ({s.reason})" for n, s in self.status.items() if s.state == Status.STATE_EMERGENCY]
+        if locked:
+            raise MissionError(f"switch off and on before the next flight: {', '.join(locked)}")
+        return self._all(Status.STATE_READY)
+
+    def find_places(self, config: SwarmConfig) -> SwarmConfig:
+        """The configuration in which everybody begins near where it stands.
+
+        :raises MissionError: it is not safe to begin.
+        """
+        vehicles = [robot.name for robot in self.settings.robots]
+        measured = np.array([self.place[name] for name in vehicles]).T
+        found = assign_places(config, vehicles, measured)
+        self.scenario = make_scenario(found)
+        check_ways(self.scenario, vehicles, measured, self.settings.station.safety)
+        return found
+
+    def take_off(self) -> None:
+        """Arm, climb to the middle of the room, go to the start."""
         self.say("arming")
         self.call("/all/arm", arm=True)
         self.wait("arming", lambda: self._all(Status.STATE_ARMED), 5.0)
@@ -235,13 +233,13 @@ class Mission:
         self.call("/all/takeoff", height=height, duration=_duration(seconds))
         time.sleep(seconds)
         self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
-        self.wait("odometry", lambda: len(self.place) == len(self.settings.robots), 5.0)
-        for robot, start in zip(self.settings.robots, self.scenario.start.T.tolist(), strict=True):
-            way = float(np.linalg.norm(np.subtract(start, self.place[robot.name])))
-            seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))
+        starts = self.scenario.start.T.tolist()
+        way = max(math.dist(start, self.place[r.name]) for r, start in zip(self.settings.robots, starts, strict=True))
+        seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))  # for all: their ways keep apart if flown together
+        for robot, start in zip(self.settings.robots, starts, strict=True):
             goal = Point(x=start[0], y=start[1], z=start[2])
             self.call(f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
-        self.wait("the way to the start", self._at_start, 20.0)
+        self.wait("the way to the start", self._at_start, seconds + 15.0)
         time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count
         # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
         self._executor.create_task(self._forget_odometry)
@@ -332,6 +330,11 @@ def fly_crazyflies(
             mission.bridge_alive = bridge.check
             mission.start()
             take_priority(settings.station.priority)
+            mission.connect()
+            swarm = mission.find_places(run.swarm)
+            if swarm != run.swarm:
+                progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
+                run = dataclasses.replace(run, swarm=swarm)
             mission.take_off()
             _start_agents(agents, run, settings, directory)
             flight = _exchange(context, run, directory, agents, bridge, progress, options, ended)
