@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from .compiled import MISSING
 from .compiled import kernel as _kernel
 from .errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/protocol.md
 
@@ -146,6 +148,8 @@ class Registry(Generic[Row]):
 
         :raises ConfigError: if one has the name of a built-in row.
         """
+        from importlib.metadata import entry_points  # a tenth of a node's start, which mostly needs no plug-in
+
         points = {point.name: point for point in entry_points(group=self.group)}
         for name in self.rows:
             if name in points:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import secrets
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -77,7 +77,7 @@ class Membership:
         self._settings = json.dumps(settings, sort_keys=True, separators=(",", ":"))
         self._hash = settings_hash(settings)
         self._publisher = node.create_publisher(Process, f"{swarm_namespace}/{names.PROCESS}", names.lockstep_qos())
-        self._process = secrets.randbits(64)
+        self._process = int.from_bytes(os.urandom(8), "little")
         self._node = node.get_fully_qualified_name()
         self._ids = list(ids)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import secrets
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 
@@ -33,6 +32,8 @@ class Run:
 
         :param session: session of authenticated frames; 0: a random one.
         """
+        import secrets  # channels draw, agents do not
+
         proof = secrets.token_bytes(_PROOF_BYTES)
         return cls(secrets.randbelow(2**32 - 1) + 1, proof, session or secrets.randbelow(MOST_SESSIONS - 1) + 1)
 
