@@ -16,7 +16,6 @@ from dtsa_agent.core import (
     SlotOutcome,
     Swarm,
     SwarmConfig,
-    registry,
 )
 from dtsa_agent.core.authentication import AuthenticatedSwarm, Authenticator
 from dtsa_agent.core.plugins import Table, make_swarm
@@ -83,7 +82,7 @@ class _Point:
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     points = {POLICIES.group: [_Point("counting", Counting)], ESTIMATORS.group: [_Point("initials", Initials)]}
-    monkeypatch.setattr(registry, "entry_points", lambda group: points.get(group, []))
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points.get(group, []))
     for rows in (POLICIES, ESTIMATORS):
         monkeypatch.setattr(rows, "_plug_ins", {})
 

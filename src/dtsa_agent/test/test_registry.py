@@ -119,7 +119,7 @@ def test_more_agents_than_a_policy_or_its_frames_can_name_are_refused_with_what_
 def test_a_plug_in_named_like_a_built_in_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for rows, name in ((POLICIES, "tdma"), (ESTIMATORS, "linear"), (AVOIDERS, "orca")):
         point = EntryPoint(name, "somebody:Thing", rows.group)
-        monkeypatch.setattr(registry, "entry_points", lambda group, point=point: [point])
+        monkeypatch.setattr("importlib.metadata.entry_points", lambda group, point=point: [point])
         with pytest.raises(ConfigError, match=f"{rows.group}: got '{name}'; allowed: another name for somebody:Thing"):
             rows.plug_ins()
         with pytest.raises(ConfigError, match="another name"):
@@ -136,7 +136,7 @@ def test_what_a_policy_declares_is_checked(monkeypatch: pytest.MonkeyPatch, what
         def load(self) -> type:
             return type("Odd", (), {what: value})
 
-    monkeypatch.setattr(registry, "entry_points", lambda group: [Point()])
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [Point()])
     with pytest.raises(ConfigError, match=f"odd.{what}"):
         POLICIES.row("odd")
 
