@@ -75,12 +75,16 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         patient = {"link_age_s": 3.0, "command_age_s": 0.45, "emergency_watchdog": False}  # it would lock them
         config, out = swarm_yaml(fleet, tmp_path, **patient), tmp_path / "out"
-        command = [*FLY, "--config", str(config), "--out", str(out), "--policy", "lease"]
+        command = [*FLY, "--config", str(config), "--out", str(out)]
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         assert result.returncode == 0, result.stderr
         summary = json.loads((out / "summary.json").read_text())
         assert (summary["end"], summary["backend"], summary["cut_short"]) == ("completed", "cflib", "")
+        assert summary["policy"] == "lease"  # the safe one, unless told otherwise
         assert 1.0 < summary["completion_time_s"] < 30.0
+        last_landed = max(e["t"] for e in fleet.events(name="state") if e["state"] == "landed")
+        begun = json.loads(fleet.truth.read_text().partition("\n")[0])["fleet"]["unix_time"]
+        assert (out / "summary.json").stat().st_mtime > begun + last_landed  # drawn and written once all stood
         assert (out / "bag" / "metadata.yaml").is_file()
         times, track, events = read_truth(fleet.truth)
         assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]

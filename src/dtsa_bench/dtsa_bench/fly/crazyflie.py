@@ -8,7 +8,8 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,13 +64,14 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
     """Settings of the swarm that a mission chooses unless the user does.
 
     The paper's room: an ellipse of half axes 1.2 m and 2.0 m, ids in order, so that everyone finds its place. More room
-    between two vehicles than in simulation, because they know where they are to a few centimetres only.
+    between two vehicles than in simulation, because they know where they are to a few centimetres only; and the policy
+    with which tables agree even where frames are lost.
 
     :param settings: the swarm's YAML.
     :param given: what the user has set, by name.
     """
     room = {"shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
-    defaults = {"agents": len(settings.robots), "avoider": "crazyflie"} | room
+    defaults = {"agents": len(settings.robots), "avoider": "crazyflie", "policy": "lease"} | room
     return {name: value for name, value in defaults.items() if given.get(name) is None}
 
 
@@ -337,21 +339,28 @@ def fly_crazyflies(
                 run = dataclasses.replace(run, swarm=swarm)
             mission.take_off()
             _start_agents(agents, run, settings, directory)
-            flight = _exchange(context, run, directory, agents, bridge, progress, options, ended)
+            flight = _exchange(context, run, directory, agents, bridge, progress, options, ended, mission)
             return flight, ended.reason
         finally:
-            urgent = threading.Event()
-            old = signal.signal(signal.SIGINT, lambda *_: urgent.set())  # one more Ctrl-C is the emergency stop
-            try:
+            with _second_interrupt() as urgent:
                 agents.stop()
                 if mission is not None:
                     mission.land(urgent)
                     mission.close()
                 _end_bridge(bridge.all[0])
-            finally:
-                signal.signal(signal.SIGINT, old)
             progress.end()
             context.try_shutdown()
+
+
+@contextmanager
+def _second_interrupt() -> Iterator[threading.Event]:
+    """Once they land, one more Ctrl-C is the emergency stop."""
+    urgent = threading.Event()
+    old = signal.signal(signal.SIGINT, lambda *_: urgent.set())
+    try:
+        yield urgent
+    finally:
+        signal.signal(signal.SIGINT, old)
 
 
 def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, directory: Path) -> None:
@@ -367,7 +376,7 @@ def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, dir
 
 
 def _exchange(context: Context, run: RunConfig, directory: Path, agents: Children, bridge: Children,
-              progress: ProgressLine, options: FlightOptions, ended: _Ended) -> Flight:  # fmt: skip
+              progress: ProgressLine, options: FlightOptions, ended: _Ended, mission: Mission) -> Flight:  # fmt: skip
     node = Node("channel", namespace=names.SWARM, context=context)
     try:
         declare_channel(node, run.air)
@@ -383,7 +392,11 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         finally:
             channel.close()
             progress.end()
-        give_way()  # the bridge does not: it has to land them
+        mission.exchanging = False
+        with _second_interrupt() as urgent:  # first they land: what follows takes seconds
+            agents.stop()
+            mission.land(urgent)
+        give_way()  # the bridge does not: it has to watch them
         pictures = options.pictures and not ended
         summary = flight.write_results(pictures, backend="cflib", cut_short=ended.reason)
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
