@@ -25,6 +25,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "soak": (("--list", "what there is"), ("kill --sample", "a few minutes' part of one")),
     "benchmark": (("--json", "all parts, as JSON"),),
+    "prove": (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only")),
+    "embedded": (("", "needs a cross compiler and QEMU, see docs/embedded.md"),),
     "replay": (
         ("runs/a", "in real time"),
         ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),

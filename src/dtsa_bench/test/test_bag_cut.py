@@ -71,7 +71,7 @@ def test_cut_anywhere_it_verifies_up_to_its_end(
     assert found[-1] == complete.slots
     assert len(set(found)) > CUTS // 4  # slot for slot, not half seconds
     (cut / "bag_0.mcap").write_bytes(data[: len(data) // 2])
-    assert recover_command.run(_Words(bag=str(cut), out=None, keep_damaged=False)) == 0  # type: ignore[arg-type]
+    assert recover_command.run(_Words(bag=str(cut), out=None, keep_damaged=False, json=False)) == 0  # type: ignore[arg-type]
     assert "breaks off at" in capsys.readouterr().out
 
 
