@@ -35,7 +35,7 @@ _TICK_NS = 2_000_000  # longest wait for a frame
 _REPEAT_S = 0.1
 _TELL_S = 1.0  # the start is told again so often, for processes that come later
 _LEAD_NS = 300_000_000  # from the start message to slot 0
-_GRACE = 0.15  # of a slot: frames are handed over ahead of their start; who is late by less than this still collides
+_GRACE = 0.05  # of a slot: frames are handed over ahead of their start; who is late by less than this still collides
 _WINDOW = 0.5  # of a slot: a frame that reaches the channel later than this after its start is dropped
 _PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports at least so long
 # After a stall the middleware repeats some messages only when its writers ask for acknowledgements, every 3 s.
