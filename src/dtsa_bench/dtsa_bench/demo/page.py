@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
-import re
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -15,6 +13,7 @@ import numpy as np
 from dtsa_bench.batch.table import write_whole
 from dtsa_bench.figures.palette import AGENT_COLOURS, agent_colour, ink_on
 from dtsa_bench.report.data import pack
+from dtsa_bench.report.page import asset, filled, whole_page
 
 from .flown import Flights, Flown, compared_s, of_step
 from .story import KILLED, Step
@@ -34,25 +33,26 @@ def write_page(path: Path, steps: Sequence[Step], flights: Flights, commands: Se
     :param flights: its flights.
     :param commands: what to do next: text and command.
     """
-    assets, report = files("dtsa_bench.demo") / "assets", files("dtsa_bench.report") / "assets"
+    assets = files("dtsa_bench.demo") / "assets"
     played = {key: _played(flown) for key, flown in flights.items() if not flown.take.live}
-    data = json.dumps({"flights": played, "colours": AGENT_COLOURS, "count": COUNT}, separators=(",", ":"))
     parts = {
         "title": html.escape(TITLE),
         "intro": html.escape(INTRO),
-        "style": "\n".join(
-            source.read_text(encoding="utf-8") for source in (report / "style.css", assets / "demo.css")
-        ),
         "steps": "\n".join(_step(step, flights) for step in steps),
         "table": _table(steps, flights),
         "commands": "\n".join(
             f"<dt>{html.escape(text)}</dt><dd><code>{html.escape(command)}</code></dd>" for text, command in commands
         ),
-        "data": data.replace("<", "\\u003c"),
-        "script": (assets / "demo.js").read_text(encoding="utf-8"),
     }
-    page = (assets / "demo.html").read_text(encoding="utf-8")
-    write_whole(path, re.sub(r"\{\{ (\w+) \}\}", lambda match: parts[match[1]], page))
+    page = whole_page(
+        "demo",
+        TITLE,
+        asset("style.css") + "\n" + (assets / "demo.css").read_text(encoding="utf-8"),
+        filled((assets / "demo.html").read_text(encoding="utf-8"), parts),
+        {"flights": played, "colours": AGENT_COLOURS, "count": COUNT},
+        (assets / "demo.js").read_text(encoding="utf-8"),
+    )
+    write_whole(path, page)
 
 
 def _played(flown: Flown) -> dict[str, Any]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import html
 import json
-import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.bag.errors import BagError
+from dtsa_bench.batch.table import write_whole
 from dtsa_bench.figures import palette
 from dtsa_bench.report.data import run_data
 
@@ -28,25 +28,51 @@ _PALETTE = {
 SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js", "page.js")
 
 
+_NOTE = "This report draws itself with JavaScript; please allow it for this file."
+_BODY = f'<noscript><p class="note">{_NOTE}</p></noscript>\n<div id="report"></div>'
+
+
+def filled(text: str, parts: Mapping[str, str]) -> str:
+    """A text with all its places filled.
+
+    :param text: a place is the name of a part in double braces.
+    :param parts: what is put in, as it is.
+    """
+    # In one pass: what is put in may itself look like a place to put something.
+    return re.sub(r"\{\{ (\w+) \}\}", lambda match: parts[match[1]], text)
+
+
+def whole_page(kind: str, title: str, style: str, body: str, data: Any, script: str) -> str:
+    """An HTML page that needs nothing else.
+
+    :param kind: class of its body.
+    :param title: plain text.
+    :param style: CSS.
+    :param body: HTML.
+    :param data: what the script finds as JSON in the element `data`.
+    :param script: JavaScript.
+    """
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False, default=str)
+    # A "<" could end the script element; as an escape it means the same in JSON.
+    parts = {"kind": kind, "title": html.escape(title), "data": text.replace("<", "\\u003c")}
+    return filled(asset("page.html"), {**parts, "style": style, "body": body, "script": script})
+
+
+def asset(name: str) -> str:
+    """A file of the report's page.
+
+    :param name: its name.
+    """
+    return (files("dtsa_bench.report") / "assets" / name).read_text(encoding="utf-8")
+
+
 def render(runs: Sequence[dict[str, Any]]) -> str:
     """The page.
 
     :param runs: what `run_data` gave for each run.
     """
-    assets = files("dtsa_bench.report") / "assets"
     content = {"runs": list(runs), "palette": _PALETTE, "reasons": dict(REASON_TEXTS)}
-    text = json.dumps(content, separators=(",", ":"), allow_nan=False, default=str)
-    # A "<" could end the script element; as an escape it means the same in JSON.
-    data = text.replace("<", "\\u003c")
-    page = (assets / "page.html").read_text(encoding="utf-8")
-    parts = {
-        "title": html.escape(_title(runs)),
-        "style": (assets / "style.css").read_text(encoding="utf-8"),
-        "data": data,
-        "script": "\n".join((assets / name).read_text(encoding="utf-8") for name in SCRIPTS),
-    }
-    # In one pass: what is put in may itself look like a place to put something.
-    return re.sub(r"\{\{ (\w+) \}\}", lambda match: parts[match[1]], page)
+    return whole_page("report", _title(runs), asset("style.css"), _BODY, content, "\n".join(map(asset, SCRIPTS)))
 
 
 def write_report(bags: Sequence[str | Path], out: str | Path, progress: Callable[[str], None] | None = None) -> Path:
@@ -69,11 +95,9 @@ def write_report(bags: Sequence[str | Path], out: str | Path, progress: Callable
             progress(str(bag))
         runs.append(run_data(bag))
     _tell_apart(runs)
-    temporary = target.with_name(f".{target.name}.part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(render(runs), encoding="utf-8")
-        os.replace(temporary, target)
+        write_whole(target, render(runs))
     except OSError as error:
         raise BagError(f"cannot write {target}: {error.strerror or error}") from error
     return target
