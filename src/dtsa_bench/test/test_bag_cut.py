@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from dtsa_agent.core import SwarmConfig
+from dtsa_bench import cli
 from dtsa_bench.bag import writer
 from dtsa_bench.bag.errors import UnusableBag
 from dtsa_bench.bag.recover import recover
-from dtsa_bench.commands import recover as recover_command
 from dtsa_bench.run_config import RunConfig, RunLimits, from_swarm
 from dtsa_bench.verify import verify_bag
 from dtsa_channel_sim import ChannelConfig
@@ -71,12 +71,5 @@ def test_cut_anywhere_it_verifies_up_to_its_end(
     assert found[-1] == complete.slots
     assert len(set(found)) > CUTS // 4  # slot for slot, not half seconds
     (cut / "bag_0.mcap").write_bytes(data[: len(data) // 2])
-    assert recover_command.run(_Words(bag=str(cut), out=None, keep_damaged=False, json=False)) == 0  # type: ignore[arg-type]
+    assert cli.main(["recover", str(cut)]) == 0
     assert "breaks off at" in capsys.readouterr().out
-
-
-class _Words:
-    """Parsed options."""
-
-    def __init__(self, **words: object) -> None:
-        self.__dict__ |= words
