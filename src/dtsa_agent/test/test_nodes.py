@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import time
 from array import array
 from pathlib import Path
 
@@ -48,9 +50,12 @@ class Channel:
 
     def call(self) -> Process:
         """Calls until a process tells about itself."""
-        message = Slot(run=self.run.number, phase=Slot.PREPARE, data=array("B", self.run.call("/test")))
-        self.graph.until(lambda: self.processes, lambda: self.publisher.publish(message))
+        self.graph.until(lambda: self.processes, self.publish_call)
         return self.processes[-1]
+
+    def publish_call(self) -> None:
+        """Calls once."""
+        self.publisher.publish(Slot(run=self.run.number, phase=Slot.PREPARE, data=array("B", self.run.call("/test"))))
 
     def end(self, slot: int) -> None:
         """Ends the run."""
@@ -91,6 +96,39 @@ def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> Non
         assert channel.answers[-1] == second  # asked again: the same answer, nothing has moved
         channel.end(2)
         assert end_of(agent) == (0, "")
+
+
+def ports_of(pid: int) -> list[Path]:
+    """The ports in shared memory on which a process listens."""
+    targets = (os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir())
+    return [Path(target[:-3]) for target in targets if "_port" in target and target.endswith("_el")]
+
+
+def forget_wait(port: Path) -> None:
+    """Marks a port's dead listener as one that was not waiting when it was killed, so that Fast DDS never misses it."""
+    with port.open("r+b", buffering=0) as file:
+        status = file.read().index(b"\x03", 20480)  # behind 512 semaphores: in use (1), and waiting (2)
+        file.seek(status)
+        file.write(b"\x01")
+
+
+@pytest.mark.ros
+def test_an_agent_started_again_after_kill_9_is_heard_from_whatever_the_dead_one_was_doing(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3")
+        first = channel.call()
+        ports = ports_of(agent.pid)
+        assert ports
+        agent.kill()
+        agent.communicate()
+        graph.processes.remove(agent)
+        for port in ports:
+            forget_wait(port)
+        locked_s = min(Path(f"{port}_el").stat().st_mtime for port in ports)
+        time.sleep(max(0.0, 1.1 - (time.time() - locked_s)))  # before, the locks might be those of a new process
+        graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3")
+        graph.until(lambda: channel.processes[-1].process != first.process, channel.publish_call)
 
 
 @pytest.mark.ros

@@ -35,6 +35,8 @@ _GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
 _TELL_S = 0.5  # counts are told that often at most
 _REFUSED_S = 10.0  # who has taken part for so long is not sent away any more
 _MOST_CALLERS = 16
+# A process that comes late shows itself on so many calls, one a second: it may find the channel before that finds it.
+_INTRODUCTIONS = 5
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last counts
 
 
@@ -44,7 +46,7 @@ class _Caller:
     def __init__(self, call: Call) -> None:
         self.call = call
         self.publisher = OnePublisher()
-        self.knows_settings = False
+        self.introductions = 0  # on calls of a run under way
 
 
 class Membership:
@@ -120,8 +122,11 @@ class Membership:
             raise Unusable(OTHER_SENDER, f"slot message {number} of run {run_text(run)}, not of its channel's series")
         if phase == Slot.REFUSE:
             self._refused(bytes(message.data))
-        if phase == Slot.PREPARE or (calls and not caller.knows_settings):
-            caller.knows_settings = True
+        if phase == Slot.PREPARE:
+            caller.introductions = _INTRODUCTIONS
+            self._introduce(run)
+        elif calls and caller.introductions < _INTRODUCTIONS:
+            caller.introductions += 1
             self._introduce(run)
 
     def _meet(self, run: int, data: bytes) -> _Caller:

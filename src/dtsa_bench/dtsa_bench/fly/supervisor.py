@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from dtsa_agent.ros.common.dds import clean_shared_memory
 from dtsa_channel_sim.ros.answers import named
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S, RealtimeChannel
@@ -89,6 +90,7 @@ class RealtimeSupervisor(ChannelObserver):
         :raises NodeError: when nobody is left.
         """
         left = not child.process.returncode
+        clean_shared_memory()  # before anybody takes the dead one's port for a living one's
         self._say(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
         for agent in child.agents:
             self._channel.lose(agent)

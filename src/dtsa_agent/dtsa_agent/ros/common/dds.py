@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import struct
 import time
 from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager, suppress
@@ -20,6 +21,10 @@ _SEGMENT = re.compile(r"fast(?:rtps|dds)_(?:port\d+|[0-9a-f]{16})")
 _LOCKS = ("_el", "_sl")  # exclusive: its one owner's; shared: of all who listen to a port
 _YOUNG_S = 1.0  # a lock file that is being made is not locked yet
 _ABANDONED_S = 60.0  # a port without any lock file: its listeners have gone in good order, a writer had it open
+# Where Fast DDS 2.14 says in a port's memory whether it can be used (its ABI 5): port, listeners, ms of two time limits
+# of which the second is a third of the first, capacity, who waits, and flags of which the lowest means "can be used".
+_PORT = struct.Struct("<7I")
+_MOST_LISTENERS, _FLAGS = 1024, 8
 
 
 def limit_to_machine(environment: MutableMapping[str, str]) -> None:
@@ -44,6 +49,10 @@ def clean_shared_memory(directory: Path = _SHARED_MEMORY) -> list[str]:
     The kernel holds a lock for every living owner of a segment and every living listener of a port: what nobody has
     locked belongs to nobody. What is young, or another user's, stays.
 
+    The dead one's port may still be open in processes that write to it, and a process that is started again gets a port
+    of the same name: the writers would go on writing to the old memory, and the new process would never hear from them.
+    So the old memory is marked as unusable, and the writers open the port anew.
+
     :param directory: where shared memory lies.
     :returns: names of the segments removed.
     """
@@ -55,11 +64,48 @@ def clean_shared_memory(directory: Path = _SHARED_MEMORY) -> list[str]:
         with _dead(locks) as dead:
             if not dead and not (not locks and "port" in path.name and _age_s(path) >= _ABANDONED_S):
                 continue
-            for file in (path, directory / f"sem.{path.name}_mutex", *locks):
-                with suppress(OSError):
-                    file.unlink()
+            with _memory(path) as memory:
+                for file in (path, directory / f"sem.{path.name}_mutex", *locks):
+                    with suppress(OSError):
+                        file.unlink()
+                # Last: a writer that sees the mark finds nothing of the old port, and makes a new one.
+                _mark_unusable(memory, path.name)
         removed.append(path.name)
     return removed
+
+
+@contextmanager
+def _memory(path: Path) -> Iterator[int | None]:
+    """A descriptor of what lies in shared memory, for as long as the context lasts; None if it cannot be had."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        yield None
+        return
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _mark_unusable(memory: int | None, name: str) -> None:
+    """Tells all who have a port open that it cannot be used any more; nothing happens to what does not look like one.
+
+    :param memory: descriptor of the port's memory.
+    :param name: of the port.
+    """
+    if memory is None or "port" not in name:
+        return
+    data = os.pread(memory, os.fstat(memory).st_size, 0)
+    number = struct.pack("<I", int(name.rpartition("port")[2]))
+    at = data.find(number)
+    while 0 <= at <= len(data) - _PORT.size:
+        _, listeners, limit_ms, pause_ms, capacity, waiting, flags = _PORT.unpack_from(data, at)
+        fits = limit_ms and pause_ms == limit_ms // 3 and capacity and max(listeners, waiting) <= _MOST_LISTENERS
+        if at % 4 == 0 and fits and flags < _FLAGS:
+            os.pwrite(memory, struct.pack("<I", flags & ~1), at + _PORT.size - 4)
+            return
+        at = data.find(number, at + 1)
 
 
 def _age_s(path: Path) -> float:

@@ -16,7 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
-from .dds import limit_to_machine
+from .dds import clean_shared_memory, limit_to_machine
 from .loop import Stop
 
 _PR_SET_PDEATHSIG = 1
@@ -58,6 +58,7 @@ def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence
     """
     supervised = follow_supervisor()
     limit_to_machine(os.environ)
+    clean_shared_memory()  # of the process, killed, whose place this one may take
     with Stop() as stop:
         try:
             rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
