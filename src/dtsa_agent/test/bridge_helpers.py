@@ -55,13 +55,15 @@ class FakeFleet:
 
 
 @contextlib.contextmanager
-def fake_fleet(folder: Path, count: int, *options: str) -> Iterator[FakeFleet]:
+def fake_fleet(
+    folder: Path, count: int, *options: str, environment: dict[str, str] | None = None
+) -> Iterator[FakeFleet]:
     """Simulated Crazyflies in a process of their own."""
     base = free_base_port(count)
     truth = folder / f"truth-{base}.jsonl"
     command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--count", str(count), "--base-port", str(base)]
     command += ["--truth", str(truth), "--quiet", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
         assert process.stdout is not None
         assert any("Ctrl-C" in line for line in process.stdout), "the simulated Crazyflies did not start"

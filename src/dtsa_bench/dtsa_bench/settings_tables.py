@@ -17,6 +17,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, VehicleParams
 from dtsa_agent.core.settings import Setting, Settings, settings_of
 from dtsa_agent.crazyflie.config import BatterySettings, RobotSettings, StationSettings
+from dtsa_agent.crazyflie.positions import PositionSettings
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
@@ -141,6 +142,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "robots": partial(settings_table, RobotSettings, skip=("name", "id")),
     "battery": partial(settings_table, BatterySettings),
     "station": partial(settings_table, StationSettings),
+    "positions": partial(settings_table, PositionSettings),
     "safety": partial(settings_table, SafetySettings),
     **{f"node {name}": partial(_node, name) for name in NODES},
 }

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.fake_crazyflie import Fleet, FleetConfig, cli, crtp, layout, toc
 from dtsa_bench.fake_crazyflie.ports import free_base_port
+from dtsa_bench.fake_crazyflie.position_filter import PositionFilter
 from dtsa_bench.fake_crazyflie.truth import read_truth
 
 
@@ -233,3 +234,37 @@ def test_a_running_fleet_answers_and_ends_with_ctrl_c(tmp_path: Path) -> None:
         finally:
             process.kill()
     assert {"t", "cf", "event", "seconds"} == set(read_truth(truth)[2][0])
+
+
+def test_external_positions_reach_the_filter_of_the_one_that_they_are_for() -> None:
+    def restarted() -> Craft:
+        craft = Craft()
+        craft.estimate.filter = PositionFilter()
+        for name, value in (("initialX", 0.3), ("resetEstimation", 1)):
+            index = toc.PARAM_ID[f"kalman.{name}"]
+            form = "<H" + toc.PARAM_TYPES[toc.PARAM_ENTRIES[index].type][1]
+            craft.ask(2, 2, struct.pack(form, index, value))
+        assert craft.estimate.filter.position == (pytest.approx(0.3), 0.0, 0.0)
+        return craft
+
+    packets = (
+        (0, struct.pack("<3f", 1.0, 2.0, 0.5)),
+        (1, struct.pack("<B7f", 8, 1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 1.0)),
+        (1, b"\x09" + struct.pack("<B3hI", 2, 9, 9, 9, 0) + struct.pack("<B3hI", 1, 1000, 2000, 500, 0)),
+        (2, struct.pack("<B3h", 7, 9, 9, 9) + struct.pack("<B3h", 1, 1000, 2000, 500)),
+    )
+    for channel, data in packets:
+        craft = restarted()
+        assert craft.estimate.filter is not None
+        assert craft.estimate.variance(0.0) == pytest.approx(100.0)
+        for _ in range(30):
+            craft.estimate.filter.predict(0.01, (0.0, 0.0, 0.0))
+            assert craft.ask(crtp.LOCALIZATION, channel, data) is None
+        assert craft.estimate.filter.position == pytest.approx((1.0, 2.0, 0.5), abs=0.002)
+        assert craft.estimate.variance(0.0) < 1e-4
+        assert craft.peer.positions_received == 30
+    for _ in range(100_000):
+        craft.estimate.filter.predict(0.01, (0.0, 0.0, 0.0))
+    assert craft.estimate.variance(0.0) == 100.0  # nothing comes any more
+    craft.ask(crtp.LOCALIZATION, 0, struct.pack("<3f", float("nan"), 0.0, 0.0))
+    assert craft.estimate.filter.position == pytest.approx((1.0, 2.0, 0.5), abs=0.5)

@@ -12,9 +12,10 @@ from dtsa_agent.crazyflie.budget import WATCHDOG_HZ, check_budget, radio_loads
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.safety import Action, SafetyMonitor, Verdict
+from dtsa_agent.crazyflie.snapshot import Snapshot
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.crazyflie.units import VehicleState
-from dtsa_agent.crazyflie.vehicle import Snapshot, Vehicle
+from dtsa_agent.crazyflie.vehicle import Vehicle
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
@@ -41,7 +42,7 @@ class Bridge:
     ) -> None:
         self.settings = settings
         station = settings.station
-        loads = radio_loads([(r.name, r.uri, r.command_rate_hz, r.log_rate_hz) for r in settings.robots])
+        loads = radio_loads(settings.radio_rates())
         for load in loads:
             log("info" if load.fits else "warn", str(load))
         wired = len(settings.robots) - sum(len(load.robots) for load in loads)
@@ -181,7 +182,7 @@ class Bridge:
             if verdict.action is Action.WARN:
                 vehicle.action = verdict.reason
             elif verdict.action is Action.HOLD:
-                vehicle.hold(verdict.reason, stale=True)
+                vehicle.hold(verdict.reason, stale=True, until_seen=verdict.rule == "positions")
             elif verdict.action is Action.LAND:
                 vehicle.land(verdict.reason)
             elif verdict.action is Action.LOST:

@@ -27,7 +27,9 @@ from dtsa_agent.core.settings import named
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.bridge_inputs import Inputs
 from dtsa_agent.crazyflie.bridge_outputs import Outputs
+from dtsa_agent.crazyflie.bridge_positions import subscribe_positions
 from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
+from dtsa_agent.crazyflie.positions import PositionSettings
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.ros.common.parameters import declare_settings
@@ -48,6 +50,16 @@ def safety_parameters(node: Node, given: SafetySettings) -> SafetySettings:
         return SafetySettings(**values)
 
 
+def position_parameters(node: Node, given: PositionSettings) -> PositionSettings:
+    """Declare one parameter a setting of motion capture; a parameter that was set beats the YAML's value.
+
+    :raises ConfigError: a value is out of range.
+    """
+    values = declare_settings(node, PositionSettings, defaults=given.to_dict(), prefix="positions.")
+    with named("positions"):
+        return PositionSettings(**values)
+
+
 class BridgeNode(Node):
     """ROS side of the bridge.
 
@@ -64,24 +76,36 @@ class BridgeNode(Node):
             raise ConfigError("config", "", "the path of a swarm's YAML file")
         settings = load_swarm(Path(given))
         safety = safety_parameters(self, settings.station.safety)
-        station = dataclasses.replace(settings.station, safety=safety)
+        positions = position_parameters(self, settings.station.positions)
+        station = dataclasses.replace(settings.station, safety=safety, positions=positions)
         self.settings = SwarmSettings(settings.robots, station)
         self.outputs = Outputs(self, self.settings)
-        self._commands = Node(
-            "crazyflie_bridge_commands",
+        self._commands = self._listener("commands")
+        self.pump = CommandPump(self._commands)
+        self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
+        self._cameras = self._listener("positions") if positions.on else None
+        self.positions = CommandPump(self._cameras) if self._cameras is not None else None
+        if self.positions is not None:
+            subscribe_positions(self.positions, positions, self.bridge.vehicles)
+
+    def _listener(self, name: str) -> Node:
+        """A node whose topics are taken by a thread of their own."""
+        return Node(
+            f"crazyflie_bridge_{name}",
             namespace=self.get_namespace(),
             context=self.context,
             enable_rosout=False,
             start_parameter_services=False,
             use_global_arguments=False,
         )
-        self.pump = CommandPump(self._commands)
-        self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
 
     def close(self) -> None:
         """End of what this node added to itself."""
         self.pump.close()
         self._commands.destroy_node()
+        if self.positions is not None and self._cameras is not None:
+            self.positions.close()
+            self._cameras.destroy_node()
         self.destroy_node()
 
     def say(self, level: str, line: str) -> None:
@@ -101,6 +125,8 @@ class BridgeNode(Node):
         :param stop: asked ten times a second; True ends the wait for the connections.
         """
         began = time.monotonic()
+        if self.positions is not None:
+            self.positions.start()
         missing = self.bridge.connect(stop=stop)
         if stop():
             return "interrupted while connecting"

@@ -14,9 +14,11 @@ from rclpy.qos import QoSProfile
 
 from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.config import SwarmSettings
+from dtsa_agent.crazyflie.positions import PositionNumbers
+from dtsa_agent.crazyflie.snapshot import Snapshot
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.crazyflie.units import VehicleState, to_map
-from dtsa_agent.crazyflie.vehicle import Snapshot, Vehicle
+from dtsa_agent.crazyflie.vehicle import Vehicle
 from dtsa_agent.ros.common.covariances import UNKNOWN, diagonal
 
 LATEST_ONLY = QoSProfile(depth=1)
@@ -42,10 +44,12 @@ class Outputs:
         self._status: dict[str, Any] = {}
         self._odom_message: dict[str, Odometry] = {}
         self._wanted: dict[str, tuple[bool, bool]] = {}  # odometry, pose: does somebody listen?
+        positions = settings.station.positions
         for robot in settings.robots:
             name = robot.name
             self._odom[name] = node.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
-            self._pose[name] = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
+            if not positions.on or positions.topic_of(name).lstrip("/") != f"{name}/pose":  # motion capture's own
+                self._pose[name] = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
             self._status[name] = node.create_publisher(Status, f"{name}/status", QoSProfile(depth=10))
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
@@ -80,7 +84,7 @@ class Outputs:
         for s in snapshots:
             self._wanted[s.name] = (
                 self._odom[s.name].get_subscription_count() > 0,
-                self._pose[s.name].get_subscription_count() > 0,
+                s.name in self._pose and self._pose[s.name].get_subscription_count() > 0,
             )
             self._status[s.name].publish(status_message(s, stamp))
 
@@ -130,6 +134,10 @@ def diagnostic(s: Snapshot) -> DiagnosticStatus:
         "commands refused": str(s.refused),
         "reason": s.reason,
     }
+    if s.positions is not None:
+        values |= position_values(s.positions)
+        if level == DiagnosticStatus.OK and s.positions.rate == 0.0:
+            level = DiagnosticStatus.WARN
     return DiagnosticStatus(
         level=level,
         name=f"crazyflie_bridge: {s.name}",
@@ -137,3 +145,17 @@ def diagnostic(s: Snapshot) -> DiagnosticStatus:
         hardware_id=s.name,
         values=[KeyValue(key=key, value=value) for key, value in values.items()],
     )
+
+
+def position_values(p: PositionNumbers) -> dict[str, str]:
+    """What /diagnostics says about motion capture and one vehicle."""
+    refused = ", ".join(f"{kind} {number}" for kind, number in sorted(p.refused.items()))
+    return {
+        "positions [Hz]": f"{p.rate:.0f}",
+        "positions sent": str(p.sent),
+        "position age [s]": f"{p.age:.2f}",
+        "position latency, median [ms]": f"{p.latency_p50 * 1000:.1f}",
+        "position latency, 99th percentile [ms]": f"{p.latency_p99 * 1000:.1f}",
+        "positions refused": refused or "0",
+        "last refusal": p.reason,
+    }

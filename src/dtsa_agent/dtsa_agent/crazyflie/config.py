@@ -22,6 +22,7 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import REQUIRED, Settings, build, check, named, nested, setting, settings_of
 from dtsa_agent.crazyflie.budget import radio_of
+from dtsa_agent.crazyflie.positions import PositionSettings
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.units import Vector
 
@@ -73,8 +74,14 @@ class RobotSettings(Settings):
         maximum=300,
     )
     connect_attempts: int = setting(3, "attempts to connect", minimum=1, maximum=100)
-    estimator_timeout_s: float = setting(
-        10.0, "time for the estimator's variances to settle", unit="s", minimum=0.1, maximum=300
+    estimator_timeout_s: float = setting(10.0, "time for the estimator to settle", unit="s", minimum=0.1, maximum=300)
+    estimator_variance_m2: float = setting(
+        0.01,
+        "largest variance of a settled estimator without motion capture; a Flow deck alone, which knows no place, "
+        "stays at 100",
+        unit="m²",
+        minimum=1e-6,
+        maximum=1000,
     )
     reset_estimator: bool = setting(True, "restart the Kalman filter and wait until it has settled")
     battery: BatterySettings = nested(BatterySettings, "voltages in flight")
@@ -132,6 +139,7 @@ class StationSettings(Settings):
     priority: int = setting(
         20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
     )
+    positions: PositionSettings = nested(PositionSettings, "positions from motion capture")
     safety: SafetySettings = nested(SafetySettings, "the safety rules")
 
 
@@ -141,6 +149,11 @@ class SwarmSettings:
 
     robots: tuple[RobotSettings, ...]  # the enabled ones, by id
     station: StationSettings
+
+    def radio_rates(self) -> list[tuple[str, str, float, float]]:
+        """Name, URI, packets/s to and log packets/s from each robot: what `radio_loads` counts."""
+        positions = self.station.positions.max_rate_hz if self.station.positions.on else 0.0
+        return [(r.name, r.uri, r.command_rate_hz + positions, r.log_rate_hz) for r in self.robots]
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of a swarm's YAML; :func:`parse_swarm` reads them back."""

@@ -19,16 +19,11 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.config import RobotSettings
-from dtsa_agent.crazyflie.mailbox import Mailbox, Order
-from dtsa_agent.crazyflie.units import LOG_VARIABLES, Setpoint, VehicleState, decode_log
-
-SETTLED_SPREAD = 0.001  # m^2, over the last samples of the estimator's variances
-SETTLED_SAMPLES = 5
-VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
-
-
-class LinkError(Exception):
-    """A connection could not be made; the text says why."""
+from dtsa_agent.crazyflie.errors import LinkError
+from dtsa_agent.crazyflie.estimates import Settling
+from dtsa_agent.crazyflie.estimator import settle
+from dtsa_agent.crazyflie.mailbox import Mailbox, Order, Position
+from dtsa_agent.crazyflie.units import LOG_VARIABLES, Setpoint, Vector, VehicleState, decode_log
 
 
 def require_cflib() -> None:
@@ -58,6 +53,8 @@ class Link:
     :param on_state: called with each decoded log packet and its time (s, monotonic), in a thread of cflib's.
     :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
     :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
+    :param settling: decides when the estimator has settled.
+    :param seen: where motion capture sees the Crazyflie (m, world); None: not at all.
     """
 
     def __init__(
@@ -67,6 +64,8 @@ class Link:
         on_state: Callable[[VehicleState, float], None],
         on_broken: Callable[[str], None],
         on_answer: Callable[[int, int], None],
+        settling: Settling,
+        seen: Callable[[], Vector | None],
     ) -> None:
         self.robot = robot
         self.mailbox = Mailbox()
@@ -81,6 +80,7 @@ class Link:
         self._on_state = on_state
         self._on_broken = on_broken
         self._on_answer = on_answer
+        self._settling, self._seen = settling, seen
         self._cf: Any = None
         self._thread = threading.Thread(target=self._work, name=f"{robot.name}-worker", daemon=True)
         self._thread.start()
@@ -91,6 +91,9 @@ class Link:
             try:
                 if isinstance(item, Setpoint):
                     self._send_setpoint(item)
+                elif isinstance(item, Position):
+                    if self._cf is not None and self.connected:
+                        item.send(self._cf)
                 else:
                     item()
             except Exception as error:  # noqa: PERF203 - one bad order must not end the worker
@@ -178,7 +181,7 @@ class Link:
             except (KeyError, AttributeError) as error:  # noqa: PERF203
                 raise LinkError(f"firmware parameter {name}: {error}") from error
         if self.robot.reset_estimator:
-            self._reset_estimator(cf)
+            settle(cf, self._settling, self._seen, self.mailbox.take_position, self.robot.estimator_timeout_s)
         self._start_log(cf, max(deadline, time.monotonic() + 2.0))
         self.connected = True
 
@@ -191,36 +194,6 @@ class Link:
 
     def _rssi(self, value: float) -> None:
         self.rssi = int(value)
-
-    def _reset_estimator(self, cf: Any) -> None:
-        """Restart the Kalman filter and wait until its variances have settled."""
-        from cflib.crazyflie.log import LogConfig
-
-        history: deque[tuple[float, ...]] = deque(maxlen=SETTLED_SAMPLES)
-        settled = threading.Event()
-
-        def sample(stamp: int, values: dict[str, float], block: Any) -> None:
-            history.append(tuple(values[name] for name in VARIANCES))
-            if len(history) == SETTLED_SAMPLES:
-                spread = max(max(axis) - min(axis) for axis in zip(*history, strict=True))
-                if spread < SETTLED_SPREAD:
-                    settled.set()
-
-        cf.param.set_value("kalman.resetEstimation", 1)
-        time.sleep(0.1)
-        cf.param.set_value("kalman.resetEstimation", 0)
-        block = LogConfig("variance", 50)
-        for name in VARIANCES:
-            block.add_variable(name, "float")
-        block.data_received_cb.add_callback(sample)
-        try:
-            cf.log.add_config(block)
-        except KeyError:
-            return  # another estimator than the Kalman filter: nothing to wait for
-        block.start()
-        if not settled.wait(self.robot.estimator_timeout_s):
-            raise LinkError(f"the estimator did not settle within {self.robot.estimator_timeout_s:g} s")
-        block.delete()
 
     def _start_log(self, cf: Any, deadline: float) -> None:
         from cflib.crazyflie.log import LogConfig

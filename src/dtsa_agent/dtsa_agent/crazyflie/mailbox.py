@@ -1,23 +1,36 @@
-"""What one worker thread has to send: orders in sequence, of streamed commands only the latest."""
+"""What one worker thread has to send: orders in sequence, of streamed commands and of positions only the latest."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 from dtsa_agent.crazyflie.units import Setpoint
 
 Order = Callable[[], None]
 
 
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where motion capture sees a Crazyflie."""
+
+    send: Callable[[Any], None]  # tells the connected one
+
+
 class Mailbox:
-    """Orders (all, in sequence) and one setpoint (the latest). Orders go first; an urgent one empties the box."""
+    """Orders (all, in sequence), one setpoint and one position (the latest), in this order.
+
+    An urgent order empties the box.
+    """
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
         self._orders: deque[Order] = deque()
         self._setpoint: Setpoint | None = None
+        self._position: Position | None = None
         self._closed = False
         self.replaced = 0  # setpoints that were overtaken by a newer one before they were sent
 
@@ -28,6 +41,21 @@ class Mailbox:
                 self.replaced += 1
             self._setpoint = setpoint
             self._condition.notify()
+
+    def put_position(self, position: Position) -> None:
+        """Replace the position that waits, if any."""
+        with self._condition:
+            self._position = position
+            self._condition.notify()
+
+    def take_position(self) -> Position | None:
+        """The position that waits, if any, for a worker that is busy with an order."""
+        with self._condition:
+            return self._take_position()
+
+    def _take_position(self) -> Position | None:
+        position, self._position = self._position, None
+        return position
 
     def put_order(self, order: Order, *, urgent: bool = False) -> None:
         """Append an order, and forget the setpoint that waits: an order ends the stream before it.
@@ -47,7 +75,7 @@ class Mailbox:
             self._orders.append(order)
             self._condition.notify()
 
-    def get(self) -> Order | Setpoint | None:
+    def get(self) -> Order | Setpoint | Position | None:
         """Wait for the next thing to send; None once the box is closed and empty."""
         with self._condition:
             while True:
@@ -56,6 +84,8 @@ class Mailbox:
                 if self._setpoint is not None:
                     setpoint, self._setpoint = self._setpoint, None
                     return setpoint
+                if self._position is not None:
+                    return self._take_position()
                 if self._closed:
                     return None
                 self._condition.wait()

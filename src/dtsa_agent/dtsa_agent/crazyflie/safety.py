@@ -7,6 +7,8 @@
 | link | age of the last log packet in flight | declare it lost, order a landing blindly |
 | commands | age of the last streamed command | hold the place, then land |
 | heartbeat | the ground station's heartbeat, once heard | stop all motors |
+| positions | age of the last pose from motion capture in flight | hold the place, then land |
+| estimate | where a flying vehicle believes to be, if that cannot be | stop where it is, then sink |
 | distance | two flying vehicles too close | land both |
 | supervisor | tumbled, crashed, locked | stop sending to it |
 
@@ -24,6 +26,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import Settings, check, setting
 from dtsa_agent.crazyflie.state_machine import IN_AIR, State
 from dtsa_agent.crazyflie.units import Vector
+
+ESTIMATE_HOLD_S = 1.0  # a vehicle whose estimate is wrong stands still that long, then it sinks
 
 
 class Action(enum.Enum):
@@ -74,6 +78,25 @@ class SafetySettings(Settings):
     min_distance_m: float = setting(
         0.15, "two flying vehicles closer than this land; 0: never", unit="m", minimum=0, maximum=10
     )
+    position_age_s: float = setting(
+        0.3, "age of the last pose from motion capture at which the place is held; 0: never",
+        unit="s", minimum=0, maximum=10,
+    )  # fmt: skip
+    position_land_s: float = setting(
+        1.0, "age of the last pose from motion capture at which the vehicle lands", unit="s", minimum=0.05, maximum=60
+    )
+    estimate_jump_m: float = setting(
+        0.5, "an estimate that moves so far at once, its velocity apart, is wrong; 0: never",
+        unit="m", minimum=0, maximum=100,
+    )  # fmt: skip
+    estimate_freeze_s: float = setting(
+        0.5, "an estimate that does not change at all for so long in flight is wrong; 0: never",
+        unit="s", minimum=0, maximum=60,
+    )  # fmt: skip
+    estimate_error_m: float = setting(
+        0.4, "an estimate so far from where motion capture sees the vehicle is wrong; 0: never",
+        unit="m", minimum=0, maximum=100,
+    )  # fmt: skip
     emergency_watchdog: bool = setting(True, "the firmware stops the motors 1 s after it last heard the bridge")
 
     def __post_init__(self) -> None:
@@ -95,6 +118,9 @@ class Watched:
     battery_critical: float  # V
     log_age: float  # s; infinite before the first packet
     command_age: float | None  # s since the last streamed command; None: high-level commands are in charge
+    position_age: float | None = None  # s since motion capture saw it; None: there is no motion capture
+    wrong: str = ""  # what is wrong with its estimate; empty: nothing
+    wrong_s: float = 0.0  # s, for how long
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +156,8 @@ class SafetyMonitor:
             found += self._battery(now, vehicle)
             found += self._link(vehicle)
             found += self._commands(vehicle)
+            found += self._positions(vehicle)
+            found += self._estimate(vehicle)
         found += self._distance(vehicles)
         found += self._heartbeat(vehicles, heartbeat_age)
         keys = {(v.name, v.rule + v.action.value) for v in found}
@@ -184,6 +212,26 @@ class SafetyMonitor:
         verdicts = [Verdict(v.name, Action.HOLD, "commands", reason)]
         if age > self.settings.command_land_s:
             verdicts.append(Verdict(v.name, Action.LAND, "commands", reason))
+        return verdicts
+
+    def _positions(self, v: Watched) -> list[Verdict]:
+        limit, age = self.settings.position_age_s, v.position_age
+        if not limit or age is None or v.state != State.FLYING or age <= limit:
+            return []
+        reason = f"not seen by motion capture for {age:.2f} s"
+        verdicts = [Verdict(v.name, Action.HOLD, "positions", reason)]
+        if age > self.settings.position_land_s:
+            verdicts.append(Verdict(v.name, Action.LAND, "positions", reason))
+        return verdicts
+
+    def _estimate(self, v: Watched) -> list[Verdict]:
+        if not v.wrong or v.state not in IN_AIR:
+            return []
+        if v.state == State.LANDING:
+            return [Verdict(v.name, Action.LAND, "estimate", v.wrong)]
+        verdicts = [Verdict(v.name, Action.HOLD, "estimate", v.wrong)]
+        if v.wrong_s > ESTIMATE_HOLD_S:
+            verdicts.append(Verdict(v.name, Action.LAND, "estimate", v.wrong))
         return verdicts
 
     def _distance(self, vehicles: Sequence[Watched]) -> list[Verdict]:

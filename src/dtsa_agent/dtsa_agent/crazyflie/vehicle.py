@@ -7,17 +7,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, Delivery
+from dtsa_agent.crazyflie.estimates import EstimateWatch, Settling
 from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.paths import shortest_s, too_short
+from dtsa_agent.crazyflie.positions import Room
 from dtsa_agent.crazyflie.safety import Watched
-from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
-from dtsa_agent.crazyflie.units import Setpoint, VehicleState, to_map, velocity_world, yaw_of
+from dtsa_agent.crazyflie.sightings import Sightings
+from dtsa_agent.crazyflie.snapshot import Snapshot
+from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, IS_FLYING, State, StateMachine
+from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, to_map, velocity_world, yaw_of
 
 # A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
 # landing and before holding a place the vehicle is first braked by streamed setpoints of zero velocity.
@@ -28,31 +31,13 @@ MIN_LAND_S = 1.0
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
 BLIND_REPEATS = 3
 BLIND_LAND_S = 2.0
+SINK_MPS = 0.3  # of a vehicle that does not know where it is
+SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
 LOW_M = 0.1  # this close to the floor there is nothing left to land from
 QUALITY_WINDOW_S = 1.0
+DOWN_M = 0.04  # m: it stands, by motion capture
 WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
 ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """State of one vehicle for those who watch."""
-
-    name: str
-    id: int
-    state: State
-    reason: str
-    vehicle: VehicleState | None
-    log_age: float  # s; infinite before the first packet
-    command_age: float  # s; infinite before the first command
-    link_quality: float  # 0..1
-    rssi: int
-    sent: int
-    received: int
-    refused: int  # streamed commands that were not for this state
-    replaced: int  # streamed commands that a newer one overtook
-    latency_p99: float  # s; 0 before the first command
-    command_hz: float
 
 
 class Vehicle:
@@ -94,7 +79,24 @@ class Vehicle:
         self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
         self._blind: list[float] = []  # when to repeat a landing that may not have been heard
         self._delivery = Delivery()
-        self.link = Link(robot, cache, self._received, self._broken, self._answered)
+        safety, positions = station.safety, station.positions
+        room: Room | None = (safety.geofence_min, safety.geofence_max) if safety.geofence else None
+        self.sightings = (
+            Sightings(self.name, positions, station.room_origin_in_world, room, log) if positions.on else None
+        )
+        self.watch = EstimateWatch(safety.estimate_jump_m, safety.estimate_freeze_s, safety.estimate_error_m)
+        self._blind_steering: tuple[Vector, float] | None = None  # velocity that needs no place, and until when (s)
+        self._trusted_height = 0.0  # m, the last one before the estimate was wrong
+        self._paused = False  # held because it is not seen: streamed commands do not count until it is
+        settling = Settling(
+            robot.estimator_variance_m2,
+            station.room_origin_in_world,
+            room,
+            positions.agree_m if positions.on else None,
+        )
+        self.link = Link(
+            robot, cache, self._received, self._broken, self._answered, settling, lambda: self.seen_at(time.monotonic())
+        )
 
     # -- what comes in ----------------------------------------------------------------------------------------------
     def _changed(self, before: State, state: State, reason: str) -> None:
@@ -108,6 +110,10 @@ class Vehicle:
         with self.lock:
             self.last = state
             self._log_times.append(now)
+            if not self.watch.wrong:
+                self._trusted_height = max(state.position[2], 0.0)
+            if self.watch.update(state, now, self.seen_at(now), flying=bool(state.info & IS_FLYING)):
+                self._log("error", f"{self.name}: {self.watch.wrong}")
             if self.machine.state not in (State.DISCONNECTED, State.CONNECTING):
                 before = self.machine.state
                 self.machine.observe(state.info)
@@ -142,12 +148,39 @@ class Vehicle:
         with self.lock:
             self.machine.silent(reason)
 
+    # -- motion capture ---------------------------------------------------------------------------------------------
+    def see(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> None:
+        """A pose from motion capture: checked, and passed on to the Crazyflie.
+
+        :param position: m, in `frame` (world or map). :param stamp: s, Unix time of the measurement; 0: not said.
+        """
+        if self.sightings is None:
+            return
+        now = time.monotonic()
+        with self.lock:
+            flying = self.last is not None and bool(self.last.info & IS_FLYING)
+            packet = self.sightings.see(position, orientation, frame, stamp, now, flying=flying)
+        if packet is not None:
+            self.link.mailbox.put_position(packet)
+
+    def seen_at(self, now: float) -> Vector | None:
+        """Where motion capture sees it (m, world); None: not at all, or not any more."""
+        return None if self.sightings is None else self.sightings.place(now)
+
+    def _misplaced(self) -> str:
+        """Why its motors may not start: it does not know where it stands. Empty if it does."""
+        if self.sightings is None or self.last is None:
+            return ""
+        problem = self.sightings.disagrees(self.last.position, time.monotonic())
+        return f"{self.name} {problem}" if problem else ""
+
     # -- connection -------------------------------------------------------------------------------------------------
     def connect(self, done: Callable[[], None]) -> None:
         """Connect in the background; `done` is called when it has worked out or not."""
         with self.lock:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
-            self._streaming = self._held = self._deaf = self.guarded = False
+            self._streaming = self._held = self._deaf = self._paused = self.guarded = False
+            self._blind_steering = None
             self._command_time = None
             self._blind.clear()
             self._delivery.cancel()
@@ -180,7 +213,7 @@ class Vehicle:
     def command(self, setpoint: Setpoint) -> bool:
         """Stream a command; False when it is not for the present state."""
         with self.lock:
-            if self.state not in ACCEPTS_COMMANDS or self._deaf or setpoint.stamp < self._guard_until:
+            if self.state not in ACCEPTS_COMMANDS or self._deaf or self._paused or setpoint.stamp < self._guard_until:
                 self.refused += 1
                 return False
             self._command_time = setpoint.stamp
@@ -224,6 +257,8 @@ class Vehicle:
         with self.lock:
             if self.state not in (State.READY, State.ARMED):
                 return f"{self.name} is {self.state.name.lower()}"
+            if arm and (problem := self._misplaced()):
+                return problem
             self.action = "arming" if arm else "disarming"
             self.machine.arm(arm)
             self._moved = False
@@ -238,12 +273,16 @@ class Vehicle:
                 return f"{self.name} is {self.state.name.lower()}, not armed"
             if self.last is not None and self.last.battery < self.robot.battery.voltage_critical:
                 return f"{self.name}: battery {self.last.battery:.2f} V"
+            if problem := self.watch.wrong and f"{self.name}: {self.watch.wrong}":
+                return problem
+            if self.state == State.ARMED and (problem := self._misplaced()):
+                return problem
             if not math.isfinite(height):
                 return f"{self.name}: height {height} m is not finite"
             z = 0.0 if self.last is None else max(self.last.position[2], 0.0)
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
-            self._deaf, self._moved = False, True
+            self._deaf, self._moved, self._blind_steering = False, True, None
             on_ground = self.state == State.ARMED
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
@@ -276,15 +315,22 @@ class Vehicle:
             )
             return ""
 
-    def hold(self, reason: str, *, stale: bool = False) -> None:
+    def hold(self, reason: str, *, stale: bool = False, until_seen: bool = False) -> None:
         """Stop where it is; the next streamed command takes over again.
 
+        A vehicle whose estimate is wrong is only kept from moving, and takes no commands any more.
+
         :param stale: because the stream broke off: the age of the last command goes on counting.
+        :param until_seen: commands do not count before motion capture sees it again.
         """
         with self.lock:
             if self.state != State.FLYING or self.last is None:
                 return
             self.action = f"hold: {reason}"
+            if self.watch.wrong:
+                self._steer_blindly((0.0, 0.0, 0.0), math.inf)
+                return
+            self._paused = until_seen
 
             def stay() -> None:
                 if self.last is None:
@@ -296,6 +342,36 @@ class Vehicle:
 
             self._held = stale
             self._brake_then(stay)
+
+    def _steer_blindly(self, velocity: Vector, until: float) -> None:
+        """Stream a velocity, whatever the estimate says, and nothing else.
+
+        :param velocity: m/s, world. :param until: s, monotonic: then the motors stop.
+        """
+        self._deaf, self._brake, self._blind_steering = True, None, (velocity, until)
+        self._held, self._streaming = False, True
+        self._delivery.cancel()
+        self.link.mailbox.put_setpoint(velocity_world(velocity, 0.0, time.monotonic()))
+
+    def _go_on_blindly(self, now: float) -> None:
+        """The next packet of a stream that needs no place; the motors stop once the vehicle must be down."""
+        assert self._blind_steering is not None
+        velocity, until = self._blind_steering
+        if self.state not in IN_AIR:
+            self._blind_steering = None
+            return
+        seen = self.seen_at(now)
+        if velocity[2] < 0.0 and (now > until or (seen is not None and seen[2] < DOWN_M)):
+            self._blind_steering, self._streaming = None, False
+            # With nothing to fly the end of the stream stops the motors.
+            self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop())
+        else:
+            self.link.mailbox.put_setpoint(velocity_world(velocity, 0.0, now))
+
+    def _sink_blindly(self) -> None:
+        seen = self.seen_at(time.monotonic())
+        height = self._trusted_height if seen is None else seen[2]
+        self._steer_blindly((0.0, 0.0, -SINK_MPS), time.monotonic() + height / SINK_MPS + SINK_MORE_S)
 
     def _brake_then(self, action: Callable[[], None]) -> None:
         """Slow down, then do something."""
@@ -335,9 +411,14 @@ class Vehicle:
             if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
             self._deaf = True
-            if self.state == State.LANDING:
+            sinks = self._blind_steering is not None and self._blind_steering[0][2] < 0.0
+            if self.state == State.LANDING and (not self.watch.wrong or sinks):
                 return ""
             self.action = f"land: {reason}"
+            if self.watch.wrong:
+                self.machine.land(self.action)
+                self._sink_blindly()
+                return ""
             # A blind landing must end a stream that the firmware may still follow.
             self._streaming = self._streaming or self.state == State.LOST
             self.machine.land(f"land: {reason}")
@@ -373,7 +454,7 @@ class Vehicle:
                 return
             self.action = f"emergency stop: {reason}"
             self._deaf = True
-            self._brake = None
+            self._brake = self._blind_steering = None
             self._delivery.cancel()
 
             def run(cf: Any) -> None:
@@ -410,7 +491,11 @@ class Vehicle:
     def tick(self, now: float) -> None:
         """Called 50 times a second: goes on braking, and sends again what has not been answered."""
         with self.lock:
-            if self._brake is not None:
+            if self._paused and self.sightings is not None:
+                self._paused = self.sightings.tracker.age(now) > self.station.safety.position_age_s
+            if self._blind_steering is not None:
+                self._go_on_blindly(now)
+            elif self._brake is not None:
                 self._slow_down(now)
             if self.state in WATCHED_OVER and (order := self._delivery.due(now)) is not None:
                 self.link.order(order)
@@ -433,17 +518,23 @@ class Vehicle:
         """What the safety rules need."""
         with self.lock:
             last = self.last
+            place = None if last is None else last.position
+            if self.watch.wrong:
+                place = self.seen_at(now)
             return Watched(
                 self.name,
                 self.state,
-                None if last is None else to_map(last.position, self.station.room_origin_in_world),
+                None if place is None else to_map(place, self.station.room_origin_in_world),
                 math.inf if last is None else last.battery,
                 self.robot.battery.voltage_warning,
                 self.robot.battery.voltage_critical,
                 self.log_age(now),
                 now - self._command_time
-                if (self._streaming or self._held) and self._command_time is not None
+                if (self._streaming or self._held) and not self.watch.wrong and self._command_time is not None
                 else None,
+                None if self.sightings is None else self.sightings.tracker.age(now),
+                self.watch.wrong,
+                now - self.watch.since,
             )
 
     def snapshot(self, now: float) -> Snapshot:
@@ -471,4 +562,5 @@ class Vehicle:
                 self.link.mailbox.replaced,
                 delays[int(0.99 * (len(delays) - 1))] if delays else 0.0,
                 len(sends) / QUALITY_WINDOW_S,
+                None if self.sightings is None else self.sightings.tracker.numbers(now),
             )

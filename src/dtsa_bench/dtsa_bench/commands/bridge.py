@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
     settings = load_swarm(args.config)
     if args.check:
-        loads = radio_loads([(r.name, r.uri, r.command_rate_hz, r.log_rate_hz) for r in settings.robots])
+        loads = radio_loads(settings.radio_rates())
         print(f"{args.config}: {len(settings.robots)} Crazyflies")
         for load in loads:
             print(load)

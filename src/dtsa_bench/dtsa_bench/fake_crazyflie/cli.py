@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,7 +16,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.priority import take_priority
 from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import FAULTS, send_fault
-from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig
+from dtsa_bench.fake_crazyflie.fleet import NUMBERS, Fleet, FleetConfig
+from dtsa_bench.fake_crazyflie.ports import free_port
 from dtsa_bench.options import add_options, given, whole_number
 
 DESCRIPTION = """\
@@ -26,6 +28,12 @@ They fly, drain their batteries and fail on command; Ctrl-C ends them."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     add_options(parser, FleetConfig, "fleet", skip=("host", "collision_m", "crash_m"))
+    parser.add_argument(
+        "--motion-capture",
+        action="store_true",
+        help="a process beside it publishes /cfN/pose at 100 Hz, as a motion capture system does, and they know no "
+        "other positions (--positions host)",
+    )
     parser.add_argument("--config", type=Path, help="swarm.yaml: count, ports and start positions come from its robots")
     parser.add_argument("--layout", choices=layout.LAYOUTS, default="ellipse", help="start positions (%(default)s)")
     parser.add_argument(
@@ -41,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument("--cf", default="all", help="id of the vehicle (default: all)")
     faults.add_argument("--rate", type=float, help="drop: share of the datagrams that is lost")
     faults.add_argument("--direction", choices=("up", "down", "both"), help="drop: up is from the host")
+    faults.add_argument("--distance", type=float, help="estimate_jump: m")
     faults.add_argument("--voltage", type=float, help="battery: V")
     faults.add_argument("--seconds", type=float, help="heals by itself after that long")
 
@@ -51,6 +60,8 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
     :raises ConfigError: a value is out of range.
     """
     options = {**given(args, FleetConfig, "fleet"), "truth": args.truth}
+    if args.motion_capture:
+        options = {"positions": "host", "tracking_port": free_port()} | options
     if args.config is not None:
         return _from_swarm(args.config, options)
     config = FleetConfig(**options)
@@ -88,11 +99,19 @@ def request_fault(args: argparse.Namespace) -> None:
             cf = int(args.cf)
         except ValueError:
             raise ConfigError("cf", args.cf, "an id, or all") from None
-    names = ("rate", "direction", "voltage", "seconds")
+    names = NUMBERS
     numbers = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     port = FleetConfig(**given(args, FleetConfig, "fleet")).control_port
     send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **numbers)
     print(f"{args.fault}: cf {args.cf}")
+
+
+def start_cameras(config: FleetConfig) -> subprocess.Popen[bytes]:
+    """The motion capture of a fleet: a process of its own, as in a laboratory. It ends with this one."""
+    from dtsa_agent.ros.common.process import SUPERVISOR  # the fleet itself needs no ROS
+
+    command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.motion_capture", "--port", str(config.tracking_port)]
+    return subprocess.Popen(command, env=os.environ | {SUPERVISOR: str(os.getpid())}, start_new_session=True)
 
 
 def status_line(fleet: Fleet) -> str:
@@ -116,6 +135,7 @@ def run(args: argparse.Namespace) -> int:
         follow_supervisor()
     priority = whole_number(args.priority, "priority", 0, 90)
     fleet = Fleet(fleet_config(args))
+    cameras = start_cameras(fleet.config) if args.motion_capture else None
     take_priority(priority)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: fleet.stop())
@@ -128,7 +148,12 @@ def run(args: argparse.Namespace) -> int:
     )
     if not args.quiet:
         _show_status(fleet)
-    fleet.run()
+    try:
+        fleet.run()
+    finally:
+        if cameras is not None:
+            cameras.terminate()
+            cameras.wait()
     if not args.quiet:
         print(status_line(fleet))
     return 0

@@ -14,6 +14,9 @@ FAULTS = {
     "close": "the socket is closed: the host's packets bounce",
     "refuse_arming": "arming requests are refused",
     "tumble": "turn over in the air: it falls",
+    "estimate_jump": "the estimate is this far (distance, m, default 2) from the truth along x",
+    "estimate_freeze": "the estimate does not change any more",
+    "unseen": "motion capture does not see it",
     "battery": "show this voltage (V, default 3.0)",
     "heal": "all of the above is over; a fallen Crazyflie is put upright",
     "reboot": "power off and on: everything is forgotten, also an emergency stop",
@@ -35,7 +38,12 @@ def check_fault(request: dict[str, Any], count: int) -> tuple[str, list[int]]:
     for i in ids:
         if not isinstance(i, int) or isinstance(i, bool) or not 1 <= i <= count:
             raise ConfigError("cf", i, f'1 to {count}, or "all"')
-    for name, low, high in (("rate", 0.0, 1.0), ("voltage", 2.0, 4.3), ("seconds", 0.0, 1e6)):
+    for name, low, high in (
+        ("rate", 0.0, 1.0),
+        ("voltage", 2.0, 4.3),
+        ("distance", -10.0, 10.0),
+        ("seconds", 0.0, 1e6),
+    ):
         value = request.get(name)
         if value is not None and not (isinstance(value, (int, float)) and low <= value <= high):
             raise ConfigError(name, value, f"{low:g} to {high:g}")

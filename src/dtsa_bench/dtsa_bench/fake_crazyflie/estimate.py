@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from dtsa_bench.fake_crazyflie.firmware import Firmware
 from dtsa_bench.fake_crazyflie.planner import IDLE, Triple
+from dtsa_bench.fake_crazyflie.position_filter import PositionFilter
 
 GRAVITY = 9.81
 VARIANCE_RESET = 1.0  # m^2, right after the estimator was reset
@@ -22,9 +23,23 @@ class Estimate:
     velocity: Triple = (0.0, 0.0, 0.0)  # m/s
     acceleration: Triple = (0.0, 0.0, 0.0)  # m/s^2
     reset_time: float = -1e9  # s, when the estimator was reset
+    filter: PositionFilter | None = None  # None: decks measure the position
+    offset: Triple = (0.0, 0.0, 0.0)  # m: a fault, so far it is from the truth
+    frozen: bool = False  # a fault: it does not change any more
+
+    def tell(self, position: Triple, velocity: Triple, acceleration: Triple) -> None:
+        """What the filter says now, unless a fault is in the way.
+
+        :param position: m, world. :param velocity: m/s. :param acceleration: m/s^2.
+        """
+        if not self.frozen:
+            x, y, z = (p + o for p, o in zip(position, self.offset, strict=True))
+            self.position, self.velocity, self.acceleration = (x, y, z), velocity, acceleration
 
     def variance(self, t: float) -> float:
         """Variance of the position in m^2: large after a reset, then small."""
+        if self.filter is not None:
+            return self.filter.variance
         return VARIANCE_REST + VARIANCE_RESET * math.exp(-(t - self.reset_time) / CONVERGE_S)
 
 

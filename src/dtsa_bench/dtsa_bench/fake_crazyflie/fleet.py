@@ -19,18 +19,22 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.flight_models import AVOIDERS, flight_model
 from dtsa_agent.core.settings import Settings, check, setting
 from dtsa_bench.fake_crazyflie import layout
+from dtsa_bench.fake_crazyflie.cameras import Cameras
 from dtsa_bench.fake_crazyflie.control import check_fault
 from dtsa_bench.fake_crazyflie.estimate import Estimate
 from dtsa_bench.fake_crazyflie.firmware import OFF, Firmware
 from dtsa_bench.fake_crazyflie.peer import PROTOCOLS, Peer
+from dtsa_bench.fake_crazyflie.position_filter import PositionFilter
 from dtsa_bench.fake_crazyflie.truth import TruthLog
 from dtsa_bench.fake_crazyflie.vehicles import Vehicles
 
 TICK_S = 0.01
 MAX_COUNT = 200
+NUMBERS = ("rate", "direction", "voltage", "distance", "seconds")
 MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record says so
 POSITION_NOISE_M = 0.002
 VELOCITY_NOISE_MPS = 0.01
+IMU_NOISE_MPS2 = 0.2  # with vibrations
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +60,14 @@ class FleetConfig(Settings):
         "Bolt), or every second one so",
         choices=("auto", "required", "mixed"),
     )
+    positions: str = setting(
+        "decks", "what tells them where they are: decks of their own, or positions that the host sends",
+        choices=("decks", "host"),
+    )  # fmt: skip
+    tracking_port: int = setting(
+        0, "UDP port on this machine that is told 100 times a second where everybody is; 0: nobody",
+        minimum=0, maximum=65535,
+    )  # fmt: skip
     noise: bool = setting(True, "sensors have noise")
     model: str = setting("orca", "flight model whose vehicle they are", choices=AVOIDERS.names, open_choices=True)
     collision_m: float = setting(
@@ -130,10 +142,16 @@ class Fleet:
             Firmware(partial(self._report, k), vehicle.tau, auto_arming=config.arms_itself(k))
             for k in range(config.count)
         ]
-        self.estimates = [Estimate() for _ in range(config.count)]
-        self.peers = [Peer(f, e, config.protocol) for f, e in zip(self.firmware, self.estimates, strict=True)]
-        streams = np.random.SeedSequence(config.seed).spawn(2)
+        host = config.positions == "host"
+        self.estimates = [Estimate(filter=PositionFilter() if host else None) for _ in range(config.count)]
+        self.peers = [
+            Peer(f, e, config.protocol, k)
+            for k, (f, e) in enumerate(zip(self.firmware, self.estimates, strict=True), 1)
+        ]
+        self.cameras = Cameras(config.tracking_port, config.count) if config.tracking_port else None
+        streams = np.random.SeedSequence(config.seed).spawn(3)
         self._noise = np.random.default_rng(streams[0])
+        self._imu = np.random.default_rng(streams[2])
         self._loss = np.random.default_rng(streams[1])
         self._close_pairs: set[tuple[int, int]] = set()
         self._running = True
@@ -168,6 +186,8 @@ class Fleet:
         if self._control is not None:
             self._control.close()
             self._control = None
+        if getattr(self, "cameras", None) is not None:
+            self.cameras.close()
         self._selector.close()
         if hasattr(self, "truth"):
             self.truth.close()
@@ -214,6 +234,8 @@ class Fleet:
         self._estimate()
         self._proximity(modes)
         self.truth.positions(self.time, self.vehicles.position)
+        if self.cameras is not None:
+            self.cameras.look(self.vehicles.position, [f.yaw for f in self.firmware])
         self._send_logs()
         for k, link in enumerate(self._links):
             if link.heal_at is not None and self.time >= link.heal_at:
@@ -226,11 +248,17 @@ class Fleet:
             state[:3] += POSITION_NOISE_M * noise[:3]
             state[3:] += VELOCITY_NOISE_MPS * noise[3:]
         acceleration = self.vehicles.acceleration.T.tolist()
+        if self.config.positions == "host":
+            measured = self.vehicles.acceleration + IMU_NOISE_MPS2 * self._imu.standard_normal((3, self.config.count))
+            for estimate, row in zip(self.estimates, measured.T.tolist(), strict=True):
+                assert estimate.filter is not None
+                estimate.filter.predict(TICK_S, (row[0], row[1], row[2]))
         for k, (row, a) in enumerate(zip(state.T.tolist(), acceleration, strict=True)):
             estimate = self.estimates[k]
-            estimate.position = tuple(row[:3])
-            estimate.velocity = tuple(row[3:])
-            estimate.acceleration = tuple(a)
+            position, velocity = (row[0], row[1], row[2]), (row[3], row[4], row[5])
+            if estimate.filter is not None:
+                position, velocity = estimate.filter.position, estimate.filter.velocity
+            estimate.tell(position, velocity, (a[0], a[1], a[2]))
 
     def _proximity(self, modes: list[str]) -> None:
         """Two flying vehicles that come too close, and what that does to them."""
@@ -327,7 +355,7 @@ class Fleet:
 
     def _apply(self, name: str, index: int, request: dict[str, Any]) -> None:
         link, firmware = self._links[index], self.firmware[index]
-        numbers = {key: value for key, value in request.items() if key in ("rate", "direction", "voltage", "seconds")}
+        numbers = {key: value for key, value in request.items() if key in NUMBERS}
         self._report(index, f"fault: {name}", **numbers)
         if name == "drop":
             rate, direction = request.get("rate", 1.0), request.get("direction", "both")
@@ -343,6 +371,12 @@ class Fleet:
             firmware.supervisor.refuse_arming = True
         elif name == "tumble":
             firmware.supervisor.tumbled = True
+        elif name == "estimate_jump":
+            self.estimates[index].offset = (request.get("distance", 2.0), 0.0, 0.0)
+        elif name == "estimate_freeze":
+            self.estimates[index].frozen = True
+        elif name == "unseen" and self.cameras is not None:
+            self.cameras.unseen.add(index)
         elif name == "battery":
             motors = firmware.supervisor.motors_allowed and firmware.supervisor.flying
             firmware.battery.force(request.get("voltage", 3.0), motors=motors)
@@ -360,5 +394,8 @@ class Fleet:
         if link.socket is None:
             link.socket = self._bind(self.config.base_port + index)
             self._selector.register(link.socket, selectors.EVENT_READ, index)
+        self.estimates[index].offset, self.estimates[index].frozen = (0.0, 0.0, 0.0), False
+        if self.cameras is not None:
+            self.cameras.unseen.discard(index)
         self.firmware[index].supervisor.refuse_arming = False
         self.firmware[index].supervisor.tumbled = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -38,12 +39,15 @@ class Peer:
     :param firmware: whom the commands go to.
     :param estimate: where the log values come from.
     :param protocol: version that is told to the host, 10 or 12.
+    :param number: last byte of its address, by which packets to several name it.
     """
 
-    def __init__(self, firmware: Firmware, estimate: Estimate, protocol: int = 12) -> None:
+    def __init__(self, firmware: Firmware, estimate: Estimate, protocol: int = 12, number: int = 1) -> None:
         self.firmware = firmware
         self.estimate = estimate
         self.protocol = protocol
+        self.number = number
+        self.positions_received = 0
         self.blocks: dict[int, Block] = {}
         self.values = [entry.value for entry in toc.PARAM_ENTRIES]
         self._handlers: dict[tuple[int, int], Handler] = {
@@ -60,7 +64,9 @@ class Peer:
             (crtp.PARAM, 3): self._param_misc,
             (crtp.MEMORY, 0): lambda data, t: b"\x01\x00" if data[:1] == b"\x01" else None,
             (crtp.COMMANDER, 0): self._manual,
+            (crtp.LOCALIZATION, 0): self._ext_position,
             (crtp.LOCALIZATION, 1): self._localization,
+            (crtp.LOCALIZATION, 2): self._ext_positions,
             (crtp.GENERIC_COMMANDER, 0): self._stream,
             (crtp.GENERIC_COMMANDER, 1): self._meta,
             (crtp.HIGH_LEVEL, 0): self._high_level,
@@ -127,7 +133,32 @@ class Peer:
             return bytes((0x82, ok, ok))
         return self._emergency(kind, t)
 
+    def _ext_position(self, data: bytes, t: float) -> None:
+        x, y, z = struct.unpack_from("<3f", data)
+        self._positioned((x, y, z))
+
+    def _ext_positions(self, data: bytes, t: float) -> None:
+        """Up to four places: id and mm of each."""
+        for number, x, y, z in struct.iter_unpack("<B3h", data[: len(data) // 7 * 7]):
+            if number == self.number:
+                self._positioned((x / 1000, y / 1000, z / 1000))
+
+    def _positioned(self, place: tuple[float, float, float]) -> None:
+        self.positions_received += 1
+        if self.estimate.filter is not None and all(map(math.isfinite, place)):
+            deviation = self.values[toc.PARAM_ID["locSrv.extPosStdDev"]]
+            self.estimate.filter.correct(place, max(deviation, 1e-4))
+
     def _localization(self, data: bytes, t: float) -> bytes | None:
+        if data[:1] == b"\x08":
+            x, y, z, *_ = struct.unpack_from("<7f", data, 1)
+            self._positioned((x, y, z))
+            return None
+        if data[:1] == b"\x09":  # up to two poses: id, mm, and the attitude in 32 bits
+            for number, x, y, z, _ in struct.iter_unpack("<B3hI", data[1 : 1 + len(data[1:]) // 11 * 11]):
+                if number == self.number:
+                    self._positioned((x / 1000, y / 1000, z / 1000))
+            return None
         return self._emergency(data[0] if data else 0, t)
 
     def _emergency(self, kind: int, t: float) -> None:
@@ -234,5 +265,8 @@ class Peer:
         self.values[index] = value
         if entry.full_name == "kalman.resetEstimation" and value:
             self.estimate.reset_time = t
+            if self.estimate.filter is not None:
+                x, y, z = (self.values[toc.PARAM_ID[f"kalman.initial{axis}"]] for axis in "XYZ")
+                self.estimate.filter.reset((x, y, z))
         elif entry.full_name == "stabilizer.stop" and value:
             self.firmware.supervisor.stop("parameter stabilizer.stop")

@@ -13,6 +13,14 @@ LAST = 32000  # below Linux's ephemeral ports
 _RANDOM = random.SystemRandom()
 
 
+def free_port() -> int:
+    """One UDP port that is free now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
 def free_base_port(count: int, first: int | None = None) -> int:
     """Base port of a fleet: it, the `count` - 1 after it, and the control port before it are free now.
 

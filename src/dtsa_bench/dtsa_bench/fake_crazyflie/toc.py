@@ -75,6 +75,8 @@ PARAM_ENTRIES: tuple[Entry, ...] = (
     Entry("kalman", "initialX", "float", 0.0),
     Entry("kalman", "initialY", "float", 0.0),
     Entry("kalman", "initialZ", "float", 0.0),
+    Entry("locSrv", "extPosStdDev", "float", 0.01),
+    Entry("locSrv", "extQuatStdDev", "float", 4.5e-3),
     Entry("stabilizer", "estimator", "uint8_t", 2),
     Entry("stabilizer", "controller", "uint8_t", 1),
     Entry("stabilizer", "stop", "uint8_t", 0),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import signal
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 import rclpy
 import yaml
 from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray
 from dtsa_msgs.msg import Status
 from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff
 from geometry_msgs.msg import Point
@@ -39,13 +41,13 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.common.priority import give_way, take_priority
-from dtsa_bench.options import new_directory
+from dtsa_bench.options import new_directory, whole_number
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .children import Child, Children, describe_end
-from .domain import ros_domain
+from .domain import LAST_DOMAIN, ros_domain
 from .flight import END_S, QUIET, Flight, run_environment
 from .options import FlightOptions
 from .places import MissionError, assign_places, check_places, check_ways
@@ -101,6 +103,7 @@ class Mission:
     ) -> None:
         self.node, self.settings, self.scenario, self.ended, self.say = node, settings, scenario, ended, say
         self.status: dict[str, Status] = {}
+        self.diagnostics: dict[str, dict[str, float | str]] = {}  # what the bridge says about each, once a second
         self.place: dict[str, tuple[float, float, float]] = {}
         self.exchanging = False
         self.bridge_alive: Callable[[], None] = lambda: None
@@ -109,6 +112,7 @@ class Mission:
             node.create_subscription(Status, f"/{robot.name}/status", self._keep_status(robot.name), 10)
             subscription = node.create_subscription(Odometry, f"/{robot.name}/odom", self._keep_place(robot.name), 1)
             self._odometry.append(subscription)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._keep_diagnostics, 10)
         self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
         self._beating = threading.Event()
         self._over = threading.Event()
@@ -136,6 +140,11 @@ class Mission:
                 self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
 
         return keep
+
+    def _keep_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.startswith("crazyflie_bridge: "):
+                self.diagnostics[status.hardware_id] = {v.key: _number(v.value) for v in status.values}
 
     def _keep_place(self, name: str) -> Callable[[Odometry], None]:
         def keep(message: Odometry) -> None:
@@ -289,6 +298,14 @@ class Mission:
         self._beating.clear()
 
 
+def _number(text: str) -> float | str:
+    """A number where it is one that JSON knows."""
+    with suppress(ValueError):
+        if math.isfinite(value := float(text)):
+            return value
+    return text
+
+
 def _duration(seconds: float) -> Duration:
     return Duration(sec=int(seconds), nanosec=int((seconds % 1.0) * 1e9))
 
@@ -313,7 +330,11 @@ def fly_crazyflies(
     check_key(run.swarm)
     require_cflib()
     scenario = check_places(settings, run.swarm)
-    with ros_domain(options.domain) as domain:
+    positions = settings.station.positions.on
+    wanted = options.domain
+    if wanted is None and positions:  # that of motion capture
+        wanted = whole_number(os.environ.get("ROS_DOMAIN_ID") or "0", "ROS_DOMAIN_ID", 0, LAST_DOMAIN)
+    with ros_domain(wanted, shared=positions) as domain:
         directory = new_directory(out)
         logs = directory / "log"
         logs.mkdir()
@@ -398,7 +419,7 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
             mission.land(urgent)
         give_way()  # the bridge does not: it has to watch them
         pictures = options.pictures and not ended
-        summary = flight.write_results(pictures, backend="cflib", cut_short=ended.reason)
+        summary = flight.write_results(pictures, backend="cflib", cut_short=ended.reason, vehicles=mission.diagnostics)
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         node.destroy_node()

@@ -1,0 +1,54 @@
+"""The motion capture of a laboratory with simulated Crazyflies: publishes what the fleet's cameras see, at 100 Hz."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import socket
+import sys
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.signals import SignalHandlerOptions
+
+from dtsa_agent.ros.common.process import follow_supervisor
+from dtsa_bench.fake_crazyflie.cameras import DATAGRAM, half_turn, read_picture
+
+QUIET = ["--ros-args", "--disable-rosout-logs"]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Publish until SIGTERM."""
+    parser = argparse.ArgumentParser(prog="motion_capture", description=__doc__, allow_abbrev=False)
+    parser.add_argument("--port", type=int, required=True, help="UDP port on which the fleet tells where everybody is")
+    parser.add_argument("--topic", default="/cf{id}/pose", help="of each, {id} is its id [%(default)s]")
+    args = parser.parse_args(argv)
+    follow_supervisor()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: sys.exit(0))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", args.port))
+        rclpy.init(args=QUIET, signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node("motion_capture", enable_rosout=False, start_parameter_services=False)
+        publishers: dict[int, Any] = {}
+        message = PoseStamped()
+        message.header.frame_id = "world"
+        try:
+            while True:
+                stamp, bodies = read_picture(sock.recv(DATAGRAM))
+                message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), int(stamp % 1.0 * 1e9)
+                p, q = message.pose.position, message.pose.orientation
+                for k, x, y, z, yaw in bodies:
+                    if k not in publishers:
+                        publishers[k] = node.create_publisher(PoseStamped, args.topic.replace("{id}", str(k)), 1)
+                    p.x, p.y, p.z = x, y, z
+                    q.z, q.w = half_turn(yaw)
+                    publishers[k].publish(message)
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
