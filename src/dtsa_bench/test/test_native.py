@@ -56,6 +56,12 @@ def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
     assert all(flight.memory < 8192 for flight in cortex)
 
 
+def test_code_for_software_doubles_gives_the_same_bits(tmp_path: Path) -> None:
+    """Here, where a longer flight costs nothing: meetings, overlaps, arrivals."""
+    plain, soft = (fly_here(tmp_path, slots=1500, soft=soft) for soft in (False, True))
+    assert [flight.digest for flight in soft] == [flight.digest for flight in plain]
+
+
 def test_every_state_of_two_agents_keeps_the_rules_and_broken_rules_are_found(tmp_path: Path) -> None:
     whole = explore(build_prover(tmp_path), World("two agents", 2))
     assert whole.closed

@@ -55,7 +55,7 @@ class SwarmState:
     in_ap: Bytes  # (V, N) A_p
     estimate_position: Floats  # (V, 3, N) m, filled by estimate(), fly() and the metrics
     estimate_velocity: Floats  # (V, 3, N) m/s
-    priority: Floats  # (V, N) g, where the policy computed it
+    priority: Floats  # (V, N) g of those on whom the policy's choice depended; others NaN (the specification has all)
     counter: Slots  # (V, N) h (eq:secondary), likewise
     entry_hash: Hashes  # (V, N)
     table_hash: Hashes  # (V,) equal hashes, equal tables

@@ -25,7 +25,7 @@ typedef struct dtsa_table {
     uint32_t *entry_hash;   /* (n) */
     uint32_t *hash;         /* digest: the XOR of the entries' */
     double *est_p, *est_v;  /* (3, n) states extrapolated to some instant */
-    double *g;              /* (n) priorities */
+    double *g;              /* (n) priorities; NaN: the choice did not depend on it */
     int64_t *h;             /* (n) counters */
     double *scratch, *ages; /* scratch_doubles(n), (n): contents undefined between calls */
 } dtsa_table;
@@ -45,9 +45,16 @@ void table_estimate(dtsa_table *table, int64_t slot, int step);
 int priority_scratch_doubles(int n);
 void priority_values(int n, double slot_s, const double *p, const double *v, double *g,
                      double *scratch);
+/* g of one agent, the same bits; eta: n doubles. */
+double priority_of(int n, double slot_s, const double *p, const double *v, int k, double *eta);
 /* -> index of the sender or -1; candidates (n) may be NULL. */
 int select_sender(int n, int selection, double epsilon, const double *g, const int64_t *h,
                   const uint8_t *in_ap, uint8_t *candidates, int *reason);
+
+/* urgent.c: as priority_values and select_sender, but g is NaN where the choice does not depend on it. g of the sender is
+ * there. */
+int select_urgent(const dtsa_config *config, const double *p, const double *v, const int64_t *h,
+                  const uint8_t *in_ap, double *g, double *scratch, int *reason);
 
 /* draw.c: what looks random, and is the same for everybody who asks the same */
 uint64_t mix64(uint64_t x);

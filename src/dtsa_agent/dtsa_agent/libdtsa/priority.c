@@ -9,6 +9,7 @@
 #include <math.h>
 
 #include "core.h"
+#include "root.h"
 
 static const double INV_PI = 0.31830988618379067154;
 
@@ -44,7 +45,13 @@ static void eta_row(int count, double slot_s, const double *restrict px, const d
         const double wx = vx[j] - kvx, wy = vy[j] - kvy, wz = vz[j] - kvz;
         const double d2 = dx * dx + dy * dy + dz * dz;
         const double w2 = wx * wx + wy * wy + wz * wz;
-        const double product = sqrt(d2 * w2);
+#ifdef DTSA_SOFT_DOUBLES
+        if (w2 == 0.0) { /* as below, with less work */
+            eta[j] = 0.0;
+            continue;
+        }
+#endif
+        const double product = root(d2 * w2);
         const int none =
             !(product > 0.0); /* v_jk = 0: eta = 0; p_kj = 0: crashed, the run is over */
         const double inverse = 1.0 / (none ? 1.0 : product);
@@ -55,7 +62,7 @@ static void eta_row(int count, double slot_s, const double *restrict px, const d
         const int steep = a > 0.5;
         const double half = 0.5 * (1.0 - a);
         const double z = steep ? half : a * a;
-        const double s = steep ? sqrt(half) : a;
+        const double s = steep ? root(half) : a;
         const double r = s * arcsin_series(z);
         const double asin_a = steep ? 1.5707963267948966 - 2.0 * r : r;
         const double share = 0.5 + copysign(asin_a, x) * INV_PI;
@@ -99,6 +106,17 @@ void priority_values(int n, double slot_s, const double *p, const double *v, dou
     }
     for (int k = 0; k < n; k++)
         if (vx[k] == 0.0 && vy[k] == 0.0 && vz[k] == 0.0) g[k] = 0.0;
+}
+
+double priority_of(int n, double slot_s, const double *p, const double *v, int k, double *eta)
+{
+    const double *px = p, *py = p + n, *pz = p + 2 * n, *vx = v, *vy = v + n, *vz = v + 2 * n;
+    if (vx[k] == 0.0 && vy[k] == 0.0 && vz[k] == 0.0) return 0.0;
+    /* As j sees k or k sees j: both signs change, and the bits are the same. k with itself: 0. */
+    eta_row(n, slot_s, px, py, pz, vx, vy, vz, px[k], py[k], pz[k], vx[k], vy[k], vz[k], eta);
+    double g = 0.0;
+    for (int j = 0; j < k; j++) g += eta[j];
+    return g + sum_row(n - k - 1, eta + k + 1);
 }
 
 /* The largest counter h among the agents of `set`, the lowest id on ties; -1 if the set is empty. */

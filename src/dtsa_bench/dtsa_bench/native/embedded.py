@@ -36,16 +36,16 @@ class Flight:
     costs: dict[str, Cost]  # by call; empty where they are not measured
 
 
-def fly_here(directory: Path, slots: int = 200, compiler: str = "gcc") -> list[Flight]:
+def fly_here(directory: Path, slots: int = 200, compiler: str = "gcc", soft: bool = False) -> list[Flight]:
     """The flights on this machine.
 
     :param directory: for the program.
     :param slots: of each flight.
     :param compiler: name of the C compiler.
+    :param soft: by the code for processors whose doubles are software.
     """
-    program = compile_program(
-        tool(compiler, compiler), directory / "flight", _files(), ["-O2", f"-I{HERE}", f"-DSLOTS={slots}"]
-    )
+    flags = ["-O2", f"-I{HERE}", f"-DSLOTS={slots}", *(["-DDTSA_SOFT_DOUBLES"] if soft else [])]
+    program = compile_program(tool(compiler, compiler), directory / "flight", _files(), flags)
     return _read(_run([str(program)]))
 
 

@@ -1,5 +1,8 @@
 /* Reciprocal avoidance in three dimensions, soft: one half-plane of velocities for each neighbour within reach. */
 #include "internal.h"
+#include "root.h"
+
+#ifndef DTSA_SOFT_DOUBLES /* orca_scalar.c has it for those */
 #include "solver.h"
 
 /* Lanes of a block's set bits, first ones first. */
@@ -175,3 +178,5 @@ void avoid_orca(const avoid_query *query, double command[3])
     else
         orca_baseline(query, command);
 }
+
+#endif

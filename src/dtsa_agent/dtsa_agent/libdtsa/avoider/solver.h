@@ -10,6 +10,9 @@
 
 enum { SOLVER_STEPS = 60, SOLVER_HALVINGS = 40 };
 
+#ifdef SOLVER_OWN_PASSES /* by the file that includes this */
+typedef struct soft_problem soft_problem;
+#else
 typedef struct {
     int blocks; /* whole vectors of half-spaces; padding has n = 0, b < 0 */
     const double *x, *y, *z, *b;
@@ -17,6 +20,7 @@ typedef struct {
     double rho;
     const double *wish; /* x0 */
 } soft_problem;
+#endif
 
 /* Value, gradient and curvature at one point. */
 typedef struct {
@@ -27,7 +31,20 @@ typedef struct {
     int changed;  /* the set of violated ones differs from that of the previous pass */
 } soft_pass;
 
-AVOID_INLINE soft_pass soft_evaluate(const soft_problem *p, const double at[3])
+#ifdef SOLVER_OWN_PASSES
+#define SOLVER_STEP static __attribute__((noinline)) /* less stack */
+static void soft_begin(const soft_problem *p, double x[3]);
+static void soft_evaluate(const soft_problem *p, const double at[3], soft_pass *pass);
+#else
+#define SOLVER_STEP AVOID_INLINE
+/* Nothing is violated so far; x is the wish. */
+AVOID_INLINE void soft_begin(const soft_problem *p, double x[3])
+{
+    for (int k = 0; k < p->blocks; k++) ((int64_t *)p->bits)[k] = 0;
+    for (int axis = 0; axis < 3; axis++) x[axis] = p->wish[axis];
+}
+
+AVOID_INLINE void soft_evaluate(const soft_problem *p, const double at[3], soft_pass *out)
 {
     const v4d ax = v4_all(at[0]), ay = v4_all(at[1]), az = v4_all(at[2]), zero = v4_all(0.0);
     v4d f = zero, gx = zero, gy = zero, gz = zero;
@@ -78,11 +95,12 @@ AVOID_INLINE soft_pass soft_evaluate(const soft_problem *p, const double at[3])
     } else {
         pass.xx = pass.yy = pass.zz = 1.0;
     }
-    return pass;
+    *out = pass;
 }
+#endif
 
 /* step = -H^-1 g; H is symmetric and at least the identity. */
-AVOID_INLINE void soft_newton(const soft_pass *h, const soft_pass *g, double step[3])
+SOLVER_STEP void soft_newton(const soft_pass *h, const soft_pass *g, double step[3])
 {
     const double a = h->yy * h->zz - h->yz * h->yz;
     const double b = h->xz * h->yz - h->xy * h->zz;
@@ -99,9 +117,9 @@ AVOID_INLINE void soft_newton(const soft_pass *h, const soft_pass *g, double ste
 /* Writes the minimiser; returns 1 if it was reached, 0 if the steps ran out (then x is the best point found). */
 AVOID_INLINE int soft_minimise(const soft_problem *p, double x[3])
 {
-    for (int k = 0; k < p->blocks; k++) ((int64_t *)p->bits)[k] = 0;
-    for (int axis = 0; axis < 3; axis++) x[axis] = p->wish[axis];
-    soft_pass here = soft_evaluate(p, x);
+    soft_pass here, there;
+    soft_begin(p, x);
+    soft_evaluate(p, x, &here);
     if (!here.violated) return 1;
     for (int k = 0; k < SOLVER_STEPS; k++) {
         double step[3];
@@ -111,10 +129,9 @@ AVOID_INLINE int soft_minimise(const soft_problem *p, double x[3])
         if (-slope <= 1e-28) return 1;
         double t = 1.0;
         double to[3];
-        soft_pass there;
         for (int halving = 0;; halving++) {
             for (int axis = 0; axis < 3; axis++) to[axis] = x[axis] + t * step[axis];
-            there = soft_evaluate(p, to);
+            soft_evaluate(p, to, &there);
             if (there.value <= here.value + 1e-4 * t * slope + noise || halving == SOLVER_HALVINGS)
                 break;
             t *= 0.5;

@@ -11,9 +11,7 @@ static choice choose_urgent(dtsa_table *t, int64_t slot)
     double *p = t->scratch, *v = p + 3 * n;
     choice made = choose_nobody();
     estimate_into(t, kind, slot, 0, p, v);
-    priority_values(n, c->slot_s, p, v, t->g, v + 3 * n);
-    made.index =
-        select_sender(n, c->selection, c->epsilon, t->g, t->h, t->in_ap, NULL, &made.reason);
+    made.index = select_urgent(c, p, v, t->h, t->in_ap, t->g, v + 3 * n, &made.reason);
     if (made.index >= 0) made.score = t->g[made.index];
     return made;
 }
