@@ -35,6 +35,7 @@ from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.priority import take_priority
 from dtsa_agent.ros.common.process import run_node
+from dtsa_agent.ros.common.slot_fields import SlotFields
 from dtsa_agent.ros.hosting import declare_swarm
 from dtsa_agent.ros.realtime import RealtimeNode
 from dtsa_agent.ros.swarm_node import parse_ids
@@ -113,7 +114,7 @@ class StationNode(RealtimeNode):
                 v.x, v.y, v.z = velocities[:, index].tolist()
                 publisher.publish(message)
 
-    def _prepare(self, message: Slot) -> bool:
+    def _prepare(self, message: SlotFields) -> bool:
         self._sense()
         if message.phase == Slot.PREPARE and self._blind:
             return True

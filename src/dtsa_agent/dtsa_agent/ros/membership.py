@@ -30,6 +30,7 @@ from .common.checks import (
 )
 from .common.intake import Intake, add_counts
 from .common.runs import Call, run_text
+from .common.slot_fields import SlotFields
 
 _GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
 _TELL_S = 0.5  # counts are told that often at most
@@ -67,7 +68,7 @@ class Membership:
         settings: Mapping[str, Any],
         swarm_namespace: str = names.SWARM,
         dropped_frames: Callable[[], dict[str, int]] = dict,
-        plausible: Callable[[Slot], None] = lambda message: None,
+        plausible: Callable[[SlotFields], None] = lambda message: None,
     ) -> None:
         self.run = 0  # the run's id; 0: none has begun yet
         self.intake = Intake(node.get_logger())
@@ -83,7 +84,7 @@ class Membership:
         self._node = node.get_fully_qualified_name()
         self._ids = list(ids)
 
-    def admits(self, message: Slot, number: int | None) -> bool:
+    def admits(self, message: SlotFields, number: int | None) -> bool:
         """Whether a slot message is one of this run; others are counted. A channel that calls is answered.
 
         :param message: the message.
@@ -97,7 +98,7 @@ class Membership:
             return False
         return True
 
-    def _check(self, message: Slot, number: int | None) -> None:
+    def _check(self, message: SlotFields, number: int | None) -> None:
         check_slot(message, self._agents)
         run, phase = message.run, message.phase
         calls = phase in (Slot.PREPARE, Slot.START)
@@ -110,9 +111,9 @@ class Membership:
         if caller is None:
             if not calls:
                 raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}, which has not called this process")
-            caller = self._meet(run, bytes(message.data))
+            caller = self._meet(run, message.data)
         if phase == Slot.END:
-            if not caller.call.ended_by(bytes(message.data)):
+            if not caller.call.ended_by(message.data):
                 raise Unusable(FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
             self._told_s = 0.0
             self._tell()
@@ -121,7 +122,7 @@ class Membership:
         if not caller.publisher.admits(number, time.monotonic()):
             raise Unusable(OTHER_SENDER, f"slot message {number} of run {run_text(run)}, not of its channel's series")
         if phase == Slot.REFUSE:
-            self._refused(bytes(message.data))
+            self._refused(message.data)
         if phase == Slot.PREPARE:
             caller.introductions = _INTRODUCTIONS
             self._introduce(run)

@@ -24,7 +24,8 @@ from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 from .common import names
 from .common.checks import SIZES, SLOT, Unusable, check_start
 from .common.loop import Stop
-from .common.stamps import header_of, ns_of, time_of
+from .common.slot_fields import SlotFields
+from .common.stamps import header_of, time_of
 from .common.wire import split_frames, unpack_received
 from .reporter import Reporter
 from .swarm_node import SwarmNode
@@ -123,7 +124,7 @@ class RealtimeNode(SwarmNode):
         self._gone: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)  # who has said on the air that it leaves
         self._signals = 0
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
-        self._early: list[Slot] = []  # frames of a slot that is still to come here
+        self._early: list[SlotFields] = []  # frames of a slot that is still to come here
 
     def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
         create = self.node.create_publisher
@@ -156,11 +157,11 @@ class RealtimeNode(SwarmNode):
         """
         return np.asarray(time_ns + time_ns * self._drift // _PPB + self._offset)
 
-    def _plausible(self, message: Slot) -> None:
+    def _plausible(self, message: SlotFields) -> None:
         now = time.monotonic_ns()
         if message.phase == Slot.START:
-            if not 0 < ns_of(message.header.stamp) <= now + _LONGEST_LEAD_NS:
-                raise Unusable(SLOT, f"a start at {ns_of(message.header.stamp) / _PPB:.3f} s, which cannot be")
+            if not 0 < message.time_ns <= now + _LONGEST_LEAD_NS:
+                raise Unusable(SLOT, f"a start at {message.time_ns / _PPB:.3f} s, which cannot be")
         elif message.phase == Slot.RUN and self._zero:
             if not len(message.sender):
                 raise Unusable(SIZES, "a delivery without a frame")
@@ -209,7 +210,7 @@ class RealtimeNode(SwarmNode):
             publisher.wait_for_all_acked(_DELIVERY)
         return True
 
-    def _prepare(self, message: Slot) -> bool:
+    def _prepare(self, message: SlotFields) -> bool:
         """Answers the channel's call, or takes the start time; False when the run is over."""
         if message.phase == Slot.PREPARE:
             self._called = True
@@ -217,7 +218,7 @@ class RealtimeNode(SwarmNode):
             self._reporter.publish(message.run)
         elif message.phase == Slot.START:
             self._begin(message.run)
-            self._zero = ns_of(message.header.stamp)
+            self._zero = message.time_ns
             if not self._called:
                 now = self.local_ns(time.monotonic_ns() - self._zero)
                 self._listeners = Listeners(self.config, self.swarm.ids, now.tolist())
@@ -274,7 +275,7 @@ class RealtimeNode(SwarmNode):
             self._open(self.slot + 1)
         return True
 
-    def _take(self, message: Slot) -> bool:
+    def _take(self, message: SlotFields) -> bool:
         if message.phase == Slot.END:
             return False
         if message.phase == Slot.RUN:
@@ -285,7 +286,7 @@ class RealtimeNode(SwarmNode):
                 self._take_frames(message)
         return True
 
-    def _take_frames(self, message: Slot) -> None:
+    def _take_frames(self, message: SlotFields) -> None:
         if message.heard_slot < self._first - 1:
             return  # from before it began
         # In the slot in which it was sent, even if this process, or the channel's, has been kept waiting since.
@@ -312,11 +313,11 @@ class RealtimeNode(SwarmNode):
                 # The frame that a newcomer took its time from may have left late.
                 self._timeless[index] = not self._called and aligner.ignored_in_a_row >= _DOUBTS
 
-    def _overhear(self, message: Slot) -> None:
+    def _overhear(self, message: SlotFields) -> None:
         """Takes in a frame of which only the time counts."""
         assert self._listeners is not None
-        heard = unpack_received(memoryview(message.received), len(message.sender), self.config.agents)
-        (frame,) = split_frames(memoryview(message.data), message.length)
+        heard = unpack_received(message.received, len(message.sender), self.config.agents)
+        (frame,) = split_frames(message.data, message.length)
         if self.swarm.unseal(frame, message.heard_slot) is None:
             return
         late, began = self._lateness(message), self.local_ns(self._began_ns(message))
@@ -330,12 +331,12 @@ class RealtimeNode(SwarmNode):
         if self._aligners:
             self._aligners[index].reset()
 
-    def _began_ns(self, message: Slot) -> int:
+    def _began_ns(self, message: SlotFields) -> int:
         """When the transmission of a frame began, by its arrival and length: ns on the channel's time line."""
-        arrival = ns_of(message.header.stamp) - names.TIME_ZERO_NS
+        arrival = message.time_ns - names.TIME_ZERO_NS
         return arrival - self._fixed_ns - self._per_byte_ns * int(message.length[0])
 
-    def _lateness(self, message: Slot) -> NDArray[np.int64]:
+    def _lateness(self, message: SlotFields) -> NDArray[np.int64]:
         """How much later than each agent expects a frame has begun, ns."""
         slot = int(message.heard_slot)
         return np.asarray(self._began_ns(message) - slot * self.slot_ns - self.starts(slot))

@@ -15,7 +15,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-from std_msgs.msg import Header
 
 from dtsa_agent.core import AbstractSwarm, AgentGroup
 from dtsa_agent.core.errors import ConfigError, DtsaError
@@ -25,6 +24,9 @@ from .common.agreement import agreed_settings
 from .common.checks import SLOT, Unusable
 from .common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
 from .common.loop import HOUSEKEEPING_S, Loop, Stop
+from .common.slot_fields import SlotFields, read_slot
+from .common.stamps import time_of
+from .common.transmission_fields import TransmissionFields, transmission_layout
 from .common.waiting import Waiting
 from .common.wire import split_frames, unpack_received
 from .membership import Membership
@@ -69,12 +71,12 @@ class SwarmNode:
         topic = f"{swarm_namespace}/{names.SLOT}"
         # Messages of strangers must not push the channel's out before they are read.
         reading = names.lockstep_qos(max(waiting, _STRANGERS // 4))
-        self.loop = Loop(node, Slot, topic, reading, intake=intake, admits=self.membership.admits)
+        self.loop = Loop(node, Slot, topic, reading, intake=intake, admits=self.membership.admits, read=read_slot)
 
     def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
-        self._message = Transmission()
-        self._message.agent = array("H", self.swarm.ids)
-        self._message.steps = self.config.steps
+        self._agent_ids = array("H", self.swarm.ids)
+        self._layout = transmission_layout(len(self.swarm.ids), self.config.steps)
+        self._bytes = b""  # the last answer
         self._publisher = self.node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
 
     @property
@@ -96,7 +98,7 @@ class SwarmNode:
             "frame rejected": swarm.rejected,
         }
 
-    def _plausible(self, message: Slot) -> None:
+    def _plausible(self, message: SlotFields) -> None:
         """Whether a slot message can be the next one.
 
         :raises Unusable: if it cannot.
@@ -180,7 +182,7 @@ class SwarmNode:
         self.node.create_timer(HOUSEKEEPING_S, guarded(look_around))
         return over
 
-    def on_slot(self, message: Slot) -> bool:
+    def on_slot(self, message: SlotFields) -> bool:
         """Answers a slot message.
 
         :returns: False when the run is over.
@@ -191,21 +193,23 @@ class SwarmNode:
             return True
         slot = message.slot
         if slot == self.slot:  # asked again: the answer was given before the channel could hear it
-            self._publisher.publish(self._message)
+            self._publisher.publish(self._bytes)
             return True
         if not slot:
             self._begin(message.run)
         if slot:
             self._hear(message, slot - 1)
             self.agents.on_slot_end()
-        self._answer(slot, message.header, self.agents.on_slot(slot))
+        # Its start is known: what a message says of it need not be believed.
+        time_ns = names.slot_time_ns(slot, self.config.slot_ns)
+        self._answer(slot, time_ns, self.agents.on_slot(slot))
         self.slot = slot
         if self._watched:
-            self._publish_odometry(message.header.stamp)
+            self._publish_odometry(time_of(time_ns))
         self.swarm.fly(slot)
         return True
 
-    def _hear(self, message: Slot, slot: int) -> NDArray[np.uint8] | None:
+    def _hear(self, message: SlotFields, slot: int) -> NDArray[np.uint8] | None:
         """Takes in frames that the air carried.
 
         :param slot: the slot in which they are heard.
@@ -214,31 +218,36 @@ class SwarmNode:
         count = len(message.sender)
         if not count:
             return self.agents.on_frames(slot, (), (), self._nothing)
-        heard = unpack_received(memoryview(message.received), count, self.config.agents)
-        frames = split_frames(memoryview(message.data), message.length)
+        heard = unpack_received(message.received, count, self.config.agents)
+        frames = split_frames(message.data, message.length)
         return self.agents.on_frames(slot, message.sender, frames, heard)
 
-    def _answer(self, slot: int, header: Header, senders: Sequence[int], run: int | None = None) -> None:
-        swarm, message = self.swarm, self._message
-        message.header = header
-        message.run = self.membership.run if run is None else run
-        message.slot = slot
+    def _answer(self, slot: int, time_ns: int, senders: Sequence[int]) -> None:
+        swarm = self.swarm
+        lengths = bytearray(len(swarm.ids))
         frames = [swarm.frame(index) for index in senders]
-        message.length = array("B", bytes(len(swarm.ids)))
         for index, frame in zip(senders, frames, strict=True):
-            message.length[index] = len(frame)
-        message.data = array("B", b"".join(frames))
-        message.chosen = array("H", swarm.chosen.tobytes())
-        message.reason = array("B", swarm.reason.tobytes())
-        message.digest = array("I", swarm.digest.tobytes())
-        message.score = array("d", swarm.score.tobytes())
-        message.track = array("d", swarm.track.tobytes())
-        message.velocity = array("d", swarm.velocity.tobytes())
-        message.command = array("d", swarm.command.tobytes())
+            lengths[index] = len(frame)
         goal = swarm.goal.tobytes()
-        message.goal = array("d", goal if goal != self._goal else b"")
+        fields = TransmissionFields(
+            time_ns=time_ns,
+            run=self.membership.run,
+            slot=slot,
+            agent=self._agent_ids,
+            length=bytes(lengths),
+            data=b"".join(frames),
+            chosen=swarm.chosen.tobytes(),
+            reason=swarm.reason.tobytes(),
+            digest=swarm.digest.tobytes(),
+            score=swarm.score.tobytes(),
+            track=swarm.track.tobytes(),
+            velocity=swarm.velocity.tobytes(),
+            command=swarm.command.tobytes(),
+            goal=goal if goal != self._goal else b"",
+        )
         self._goal = goal
-        self._publisher.publish(message)
+        self._bytes = self._layout.pack(fields)
+        self._publisher.publish(self._bytes)
 
     def _publish_odometry(self, stamp: Time) -> None:
         message = Odometry()

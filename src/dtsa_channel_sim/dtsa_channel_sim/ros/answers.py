@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from dtsa_msgs.msg import Transmission
 from numpy.typing import NDArray
 
 from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unusable, check_frames
+from dtsa_agent.ros.common.transmission_fields import TransmissionFields
 from dtsa_agent.ros.common.wire import split_frames
 
 Array = NDArray[np.float64]
-_FLOATS = ("track", "velocity", "command", "goal", "score")
+_MOTION = ("track", "velocity", "command", "goal")
 
 
 @dataclass(slots=True)
@@ -48,17 +50,19 @@ class Answers:
         self.reason = np.zeros(agents, dtype=np.uint8)
         self.digest = np.zeros(agents, dtype=np.uint32)
         self.score = np.zeros(agents)
-        self.track = np.zeros((steps, 3, agents))  # m, positions at the control instants of the slot before
-        self.velocity = np.zeros((3, agents))  # m/s, now
-        self.command = np.zeros((3, agents))  # m/s, now
-        self.goal = np.zeros((3, agents))  # m
+        # All motion lies in one array, as in a message: who answers is written into it at once.
+        self._motion = np.zeros((3 * steps + 9, agents))
+        self.track = self._motion[:-9].reshape(steps, 3, agents)  # m, at the control instants of the slot before
+        self.velocity = self._motion[-9:-6]  # m/s, now
+        self.command = self._motion[-6:-3]  # m/s, now
+        self.goal = self._motion[-3:]  # m
         self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
         self.taken_in: list[TakenIn] | None = None  # real time: what the agents say to have taken in during the slot
         self._told = np.zeros(agents, dtype=np.bool_)  # whose goals have been told
         self._layouts: dict[bytes, tuple[int, slice | NDArray[np.intp]]] = {}
-        # Numbers an agent in each field of a message; of its frames' bytes there are as many as the lengths say.
+        # Numbers an agent in each field of a message, beside the frames' bytes.
         self._sizes = {
-            "length": 1, "data": 0, "chosen": 1, "reason": 1, "digest": 1, "score": 1,
+            "length": 1, "chosen": 1, "reason": 1, "digest": 1, "score": 1,
             "track": 3 * steps, "velocity": 3, "command": 3, "goal": 3,
         }  # fmt: skip
 
@@ -78,31 +82,31 @@ class Answers:
         self.missing = self.agents
         self.frames = {}
 
-    def add(self, message: Any) -> bool:
+    def add(self, message: TransmissionFields | Transmission) -> bool:
         """Takes in one transmission message.
 
-        :param message: a dtsa_msgs/Transmission.
+        :param message: its fields, or a message whose fields may not fit together.
         :returns: False if its agents have answered already (a message sent twice); nothing is changed then.
         :raises Unusable: if its fields do not fit together, naming the agents as far as it does.
         """
         count, at = self._where(message.agent)
         if self.answered[at].any():
             return False
-        # Everything in here runs once a message: what is read twice is kept.
-        told = {name: getattr(message, name) for name in self._sizes}
-        self._check_sizes(message, count, told)
-        track, velocity, command, goal, score = (np.frombuffer(told[name]) for name in _FLOATS)
-        self._check_numbers(message, (track, velocity, command, goal), score)
-        frames = split_frames(memoryview(told["data"]), told["length"]) if len(told["data"]) else []
-        self.track[:, :, at] = track.reshape(self.steps, 3, count)
-        self.velocity[:, at] = velocity.reshape(3, count)
-        self.command[:, at] = command.reshape(3, count)
-        if len(goal):
-            self.goal[:, at] = goal.reshape(3, count)
+        fields = message if isinstance(message, TransmissionFields) else self._fields(message, count)
+        frames: list[bytes] = []
+        if fields.data or any(fields.length):
+            check_frames(fields.length, fields.data)
+            frames = split_frames(fields.data, fields.length)
+        motion = np.frombuffer(b"".join((fields.track, fields.velocity, fields.command, fields.goal)))
+        score = np.frombuffer(fields.score)
+        chosen = np.frombuffer(fields.chosen, dtype=np.uint16)
+        self._check_numbers(message, motion, score, chosen)
+        self._motion[: len(motion) // count, at] = motion.reshape(-1, count)
+        if fields.goal:
             self._told[at] = True
-        self.chosen[at] = np.frombuffer(told["chosen"], dtype=np.uint16)
-        self.reason[at] = np.frombuffer(told["reason"], dtype=np.uint8)
-        self.digest[at] = np.frombuffer(told["digest"], dtype=np.uint32)
+        self.chosen[at] = chosen
+        self.reason[at] = np.frombuffer(fields.reason, dtype=np.uint8)
+        self.digest[at] = np.frombuffer(fields.digest, dtype=np.uint32)
         self.score[at] = score
         for agent, frame in zip(message.agent, frames, strict=False):
             if frame:
@@ -130,33 +134,35 @@ class Answers:
         self._told[at] = self.answered[at] = True
         self.missing -= count
 
-    def _check_sizes(self, message: Any, count: int, told: dict[str, Any]) -> None:
-        """Whether the fields of a message are as long as its agents are many.
+    def _fields(self, message: Transmission, count: int) -> TransmissionFields:
+        """The fields of a message, as long as its agents are many.
 
         :raises Unusable: if they are not.
         """
         if message.steps != self.steps:
             raise self._unusable(RANGE, message, f"{message.steps} control instants a slot instead of {self.steps}")
-        for name, values in told.items():
-            found, wanted = len(values), self._sizes[name] * count
-            if found != wanted and name != "data" and (name != "goal" or found):
+        for name, size in self._sizes.items():
+            found, wanted = len(getattr(message, name)), size * count
+            if found != wanted and (name != "goal" or found):
                 raise self._unusable(SIZES, message, f"{found} numbers in {name} for {count} agents")
-        if len(told["data"]) or any(told["length"]):
-            check_frames(told["length"], told["data"])
+        told = {name: getattr(message, name).tobytes() for name in (*self._sizes, "data")}
+        return TransmissionFields(0, message.run, message.slot, message.agent, **told)
 
-    def _check_numbers(self, message: Any, motion: tuple[Array, ...], score: Array) -> None:
+    def _check_numbers(
+        self, message: TransmissionFields | Transmission, motion: Array, score: Array, chosen: NDArray[np.uint16]
+    ) -> None:
         """Whether the numbers of a message can be.
 
         :raises Unusable: if they cannot.
         """
-        largest = max(message.chosen)
+        largest = chosen.max()
         if largest > self.agents:
             raise self._unusable(RANGE, message, f"{largest} chosen of {self.agents} agents")
         # A sum of squares is finite only if all its terms are, and small only if they are.
-        for values in motion:
-            if not values.dot(values) <= FARTHEST_M**2:
-                raise self._unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
-        if not (score == score).all():
+        if not motion.dot(motion) <= FARTHEST_M**2:
+            raise self._unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
+        squares = score.dot(score)
+        if squares != squares:
             raise self._unusable(RANGE, message, "scores that are no numbers")
 
     @staticmethod

@@ -15,6 +15,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import OTHER_RUN, SLOT, UNREADABLE, Unusable
 from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of
+from dtsa_agent.ros.common.transmission_fields import TransmissionFields, read_transmission
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
@@ -138,13 +139,15 @@ class LockstepChannel(RosChannel):
         if fresh:
             self._observers.answer_received(slot, message.agent.tobytes(), data)
 
-    def _decoded(self, data: bytes) -> Any:
-        """A transmission message of one of this run's processes.
+    def _decoded(self, data: bytes) -> TransmissionFields | Transmission:
+        """A transmission message of one of this run's processes; where it is laid out as usual, its fields.
 
         :raises Unusable: if it is none.
         """
+        message = read_transmission(data, self.agents, self.answers.steps)
         try:
-            message = deserialize_message(data, Transmission)
+            if message is None:
+                message = deserialize_message(data, Transmission)
         except Exception as error:  # rclpy has no common base for what a message can do to it
             said = (str(error).splitlines() or [""])[0]
             raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no Transmission ({said})") from None

@@ -98,6 +98,7 @@ class Feed:
     :param topic: what it subscribes to.
     :param qos: quality of service.
     :param raw: messages are taken as serialised bytes.
+    :param read: makes messages of serialised bytes, in place of rclpy.
     :param intake: counts messages that cannot be read; None: they are errors.
     :param admits: says by a message and its publisher's number for it whether it is taken in; None: all are.
     """
@@ -111,14 +112,16 @@ class Feed:
         raw: bool = False,
         intake: Intake | None = None,
         admits: Callable[[Any, int | None], bool] | None = None,
+        read: Callable[[bytes], Any] | None = None,
     ) -> None:
+        raw = raw or read is not None
         self.subscription = node.create_subscription(
             msg_type, topic, self._never, qos, callback_group=_OwnHands(), raw=raw
         )
         self.handle = self.subscription.handle
         self.number: int | None = None  # of the message taken last, as its publisher counts
         self._type, self._raw = msg_type, raw
-        self._intake, self._admits = intake, admits
+        self._intake, self._admits, self._read = intake, admits, read
         self._stack = ExitStack()
         self._stack.enter_context(self.handle)
 
@@ -130,14 +133,16 @@ class Feed:
         for _ in range(_MOST_DROPPED):
             try:
                 taken = self.handle.take_message(self._type, self._raw)
+                if taken is None:
+                    return None
+                message, info = taken
+                if self._read is not None:
+                    message = self._read(message)
             except Exception as error:  # rclpy has no common base for what a message can do to it
                 if self._intake is None:
                     raise
                 self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
                 continue
-            if taken is None:
-                return None
-            message, info = taken
             self.number = info["publication_sequence_number"]
             if self._admits is None or self._admits(message, self.number):
                 return message
