@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -199,3 +201,22 @@ def test_a_directory_or_a_domain_in_use_is_one_line_and_exit_code_2(
         assert main(["fly", "--out", str(tmp_path / "out"), "--domain", str(taken)]) == 2
         assert "in use" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_large_blocks_of_a_recorder_stay_out_of_its_heap() -> None:
+    program = """
+import ctypes
+from dtsa_bench.fly.heap import keep_heap_small
+libc = ctypes.CDLL(None)
+class Blocks(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_size_t) for name in "arena free small mapped bytes a b c d e".split()]
+libc.mallinfo2.restype = Blocks
+def taken():
+    before = libc.mallinfo2().mapped
+    kept = [bytearray(1 << 17) for _ in range(64)]
+    return libc.mallinfo2().mapped - before
+bytearray(1 << 20)  # freed at once: from now on glibc puts such blocks into the heap
+print(taken(), keep_heap_small(), taken() > 0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0", "True", "True"]

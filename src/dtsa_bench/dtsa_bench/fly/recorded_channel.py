@@ -30,6 +30,7 @@ from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .clock_statistics import ClockStatistics
+from .heap import keep_heap_small
 from .live_topics import LiveTopics
 from .machine import DeliveryStatistics, channel_summary, warning
 from .measurement import FlightMeasurement
@@ -60,6 +61,7 @@ class RecordedFlight:
         end_s: float = 4.0,
         space: str = names.SWARM,
     ) -> None:
+        keep_heap_small()
         identity = Run.draw(run.swarm.auth_session)
         agreed = agreed_settings(run.swarm, run.mode)
         if run.swarm.auth:  # the bag says in which session its frames are authentic
