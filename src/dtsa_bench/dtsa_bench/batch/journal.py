@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -74,6 +75,8 @@ class Journal:
         try:
             self._append(rows)
         except OSError as error:
+            with suppress(OSError):  # what is left of the rows in its buffer cannot be written either
+                self.close()
             raise DtsaError(f"{self.path} cannot be written ({error.strerror})") from error
 
     def _append(self, rows: Iterable[Row]) -> None:
@@ -87,9 +90,9 @@ class Journal:
 
     def close(self) -> None:
         """Closes the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
 
 
 def read_rows(path: Path) -> Iterator[Row]:
