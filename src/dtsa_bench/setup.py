@@ -36,5 +36,16 @@ setup(
             "recorded_channel = dtsa_bench.entry:recorded_channel",
             "fake_crazyflie = dtsa_bench.entry:fake_crazyflie",
         ],
+        "dtsa.policies": [
+            "genie-age = dtsa_bench.schemes:GenieAge",
+            "genie-error = dtsa_bench.schemes:GenieError",
+            "dominance = dtsa_bench.schemes:Dominance",
+            "event-tdma = dtsa_bench.schemes:EventTdma",
+            "sotdma = dtsa_bench.schemes:Sotdma",
+            "threshold-aloha = dtsa_bench.schemes:ThresholdAloha",
+            "pure-aloha = dtsa_bench.schemes:PureAloha",
+            "beacons = dtsa_bench.schemes:Beacons",
+            "csma = dtsa_bench.schemes:Csma",
+        ],
     },
 )

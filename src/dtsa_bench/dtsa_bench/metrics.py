@@ -9,6 +9,7 @@ ended has age 0.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,7 @@ class FlightMetrics:
         if self._course is not None:
             self._course.advance(0, start)
         self._last = start  # (3, N) m, positions at the end of the last slot
+        self.frames: Counter[int] = Counter()  # frames on the air, by their lengths in bytes: whoever sends counts them
         self._tail = math.ceil(limits.tail_s * 1e9 / swarm.slot_ns - 1e-6)
         # First number of slots at which the flight is over whatever happens.
         self._limit = max(1, math.ceil(limits.timeout_s * 1e9 / swarm.slot_ns - 1e-6))
@@ -200,6 +202,8 @@ class FlightMetrics:
         pair = sums["pair"] if sums["pair"][0] else None
         news = sums["age_count"]
         efficiency = list(self.efficiencies().values())
+        airtime = self.run.air.airtime
+        on_air_s = sum(airtime.on_air_ns(length) * count for length, count in self.frames.items()) / 1e9
         return {
             "agents": swarm.agents,
             "moving": swarm.movers,
@@ -232,6 +236,11 @@ class FlightMetrics:
             "lost_agents": sorted(self.lost),
             "age_mean_slots": sums["age_sum"] / news if news else None,
             "age_max_slots": sums["age_max"] if news else None,
+            "age_mean_ms": sums["age_sum"] / news * swarm.slot_ms if news else None,
+            "age_max_ms": sums["age_max"] * swarm.slot_ms if news else None,
+            "frames_per_s": self.frames.total() / flown if flown else None,
+            "bytes_per_s": sum(length * count for length, count in self.frames.items()) / flown if flown else None,
+            "channel_load": on_air_s / flown if flown else None,
             "estimate_error_mean_m": sums["error_sum"] / news if news else None,
             "estimate_error_max_m": sums["error_max"] if news else None,
             "wall_time_s": wall_time_s,

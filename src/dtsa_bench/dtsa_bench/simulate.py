@@ -22,6 +22,7 @@ from dtsa_channel_sim.model.verdict import SUCCESS
 
 from .metrics import FlightMetrics
 from .run_config import RunConfig
+from .unslotted import UnslottedTraffic
 
 Array = NDArray[np.float64]
 
@@ -109,7 +110,10 @@ def simulate(
     swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared, core=core))
     metrics = FlightMetrics(run, scenario, core)
     kept = Trace() if trace else None
-    _fly(swarm, Channel(run.air), metrics, kept, observer, ages)
+    if run.swarm.policy_row.unslotted:
+        _fly_unslotted(swarm, Channel(run.air), metrics, kept, observer, ages)
+    else:
+        _fly(swarm, Channel(run.air), metrics, kept, observer, ages)
     return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
 
 
@@ -118,7 +122,7 @@ def _fly(
 ) -> None:
     """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
     advance, begin, fly, hear, end = swarm.scenario.advance, swarm.begin, swarm.fly, swarm.hear, swarm.end
-    frame, arbitrate, update = swarm.frame, channel.arbitrate, metrics.update
+    frame, arbitrate, update, frames = swarm.frame, channel.arbitrate, metrics.update, metrics.frames
     ids, track, position = swarm.ids, swarm.track, swarm.position
     tables = swarm if ages else None
     table = 0 if swarm.shared else observer - 1
@@ -129,7 +133,10 @@ def _fly(
         heard = [(ids[index], frame(index)) for index in begin(slot)]
         if compare is not None:
             compare(slot, swarm.digest, swarm.chosen)
-        verdict = arbitrate(slot, [i for i, _ in heard], [len(data) for _, data in heard], position)
+        lengths = [len(data) for _, data in heard]
+        verdict = arbitrate(slot, [i for i, _ in heard], lengths, position)
+        for length in lengths:
+            frames[length] += 1
         fly(slot)
         received = verdict.received
         if received is not None:
@@ -144,6 +151,27 @@ def _fly(
             _keep(kept, swarm, slot, verdict.senders, verdict.outcome, table)
         if over:
             return
+        slot += 1
+
+
+def _fly_unslotted(
+    swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int, ages: bool
+) -> None:
+    """The same for agents that send at any instant: what arrives in a slot is heard in it."""
+    traffic = UnslottedTraffic(swarm, channel)
+    slot, over = 0, ""
+    while not over:
+        swarm.scenario.advance(slot, swarm)
+        carried = traffic.slot(slot)
+        metrics.compare_tables(slot, swarm.digest, swarm.chosen)
+        metrics.frames.update(carried.lengths)
+        swarm.fly(slot)
+        for frame, mask in carried.heard:
+            swarm.hear(slot, frame, mask)
+        swarm.end(slot)
+        over = metrics.update(slot, swarm.track, swarm if ages else None, carried.outcome)
+        if kept is not None:
+            _keep(kept, swarm, slot, carried.senders, carried.outcome, observer - 1)
         slot += 1
 
 

@@ -103,6 +103,8 @@ class SwarmState:
             others = ", ".join(row.name for row in ESTIMATORS.rows.values() if not row.needs_everybody)
             allowed = f"{others}: it needs all agents in one process"
             raise ConfigError("estimator", config.estimator, allowed)
+        if config.policy_row.needs_everybody and 0 < count < config.agents:
+            raise ConfigError("policy", config.policy, "one that does not look into all agents, or all in one process")
         if shared_table and config.policy_row.agent_state:
             why = f"False: with policy {config.policy} every agent knows something of its own"
             raise ConfigError("shared_table", True, why)

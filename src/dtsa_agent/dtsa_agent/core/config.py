@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from .errors import ConfigError
 from .flight_models import AVOIDERS, flight_model
-from .frame import EXTENT_M, PROFILE_EXTENDED, PROFILE_PAPER_INTENT, TAG_LENGTH
+from .frame import EXTENT_M, PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, TAG_LENGTH
 from .reference.frame import EXTENDED_SENDER_MAX, FRAME_MAX, LENGTHS
 from .registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow
 from .settings import Settings, check, setting
@@ -39,7 +39,7 @@ class SwarmConfig(Settings):
     avoider: str = setting(
         "orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS.names, open_choices=True
     )
-    slot_ms: float = setting(10.0, "length of a time slot, t_s", unit="ms", minimum=0.5, maximum=1000)
+    slot_ms: float = setting(10.0, "length of a time slot, t_s", unit="ms", minimum=0.3, maximum=1000)
     seed: int = setting(1, "seed of the whole run", minimum=0, maximum=2**63 - 1)
 
     epsilon: float = setting(
@@ -185,6 +185,13 @@ class SwarmConfig(Settings):
     def own_bytes(self) -> int:
         """Bytes that plug-ins append to each frame."""
         return self.policy_row.own_bytes + self.estimator_row.own_bytes
+
+    @property
+    def frame_length(self) -> int:
+        """Length of each frame on the air, bytes, with what plug-ins and authentication append."""
+        intent = PROFILE_PAPER_INTENT if self.estimator_row.needs_intent else PROFILE_PAPER
+        profile = PROFILE_EXTENDED if self.extended else intent
+        return LENGTHS[profile] + self.own_bytes + (TAG_LENGTH if self.auth else 0)
 
     @property
     def policy_row(self) -> PolicyRow:

@@ -113,6 +113,39 @@ class Policy(Protocol):
         """The id that this observer takes for the sender of a slot, 0: nobody. It sends if that is its own."""
 
 
+class Genie(Protocol):
+    """Who sends next, said by one who looks into all agents: a bound to compare with. Made once, for agent 0."""
+
+    def senders(self, swarm: AbstractSwarm, slot: int) -> Sequence[int]:
+        """The ids that send in a slot.
+
+        :param swarm: all agents: true states and everybody's table, to be read only.
+        """
+
+
+class Radio(Protocol):
+    """The radio of an agent that is not bound to slots."""
+
+    def busy(self) -> bool:
+        """Whether it finds the air in use now, or sends itself."""
+
+    def send(self) -> bool:
+        """Begins to send the agent's frame, with its state at the start of the slot; False: it still sends another."""
+
+
+class Unslotted(Protocol):
+    """A policy that is not bound to slots. Slots only say how often vehicles are steered and ages are counted."""
+
+    def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
+        """Acts at an instant; first called at 0.
+
+        :param table: what this agent knew when the slot began.
+        :param now_ns: ns since the start of slot 0.
+        :param radio: its radio.
+        :returns: when to be called again, ns, later than now.
+        """
+
+
 class Estimator(Protocol):
     """Where the others are by now. It may have what :class:`Speaks` has.
 
@@ -185,12 +218,14 @@ class PluginSwarm(SwarmWrapper):
         self._make_parts()
 
     def _make_parts(self) -> None:
+        everybody = self.config.policy_row.needs_everybody and bool(self.ids)
+        self._genie = POLICIES.factory(self.config.policy)(self.config, 0) if everybody else None
         self._policies, self._estimators, self._avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
         self._list_speakers()
 
     def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Any]:
         name = getattr(self.config, registry.kind)
-        if name in registry.rows:
+        if name in registry.rows or getattr(registry.row(name), "needs_everybody", False):
             return []
         factory = registry.factory(name)
         return [factory(self.config, agent) for agent in ids]
@@ -202,7 +237,20 @@ class PluginSwarm(SwarmWrapper):
         self._speakers = [[(made[row], size) for made, size in parts if made] for row in range(len(self._ids))]
         self._listen_to_outcome = any(hasattr(part, "slot_over") for row in self._speakers for part, _ in row)
 
+    @property
+    def policies(self) -> list[Any]:
+        """The policy of each observer; empty if it is built in, or one looks into all agents."""
+        return self._policies
+
+    @property
+    def tables(self) -> list[Table]:
+        """What each observer knows."""
+        return self._tables
+
     def decide(self, slot: int) -> None:
+        if self._genie is not None:
+            self._ask_genie(self._genie, slot)
+            return
         if not self._policies:
             self.inner.decide(slot)
             return
@@ -215,6 +263,20 @@ class PluginSwarm(SwarmWrapper):
                 )
             self.chosen[index] = chosen
             self.sends[index] = chosen == agent and self.present[index]
+        self._note_decision()
+
+    def _ask_genie(self, genie: Genie, slot: int) -> None:
+        senders = [int(agent) for agent in genie.senders(self, slot)]
+        if not all(1 <= agent <= self.config.agents for agent in senders):
+            allowed = f"1 to {self.config.agents}"
+            raise LocalProtocolError(f"policy {self.config.policy}: chose {senders} in slot {slot}; allowed: {allowed}")
+        self.chosen[:] = senders[0] if senders else 0
+        self.sends[:] = 0
+        for agent in senders:
+            self.sends[agent - 1] = self.present[agent - 1] > 0
+        self._note_decision()
+
+    def _note_decision(self) -> None:
         self.reason[:] = _PLUGIN_REASON
         self.score[:] = 0.0
         self.digest[:] = self.table_hash[: len(self.ids)]

@@ -49,6 +49,8 @@ class PolicyRow:
     :param most_agents: largest number of agents; None: as many as a swarm may have.
     :param port: what it uses of the air, of :data:`PORT`.
     :param own_bytes: bytes of its own that a plug-in appends to frames.
+    :param needs_everybody: it looks into all agents: they must be in one process. For comparison only.
+    :param unslotted: it sends at any instant; slots only say how often vehicles are steered and ages are counted.
     """
 
     name: str
@@ -65,6 +67,8 @@ class PolicyRow:
     most_agents: int | None = None
     port: tuple[str, ...] = ("send", "received")
     own_bytes: int = 0
+    needs_everybody: bool = False
+    unslotted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +189,9 @@ def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
     port = tuple(getattr(factory, "port", ("send", "received")))
     if not set(port) <= set(PORT):
         raise ConfigError(f"{name}.port", port, "some of " + ", ".join(PORT))
+    needs_everybody = callable(getattr(factory, "senders", None))
+    if needs_everybody and _own_bytes(name, factory):
+        raise ConfigError(f"{name}.own_bytes", factory.own_bytes, "0 for a policy that looks into all agents")
     return PolicyRow(
         name,
         name,
@@ -193,6 +200,8 @@ def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
         may_join=bool(getattr(factory, "may_join", False)),
         port=port,
         own_bytes=_own_bytes(name, factory),
+        needs_everybody=needs_everybody,
+        unslotted=callable(getattr(factory, "wake", None)),
     )
 
 

@@ -99,6 +99,7 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
     if run.swarm.estimator_row.needs_everybody and (options.processes or agents) > 1:
         raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
+    _check_policy(run, options)
     late = dict(options.late)
     for name, value in (("respawn", options.respawn), ("late", late or None)):
         if value is not None and run.mode == LOCKSTEP:
@@ -109,6 +110,15 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
         raise ConfigError("late", late, f"some, not all, of the agents 1 to {agents}")
     if late and options.processes is not None:
         raise ConfigError("late", late, "only with --processes per-agent")
+
+
+def _check_policy(run: RunConfig, options: FlightOptions) -> None:
+    """What the policy asks of a flight of nodes."""
+    row = run.swarm.policy_row
+    if row.unslotted:
+        raise ConfigError("policy", row.name, "a slotted one; what sends at any instant is for simulate and sweep")
+    if row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or run.swarm.agents) > 1):
+        raise ConfigError("policy", row.name, "in lockstep with --processes 1 only: it looks into all agents")
 
 
 def fly(

@@ -62,6 +62,7 @@ class FlightMeasurement(ChannelObserver, Referee):
     def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         self._outcome = verdict.outcome
         self._compared = answers.digest.copy(), answers.chosen.copy()
+        self.metrics.frames.update(len(frames[sender]) for sender in verdict.senders)
         self.scenario.advance(slot, self._tables)  # what all know about each other's goals
         if answers.taken_in is not None:  # in real time the receivers themselves know best
             for taken in answers.taken_in:

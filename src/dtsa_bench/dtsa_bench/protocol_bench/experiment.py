@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import Scenario, Swarm, SwarmConfig
+from dtsa_agent.core import Scenario, SwarmConfig
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_channel_sim import Channel, ChannelConfig
 
 from .ledger import Ledger
@@ -114,7 +115,7 @@ class Experiment:
         shared: bool = False,
     ) -> None:
         self.config = config
-        self.swarm = Swarm(config, still_scenario(config.agents, config.seed), shared_table=shared)
+        self.swarm = make_swarm(config, still_scenario(config.agents, config.seed), shared_table=shared)
         self.channel = Channel(channel or ChannelConfig(agents=config.agents, slot_ns=config.slot_ns, seed=config.seed))
         self.warmup = warmup
         self.moving: NDArray[np.bool_] = np.zeros(config.agents, dtype=np.bool_)

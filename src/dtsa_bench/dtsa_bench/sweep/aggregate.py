@@ -35,6 +35,8 @@ MEASURES = {
         Measure("efficiency_mean", "trajectory efficiency", "", 3, True, 1),
         Measure("completion_time_s", "completion time", "s", 2, True, -1),
         Measure("age_mean_slots", "age", "slots", 2, False, -1),
+        Measure("age_mean_ms", "age", "ms", 1, False, -1),
+        Measure("channel_load", "share of time on the air", "", 4, False, -1),
         Measure("estimate_error_mean_m", "error of estimates", "m", 4, False, -1),
         Measure("wasted_share", "slots without a frame", "", 3, False, -1),
     )

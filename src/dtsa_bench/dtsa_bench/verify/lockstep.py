@@ -111,6 +111,7 @@ class LockstepCheck:
         swarm = rebuild.swarm
         self.agreement = self.agreement and bool((swarm.chosen == swarm.chosen[0]).all())
         self.metrics.compare_tables(slot, swarm.digest, swarm.chosen)
+        self.metrics.frames.update(len(swarm.frame(int(index))) for index in swarm.frame_length.nonzero()[0])
         self.metrics.update(slot, swarm.track, swarm, verdict.outcome)
         return True
 

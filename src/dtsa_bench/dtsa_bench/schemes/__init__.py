@@ -1,0 +1,15 @@
+"""Schemes of the literature, and bounds, as plug-ins beside the built-in policies. docs/league.md has a page of each.
+
+Each is announced by entry point in the group ``dtsa.policies``, so ``--policy genie-age`` works in `simulate` and
+`sweep`, and in nodes where its kind allows it.
+"""
+
+from .contention import Dominance, ThresholdAloha
+from .event_tdma import EventTdma
+from .genie import GenieAge, GenieError
+from .sotdma import Sotdma
+from .unslotted import Beacons, Csma, PureAloha
+
+__all__ = [
+    "Beacons", "Csma", "Dominance", "EventTdma", "GenieAge", "GenieError", "PureAloha", "Sotdma", "ThresholdAloha",
+]  # fmt: skip

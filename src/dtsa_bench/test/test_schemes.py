@@ -1,0 +1,194 @@
+"""Schemes of the literature, and bounds: numbers of their sources, and what they may not do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import dtsa
+from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.core.plugins import make_swarm
+from dtsa_agent.core.registry import POLICIES
+from dtsa_bench.fly.flight import FlightOptions, check_options
+from dtsa_bench.protocol_bench.experiment import Experiment
+from dtsa_bench.run_config import RunConfig
+from dtsa_bench.schemes.optimum import optimum
+from dtsa_bench.simulate import simulate
+from dtsa_bench.unslotted import UnslottedTraffic
+from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim.model.airtime import Airtime
+
+
+def steady(
+    policy: str,
+    agents: int,
+    movers: int,
+    loss: float = 0.0,
+    slots: int = 3000,
+    warmup: int | None = None,
+    **settings: object,
+) -> Experiment:
+    """Some circle, the rest hover."""
+    config = SwarmConfig(agents=agents, moving=0, avoider="none", seed=3, policy=policy, **settings)
+    channel = ChannelConfig(agents=agents, slot_ns=config.slot_ns, seed=3, loss=loss)
+    experiment = Experiment(config, channel, movers=range(1, movers + 1), warmup=warmup or 20 * agents)
+    experiment.run(slots)
+    return experiment
+
+
+def test_without_loss_the_genie_reaches_the_bound_and_nobody_gets_below_it() -> None:
+    """(N_p - 1) / 2: round robin over the movers."""
+    assert steady("genie-age", 12, 6).outcome.age == pytest.approx(2.5)
+    for policy in ("tdma", "lease", "genie-error", "dtsa"):
+        assert steady(policy, 12, 6).outcome.age > 2.5 - 1e-9
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.3])
+def test_nobody_is_ahead_of_the_genie_under_loss(loss: float) -> None:
+    genie = steady("genie-age", 12, 6, loss, frame="extended").outcome.age
+    assert genie < steady("lease", 12, 6, loss).outcome.age < steady("tdma", 12, 6, loss).outcome.age
+    assert genie < steady("tdma", 12, 6, loss, frame="extended").outcome.age
+
+
+def test_greedy_is_almost_optimal_for_three_agents() -> None:
+    perfect = optimum(0.0, cap=4)
+    assert perfect.best == perfect.greedy == perfect.tdma == pytest.approx(1.0)
+    lossy = optimum(0.2, cap=6, tolerance=1e-4)
+    assert lossy.best <= lossy.greedy < 1.005 * lossy.best < 0.95 * lossy.tdma
+
+
+def test_the_tdma_of_the_dynamic_program_is_that_of_the_simulation() -> None:
+    simulated = steady("tdma", 3, 3, 0.2, slots=40_000).outcome.age
+    assert simulated == pytest.approx(optimum(0.2, cap=4, tolerance=1e-3).tdma, rel=0.03)
+
+
+def test_the_genie_by_error_has_the_least_errors() -> None:
+    """Squared errors, which it weighs: of few that move, those that turn are worth more than those that do not."""
+
+    def error(policy: str) -> float:
+        flights = [dtsa.simulate(agents=12, moving=6, policy=policy, slot_ms=30, seed=seed) for seed in range(1, 5)]
+        return float(np.mean([flight.summary["estimate_error_mean_m"] for flight in flights]))
+
+    assert error("genie-error") < error("genie-age") < error("tdma")
+
+
+def test_threshold_aloha_has_the_age_of_its_source() -> None:
+    """1.4169 n for many agents, ages counted from 1."""
+    ages = steady("threshold-aloha", 200, 200, slots=4000, warmup=1200).outcome
+    assert (ages.age + 1) / 200 == pytest.approx(1.4169, rel=0.05)
+
+
+def traffic(policy: str, slots: int, **settings: object) -> tuple[UnslottedTraffic, list[object], SwarmConfig]:
+    """The air alone: nobody flies."""
+    config = SwarmConfig(agents=20, policy=policy, seed=5, slot_ms=2, **settings)
+    swarm = make_swarm(config)
+    air = UnslottedTraffic(swarm, Channel(ChannelConfig(agents=20, slot_ns=config.slot_ns, seed=5)))
+    return air, [air.slot(slot) for slot in range(slots)], config
+
+
+@pytest.mark.parametrize(("load", "most"), [(0.5, 1 / (2 * math.e)), (0.1, 0.1 * math.exp(-0.2))])
+def test_pure_aloha_carries_what_the_textbook_says(load: float, most: float) -> None:
+    """G e^(-2 G) of the air carries whole frames."""
+    _, carried, config = traffic("pure-aloha", 4000, options={"pure-aloha.load": load})
+    whole = sum(len(slot.heard) for slot in carried)
+    share = whole * Airtime().on_air_ns(config.frame_length) / (4000 * config.slot_ns)
+    assert share == pytest.approx(most, rel=0.05)
+
+
+def test_carrier_sense_helps_where_frames_are_longer_than_the_turn_round_of_radios() -> None:
+    """Who finds the air free needs 0.13 ms to send: as long as a frame of 19 bytes is, half as long as one of 60."""
+
+    def lost(policy: str, frame: str, **settings: object) -> tuple[float, int, int]:
+        _, carried, config = traffic(policy, 2000, frame=frame, **settings)
+        sent = sum(len(slot.lengths) for slot in carried)
+        return 1.0 - sum(len(slot.heard) for slot in carried) / sent, sent, config.frame_length
+
+    def gain(frame: str) -> float:
+        sensing, sent, length = lost("csma", frame, options={"csma.period_ms": 15.0, "csma.window_ms": 15.0})
+        load = sent * Airtime().on_air_ns(length) / (2000 * 2_000_000)
+        return lost("pure-aloha", frame, options={"pure-aloha.load": load})[0] / sensing
+
+    assert gain("extended") > 1.15
+    assert gain("paper") < 1.05
+
+
+def test_beacons_come_at_their_rate_and_two_with_one_phase_collide_for_good() -> None:
+    _, carried, _ = traffic("beacons", 1000, options={"beacons.period_ms": 20.0})
+    sent = sum(len(slot.lengths) for slot in carried)
+    assert sent == pytest.approx(20 * 1000 * 2 / 20, rel=0.02)
+    heard = [len({frame[1] for frame, _ in slot.heard}) for slot in carried]
+    assert sum(heard[:500]) == pytest.approx(sum(heard[500:]), abs=20)  # the same ones, period after period
+
+
+def test_event_triggered_tdma_is_silent_while_it_would_say_nothing_new() -> None:
+    busy, quiet = (steady(policy, 12, 4).outcome for policy in ("tdma", "event-tdma"))
+    assert busy.idle == 0
+    assert quiet.idle > 0.4 * quiet.slots
+    assert quiet.collisions == 0
+    flown = dtsa.simulate(agents=12, policy="event-tdma", slot_ms=2, options={"event-tdma.error_m": 0.02}).summary
+    assert flown["completed"]
+    assert flown["channel_load"] < 0.8 * dtsa.simulate(agents=12, policy="tdma", slot_ms=2).summary["channel_load"]
+
+
+def test_sotdma_finds_slots_of_its_own() -> None:
+    run = steady("sotdma", 12, 12, slots=3000)
+    late = [slot for slot in run.outcome.collision_slots if slot >= 1500]
+    assert len(late) < 0.05 * 1500
+    assert run.outcome.age < 2 * 12
+
+
+def test_dominance_prefers_those_who_turn() -> None:
+    def error(policy: str) -> float:
+        flights = [dtsa.simulate(agents=12, moving=6, policy=policy, slot_ms=30, seed=seed) for seed in range(1, 5)]
+        return float(np.mean([flight.summary["estimate_error_mean_m"] for flight in flights]))
+
+    assert error("dominance") < error("tdma")
+
+
+def test_every_scheme_flies_and_the_same_seed_gives_the_same_flight() -> None:
+    for name in sorted(POLICIES.plug_ins()):
+        if not POLICIES.factory(name).__module__.startswith("dtsa_bench.schemes"):
+            continue
+        flights = [dtsa.simulate(agents=4, policy=name, slot_ms=2, loss=0.1, seed=7, timeout_s=3) for _ in range(2)]
+        assert flights[0].summary["slots"]["total"] > 500, name
+        first, second = ({**flight.summary, "wall_time_s": 0, "realtime_factor": 0} for flight in flights)
+        assert first == second, name
+
+
+def test_nodes_refuse_what_nodes_cannot_do() -> None:
+    for policy, options, mode in (
+        ("beacons", FlightOptions(processes=1), "lockstep"),
+        ("genie-age", FlightOptions(processes=2), "lockstep"),
+        ("genie-age", FlightOptions(processes=1), "realtime"),
+    ):
+        with pytest.raises(ConfigError, match="policy"):
+            check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode=mode), options)
+    check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="genie-age")), FlightOptions(processes=1))
+    with pytest.raises(ConfigError, match="policy"):
+        make_swarm(SwarmConfig(agents=4, policy="genie-age"), local=[1, 2])
+
+
+def test_wrong_answers_of_such_plug_ins_are_named() -> None:
+    class Wrong:
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            pass
+
+        def senders(self, swarm: object, slot: int) -> list[int]:
+            return [5]
+
+    class Stuck:
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            pass
+
+        def wake(self, table: object, now_ns: int, radio: object) -> int:
+            return now_ns
+
+    dtsa.register("policy", "wrong-genie", Wrong)
+    dtsa.register("policy", "stuck", Stuck)
+    with pytest.raises(LocalProtocolError, match=r"wrong-genie: chose \[5\] in slot 0; allowed: 1 to 4"):
+        simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="wrong-genie")))
+    with pytest.raises(LocalProtocolError, match="stuck: wake gave 0 ns"):
+        simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="stuck")))
