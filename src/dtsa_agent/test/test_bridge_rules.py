@@ -104,14 +104,16 @@ def test_examples_are_usable(name: str) -> None:
 
 
 # -- radio budget -----------------------------------------------------------------------------------------------------
-def robots(count: int, rate: float, radio: str = "0") -> list[tuple[str, str, float, float]]:
-    return [(f"cf{k}", f"radio://{radio}/80/2M/E7E7E7E7{k:02X}", rate, rate) for k in range(1, count + 1)]
+def robots(count: int, rate: float, radio: str = "0", bits: str = "2M") -> list[tuple[str, str, float, float]]:
+    return [(f"cf{k}", f"radio://{radio}/80/{bits}/E7E7E7E7{k:02X}", rate, rate) for k in range(1, count + 1)]
 
 
-@pytest.mark.parametrize(("rate", "most"), [(50.0, 4), (20.0, 8)])
-def test_budget_is_what_one_radio_is_known_to_carry(rate: float, most: int) -> None:
-    check_budget(radio_loads(robots(most, rate)), force=False)
-    loads = radio_loads(robots(most + 1, rate))
+@pytest.mark.parametrize(
+    ("rate", "most", "bits"), [(50.0, 4, "2M"), (20.0, 8, "2M"), (50.0, 4, "1M"), (50.0, 2, "250K"), (20.0, 4, "250K")]
+)
+def test_budget_is_what_one_radio_is_known_to_carry(rate: float, most: int, bits: str) -> None:
+    check_budget(radio_loads(robots(most, rate, bits=bits)), force=False)
+    loads = radio_loads(robots(most + 1, rate, bits=bits))
     assert "DOES NOT FIT" in str(loads[0])
     with pytest.raises(ConfigError, match=f"{most} Crazyflies"):
         check_budget(loads, force=False)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dtsa_agent.crazyflie.budget import WATCHDOG_HZ, check_budget, radio_loads
 from dtsa_agent.crazyflie.config import SwarmSettings
+from dtsa_agent.crazyflie.emergency_radio import EmergencyRadio
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.safety import Action, SafetyMonitor, Verdict
 from dtsa_agent.crazyflie.snapshot import Snapshot
@@ -58,6 +59,7 @@ class Bridge:
         cache = cache.expanduser()
         cache.mkdir(parents=True, exist_ok=True)
         self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
+        self.emergency = EmergencyRadio([r.uri for r in settings.robots], log)
         self.monitor = SafetyMonitor(station.safety)
         self._heartbeat: float | None = None
         self._closing = threading.Event()
@@ -142,6 +144,7 @@ class Bridge:
     def stop_all(self, reason: str) -> None:
         """Emergency stop of all."""
         self._log("error", f"EMERGENCY STOP of all: {reason}")
+        self.emergency.stop_all()
         for vehicle in self.vehicles.values():
             vehicle.stop(reason)
 
@@ -243,3 +246,4 @@ class Bridge:
         for vehicle in self.vehicles.values():
             if not vehicle.link.join(max(0.0, deadline - time.monotonic())):
                 self._log("warn", f"{vehicle.name}: the link does not close")
+        self.emergency.close()

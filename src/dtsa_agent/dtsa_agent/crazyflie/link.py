@@ -1,7 +1,8 @@
-"""The link to one Crazyflie: the only module that talks to cflib.
+"""The link to one Crazyflie: with `radio_link` and `emergency_radio` the only module that talks to cflib.
 
 Each link has one worker thread. It connects, and it alone sends: cflib's send can block for seconds under a lock, so
-nothing else may wait for it. cflib's own threads only deliver log packets.
+nothing else may wait for it. cflib's own threads only deliver log packets. A link that ends by itself is opened again,
+again and again, until it is closed.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
+import math
+import os
 import threading
 import time
 import warnings
@@ -23,7 +26,16 @@ from dtsa_agent.crazyflie.errors import LinkError
 from dtsa_agent.crazyflie.estimates import Settling
 from dtsa_agent.crazyflie.estimator import settle
 from dtsa_agent.crazyflie.mailbox import Mailbox, Order, Position
+from dtsa_agent.crazyflie.radio_link import ROOM_S, Heard, RadioPort, keep_links_open, packets_of
 from dtsa_agent.crazyflie.units import LOG_VARIABLES, Setpoint, Vector, VehicleState, decode_log
+
+SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only
+FIRST_ANSWER_S = 2.0  # over the air nothing else tells that nobody is there: the link stays open
+STUCK_S = 0.25  # nothing acknowledged for that long, though cflib asks all the time
+REOPEN_S = (0.1, 2.0)  # first and longest pause before a link that ended is opened again
+REOPEN_TIMEOUT_S = 3.0  # for one such attempt
+LOG_ORDER_S = 0.4  # nothing logged for that long, though it can be heard: the log is ordered anew
+IDLE_S = 0.01
 
 
 def require_cflib() -> None:
@@ -37,12 +49,28 @@ def require_cflib() -> None:
         )
     import cflib.crtp
 
+    if path := os.environ.get(SIMULATED_RADIO):
+        from dtsa_agent.crazyflie import simulated_radio
+
+        simulated_radio.install(Path(path))
     if not cflib.crtp.CLASSES:
         cflib.crtp.init_drivers()
+    keep_links_open()
     # Its own warnings are about what the bridge reports by itself, in terms of the swarm.
     for name in ("cflib", "cflib.crazyflie", "cflib.crtp"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", message="The supervisor subsystem requires CRTP", category=UserWarning)
+
+
+class _Command:
+    """An order that consists of commands: it can be sent past a packet that is stuck."""
+
+    def __init__(self, link: Link, action: Callable[[Any], None]) -> None:
+        self.action = action
+        self._link = link
+
+    def __call__(self) -> None:
+        self._link.run(self.action)
 
 
 class Link:
@@ -50,7 +78,7 @@ class Link:
 
     :param robot: address and settings.
     :param cache: folder for the tables of variables.
-    :param on_state: called with each decoded log packet and its time (s, monotonic), in a thread of cflib's.
+    :param on_state: called with each decoded log packet and when it was logged (s, monotonic), in a thread of cflib's.
     :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
     :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
     :param settling: decides when the estimator has settled.
@@ -82,22 +110,54 @@ class Link:
         self._on_answer = on_answer
         self._settling, self._seen = settling, seen
         self._cf: Any = None
+        self._radio: RadioPort | None = None
+        self._heard = Heard()
+        self._log_block: Any = None
+        self._log_ordered = 0.0  # s, monotonic
+        self._reopen = False
+        self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
+        self.reopened = 0  # times that a link which had ended by itself was opened again
+        self.past = 0  # packets sent past one that was stuck
         self._thread = threading.Thread(target=self._work, name=f"{robot.name}-worker", daemon=True)
         self._thread.start()
 
     # -- worker -----------------------------------------------------------------------------------------------------
     def _work(self) -> None:
-        while (item := self.mailbox.get()) is not None:
+        while self.mailbox.wait():
             try:
+                if self.stuck:
+                    self._send_past()
+                    continue
+                item = self.mailbox.get()
                 if isinstance(item, Setpoint):
                     self._send_setpoint(item)
                 elif isinstance(item, Position):
                     if self._cf is not None and self.connected:
                         item.send(self._cf)
-                else:
+                elif item is not None:
                     item()
-            except Exception as error:  # noqa: PERF203 - one bad order must not end the worker
+            except Exception as error:  # one bad order must not end the worker
                 self._on_broken(f"could not send: {error}")
+
+    @property
+    def stuck(self) -> bool:
+        """Whether a packet waits for its acknowledgement and keeps all others waiting; looks for a while."""
+        radio = self._radio
+        if radio is None or not self.connected:
+            return False
+        return self._heard.age(time.monotonic()) > STUCK_S or not radio.wait_for_room(ROOM_S)
+
+    def _send_past(self) -> None:
+        """Nothing can be sent as usual: the next order goes past what waits, blindly. Streamed commands wait."""
+        order, cf, radio = self.mailbox.take_order(), self._cf, self._radio
+        if isinstance(order, _Command) and cf is not None and radio is not None:
+            packets = packets_of(cf, order.action) or []
+            self.past += len(packets)
+            radio.send_past(packets)
+        elif order is not None:
+            order()
+        else:
+            time.sleep(IDLE_S)
 
     def _send_setpoint(self, setpoint: Setpoint) -> None:
         cf = self._cf
@@ -115,12 +175,19 @@ class Link:
         :param urgent: before everything that waits. :param background: without ending the stream of setpoints.
         """
 
-        def run() -> None:
-            if self._cf is not None and self.connected:
-                action(self._cf)
-                self.sent += 1
+        self._post(_Command(self, action), urgent=urgent, background=background)
 
-        self._post(run, urgent=urgent, background=background)
+    def run(self, action: Callable[[Any], None]) -> None:
+        """In the worker: do something with the connected `Crazyflie` object. Over the air no packet is waited for."""
+        cf, radio = self._cf, self._radio
+        if cf is None or not self.connected:
+            return
+        self.sent += 1
+        packets = None if radio is None else packets_of(cf, action)
+        if radio is None or packets is None:
+            action(cf)
+        else:
+            radio.send(cf, packets)
 
     def _post(self, order: Order, *, urgent: bool, background: bool) -> None:
         if background:
@@ -144,18 +211,47 @@ class Link:
                     self._drop()
             done(reason)
 
+        self._reopen = False
         self.mailbox.put_order(run, urgent=True)
 
-    def _connect(self) -> None:
+    def _open_again(self) -> None:
+        """In the worker: the link has ended by itself; open it until it is open, closed, or connected anew."""
+        pause, longest = REOPEN_S
+        while self._reopen and not self.mailbox.closed:
+            try:
+                self._connect(again=True)
+            except LinkError:  # noqa: PERF203
+                self._drop()
+                time.sleep(pause)
+                pause = min(2 * pause, longest)
+            else:
+                self._reopen = False
+                self.reopened += 1
+
+    def _connect(self, *, again: bool = False) -> None:
+        """Connect.
+
+        :param again: in flight perhaps: nothing is set, the estimator is left alone.
+        :raises LinkError: it did not work.
+        """
         from cflib.crazyflie import Crazyflie
         from cflib.crtp.crtpstack import CRTPPort
 
         self._drop()
-        deadline = time.monotonic() + self.robot.connect_timeout_s
+        limit = min(self.robot.connect_timeout_s, REOPEN_TIMEOUT_S if again else math.inf)
+        deadline = time.monotonic() + limit
         settled = threading.Event()
         failure: list[str] = []
         cf = Crazyflie(rw_cache=str(self._cache))
-        cf.fully_connected.add_callback(lambda uri: settled.set())
+        (cf.connected if again else cf.fully_connected).add_callback(lambda uri: settled.set())
+        heard = threading.Event()
+
+        def established(uri: str) -> None:
+            heard.set()
+            if again and self.guarded:
+                cf.supervisor.send_emergency_stop_watchdog()
+
+        cf.link_established.add_callback(established)
 
         def broken(uri: str, message: str) -> None:
             failure.append(message.partition("\n\n")[0].replace("\n", " "))
@@ -163,6 +259,8 @@ class Link:
             if self._cf is cf and self.connected:
                 self.connected = False
                 self._on_broken(f"link broken: {failure[-1]}")
+                self._reopen = True
+                self.mailbox.put_order(self._open_again, urgent=True)
 
         cf.connection_failed.add_callback(broken)
         cf.connection_lost.add_callback(broken)
@@ -171,18 +269,24 @@ class Link:
         cf.link_statistics.uplink_rssi_updated.add_callback(self._rssi)
         self._cf = cf
         cf.open_link(self.robot.uri)
+        radio = RadioPort.of(cf)
+        if radio is not None and not heard.wait(FIRST_ANSWER_S) and not failure:
+            raise LinkError(f"nobody answers on the air within {FIRST_ANSWER_S:g} s")
         if not settled.wait(max(0.0, deadline - time.monotonic())):
-            raise LinkError(f"no answer within {self.robot.connect_timeout_s:g} s")
+            raise LinkError(f"no answer within {limit:g} s")
         if failure:
             raise LinkError(failure[0])
-        for name, value in self.robot.firmware_params.items():
+        for name, value in self.robot.firmware_params.items() if not again else ():
             try:
                 cf.param.set_value(name, value)
             except (KeyError, AttributeError) as error:  # noqa: PERF203
                 raise LinkError(f"firmware parameter {name}: {error}") from error
-        if self.robot.reset_estimator:
+        if self.robot.reset_estimator and not again:
             settle(cf, self._settling, self._seen, self.mailbox.take_position, self.robot.estimator_timeout_s)
         self._start_log(cf, max(deadline, time.monotonic() + 2.0))
+        if radio is not None:
+            cf.link_statistics.latency.stop()  # its pings would wait behind a stuck packet, and have the link closed
+        self._radio = radio
         self.connected = True
 
     def _answer(self, packet: Any) -> None:
@@ -191,23 +295,29 @@ class Link:
 
     def _quality(self, percent: float) -> None:
         self.radio_quality = percent / 100
+        self._heard.acknowledge(time.monotonic())
 
     def _rssi(self, value: float) -> None:
         self.rssi = int(value)
 
     def _start_log(self, cf: Any, deadline: float) -> None:
+        first = threading.Event()
+        self._begin_log(cf, first.set)
+        if not first.wait(max(0.0, deadline - time.monotonic())):
+            raise LinkError("no log packets")
+
+    def _begin_log(self, cf: Any, received: Callable[[], None]) -> None:
+        """Order the log; `received` is called with each packet."""
         from cflib.crazyflie.log import LogConfig
 
-        first = threading.Event()
         block = LogConfig("state", max(10, round(1000 / self.robot.log_rate_hz / 10) * 10))
         for name in LOG_VARIABLES:
             block.add_variable(name)
 
         def receive(stamp: int, values: dict[str, float], config: Any) -> None:
             self.received += 1
-            self._on_state(decode_log(values), time.monotonic())
-            if not first.is_set():
-                first.set()
+            self._on_state(decode_log(values), self._heard.sampled(stamp, time.monotonic()))
+            received()
 
         block.data_received_cb.add_callback(receive)
         try:
@@ -215,14 +325,35 @@ class Link:
         except KeyError as error:
             raise LinkError(f"the firmware does not log {error}: update it") from error
         block.start()
-        if not first.wait(max(0.0, deadline - time.monotonic())):
-            raise LinkError("no log packets")
+        self._log_block = block
+
+    def order_log(self, now: float) -> None:
+        """Order the log anew, if it can be heard now (s, monotonic): the firmware ends it in a gap of a second."""
+        heard = self._heard
+        if heard.age(now) > STUCK_S or now - max(heard.logged, heard.since, self._log_ordered) < LOG_ORDER_S:
+            return
+        self._log_ordered = now
+
+        def order(cf: Any) -> None:
+            self._log_block.delete()
+            with contextlib.suppress(ValueError):
+                cf.log.log_blocks.remove(self._log_block)
+            self._begin_log(cf, lambda: None)
+
+        self._post(lambda: self.run(order), urgent=False, background=True)
 
     def _drop(self) -> None:
-        """Forget the connection. Sends a zero setpoint: only for one that does not fly."""
+        """Forget the connection. If there is one, a zero setpoint is sent: only for one that does not fly."""
+        silent = not self.connected or self._radio is None or not self._radio.wait_for_room(0.0)
         self.connected = False
         cf, self._cf = self._cf, None
+        radio, self._radio = self._radio, None
+        if radio is not None:
+            radio.close()
         if cf is not None:
+            if silent and RadioPort.of(cf) is not None:  # the setpoint would wait in vain, or meet one that flies
+                link, cf.link = cf.link, None
+                link.close()
             with contextlib.suppress(Exception):  # whatever state it is in, we are done with it
                 cf.close_link()
 

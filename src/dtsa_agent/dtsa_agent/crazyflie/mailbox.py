@@ -90,6 +90,27 @@ class Mailbox:
                     return None
                 self._condition.wait()
 
+    def wait(self) -> bool:
+        """Wait until there is something to send; False once the box is closed and empty."""
+        with self._condition:
+            while not (self._full or self._closed):
+                self._condition.wait()
+            return self._full
+
+    @property
+    def _full(self) -> bool:
+        return bool(self._orders) or self._setpoint is not None or self._position is not None
+
+    def take_order(self) -> Order | None:
+        """The next order, if there is one; the setpoint stays."""
+        with self._condition:
+            return self._orders.popleft() if self._orders else None
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing more will come."""
+        return self._closed
+
     def close(self) -> None:
         """Nothing more will come."""
         with self._condition:

@@ -31,8 +31,12 @@ MIN_LAND_S = 1.0
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
 BLIND_REPEATS = 3
 BLIND_LAND_S = 2.0
+<<<<<<< HEAD
 SINK_MPS = 0.3  # of a vehicle that does not know where it is
 SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
+=======
+FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
+>>>>>>> 3ef6e07 (Links over the air stay open, come back, and carry blind orders past a packet that is stuck)
 LOW_M = 0.1  # this close to the floor there is nothing left to land from
 QUALITY_WINDOW_S = 1.0
 DOWN_M = 0.04  # m: it stands, by motion capture
@@ -110,10 +114,15 @@ class Vehicle:
         with self.lock:
             self.last = state
             self._log_times.append(now)
+<<<<<<< HEAD
             if not self.watch.wrong:
                 self._trusted_height = max(state.position[2], 0.0)
             if self.watch.update(state, now, self.seen_at(now), flying=bool(state.info & IS_FLYING)):
                 self._log("error", f"{self.name}: {self.watch.wrong}")
+=======
+            if self.machine.state == State.LOST and time.monotonic() - now > FRESH_S:
+                return  # it delivers what it logged in the gap; what comes next is new
+>>>>>>> 3ef6e07 (Links over the air stay open, come back, and carry blind orders past a packet that is stuck)
             if self.machine.state not in (State.DISCONNECTED, State.CONNECTING):
                 before = self.machine.state
                 self.machine.observe(state.info)
@@ -497,6 +506,8 @@ class Vehicle:
                 self._go_on_blindly(now)
             elif self._brake is not None:
                 self._slow_down(now)
+            if self.state not in (State.DISCONNECTED, State.CONNECTING):
+                self.link.order_log(now)
             if self.state in WATCHED_OVER and (order := self._delivery.due(now)) is not None:
                 self.link.order(order)
 
@@ -510,6 +521,7 @@ class Vehicle:
                 self._high_level(LAND, lambda cf: cf.high_level_commander.land(0.0, seconds, yaw=None), math.inf)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
             self.guarded |= watchdog and self.state in WATCHED_OVER
+            self.link.guarded = self.guarded
             if self.guarded and self.state not in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY):
                 self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
 

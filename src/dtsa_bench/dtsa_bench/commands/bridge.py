@@ -30,7 +30,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         default="cflib",
         help="cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
     )
+    add_simulated_radio(parser)
     parser.add_argument("--check", action="store_true", help="check the file, print the radio budget, and end")
+
+
+def add_simulated_radio(parser: argparse._ActionsContainer) -> None:
+    """Add the option that puts simulated Crazyradios in the place of real ones."""
+    parser.add_argument(
+        "--simulated-radio",
+        type=Path,
+        metavar="SOCKET",
+        help="simulation only: radio:// goes to the Crazyradios of `fake-crazyflie --simulated-radio SOCKET`",
+    )
+
+
+def use_simulated_radio(args: argparse.Namespace) -> None:
+    """Tell this process and those that it starts."""
+    from dtsa_agent.crazyflie.link import SIMULATED_RADIO
+
+    if args.simulated_radio is not None:
+        os.environ[SIMULATED_RADIO] = str(args.simulated_radio.resolve())
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.crazyflie.config import load_swarm
     from dtsa_agent.crazyflie.link import require_cflib
 
+    use_simulated_radio(args)
     settings = load_swarm(args.config)
     if args.check:
         loads = radio_loads(settings.radio_rates())

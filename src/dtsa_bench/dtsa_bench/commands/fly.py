@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.settings import settings_of
+from dtsa_bench.commands.bridge import add_simulated_radio, use_simulated_radio
 from dtsa_bench.fly.options import FlightOptions
 from dtsa_bench.options import add_mode_options, add_options, add_run_options, given, run_config, whole_number
 
@@ -49,6 +50,7 @@ def add_parser(subparsers: Any) -> None:
     crazyflies.add_argument(
         "--config", metavar="FILE", default=None, help="swarm.yaml of the Crazyflies, for --backend cflib"
     )
+    add_simulated_radio(crazyflies)
     add_run_options(parser)
     clocks = add_mode_options(parser)
     kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
@@ -140,6 +142,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
             raise ConfigError(name, value, "only with --backend sim")
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
+    use_simulated_radio(args)
     path = Path(args.config)
     settings = load_swarm(path)
     from dtsa_agent.ros.common.loop import Stop

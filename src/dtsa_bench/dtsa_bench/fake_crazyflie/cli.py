@@ -18,6 +18,7 @@ from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import FAULTS, send_fault
 from dtsa_bench.fake_crazyflie.fleet import NUMBERS, Fleet, FleetConfig
 from dtsa_bench.fake_crazyflie.ports import free_port
+from dtsa_bench.fake_crazyflie.radio.settings import RadioSettings, Station
 from dtsa_bench.options import add_options, given, whole_number
 
 DESCRIPTION = """\
@@ -44,6 +45,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--priority", metavar="N", default="30", help="real-time priority, 0 to 90: the world waits for nobody [30]"
     )
     parser.add_argument("--quiet", action="store_true", help="no status line")
+    radio = parser.add_argument_group("simulated radios", "Crazyradios in place of UDP; simulation only")
+    radio.add_argument(
+        "--simulated-radio",
+        type=Path,
+        metavar="SOCKET",
+        help="new Unix socket, for `bridge --simulated-radio SOCKET`",
+    )
+    add_options(radio, RadioSettings, "radio", prefix="radio-")
     faults = parser.add_argument_group("faults", "sent to a fleet that is already running, instead of starting one")
     faults.add_argument("--fault", choices=FAULTS, help="; ".join(f"{k}: {v}" for k, v in FAULTS.items()))
     faults.add_argument("--cf", default="all", help="id of the vehicle (default: all)")
@@ -59,11 +68,14 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
 
     :raises ConfigError: a value is out of range.
     """
-    options = {**given(args, FleetConfig, "fleet"), "truth": args.truth}
+    radio = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
+    options = {**given(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
     if args.motion_capture:
         options = {"positions": "host", "tracking_port": free_port()} | options
     if args.config is not None:
         return _from_swarm(args.config, options)
+    if radio.path is not None:
+        raise ConfigError("config", None, "--config FILE with --simulated-radio: its URIs say where they listen")
     config = FleetConfig(**options)
     start = layout.positions(args.layout, config.count, tuple(args.half_axes))
     return dataclasses.replace(config, start=start)
@@ -75,6 +87,11 @@ def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
     from dtsa_agent.crazyflie.config import load_swarm
 
     robots = load_swarm(path).robots
+    start = np.array([robot.initial_position for robot in robots]).T
+    radio: RadioSettings = options["radio"]
+    if radio.path is not None:
+        radio = dataclasses.replace(radio, stations=tuple(Station.of(robot.uri) for robot in robots))
+        return FleetConfig(**{**options, "count": len(robots), "start": start, "radio": radio})
     ports = []
     for robot in robots:
         if not robot.uri.startswith("udp://"):
@@ -84,7 +101,6 @@ def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
         raise ConfigError("robots", ports, "ports that follow each other, in the order of the robots")
     if options.get("count") not in (None, len(ports)):
         raise ConfigError("count", options["count"], f"{len(ports)}, as in {path}")
-    start = np.array([robot.initial_position for robot in robots]).T
     return FleetConfig(**{**options, "count": len(ports), "base_port": ports[0], "start": start})
 
 

@@ -1,4 +1,7 @@
-"""A fleet of simulated Crazyflies: one UDP port each, one process and one thread for all of them."""
+"""A fleet of simulated Crazyflies: one process and one thread for all of them.
+
+Each has a UDP port of its own, or all are reached by simulated radios.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,8 @@ from dtsa_bench.fake_crazyflie.estimate import Estimate
 from dtsa_bench.fake_crazyflie.firmware import OFF, Firmware
 from dtsa_bench.fake_crazyflie.peer import PROTOCOLS, Peer
 from dtsa_bench.fake_crazyflie.position_filter import PositionFilter
+from dtsa_bench.fake_crazyflie.radio.settings import RadioSettings
+from dtsa_bench.fake_crazyflie.radio.side import Host, RadioSide
 from dtsa_bench.fake_crazyflie.truth import TruthLog
 from dtsa_bench.fake_crazyflie.vehicles import Vehicles
 
@@ -43,6 +48,7 @@ class FleetConfig(Settings):
 
     :param start: start positions, (3, count), m, world; None: an ellipse.
     :param truth: file for the record of what really happened; None: no record.
+    :param radio: simulated radios in place of UDP; without a path: UDP.
     :raises ConfigError: a value is out of range.
     """
 
@@ -75,6 +81,7 @@ class FleetConfig(Settings):
     )
     crash_m: float = setting(0.12, "two flying vehicles closer than this fall", unit="m", minimum=0, maximum=10)
     truth: Path | None = None
+    radio: RadioSettings = field(default_factory=RadioSettings)
 
     def __post_init__(self) -> None:
         check(self)
@@ -87,6 +94,8 @@ class FleetConfig(Settings):
             raise ConfigError("start", np.shape(self.start), f"an array of shape (3, {self.count})")
         if not self.control_port:
             object.__setattr__(self, "control_port", self.base_port - 1)
+        if self.radio.path is not None and len(self.radio.stations) != self.count:
+            raise ConfigError("radio", len(self.radio.stations), f"a station for each of {self.count} vehicles")
 
     def arms_itself(self, index: int) -> bool:
         """Whether the vehicle with this index does not wait to be armed."""
@@ -95,6 +104,8 @@ class FleetConfig(Settings):
     @property
     def uris(self) -> list[str]:
         """Where cflib finds them."""
+        if self.radio.path is not None:
+            return [station.uri for station in self.radio.stations]
         return [f"udp://{self.host}:{self.base_port + k}" for k in range(self.count)]
 
 
@@ -118,7 +129,9 @@ class Fleet:
 
     def __init__(self, config: FleetConfig) -> None:
         self.config = config
-        self._selector = selectors.DefaultSelector()
+        # epoll waits in whole milliseconds, which are long on the air.
+        self._selector = selectors.SelectSelector() if config.radio.path is not None else selectors.DefaultSelector()
+        self.radio: RadioSide | None = None
         self._links: list[_Link] = []
         self._control: socket.socket | None = None
         self._open_sockets()
@@ -170,7 +183,11 @@ class Fleet:
         return sock
 
     def _open_sockets(self) -> None:
-        for k in range(self.config.count):
+        if self.config.radio.path is not None:
+            self.radio = RadioSide(self.config.radio, self._hear, self._passes)
+            self._selector.register(self.radio.listener, selectors.EVENT_READ, self.radio)
+            self._links = [_Link(None) for _ in range(self.config.count)]
+        for k in range(0 if self.radio else self.config.count):
             sock = self._bind(self.config.base_port + k)
             self._links.append(_Link(sock))
             self._selector.register(sock, selectors.EVENT_READ, k)
@@ -188,6 +205,9 @@ class Fleet:
             self._control = None
         if getattr(self, "cameras", None) is not None:
             self.cameras.close()
+        if self.radio is not None:
+            self.radio.close()
+            self.radio = None
         self._selector.close()
         if hasattr(self, "truth"):
             self.truth.close()
@@ -283,7 +303,13 @@ class Fleet:
 
     # -- links ------------------------------------------------------------------------------------------------------
     def _serve(self, timeout: float) -> None:
+        if self.radio is not None:
+            due = self.radio.wait_s()
+            timeout = timeout if due is None else min(timeout, due)
         for key, _ in self._selector.select(timeout):
+            if isinstance(key.data, (RadioSide, Host)):
+                self._serve_radio(key.data)
+                continue
             if key.data < 0:
                 self._serve_control()
                 continue
@@ -294,6 +320,29 @@ class Fleet:
                 except (BlockingIOError, ConnectionError):
                     break
                 self._receive(key.data, datagram, host)
+        if self.radio is not None:
+            self.radio.run()
+
+    def _serve_radio(self, what: RadioSide | Host) -> None:
+        assert self.radio is not None
+        if isinstance(what, RadioSide):
+            if (host := self.radio.accept()) is not None:
+                self._selector.register(host.socket, selectors.EVENT_READ, host)
+            return
+        sock = what.socket
+        if not self.radio.serve(what):
+            self._selector.unregister(sock)
+
+    def _passes(self, index: int, up: bool) -> bool:
+        """Whether a packet on the air passes the faults of a vehicle's link."""
+        link = self._links[index]
+        rate = link.drop_up if up else link.drop_down
+        return not link.frozen and not (rate and self._loss.random() < rate)
+
+    def _hear(self, index: int, packet: bytes, t: float) -> None:
+        reply = self.peers[index].receive(packet, self.time)
+        if reply is not None and self.radio is not None:
+            self.radio.receivers[index].push(reply)
 
     def _receive(self, index: int, datagram: bytes, host: tuple[str, int]) -> None:
         link = self._links[index]
@@ -314,6 +363,17 @@ class Fleet:
             link.socket.sendto(datagram, link.host)
 
     def _send_logs(self) -> None:
+        if self.radio is not None:
+            now = self.radio.now_ns() / 1e9
+            for peer, receiver in zip(self.peers, self.radio.receivers, strict=True):
+                packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks else ()
+                if packets and not receiver.connected(now):  # nobody is there: the log ends
+                    peer.blocks.clear()
+                    receiver.silent()
+                else:
+                    for packet in packets:
+                        receiver.push(packet)
+            return
         for peer, link in zip(self.peers, self._links, strict=True):
             if peer.blocks and link.host is not None:
                 for datagram in peer.log_packets(self.tick, self.time):
@@ -363,6 +423,8 @@ class Fleet:
             link.drop_down = rate if direction in ("down", "both") else link.drop_down
         elif name == "freeze":
             link.frozen = True
+        elif name == "close" and self.radio is not None:
+            link.frozen = True  # on the air nothing bounces
         elif name == "close" and link.socket is not None:
             self._selector.unregister(link.socket)
             link.socket.close()
@@ -385,13 +447,15 @@ class Fleet:
             if name == "reboot":
                 firmware.reset()
                 self.peers[index].reset()
+                if self.radio is not None:
+                    self.radio.receivers[index].reset()
 
     def _heal(self, index: int) -> None:
         link = self._links[index]
         link.drop_up = link.drop_down = 0.0
         link.frozen = False
         link.heal_at = None
-        if link.socket is None:
+        if link.socket is None and self.radio is None:
             link.socket = self._bind(self.config.base_port + index)
             self._selector.register(link.socket, selectors.EVENT_READ, index)
         self.estimates[index].offset, self.estimates[index].frozen = (0.0, 0.0, 0.0), False

@@ -1,0 +1,1 @@
+"""A simulated radio: Crazyradio dongles below pyusb, simulated Crazyflies on the air."""

@@ -1,0 +1,36 @@
+"""Times and sizes on the air between a Crazyradio and a Crazyflie (Nordic's Enhanced ShockBurst)."""
+
+from __future__ import annotations
+
+from dtsa_channel_sim.model.airtime import OVERHEAD_BITS
+
+BITRATES = {"250K": 250_000, "1M": 1_000_000, "2M": 2_000_000}
+RATE_NAMES = tuple(BITRATES)  # by the number of the dongle's request SET_DATA_RATE
+TURN_NS = 130_000  # a radio turns from receiving to sending, or starts to send
+MAX_PAYLOAD = 32  # bytes of a packet, and of an acknowledgement
+BROADCAST = bytes.fromhex("FFE7E7E7E7")  # every Crazyflie listens to it, and acknowledges nothing
+# Payload of an acknowledgement that fits into 1, 2, ... steps of the nRF24LU1+'s retry delay, by data rate.
+_ARD_STEPS = {"250K": (0, 0, 8, 16, 24, 32), "1M": (15, 32), "2M": (5, 32)}
+_ARD_STEP_NS = 250_000
+
+
+def on_air_ns(length: int, rate: str) -> int:
+    """Time that a packet's bits are on air, ns.
+
+    :param length: bytes of payload, 0 to 32.
+    :param rate: a key of BITRATES.
+    """
+    return (OVERHEAD_BITS + 8 * length) * 1_000_000_000 // BITRATES[rate]
+
+
+def retry_delay_ns(ard: int, rate: str) -> int:
+    """How long a Crazyradio PA waits for an acknowledgement, ns from the end of its packet.
+
+    :param ard: value of the request SET_RADIO_ARD: steps of 250 us, or with bit 7 the bytes of an acknowledgement.
+    :param rate: a key of BITRATES.
+    """
+    if not ard & 0x80:
+        return _ARD_STEP_NS * ((ard & 0x0F) + 1)
+    wanted = min(ard & 0x7F, MAX_PAYLOAD)
+    steps = next(i for i, fits in enumerate(_ARD_STEPS[rate]) if fits >= wanted)
+    return _ARD_STEP_NS * (steps + 1)
