@@ -31,12 +31,9 @@ MIN_LAND_S = 1.0
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
 BLIND_REPEATS = 3
 BLIND_LAND_S = 2.0
-<<<<<<< HEAD
 SINK_MPS = 0.3  # of a vehicle that does not know where it is
 SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
-=======
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
->>>>>>> 3ef6e07 (Links over the air stay open, come back, and carry blind orders past a packet that is stuck)
 LOW_M = 0.1  # this close to the floor there is nothing left to land from
 QUALITY_WINDOW_S = 1.0
 DOWN_M = 0.04  # m: it stands, by motion capture
@@ -114,15 +111,12 @@ class Vehicle:
         with self.lock:
             self.last = state
             self._log_times.append(now)
-<<<<<<< HEAD
+            if self.machine.state == State.LOST and time.monotonic() - now > FRESH_S:
+                return  # it delivers what it logged in the gap; what comes next is new
             if not self.watch.wrong:
                 self._trusted_height = max(state.position[2], 0.0)
             if self.watch.update(state, now, self.seen_at(now), flying=bool(state.info & IS_FLYING)):
                 self._log("error", f"{self.name}: {self.watch.wrong}")
-=======
-            if self.machine.state == State.LOST and time.monotonic() - now > FRESH_S:
-                return  # it delivers what it logged in the gap; what comes next is new
->>>>>>> 3ef6e07 (Links over the air stay open, come back, and carry blind orders past a packet that is stuck)
             if self.machine.state not in (State.DISCONNECTED, State.CONNECTING):
                 before = self.machine.state
                 self.machine.observe(state.info)

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 
 Row = dict[str, Any]
 WHAT = "crazyflie bridge"
 COUNT = 12
+DONGLES = 3
 RATE_HZ = 50.0
 SETTLE_S = 2.0
 MEASURE_S = 10.0
@@ -45,14 +47,19 @@ def crazyflie(count: int = COUNT, measure_s: float = MEASURE_S) -> Iterator[Row]
     yield measure(count, measure_s)
 
 
-def measure(count: int, measure_s: float, safety: Mapping[str, float] | None = None) -> Row:
+def measure(
+    count: int, measure_s: float, safety: Mapping[str, float] | None = None, *, loss: float | None = None
+) -> Row:
     """One flight.
 
     Commands leave in bursts, one for each Crazyflie every 20 ms, as a swarm's agents send them. The latency is from
     just before the publication in this process to the arrival of the datagram, as the kernel notes it. The tables of
     variables are not cached; the time to close is that to the end of the bridge's process.
 
+    Over the air the arrival is the end of the packet on the air.
+
     :param safety: the bridge's limits that are not the defaults.
+    :param loss: share of packets lost on the air of three simulated dongles; None: over UDP.
     :raises BenchmarkError: the bridge, or somebody in its care, does not get as far as that.
     """
     from ..fake_crazyflie.ports import free_base_port
@@ -67,12 +74,17 @@ def measure(count: int, measure_s: float, safety: Mapping[str, float] | None = N
         environment = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": place}
         base = free_base_port(count)
         arrivals = folder / "arrivals.npy"
-        far, near = Children(folder, environment), Children(folder, environment)
+        socket = folder / "radio"
+        over = {} if loss is None else {SIMULATED_RADIO: str(socket)}
+        far, near = Children(folder, environment), Children(folder, environment | over)
         pilot = Pilot(domain, count)
         try:
-            far.start("fleet", [], "dtsa_bench.benchmark.stamped_fleet", [str(count), str(base), str(arrivals)])
+            config = _swarm_yaml(folder, count, base, safety or {}, air=loss is not None)
+            words = [str(count), str(base), str(arrivals)]
+            if loss is not None:
+                words += [str(config), str(socket), str(loss)]
+            far.start("fleet", [], "dtsa_bench.benchmark.stamped_fleet", words)
             _until("the simulated Crazyflies", lambda: READY in far.all[0].log.read_text(), far.check)
-            config = _swarm_yaml(folder, count, base, safety or {})
             near.start("bridge", [], "dtsa_agent.crazyflie.bridge_node", ["--ros-args", "-p", f"config:={config}"])
             bridge = near.all[0]
 
@@ -149,15 +161,22 @@ def targets(row: Row) -> Iterator[tuple[str, float, float, bool]]:
     yield f"{who}close [s]", row["close_s"], 3.0, False
 
 
-def _swarm_yaml(folder: Path, count: int, base: int, safety: Mapping[str, float]) -> Path:
+def _swarm_yaml(folder: Path, count: int, base: int, safety: Mapping[str, float], *, air: bool) -> Path:
     import yaml
 
-    robots = {f"cf{k + 1}": {"uri": f"udp://127.0.0.1:{base + k}"} for k in range(count)}
+    robots = {
+        f"cf{k + 1}": {"uri": _radio_uri(k, count) if air else f"udp://127.0.0.1:{base + k}"} for k in range(count)
+    }
     path = folder / "swarm.yaml"
     common = {"command_rate_hz": RATE_HZ, "log_rate_hz": RATE_HZ}
     station = {"min_connected": count, "toc_cache": str(folder / "cache"), "safety": dict(safety)}
     path.write_text(yaml.safe_dump({"robots": robots, "all": common, "station": station}), encoding="utf-8")
     return path
+
+
+def _radio_uri(index: int, count: int) -> str:
+    dongle = index * DONGLES // count
+    return f"radio://{dongle}/{20 + 30 * dongle}/2M/E7E7E7E7{index + 1:02X}"
 
 
 def _until(

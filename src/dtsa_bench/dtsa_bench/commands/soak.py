@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.list:
         for name, text in SOAKS.items():
-            print(f"{name:9} {text}")
+            print(f"{name:10} {text}")
         return 0
     if args.name not in SOAKS:
         raise ConfigError("name", args.name or "", ", ".join(SOAKS))

@@ -12,6 +12,7 @@ SOAKS = {
     "memory": "an hour of lockstep and ten minutes of real time: no process grows",
     "reference": "200 random flights on the compiled core and on the specification: equal bit for bit",
     "fuzz": "an hour of coverage-guided fuzzing of decoders and event streams of libdtsa (needs clang)",
+    "crazyflie": "missions of twelve, gaps of the air, streams of commands: over UDP and simulated radios with losses",
     "load": "12 and 18 agents at 10 ms beside six busy loops: flights end by themselves and by Ctrl-C",
 }
 

@@ -1,0 +1,40 @@
+"""Crazyflies: missions, gaps of the air and streams of commands, over UDP and over simulated radios."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from dtsa_bench.batch.task import Row
+
+from ..item import Item, Soak
+from . import gaps, missions, streams
+
+_PARTS = {"mission": missions.run, "gap": gaps.run, "stream": streams.run}
+
+
+def _items() -> Iterator[Item]:
+    for part in (streams, gaps, missions):
+        yield from part.items()
+
+
+def _run(item: Item, directory: Path) -> dict[str, Any]:
+    return _PARTS[str(item.settings["part"])](item, directory)
+
+
+def _figures(rows: Sequence[Row]) -> dict[str, Any]:
+    figures: dict[str, Any] = {}
+    for name, part in (("mission", missions), ("gap", gaps), ("stream", streams)):
+        figures.update(part.figures([row for row in rows if row.get("part") == name]))
+    return figures
+
+
+SOAK = Soak(
+    "crazyflie",
+    "missions of twelve complete with code 0, nobody nearer than 0.25 m, over UDP and over radios that lose packets; "
+    "nobody falls after a gap of the air below 0.75 s; commands reach twelve over three dongles at 50 Hz",
+    tuple(_items()),
+    _run,
+    _figures,
+)
