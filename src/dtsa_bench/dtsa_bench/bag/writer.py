@@ -23,6 +23,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.wire import RUN_MESSAGES
 from dtsa_bench import __version__
 from dtsa_bench.bag import metadata, schema
+from dtsa_bench.bag.chunk_builder import write_quickly
 from dtsa_bench.bag.chunk_indexes import keep_small
 from dtsa_bench.bag.digest import KEY, BagDigest
 from dtsa_bench.bag.errors import BagError
@@ -104,6 +105,7 @@ class BagWriter:
         size = _UNLIMITED if marked else chunk_size
         self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
         keep_small(self._mcap)
+        write_quickly(self._mcap)
         try:
             self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
             self._add_metadata_record()
