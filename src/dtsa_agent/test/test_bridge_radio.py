@@ -48,6 +48,20 @@ def radio_flight(
             yield fleet, pilot
 
 
+@flown_again_when_overloaded
+def test_a_link_that_cflib_closes_is_opened_again_in_flight(tmp_path: Path) -> None:
+    with radio_flight(tmp_path, 2, {"safety": {"emergency_watchdog": False}}) as (fleet, pilot):
+        pilot.take_off()
+        link = pilot.bridge.vehicles["cf1"].link
+        link._cf.link.link_error_callback("Too many packets lost")  # as cflib does it after 100 of them
+        assert pilot.logged("cf1: flying -> lost .*Too many packets lost")
+        wait_for(lambda: link.reopened == 1 and pilot.state(1) != State.LOST, 5.0)
+        wait_for(lambda: pilot.state(1) == State.FLYING)
+        pilot.bridge.land_all("test over")
+        assert pilot.bridge.wait_landed(lambda: False) == []
+        assert [e for e in fleet.flown(1) if e in ("level out", "locked")] in ([], ["level out"])
+
+
 def test_an_emergency_stop_reaches_all_that_listen(tmp_path: Path) -> None:
     """Also those whose acknowledgements are missing, and one that this bridge has never met."""
     with radio_flight(tmp_path, 3, {}, strangers=1) as (fleet, pilot):

@@ -40,7 +40,17 @@ MIXED = ("--arming", "mixed")  # stock ones, which arm themselves, beside those 
 
 def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
     """The swarm's YAML, everybody on its place of the ellipse."""
-    data: dict[str, Any] = settings(fleet, {"safety": safety})
+    return written(settings(fleet, {"safety": safety}), folder)
+
+
+def radio_yaml(folder: Path, **safety: float) -> Path:
+    """The same over two dongles."""
+    robots = {f"cf{k}": {"uri": f"radio://{k % 2}/{40 + 40 * (k % 2)}/2M/E7E7E7E7{k:02X}"} for k in range(1, COUNT + 1)}
+    return written({"robots": robots, "station": {"toc_cache": str(folder / "cache"), "safety": safety}}, folder)
+
+
+def written(data: dict[str, Any], folder: Path) -> Path:
+    """The YAML's file."""
     for k, robot in enumerate(data["robots"].values()):
         angle = 2 * math.pi * k / COUNT
         robot["initial_position"] = [round(1.2 * math.cos(angle), 3), round(2.0 * math.sin(angle), 3), 0.0]
@@ -72,10 +82,15 @@ def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
 
 @flown_again_when_overloaded
 def test_take_off_exchange_landing(tmp_path: Path) -> None:
-    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
-        patient = {"link_age_s": 3.0, "command_age_s": 0.45, "emergency_watchdog": False}  # it would lock them
-        config, out = swarm_yaml(fleet, tmp_path, **patient), tmp_path / "out"
-        command = [*FLY, "--config", str(config), "--out", str(out)]
+    """Over simulated radios, on which a twentieth of all packets is lost."""
+    patient = {"link_age_s": 3.0, "command_age_s": 0.45, "emergency_watchdog": False}  # it would lock them
+    config, out, radio = (
+        radio_yaml(tmp_path, **patient),
+        tmp_path / "out",
+        ("--simulated-radio", str(tmp_path / "radio")),
+    )
+    with fake_fleet(tmp_path, COUNT, "--config", str(config), *radio, "--radio-loss", "0.05", *MIXED) as fleet:
+        command = [*FLY, "--config", str(config), "--out", str(out), *radio]
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         assert result.returncode == 0, result.stderr
         summary = json.loads((out / "summary.json").read_text())

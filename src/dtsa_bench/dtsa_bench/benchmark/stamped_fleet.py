@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.crazyflie.config import load_swarm
+from dtsa_agent.ros.common.priority import take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
 from dtsa_bench.fake_crazyflie import crtp
 from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig
 from dtsa_bench.fake_crazyflie.radio.settings import RadioSettings, Station
 
+PRIORITY = 30
 READY = "the simulated Crazyflies are there"
 # A command's number travels in its velocity along x: far below anything that moves a vehicle.
 STEP_MPS = 1e-6
@@ -80,6 +82,7 @@ def main() -> int:
     """Flies until SIGINT or SIGTERM, then writes the arrivals (NumPy, shape (n, 3))."""
     count, base_port, path = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     follow_supervisor()
+    take_priority(PRIORITY)  # as simulated Crazyflies do: the world waits for nobody
     radio = RadioSettings()
     if len(sys.argv) > 4:
         stations = tuple(Station.of(robot.uri) for robot in load_swarm(Path(sys.argv[4])).robots)

@@ -15,8 +15,8 @@ _PARTS = {"mission": missions.run, "gap": gaps.run, "stream": streams.run}
 
 
 def _items() -> Iterator[Item]:
-    for part in (streams, gaps, missions):
-        yield from part.items()
+    """All items, some of each kind first: a soak that is cut short has seen everything."""
+    yield from sorted((item for part in (streams, gaps, missions) for item in part.items()), key=lambda i: i.seed)
 
 
 def _run(item: Item, directory: Path) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
             result = dtsa("fly", "--backend", "cflib", *words, patience_s=_PATIENCE_S)
             said = result.stderr.strip()[-300:]
             met(result.returncode == 0, f"flight {number + 1}: exit code {result.returncode}: {said}")
-            completed.append(json.loads((out / "summary.json").read_text())["completion_s"])
+            completed.append(json.loads((out / "summary.json").read_text())["completion_time_s"])
     closest = closest_m(fleet.truth)
     met(closest >= CLOSEST_M, f"two came to {closest:.3f} m")
     return {**item.settings, "closest_m": round(closest, 3), "completion_s": completed}
