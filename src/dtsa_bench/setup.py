@@ -32,7 +32,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "dtsa = dtsa_bench.cli:main",
+            "dtsa = dtsa_bench.entry:dtsa",
             "recorded_channel = dtsa_bench.entry:recorded_channel",
             "fake_crazyflie = dtsa_bench.entry:fake_crazyflie",
         ],

@@ -2,6 +2,6 @@
 
 import sys
 
-from dtsa_bench.cli import main
+from dtsa_bench.entry import dtsa
 
-sys.exit(main())
+sys.exit(dtsa())

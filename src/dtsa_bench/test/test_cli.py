@@ -63,6 +63,20 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
         cli.main(["probe"])
 
 
+def test_an_interrupted_command_is_not_kept_by_what_is_left_of_the_interpreter() -> None:
+    program = """
+import atexit, sys, threading, time
+from dtsa_bench import cli, entry
+atexit.register(print, "said at the end")
+threading.Thread(target=time.sleep, args=(60,)).start()  # an interpreter that ends in good order waits for it
+cli.main = lambda: int(sys.argv[1])
+sys.exit(entry.dtsa())
+"""
+    words = [sys.executable, "-c", program, "130"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "said at the end\n", "")
+
+
 def test_interrupt_is_exit_130_without_traceback(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,8 +16,10 @@ from node_helpers import end_of, ros_graph
 pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.ros.common.loop import Stop
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.fly.domain import ros_domain
+from dtsa_bench.fly.flight import fly as fly_here
 from dtsa_bench.run_config import RunConfig, RunLimits
 from dtsa_bench.simulate import simulate
 from dtsa_channel_sim import ChannelConfig, ClockConfig, make_clocks
@@ -220,3 +222,13 @@ print(taken(), keep_heap_small(), taken() > 0)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "True", "True"]
+
+
+def test_after_a_signal_no_process_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOG_DIR", "")  # put back afterwards
+    swarm, stop = SwarmConfig(agents=4), Stop()
+    stop.signal = signal.SIGINT
+    run = RunConfig(swarm, ChannelConfig(agents=4, slot_ns=swarm.slot_ns))
+    with pytest.raises(KeyboardInterrupt):
+        fly_here(run, tmp_path / "out", stop=stop)
+    assert list((tmp_path / "out" / "log").iterdir()) == []

@@ -154,9 +154,9 @@ def fly(
         context = Context()
         children = Children(directory / "log", run_environment(domain, directory / "log"))
         progress = progress or ProgressLine(label)
-        # Started first: the interpreter of each process needs longer than all that follows here.
-        late = _start_agents(children, run, options, directory)
         try:
+            # Started first: the interpreter of each process needs longer than all that follows here.
+            late = _start_agents(children, run, options, directory, stop)
             try:
                 with stop.at_once():
                     rclpy.init(
@@ -240,8 +240,13 @@ def _cut_short(channel: Any, ended: EarlyEnd, failure: DtsaError | None) -> dict
     return {"cut_short": reason} if reason else {}
 
 
-def _start_agents(children: Children, run: RunConfig, options: FlightOptions, directory: Path) -> list[LateStart]:
-    """Starts the agents' processes, but for those that come late."""
+def _start_agents(
+    children: Children, run: RunConfig, options: FlightOptions, directory: Path, stop: Stop
+) -> list[LateStart]:
+    """Starts the agents' processes, but for those that come late.
+
+    :raises KeyboardInterrupt: on a signal; not while a process is being started, so that none is forgotten.
+    """
     swarm = run.swarm
     parameters = directory / "parameters.yaml"
     values = {**to_parameters(swarm.to_dict(), SwarmConfig), "mode": run.mode}
@@ -251,6 +256,8 @@ def _start_agents(children: Children, run: RunConfig, options: FlightOptions, di
     late: list[LateStart] = []
     if options.processes is None:
         for agent in range(1, swarm.agents + 1):
+            if stop:
+                raise KeyboardInterrupt
             place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_arguments(run, [agent])]
             start = partial(children.start, f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
             if agent in options.late:
@@ -260,6 +267,8 @@ def _start_agents(children: Children, run: RunConfig, options: FlightOptions, di
         return late
     shared = str(run.mode == LOCKSTEP and may_share(run)).lower()
     for number, ids in enumerate(split(swarm.agents, options.processes), 1):
+        if stop:
+            raise KeyboardInterrupt
         own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_table:={shared}"]
         name = f"swarm_host_{number} with {named(ids)}"
         children.start(name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_arguments(run, ids)])
