@@ -92,7 +92,9 @@ class Graph:
 def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Graph]]:
     with ros_domain() as domain, fake_fleet(tmp_path, COUNT, "--arming", "mixed") as fleet:
         config = tmp_path / "swarm.yaml"
-        config.write_text(yaml.safe_dump(settings(fleet, PATIENT)))
+        data = settings(fleet, PATIENT)
+        data["robots"]["cf3"]["group_mask"] = 2
+        config.write_text(yaml.safe_dump(data))
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         command = [sys.executable, "-m", "dtsa_agent.crazyflie.bridge_node", "--ros-args", "-p", f"config:={config}"]
         process = subprocess.Popen(
@@ -119,6 +121,11 @@ def up(graph: Graph) -> None:
     wait_for(lambda: all(graph.state(k) == "armed" for k in (1, 2, 3)))
     assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=2)).success
     wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2]) < 0.1 for k in (1, 2, 3)))
+
+
+def refused_commands(graph: Graph, k: int) -> int:
+    values = graph.last["/diagnostics"].status[k - 1].values
+    return next(int(v.value) for v in values if v.key == "commands refused")
 
 
 @flown_again_when_overloaded
@@ -153,6 +160,26 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         diagnostics = {s.hardware_id: s for s in graph.last["/diagnostics"].status}
         assert {"cf1", "cf2", "cf3"} == set(diagnostics)
         assert "battery [V]" in {v.key for v in diagnostics["cf1"].values}
+        # Groups: nobody is in the fourth, cf3 alone is in the second.
+        here = Point(x=graph.place(3)[0], y=graph.place(3)[1], z=0.1)
+        answer = graph.call(GoTo, "/all/go_to", group_mask=4, goal=here, duration=Duration(sec=1))
+        assert (answer.success, answer.message) == (False, "nobody of cf1, cf2, cf3 is in a group of 4")
+        before = len(fleet.events(1, "go_to")), len(fleet.events(3, "go_to"))
+        assert graph.call(GoTo, "/all/go_to", group_mask=2, goal=here, duration=Duration(sec=1)).success
+        wait_for(lambda: len(fleet.events(3, "go_to")) > before[1])
+        assert len(fleet.events(1, "go_to")) == before[0]
+        # Goals, heights and commands outside the fence, or faster than anybody means, are refused in so many words.
+        answer = graph.call(GoTo, "/cf3/go_to", goal=Point(x=1.95), duration=Duration(sec=5))
+        assert "cf3: the goal (1.95, 0.00, 0.00) is 0.45 m outside the geofence in x" in answer.message
+        answer = graph.call(GoTo, "/cf3/go_to", relative=True, goal=Point(y=9.0), duration=Duration(sec=50))
+        assert "outside the geofence in y" in answer.message
+        answer = graph.call(Takeoff, "/cf3/takeoff", height=3.0, duration=Duration(sec=9))
+        assert "cf3: the take-off to" in answer.message
+        refused = next(int(v.value) for v in diagnostics["cf2"].values if v.key == "commands refused")
+        rushing = VelocityWorld()
+        rushing.vel.x = 50.0
+        graph.velocity[2].publish(rushing)
+        wait_for(lambda: refused_commands(graph, 2) > refused)
         # A go_to that no Crazyflie can keep is refused; a landing is not, it takes longer.
         answer = graph.call(
             GoTo, "/cf3/go_to", relative=True, goal=Point(y=0.5), duration=Duration(nanosec=100_000_000)
@@ -167,6 +194,7 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         output, _ = process.communicate(timeout=60)
         assert process.returncode == 0, output
         assert "landing" in output
+        assert "cf2: a command with 50.00 m/s is refused" in output
         for k in (1, 2, 3):
             assert fleet.events(k, "land")
             assert fleet.flown(k)[2] == "landed"
@@ -199,6 +227,14 @@ def test_emergency_service(tmp_path: Path) -> None:
         wait_for(lambda: graph.state(2) == graph.state(3) == "emergency")
         for k in (1, 2, 3):
             assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
+        # Nobody starts in an emergency, and the answer says what to do.
+        answer = graph.call(Arm, "/cf1/arm", arm=True)
+        assert "cf1 is emergency (emergency stop: service emergency): switch it off and on" in answer.message
+        answer = graph.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
+        assert (answer.success, "0 Crazyflies are usable, min_connected is 1" in answer.message) == (False, True)
+        # A second bridge to the same Crazyflies does not start.
+        result = run_bridge(f"config:={tmp_path / 'swarm.yaml'}")
+        assert (result.returncode, "robots.cf1.uri" in result.stderr) == (2, True)
 
 
 def run_bridge(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
+import re
 import subprocess
 import sys
+import tempfile
 import threading
 from pathlib import Path
 from typing import Any
@@ -16,8 +19,11 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.crazyflie import state_machine as sm
+from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.budget import check_budget, radio_loads, radio_of
-from dtsa_agent.crazyflie.config import load_swarm, parse_swarm
+from dtsa_agent.crazyflie.claims import Claims
+from dtsa_agent.crazyflie.config import StationSettings, load_swarm, parse_swarm
+from dtsa_agent.crazyflie.limits import check_stream, outside_fence
 from dtsa_agent.crazyflie.mailbox import Mailbox
 from dtsa_agent.crazyflie.safety import Action, SafetyMonitor, SafetySettings, Watched
 from dtsa_agent.crazyflie.state_machine import State, StateMachine
@@ -401,3 +407,78 @@ def test_an_ordinary_user_gets_the_real_time_priority_that_is_granted_and_no_mor
         pytest.skip("this root may not do that either")
     assert take_all("50") == take_all("7") == "\n"
     assert take_all("6") == "Operation not permitted; see ulimit -r\n"
+
+
+# -- limits of what is flown ------------------------------------------------------------------------------------------
+TWELVE_WRONG_FILES = {
+    "the same robot twice": ("robots:\n  cf1: {uri: 'udp://h:1'}\n  cf1: {uri: 'udp://h:2'}\n", "cf1"),
+    "a place that is no number": ("robots: {cf1: {uri: 'udp://h:1', initial_position: [.nan, 0, 0]}}", "initial_pos"),
+    "a place at infinity": ("robots: {cf1: {uri: 'udp://h:1', initial_position: [0, .inf, 0]}}", "initial_position"),
+    "channel 200": ("robots: {cf1: {uri: radio://0/200/2M/E7E7E7E701}}", "channel from 0 to 125"),
+    "port 99999": ("robots: {cf1: {uri: 'udp://h:99999'}}", "port from 1 to 65535"),
+    "port 0": ("robots: {cf1: {uri: 'udp://h:0'}}", "port from 1 to 65535"),
+    "one Crazyflie under two names": (
+        "robots: {cf1: {uri: 'radio://0/80/2M/E7E7E7E701'}, cf2: {uri: 'radio://0/80/2M/E7E7E7E701?rate_limit=100'}}",
+        "URI of its own",
+    ),
+    "agent 0": ("robots: {cf0: {uri: 'udp://h:1'}}", "robots.cf0.id"),
+    "group 256": ("robots: {cf1: {uri: 'udp://h:1', group_mask: 256}}", "group_mask"),
+    "a list of robots": ("robots: [cf1, cf2]", "a mapping"),
+    "a parameter that is no number": (
+        "robots: {cf1: {uri: 'udp://h:1', firmware_params: {locSrv: {extPosStdDev: .nan}}}}", "extPosStdDev"
+    ),
+    "a fence without an end": (
+        "robots: {cf1: {uri: 'udp://h:1'}}\nstation: {safety: {geofence_max: [1.5, .inf, 1]}}", "geofence_max"
+    ),
+    "half a file": ("robots: {cf1: {uri: 'udp://h:1'", "YAML"),
+    "no text": ("\x00\x01", "YAML"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TWELVE_WRONG_FILES)
+def test_a_wrong_file_is_answered_clearly(tmp_path: Path, name: str) -> None:
+    text, words = TWELVE_WRONG_FILES[name]
+    path = tmp_path / "swarm.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load_swarm(path)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> None:
+    station = StationSettings()
+    assert outside_fence((1.5, 0.0, 1.0), station) == ""
+    assert outside_fence((1.95, 0.0, 0.95), station) == "(1.95, 0.00, 0.00) is 0.45 m outside the geofence in x"
+    assert outside_fence((0.0, 0.0, 2.5), station).endswith("0.60 m outside the geofence in z")
+    open_air = dataclasses.replace(station, safety=SafetySettings(geofence=False))
+    assert outside_fence((9.0, 0.0, 1.0), open_air) == ""
+    still = (0.0, 0.0, 0.0)
+    for setpoint in (
+        units.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0),
+        units.position((1.0, 2.0, 1.0), 0.0, 0.0),
+        units.hover(1.0, 0.0, 0.0, 1.0, 0.0),
+        units.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0),
+    ):
+        check_stream(setpoint, station)
+    for setpoint, words in (
+        (units.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
+        (units.hover(0.0, -50.0, 0.0, 1.0, 0.0), "50.00 m/s"),
+        (units.hover(0.0, 0.0, 0.0, 3.0, 0.0), "outside the geofence in z"),
+        (units.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
+        (units.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
+        (units.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(words)):
+            check_stream(setpoint, station)
+
+
+def test_a_crazyflie_belongs_to_one_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    first = Claims([("cf1", "radio://0/80/2M/E7E7E7E701"), ("cf2", "radio://0/80/2M/E7E7E7E702")])
+    with pytest.raises(ConfigError, match="no other bridge") as error:
+        Claims([("cf9", "radio://0/80/2M/E7E7E7E709"), ("a2", "radio://0/80/2M/e7e7e7e702?rate_limit=50")])
+    assert error.value.field == "robots.a2.uri"
+    Claims([("cf9", "radio://0/80/2M/E7E7E7E709")]).release()  # what it had taken before it was refused is free
+    first.release()
+    Claims([("cf2", "radio://0/80/2M/E7E7E7E702")]).release()

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from dtsa_agent.crazyflie.budget import WATCHDOG_HZ, check_budget, radio_loads
+from dtsa_agent.crazyflie.claims import Claims
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.emergency_radio import EmergencyRadio
 from dtsa_agent.crazyflie.link import require_cflib
@@ -51,6 +52,7 @@ class Bridge:
             log("info", f"{wired} Crazyflies without a radio (udp, usb): no budget")
         check_budget(loads, force=station.force_budget)
         require_cflib()
+        self._claims = Claims((robot.name, robot.uri) for robot in settings.robots)
         self._log = log
         self._on_event = on_event
         cache = Path(
@@ -115,7 +117,7 @@ class Bridge:
         for name in names:
             vehicle = self.vehicles[name]
             if len(names) > 1 and vehicle.state in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY, State.LOST):
-                problems.append(f"{name} skipped: {vehicle.state.name.lower()}")
+                problems.append(f"{name} skipped: {vehicle.standing}")
                 continue
             problem = order(vehicle)
             if problem:
@@ -247,3 +249,4 @@ class Bridge:
             if not vehicle.link.join(max(0.0, deadline - time.monotonic())):
                 self._log("warn", f"{vehicle.name}: the link does not close")
         self.emergency.close()
+        self._claims.release()

@@ -18,6 +18,7 @@ from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.bridge import Bridge
+from dtsa_agent.crazyflie.limits import check_stream
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.units import to_world
 from dtsa_agent.crazyflie.vehicle import Vehicle
@@ -76,7 +77,9 @@ class Inputs:
         age = (time.time_ns() - info["source_timestamp"]) * 1e-9
         try:
             setpoint = convert(message, time.monotonic() - min(max(age, 0.0), MAX_CLOCK_S))
+            check_stream(setpoint, vehicle.station)
         except ValueError as error:
+            vehicle.refused += 1
             self._node.get_logger().warning(f"{vehicle.name}: {error}", throttle_duration_sec=1.0)
             return
         if not vehicle.command(setpoint):
@@ -103,7 +106,17 @@ class Inputs:
         return units.hover(m.vx, m.vy, m.yaw_rate, m.z_distance, stamp)
 
     # -- services ---------------------------------------------------------------------------------------------------
-    def _each(self, names: list[str], order: Callable[[Vehicle], str | None], response: Any) -> Any:
+    def _each(self, names: list[str], order: Callable[[Vehicle], str | None], response: Any, group: int = 0) -> Any:
+        """Give an order to those that are addressed.
+
+        :param group: 0: to all of them; else to those in one of these groups.
+        """
+        if group:
+            members = [name for name in names if self._bridge.vehicles[name].robot.group_mask & group]
+            if not members:
+                response.success, response.message = False, f"nobody of {', '.join(names)} is in a group of {group}"
+                return response
+            names = members
         response.success, response.message = self._bridge.each(names, order)
         return response
 
@@ -113,12 +126,14 @@ class Inputs:
             self._node.get_logger().error(f"no take-off: {problem}")
             response.success, response.message = False, problem
             return response
-        return self._each(names, lambda v: v.takeoff(request.height, _seconds(request.duration)), response)
+        seconds = _seconds(request.duration)
+        return self._each(names, lambda v: v.takeoff(request.height, seconds), response, request.group_mask)
 
     def _land(self, names: list[str], request: Any, response: Any) -> Any:
         duration = _seconds(request.duration)
         notes: list[str] = []
-        self._each(names, lambda v: v.land("service", request.height, duration, notes.append), response)
+        order = lambda v: v.land("service", request.height, duration, notes.append)  # noqa: E731
+        self._each(names, order, response, request.group_mask)
         response.message = "; ".join(filter(None, (response.message, *notes)))
         return response
 
@@ -130,13 +145,15 @@ class Inputs:
             return response
         if not request.relative:
             place = to_world(place, self._origin)
-        return self._each(names, lambda v: v.go_to(place, request.yaw, duration, request.relative), response)
+        order = lambda v: v.go_to(place, request.yaw, duration, request.relative)  # noqa: E731
+        return self._each(names, order, response, request.group_mask)
 
     def _arm(self, names: list[str], request: Any, response: Any) -> Any:
         return self._each(names, lambda v: v.arm(request.arm), response)
 
     def _notify(self, names: list[str], request: Any, response: Any) -> Any:
-        return self._each(names, lambda v: v.notify_setpoints_stop(request.remain_valid_millisecs), response)
+        order = lambda v: v.notify_setpoints_stop(request.remain_valid_millisecs)  # noqa: E731
+        return self._each(names, order, response, request.group_mask)
 
     def _emergency(self, names: list[str], request: Any, response: Any) -> Any:
         for name in names:

@@ -13,6 +13,7 @@ station:
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.units import Vector
 
 NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*?(\d+)$")
+CHANNEL = re.compile(r"radio://[^/]+/(\d+)")
+PORT = re.compile(r"udp://.*:(\d+)$")
+LAST_CHANNEL, LAST_PORT = 125, 65535
 SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
 # Keys that Crazyswarm2's files have and that mean nothing here: its files can be used as they are.
 IGNORED = frozenset({"motion_capture", "big_quad", "firmware_logging", "reference_frame", "broadcasts", "marker"})
@@ -61,6 +65,10 @@ class RobotSettings(Settings):
     uri: str = setting(REQUIRED, "the Crazyflie's address, such as radio://0/80/2M/E7E7E7E701", custom=True)
     enabled: bool = setting(True, "false: it takes no part")
     type: str = setting("", "one of robot_types, whose values it takes over")
+    group_mask: int = setting(
+        0, "groups that it belongs to, a bit each: services with a group_mask reach those that share a bit with it",
+        minimum=0, maximum=255,
+    )  # fmt: skip
     initial_position: Vector = setting(
         (0.0, 0.0, 0.0), "place at the start, in the Crazyflies' own world (z = 0 is the floor)", unit="m"
     )
@@ -93,6 +101,7 @@ class RobotSettings(Settings):
         check(self)
         object.__setattr__(self, "uri", str(self.uri))
         radio_of(self.uri)
+        _check_numbers(self.uri)
         object.__setattr__(self, "firmware_params", _params(self.firmware_params))
 
     def to_dict(self) -> dict[str, Any]:
@@ -132,6 +141,9 @@ class StationSettings(Settings):
     )
     max_speed_mps: float = setting(
         1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
+    )
+    max_stream_mps: float = setting(
+        3.0, "streamed commands that are faster are refused", unit="m/s", minimum=0.1, maximum=30
     )
     landing_timeout_s: float = setting(
         20.0, "longest wait for all to land at the end", unit="s", minimum=1, maximum=300
@@ -208,6 +220,18 @@ def parse_swarm(data: object) -> SwarmSettings:
     return SwarmSettings(tuple(robots), station)
 
 
+def _check_numbers(uri: str) -> None:
+    """Channel and port of an address.
+
+    :raises ConfigError: there is no such channel or port.
+    """
+    channel, port = CHANNEL.match(uri), PORT.match(uri)
+    if channel is not None and int(channel[1]) > LAST_CHANNEL:
+        raise ConfigError("uri", uri, f"a channel from 0 to {LAST_CHANNEL}")
+    if port is not None and not 1 <= int(port[1]) <= LAST_PORT:
+        raise ConfigError("uri", uri, f"a port from 1 to {LAST_PORT}")
+
+
 def _mapping(field: str, value: object) -> dict[str, Any]:
     if value is None:
         return {}
@@ -251,7 +275,7 @@ def _params(groups: object) -> dict[str, float]:
     result: dict[str, float] = {}
     for group, names in _mapping("firmware_params", groups).items():
         for name, value in _mapping(f"firmware_params.{group}", names).items():
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise ConfigError(f"firmware_params.{group}.{name}", value, "a number")
             result[f"{group}.{name}"] = value
     return result

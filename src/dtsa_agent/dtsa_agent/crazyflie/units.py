@@ -15,6 +15,7 @@ from dataclasses import dataclass
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
+VELOCITY_WORLD, POSITION, HOVER, FULL_STATE = "velocity_world", "position", "hover", "full_state"
 FULL_STATE_LIMIT = 32.767  # m, m/s, m/s^2, rad/s: 16 bit numbers in thousandths
 
 # One log block of 20 bytes has everything; a block may have 26.
@@ -109,18 +110,18 @@ class Setpoint:
 
 def velocity_world(velocity: Vector, yaw_rate: float, stamp: float) -> Setpoint:
     """Velocity in m/s along the world's axes, yaw rate in rad/s -> the firmware's degrees per second."""
-    return Setpoint("velocity_world", (*_finite(velocity), math.degrees(*_finite((yaw_rate,)))), stamp)
+    return Setpoint(VELOCITY_WORLD, (*_finite(velocity), math.degrees(*_finite((yaw_rate,)))), stamp)
 
 
 def position(place: Vector, yaw: float, stamp: float) -> Setpoint:
     """Place in m (world), yaw in rad -> the firmware's degrees."""
-    return Setpoint("position", (*_finite(place), math.degrees(*_finite((yaw,)))), stamp)
+    return Setpoint(POSITION, (*_finite(place), math.degrees(*_finite((yaw,)))), stamp)
 
 
 def hover(vx: float, vy: float, yaw_rate: float, height: float, stamp: float) -> Setpoint:
     """Velocity in m/s along the body's heading, yaw rate in rad/s -> degrees/s, height in m above the floor."""
     vx, vy, yaw_rate, height = _finite((vx, vy, yaw_rate, height))
-    return Setpoint("hover", (vx, vy, math.degrees(yaw_rate), height), stamp)
+    return Setpoint(HOVER, (vx, vy, math.degrees(yaw_rate), height), stamp)
 
 
 def full_state(
@@ -136,7 +137,7 @@ def full_state(
     q = _finite(orientation)
     norm = math.sqrt(sum(c * c for c in q))
     q = tuple(c / norm for c in q) if norm > 1e-6 else (0.0, 0.0, 0.0, 1.0)
-    return Setpoint("full_state", (*vectors, q, roll_rate, pitch_rate, yaw_rate), stamp)
+    return Setpoint(FULL_STATE, (*vectors, q, roll_rate, pitch_rate, yaw_rate), stamp)
 
 
 def _saturate(value: float) -> float:

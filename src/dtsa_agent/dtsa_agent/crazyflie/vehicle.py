@@ -13,6 +13,7 @@ from typing import Any
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, Delivery
 from dtsa_agent.crazyflie.estimates import EstimateWatch, Settling
+from dtsa_agent.crazyflie.limits import outside_fence
 from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.paths import shortest_s, too_short
 from dtsa_agent.crazyflie.positions import Room
@@ -208,6 +209,13 @@ class Vehicle:
         """Where the state machine stands."""
         return self.machine.state
 
+    @property
+    def standing(self) -> str:
+        """Its state in words, and the way out of one that has no other."""
+        if self.state == State.EMERGENCY:
+            return f"emergency ({self.machine.reason}): switch it off and on, then call /{self.name}/reconnect"
+        return self.state.name.lower()
+
     def log_age(self, now: float) -> float:
         """Seconds since the last log packet; infinite before the first one."""
         return now - self._log_times[-1] if self._log_times else math.inf
@@ -259,7 +267,7 @@ class Vehicle:
         """Let the motors run, or lock them; why not, or an empty text."""
         with self.lock:
             if self.state not in (State.READY, State.ARMED):
-                return f"{self.name} is {self.state.name.lower()}"
+                return f"{self.name} is {self.standing}"
             if arm and (problem := self._misplaced()):
                 return problem
             self.action = "arming" if arm else "disarming"
@@ -273,7 +281,7 @@ class Vehicle:
         """Climb to a height (m above the floor) within a duration (s); why not, or an empty text."""
         with self.lock:
             if self.state not in (State.ARMED, State.FLYING, State.LANDING):
-                return f"{self.name} is {self.state.name.lower()}, not armed"
+                return f"{self.name} is {self.standing}, not armed"
             if self.last is not None and self.last.battery < self.robot.battery.voltage_critical:
                 return f"{self.name}: battery {self.last.battery:.2f} V"
             if problem := self.watch.wrong and f"{self.name}: {self.watch.wrong}":
@@ -282,6 +290,9 @@ class Vehicle:
                 return problem
             if not math.isfinite(height):
                 return f"{self.name}: height {height} m is not finite"
+            x, y, _ = (0.0, 0.0, 0.0) if self.last is None else self.last.position
+            if self.last is not None and (problem := outside_fence((x, y, height), self.station)):
+                return f"{self.name}: the take-off to {problem}"
             z = 0.0 if self.last is None else max(self.last.position[2], 0.0)
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
@@ -304,8 +315,14 @@ class Vehicle:
         """Fly to a place (m, world; relative: an offset) within a duration (s); why not, or an empty text."""
         with self.lock:
             if self.state != State.FLYING or self._deaf:
-                return f"{self.name} is {self.state.name.lower()}" + (f" ({self.action})" if self._deaf else "")
+                return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
             here = (0.0, 0.0, 0.0) if relative or self.last is None else self.last.position
+            goal = place
+            if relative and self.last is not None:
+                a, b = self.last.position, place
+                goal = (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+            if problem := outside_fence(goal, self.station):
+                return f"{self.name}: the goal {problem}"
             if problem := too_short(duration, math.dist(place, here), self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
             self.action = "go_to"
@@ -410,7 +427,7 @@ class Vehicle:
         with self.lock:
             height = height if math.isfinite(height) else 0.0
             if self.state not in (State.ARMED, State.FLYING, State.LANDING, State.LOST):
-                return f"{self.name} is {self.state.name.lower()}"
+                return f"{self.name} is {self.standing}"
             if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
             self._deaf = True
@@ -471,7 +488,7 @@ class Vehicle:
         """End the stream of setpoints and hold; why not, or an empty text."""
         with self.lock:
             if self.state not in ACCEPTS_COMMANDS:
-                return f"{self.name} is {self.state.name.lower()}"
+                return f"{self.name} is {self.standing}"
             if self.state == State.FLYING:
                 self.hold("the stream of commands was declared over")  # tells the firmware, too
             else:

@@ -1,0 +1,55 @@
+"""What is not flown although it could be: places outside the geofence, speeds that nobody means."""
+
+from __future__ import annotations
+
+import math
+
+from dtsa_agent.crazyflie.config import StationSettings
+from dtsa_agent.crazyflie.units import FULL_STATE, HOVER, POSITION, VELOCITY_WORLD, Setpoint, Vector, to_map
+
+
+def outside_fence(place: Vector, station: StationSettings) -> str:
+    """How a place is outside the geofence; empty if it is not, or if there is no fence.
+
+    :param place: m, world.
+    :param station: fence, tolerance, and where the room is.
+    """
+    fence = station.safety
+    if not fence.geofence:
+        return ""
+    here = to_map(place, station.room_origin_in_world)
+    for axis, p, low, high in zip("xyz", here, fence.geofence_min, fence.geofence_max, strict=True):
+        away = max(low - p, p - high)
+        if away > fence.geofence_tolerance_m:
+            where = ", ".join(f"{v:.2f}" for v in here)
+            return f"({where}) is {away:.2f} m outside the geofence in {axis}"
+    return ""
+
+
+def check_stream(setpoint: Setpoint, station: StationSettings) -> None:
+    """Refuse a streamed command that leads out of the room, or is too fast.
+
+    :param setpoint: the command, in the firmware's units.
+    :raises ValueError: why it is refused.
+    """
+    place, velocity = _place_and_velocity(setpoint, station)
+    speed, limit = math.hypot(*velocity), station.max_stream_mps
+    if speed > limit:
+        raise ValueError(f"a command with {speed:.2f} m/s is refused (station.max_stream_mps is {limit:g})")
+    if place is not None and (problem := outside_fence(place, station)):
+        raise ValueError(f"a command to {problem} is refused")
+
+
+def _place_and_velocity(setpoint: Setpoint, station: StationSettings) -> tuple[Vector | None, tuple[float, ...]]:
+    """Where (m, world) and how fast (m/s) a command leads."""
+    a = setpoint.arguments
+    if setpoint.kind == POSITION:
+        return (a[0], a[1], a[2]), ()  # type: ignore[return-value]
+    if setpoint.kind == VELOCITY_WORLD:
+        return None, (a[0], a[1], a[2])  # type: ignore[return-value]
+    if setpoint.kind == HOVER:
+        x, y, _ = station.room_origin_in_world
+        return (x, y, a[3]), (a[0], a[1])  # type: ignore[return-value]
+    if setpoint.kind == FULL_STATE:
+        return a[0], a[1]  # type: ignore[return-value]
+    return None, ()
