@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -28,7 +29,9 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_bench.fake_crazyflie.truth import read_truth
-from dtsa_bench.fly.places import MissionError, assign_places, check_ways
+from dtsa_bench.fly.bringing import plan_moves
+from dtsa_bench.fly.domain import ros_domain
+from dtsa_bench.fly.places import MissionError, assign_places, check_standing, crossings
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 COUNT = 4
@@ -64,20 +67,20 @@ def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
     names = [f"cf{k}" for k in range(1, 13)]
     fence = SafetySettings()
     start = make_scenario(config).start
-    assert assign_places(config, names, start) is config
+    assert assign_places(config, start) is config
     measured = np.roll(start, 5, axis=1) + np.random.default_rng(1).uniform(-0.15, 0.15, (3, 12))
-    found = assign_places(config, names, measured)
+    found = assign_places(config, measured)
     assert found.place_numbers == np.roll(np.arange(1, 13), 5).tolist()
-    check_ways(make_scenario(found), names, measured, fence)
-    with pytest.raises(MissionError, match=r"cf1 and cf7 would pass at 0\.\d\d m"):
-        check_ways(make_scenario(config), names, np.roll(start, 6, axis=1), fence)  # all through the middle
-    with pytest.raises(MissionError, match=r"let.* begin: cf1 by \d\.\d\d m, cf2 by"):
-        assign_places(found, names, start)
+    check_standing(names, measured, fence)
+    assert not crossings(make_scenario(found), names, measured)
+    across = crossings(make_scenario(config), names, np.roll(start, 6, axis=1))  # all through the middle
+    assert "cf1 and cf7 at 0.0" in ", ".join(across)
+    assert assign_places(found, start) is found  # roles that the user has given are kept
     measured = start.copy()
     measured[:2, 3] = measured[:2, 4] + (0.1, 0.0)
     measured[0, 0] = 2.5
     with pytest.raises(MissionError, match=r"cf1 stands 1\.00 m outside .*; cf4 and cf5 stand 0\.10 m apart"):
-        check_ways(make_scenario(config), names, measured, fence)
+        check_standing(names, measured, fence)
 
 
 @flown_again_when_overloaded
@@ -117,14 +120,76 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
         during = track[(times >= begin) & (times <= end)]
         gap = np.linalg.norm(during[:, :, :, None] - during[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
         assert summary["min_distance_m"] == pytest.approx(gap.min(), abs=0.05)
-        # Once more from where they stand now: at each other's places.
-        command[command.index(str(out))] = str(tmp_path / "again")
-        result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-        assert result.returncode == 0, result.stderr
-        assert "exchange of roles, places 3 4 1 2" in result.stderr
+
+
+def test_whoever_may_not_exchange_roles_is_brought_over_the_others() -> None:
+    config = SwarmConfig(agents=12, permute=False, shape="ellipse", axis_x_m=1.2, axis_y_m=2.0)
+    names = [f"cf{k}" for k in range(1, 13)]
+    goal, fence, random = make_scenario(config).start, SafetySettings(), np.random.default_rng(3)
+    for order in (np.roll(np.arange(12), 1), np.roll(np.arange(12), 6), *(random.permutation(12) for _ in range(20))):
+        here = goal[:, order] + np.array([[0.08], [0.08], [0.0]]) * random.uniform(-1, 1, (3, 12))
+        for move in plan_moves(names, here, goal, fence):
+            for waypoint in move.waypoints:
+                begin = here[:, move.index, None]
+                steps = begin + (np.array(waypoint)[:, None] - begin) * np.linspace(0, 1, 50)
+                assert (np.abs(steps) <= np.array(fence.geofence_max)[:, None]).all()
+                others = np.delete(here, move.index, axis=1)
+                gap = np.linalg.norm(steps[:2, :, None] - others[:2, None], axis=0)
+                below = steps[2, :, None] - others[2, None] < 0.5
+                assert gap[below].min(initial=1.0) > 0.34
+                here[:, move.index] = waypoint
+        assert np.abs(here - goal).max() < 0.06
+    crowded = goal.copy()
+    crowded[:2, 1] = crowded[:2, 0] - (0.1, 0.0)
+    with pytest.raises(MissionError, match=r"cf1 and cf2 hover 0\.10 m apart"):
+        plan_moves(names, crowded, goal, fence)
+    low = SafetySettings(geofence_max=(1.5, 2.3, 0.4))
+    with pytest.raises(MissionError, match=r"is above the geofence's 0\.4 m"):
+        plan_moves(names, np.roll(goal, 1, axis=1), goal, low)
+    pair = np.array([[-0.3, 0.3], [0.0, 0.0], [0.0, 0.0]])
+    narrow = SafetySettings(geofence_min=(-0.5, -0.3, -0.95), geofence_max=(0.5, 0.3, 0.95))
+    with pytest.raises(MissionError, match=r"cf1, cf2 stand at each other's places, and no place aside"):
+        plan_moves(names[:2], pair, pair[:, ::-1], narrow)
+
+
+@flown_again_when_overloaded
+def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> None:
+    """The first one finds two at each other's places and may not exchange roles; the second one exchanges them."""
+    with ros_domain() as domain:
+        pass  # free: the bridge's now
+    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
+        config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
+        data = yaml.safe_load(config.read_text())
+        robots = list(data["robots"].values())  # cf1 is the agent of the third place's vehicle, and the other way round
+        robots[0]["uri"], robots[2]["uri"] = robots[2]["uri"], robots[0]["uri"]
+        config.write_text(yaml.safe_dump(data))
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        log = (tmp_path / "bridge.log").open("w+")
+        command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config)]
+        bridge = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        try:
+            for number, (options, words) in enumerate((
+                (["--places", "1 2 3 4"], "brought to their places one by one: cf1 and cf3 at 0.0"),
+                ([], "exchange of roles, places 3 4 1 2"),
+            )):  # fmt: skip
+                command = [*FLY, "--config", str(config), "--attach", "--out", str(tmp_path / str(number)), *options]
+                result = subprocess.run(
+                    command, env=environment, capture_output=True, text=True, timeout=150, check=False
+                )
+                assert result.returncode == 0, result.stderr + (tmp_path / "bridge.log").read_text()
+                assert words in result.stderr
+            bridge.send_signal(signal.SIGINT)
+            assert bridge.wait(60) == 0
+        finally:
+            bridge.kill()
+            bridge.wait()
+            log.close()
         _, track, events = read_truth(fleet.truth)
         assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
-        assert np.linalg.norm(track[-1][:2] - track[0][:2], axis=0).max() < 0.5
+        assert [e["event"] for e in events].count("takeoff") == 2 * COUNT
+        flown = track[track[:, 2].min(axis=1) > 0.5]
+        gap = np.linalg.norm(flown[:, :, :, None] - flown[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
+        assert gap.min() > 0.25
 
 
 @flown_again_when_overloaded

@@ -132,8 +132,7 @@ class Link:
                 if isinstance(item, Setpoint):
                     self._send_setpoint(item)
                 elif isinstance(item, Position):
-                    if self._cf is not None and self.connected:
-                        item.send(self._cf)
+                    self.run(item.send)
                 elif item is not None:
                     item()
             except Exception as error:  # one bad order must not end the worker

@@ -51,6 +51,12 @@ def add_parser(subparsers: Any) -> None:
         "--config", metavar="FILE", default=None, help="swarm.yaml of the Crazyflies, for --backend cflib"
     )
     add_simulated_radio(crazyflies)
+    crazyflies.add_argument(
+        "--attach",
+        action="store_true",
+        help="by the bridge that runs already (dtsa bridge) on the ROS domain of --domain or ROS_DOMAIN_ID, and goes "
+        "on: for several missions in a row",
+    )
     add_run_options(parser)
     clocks = add_mode_options(parser)
     kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
@@ -76,6 +82,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.config is not None:
         raise ConfigError("config", args.config, "a swarm.yaml together with --backend cflib")
+    if args.attach:
+        raise ConfigError("attach", True, "a mission, --backend cflib")
 
     processes = None
     if args.processes != "per-agent":
@@ -155,7 +163,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     options = FlightOptions(domain=domain, pictures=args.picture)
     with Stop() as stop:
-        flight, cut_short = fly_crazyflies(config, settings, path, args.out, options, stop)
+        flight, cut_short = fly_crazyflies(config, settings, path, args.out, options, stop, attach=args.attach)
     _tell(args, flight)
     if cut_short:
         print(f"dtsa: the exchange was cut short: {cut_short}; all have landed", file=sys.stderr)

@@ -46,11 +46,12 @@ from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
+from .bringing import plan_moves
 from .children import Child, Children, describe_end
 from .domain import LAST_DOMAIN, ros_domain
 from .flight import END_S, QUIET, Flight, run_environment
 from .options import FlightOptions
-from .places import MissionError, assign_places, check_places, check_ways
+from .places import MissionError, assign_places, check_places, check_standing, crossings
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import RealtimeSupervisor, Supervisor
@@ -58,6 +59,9 @@ from .supervisor import RealtimeSupervisor, Supervisor
 ARRIVED_M = 0.12  # m: at its start when this close
 CLIMB_MPS = 0.4
 SHIFT_MPS = 0.3
+BRING_MPS = 0.8  # of one that is brought to its place, at most
+KEEP_M = 0.3  # nobody comes closer to one that is brought to its place
+BRIDGE_SILENT_S = 3.0
 BRIDGE_S = 60.0  # s, for the connections
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
 
@@ -105,6 +109,8 @@ class Mission:
         self.status: dict[str, Status] = {}
         self.diagnostics: dict[str, dict[str, float | str]] = {}  # what the bridge says about each, once a second
         self.place: dict[str, tuple[float, float, float]] = {}
+        self.crossing: list[str] = []  # whose ways to the starts cross: they are brought there one by one
+        self.heard = time.monotonic()  # s, monotonic, the last status of anybody
         self.exchanging = False
         self.bridge_alive: Callable[[], None] = lambda: None
         self._odometry: list[Any] = []
@@ -136,6 +142,7 @@ class Mission:
     def _keep_status(self, name: str) -> Callable[[Status], None]:
         def keep(message: Status) -> None:
             self.status[name] = message
+            self.heard = time.monotonic()
             if self.exchanging and message.state != Status.STATE_FLYING and not self.ended.reason:
                 self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
 
@@ -157,6 +164,15 @@ class Mission:
         while not self._over.wait(0.1):
             if self._beating.is_set():
                 self._heartbeat.publish(EmptyMessage())
+
+    def check_bridge(self) -> None:
+        """For a bridge that is not a child of this process.
+
+        :raises MissionError: nothing is heard of it.
+        """
+        silent = time.monotonic() - self.heard
+        if self.status and silent > BRIDGE_SILENT_S:
+            raise MissionError(f"the bridge has been silent for {silent:.1f} s")
 
     def start(self) -> None:
         """Begin to listen."""
@@ -227,9 +243,13 @@ class Mission:
         """
         vehicles = [robot.name for robot in self.settings.robots]
         measured = np.array([self.place[name] for name in vehicles]).T
-        found = assign_places(config, vehicles, measured)
+        fence = self.settings.station.safety
+        check_standing(vehicles, measured, fence)
+        found = assign_places(config, measured)
         self.scenario = make_scenario(found)
-        check_ways(self.scenario, vehicles, measured, self.settings.station.safety)
+        self.crossing = crossings(self.scenario, vehicles, measured)
+        if self.crossing:  # can it be done? Before motors turn.
+            plan_moves(vehicles, measured * [[1.0], [1.0], [0.0]], self.scenario.start, fence)
         return found
 
     def take_off(self) -> None:
@@ -244,6 +264,8 @@ class Mission:
         self.call("/all/takeoff", height=height, duration=_duration(seconds))
         time.sleep(seconds)
         self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
+        if self.crossing:
+            self._bring()
         starts = self.scenario.start.T.tolist()
         way = max(math.dist(start, self.place[r.name]) for r, start in zip(self.settings.robots, starts, strict=True))
         seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))  # for all: their ways keep apart if flown together
@@ -255,6 +277,35 @@ class Mission:
         # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
         self._executor.create_task(self._forget_odometry)
         self.exchanging = True
+
+    def _bring(self) -> None:
+        """One after the other to its place: flown at the same time their straight ways would cross."""
+        vehicles = [robot.name for robot in self.settings.robots]
+        hover = np.array([self.place[name] for name in vehicles]).T
+        moves = plan_moves(vehicles, hover, self.scenario.start, self.settings.station.safety)
+        for number, move in enumerate(moves, 1):
+            name = vehicles[move.index]
+            self.say(f"bringing {name} to its place ({number} of {len(moves)})")
+            for waypoint in move.waypoints:
+                self._lead(name, waypoint)
+
+    def _lead(self, name: str, waypoint: tuple[float, float, float]) -> None:
+        """One flies to a place, all others hover.
+
+        :raises MissionError: it does not arrive, or somebody is in its way.
+        """
+        way = math.dist(self.place[name], waypoint)
+        seconds = 0.3 + max(way / BRING_MPS, shortest_s(way, self.settings.station.max_speed_mps))
+        x, y, z = waypoint
+        self.call(f"/{name}/go_to", goal=Point(x=x, y=y, z=z), duration=_duration(seconds))
+
+        def arrived() -> bool:
+            for other, place in self.place.items():
+                if other != name and (gap := math.dist(self.place[name], place)) < KEEP_M:
+                    raise MissionError(f"{name} comes within {gap:.2f} m of {other} on its way (limit {KEEP_M} m)")
+            return math.dist(self.place[name], waypoint) < ARRIVED_M
+
+        self.wait(f"the way of {name} to its place", arrived, seconds + 10.0)
 
     def _forget_odometry(self) -> None:
         while self._odometry:
@@ -311,7 +362,14 @@ def _duration(seconds: float) -> Duration:
 
 
 def fly_crazyflies(
-    run: RunConfig, settings: SwarmSettings, swarm_yaml: Path, out: str | Path, options: FlightOptions, stop: Stop
+    run: RunConfig,
+    settings: SwarmSettings,
+    swarm_yaml: Path,
+    out: str | Path,
+    options: FlightOptions,
+    stop: Stop,
+    *,
+    attach: bool = False,
 ) -> tuple[Flight, str]:
     """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
 
@@ -321,6 +379,7 @@ def fly_crazyflies(
     :param out: directory for the bag and the results.
     :param options: domain, pictures.
     :param stop: a flag that ends the mission early.
+    :param attach: by the bridge that runs already on this ROS domain, and goes on running.
     :returns: the results, and why the exchange was cut short (empty: it was not).
     :raises ConfigError: before anything has been started.
     :raises DtsaError: something failed before the exchange began, or a node died.
@@ -330,11 +389,11 @@ def fly_crazyflies(
     check_key(run.swarm)
     require_cflib()
     scenario = check_places(settings, run.swarm)
-    positions = settings.station.positions.on
+    shared = attach or settings.station.positions.on
     wanted = options.domain
-    if wanted is None and positions:  # that of motion capture
+    if wanted is None and shared:  # that of the bridge, or of motion capture
         wanted = whole_number(os.environ.get("ROS_DOMAIN_ID") or "0", "ROS_DOMAIN_ID", 0, LAST_DOMAIN)
-    with ros_domain(wanted, shared=positions) as domain:
+    with ros_domain(wanted, shared=shared) as domain:
         directory = new_directory(out)
         logs = directory / "log"
         logs.mkdir()
@@ -342,15 +401,16 @@ def fly_crazyflies(
         context = Context()
         progress = ProgressLine("fly")
         bridge, agents = Children(logs, environment), Children(logs, environment)
-        bridge.start("bridge", [], "dtsa_agent.crazyflie.bridge_node",
-                     ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
+        if not attach:
+            bridge.start("bridge", [], "dtsa_agent.crazyflie.bridge_node",
+                         ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
         ended = _Ended(stop)
         mission: Mission | None = None
         try:
             rclpy.init(args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
             node = Node("mission", context=context, enable_rosout=False, start_parameter_services=False)
             mission = Mission(node, settings, scenario, ended, progress.show)
-            mission.bridge_alive = bridge.check
+            mission.bridge_alive = mission.check_bridge if attach else bridge.check
             mission.start()
             take_priority(settings.station.priority)
             mission.connect()
@@ -358,6 +418,8 @@ def fly_crazyflies(
             if swarm != run.swarm:
                 progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
                 run = dataclasses.replace(run, swarm=swarm)
+            if mission.crossing:
+                progress.say(f"brought to their places one by one: {', '.join(mission.crossing)} otherwise")
             mission.take_off()
             _start_agents(agents, run, settings, directory)
             flight = _exchange(context, run, directory, agents, bridge, progress, options, ended, mission)
@@ -368,7 +430,8 @@ def fly_crazyflies(
                 if mission is not None:
                     mission.land(urgent)
                     mission.close()
-                _end_bridge(bridge.all[0])
+                if not attach:
+                    _end_bridge(bridge.all[0])
             progress.end()
             context.try_shutdown()
 

@@ -45,24 +45,20 @@ def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
     return scenario
 
 
-def assign_places(config: SwarmConfig, names: Sequence[str], measured: Array) -> SwarmConfig:
-    """The configuration in which everybody begins near where it stands.
+def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
+    """The configuration in which everybody begins near where it stands, if roles may be exchanged.
 
     If somebody is not where it would begin, all exchange places: the sum of the squared ways is the smallest possible,
-    with which ways that are flown at the same time keep 0.7 times the distance of the starts or goals.
+    with which ways that are flown at the same time keep 0.7 times the distance of the starts or goals. Roles that
+    `places` gives are kept.
 
     :param config: the swarm.
-    :param names: of the vehicles, by id.
     :param measured: (3, N), m, frame map: where they stand.
-    :raises MissionError: the user has said who begins where, and somebody does not stand there.
     """
     start = make_scenario(config).start
     away = np.linalg.norm(measured[:2] - start[:2], axis=0)
-    if away.max() <= PLACE_M:
+    if away.max() <= PLACE_M or config.places:
         return config
-    if config.places:
-        wrong = [f"{name} by {d:.2f} m" for name, d in zip(names, away.tolist(), strict=True) if d > PLACE_M]
-        raise MissionError(f"not where `places` lets them begin: {', '.join(wrong)}")
     from scipy.optimize import linear_sum_assignment  # comes with cflib
 
     count = config.agents
@@ -72,10 +68,9 @@ def assign_places(config: SwarmConfig, names: Sequence[str], measured: Array) ->
     return dataclasses.replace(config, places=" ".join(str(place + 1) for place in chosen.tolist()))
 
 
-def check_ways(scenario: Scenario, names: Sequence[str], measured: Array, fence: SafetySettings) -> None:
-    """Whether all can take off where they stand, and fly straight to their starts at the same time.
+def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings) -> None:
+    """Whether all can take off where they stand.
 
-    :param scenario: where they begin.
     :param names: of the vehicles, by id.
     :param measured: (3, N), m, frame map: where they stand.
     :param fence: the room.
@@ -88,17 +83,30 @@ def check_ways(scenario: Scenario, names: Sequence[str], measured: Array, fence:
             outside = float(max((low - (x, y)).max(), ((x, y) - high).max()))
             if outside > fence.geofence_tolerance_m:
                 problems.append(f"{name} stands {outside:.2f} m outside the geofence at ({x:.2f}, {y:.2f})")
-    goal = scenario.start[:2]
     for a in range(len(names)):
         for b in range(a):
             standing = float(np.linalg.norm(measured[:2, a] - measured[:2, b]))
-            closest = _closest(measured[:2, a] - measured[:2, b], goal[:, a] - goal[:, b])
             if standing < APART_M:
                 problems.append(f"{names[b]} and {names[a]} stand {standing:.2f} m apart")
-            elif closest < APART_M:
-                problems.append(f"{names[b]} and {names[a]} would pass at {closest:.2f} m on the way to their starts")
     if problems:
         raise MissionError(f"no take-off (at least {APART_M} m apart): {'; '.join(problems)}")
+
+
+def crossings(scenario: Scenario, names: Sequence[str], measured: Array) -> list[str]:
+    """Who would come too close if all flew straight to their starts at the same time.
+
+    :param scenario: where they begin.
+    :param names: of the vehicles, by id.
+    :param measured: (3, N), m, frame map: where they are.
+    """
+    goal = scenario.start[:2]
+    found = []
+    for a in range(len(names)):
+        for b in range(a):
+            closest = _closest(measured[:2, a] - measured[:2, b], goal[:, a] - goal[:, b])
+            if closest < APART_M:
+                found.append(f"{names[b]} and {names[a]} at {closest:.2f} m")
+    return found
 
 
 def _closest(begin: Array, end: Array) -> float:
