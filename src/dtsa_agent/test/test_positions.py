@@ -20,6 +20,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.config import parse_swarm
 from dtsa_agent.crazyflie.estimates import EstimateWatch, Settling
 from dtsa_agent.crazyflie.positions import MOVED_AGAIN, PositionSettings, Tracker
+from dtsa_agent.crazyflie.sightings import Sightings
 from dtsa_agent.crazyflie.units import VehicleState
 
 ROOM = ((-1.5, -2.3, -0.95), (1.5, 2.3, 0.95))
@@ -95,6 +96,22 @@ def test_latency_and_rate() -> None:
     assert numbers.rate == pytest.approx(100, abs=1)
     assert (numbers.latency_p50, numbers.latency_p99) == (pytest.approx(0.004), pytest.approx(0.004))
     assert (numbers.sent, numbers.age) == (150, pytest.approx(0.005))
+
+
+def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None:
+    pytest.importorskip("cflib")
+    from dtsa_agent.crazyflie.radio_link import packets_of
+
+    for send, size, header in (("extpose", 29, 0x61), ("extpos", 12, 0x60)):
+        sightings = Sightings("cf1", PositionSettings(source="pose", send=send), ORIGIN, ROOM, lambda *line: None)
+        packet = sightings.see((1.0, 2.0, 0.5), LEVEL, "world", 0.0, 5.0, flying=False)
+        assert packet is not None
+        (data,) = packets_of(SimpleNamespace(platform=None), packet.send) or []
+        assert (len(data) - 1, data[0] & 0xF3, sightings.tracker.sent) == (size, header, 1)
+        assert sightings.place(5.2) == (1.0, 2.0, 0.5)
+        assert sightings.disagrees((1.0, 2.0, 0.45), 5.2) == ""
+        assert "0.30 m from where it believes to be" in sightings.disagrees((1.0, 2.0, 0.8), 5.2)
+        assert "not seen by motion capture (no pose comes)" in sightings.disagrees((1.0, 2.0, 0.5), 6.0)
 
 
 # -- estimates --------------------------------------------------------------------------------------------------------

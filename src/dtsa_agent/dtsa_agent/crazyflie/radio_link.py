@@ -42,6 +42,7 @@ class Recorder:
     def __init__(self, cf: Any) -> None:
         from cflib.crazyflie.commander import Commander
         from cflib.crazyflie.high_level_commander import HighLevelCommander
+        from cflib.crazyflie.localization import Localization
         from cflib.crazyflie.supervisor import Supervisor
 
         self.packets: list[bytes] = []
@@ -49,6 +50,7 @@ class Recorder:
         self.commander = Commander(self)
         self.high_level_commander = HighLevelCommander(self)
         self.supervisor = Supervisor(self)
+        self.loc = Localization(self)
 
     def send_packet(self, packet: Any, *_: Any, **__: Any) -> None:
         self.packets.append(bytes((packet.header,)) + bytes(packet.data))
