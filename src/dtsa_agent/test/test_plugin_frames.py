@@ -12,7 +12,7 @@ from dtsa_agent.core import (
     AbstractSwarm,
     Agent,
     ConfigError,
-    LocalProtocolError,
+    PluginError,
     SlotOutcome,
     Swarm,
     SwarmConfig,
@@ -92,8 +92,7 @@ def config(**settings: Any) -> SwarmConfig:
 
 
 def parts(swarm: AbstractSwarm, kind: str) -> list[Any]:
-    found: list[Any] = getattr(swarm, f"_{kind}")
-    return found
+    return [part.made for part in getattr(swarm, f"_{kind}")]
 
 
 def fly(swarm: AbstractSwarm, slots: range, lost: tuple[int, int] | None = None) -> list[bytes]:
@@ -195,7 +194,7 @@ def test_more_bytes_than_fit_are_refused_and_a_broken_promise_is_the_plug_ins_fa
         config(frame="extended", estimator="linear", auth=True)
     monkeypatch.setattr(Counting, "say", lambda self, table, slot: b"abc")
     swarm = make_swarm(config())
-    with pytest.raises(LocalProtocolError, match=r"Counting\.say: gave 3 bytes, declared 4"):
+    with pytest.raises(PluginError, match="policy counting, say: gave 3 bytes, declared 4"):
         swarm.begin(0)
 
 

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dtsa_agent.core import REASONS, Agent, ConfigError, LocalProtocolError, SwarmConfig, plugins
+import dtsa
+from dtsa_agent.core import REASONS, Agent, ConfigError, PluginError, SwarmConfig, plugins
 from dtsa_agent.core.flight_models import flight_model
 from dtsa_agent.core.registry import POLICIES
+from dtsa_bench.batch.task import Task
 from dtsa_bench.simulate import simulate
 from dtsa_bench.sweep import spec, work
 
@@ -129,8 +131,79 @@ def test_sweeps_take_plugins_by_name_and_their_failures_are_rows(monkeypatch: py
     assert row["status"] == "failed"
     assert "ZeroDivisionError" in row["reason"]
     monkeypatch.setattr(dtsa_plugins.LeastKnown, "choose", lambda self, view, slot: 99)
-    with pytest.raises(LocalProtocolError, match="99"):
+    with pytest.raises(PluginError, match="policy least-known, choose: chose agent 99 in slot 0; allowed: 0"):
         simulate(spec.run_config({**tasks[0].settings, "agents": 6, "moving": 6}))
+
+
+_WRONG = """
+class {name}:
+    def __init__(self, config, agent):
+        if {where!r} == "factory":
+            raise KeyError("no such option")
+
+    def choose(self, table, slot):
+        {choose}
+
+    def estimate(self, table, slot, step, position, velocity):
+        position[0, 0] = float("nan")
+
+    def command(self, table, slot, step):
+        return {command}
+"""
+
+
+def _wrong(where: str, choose: str = "return 1", command: str = "(0.0, 0.0, 0.0)") -> Any:
+    scope: dict[str, Any] = {}
+    exec(compile(_WRONG.format(name="Wrong", where=where, choose=choose, command=command), "wrong.py", "exec"), scope)
+    return scope["Wrong"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "said"),
+    [
+        ("policy", _wrong("factory"), r"policy wrong: KeyError: 'no such option' \(wrong.py:5\)"),
+        ("policy", _wrong("", "raise RuntimeError('lost')"), r"policy wrong, choose: RuntimeError: lost \(wrong"),
+        ("policy", _wrong("", "return None"), r"wrong, choose: chose agent None in slot 0; allowed: 0 \(nobody\) to 4"),
+        ("policy", _wrong("", "return 1.5"), "policy wrong, choose: chose agent 1.5 in slot 0"),
+        ("policy", _wrong("", "return -1"), "policy wrong, choose: chose agent -1 in slot 0"),
+        ("estimator", _wrong(""), "estimator wrong, estimate: wrote a number that is not finite in slot 0"),
+        ("avoider", _wrong("", command="(1.0, 2.0)"), r"wrong, command: gave \(1.0, 2.0\) in slot 0; allowed: three"),
+        ("avoider", _wrong("", command="(1.0, 2.0, float('inf'))"), "avoider wrong, command: gave"),
+        ("avoider", _wrong("", command="'fast'"), "avoider wrong, command: gave 'fast'"),
+    ],
+)  # fmt: skip
+def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(kind: str, wrong: Any, said: str) -> None:
+    dtsa.register(kind, "wrong", wrong)
+    settings = {"policy": "tdma", "estimator": "linear", kind: "wrong"}
+    run = spec.run_config({"agents": 4, "timeout_s": 0.2, **settings})
+    with pytest.raises(PluginError, match=said):
+        simulate(run)
+    row = work.fly_one(Task("key", 0, 1, {"agents": 4, "timeout_s": 0.2, **settings}, 1.0))
+    assert row["status"] == "failed"
+    assert row["reason"].startswith(f"PluginError: {kind} wrong")
+
+
+@pytest.mark.ros
+def test_a_plugin_that_raises_is_named_where_nodes_fly_it(installed: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    broken = tmp_path / "path"
+    shutil.copytree(installed, broken)
+    source = broken / "dtsa_plugins" / "__init__.py"
+    source.write_text(
+        source.read_text().replace(
+            "        speed = np.sqrt(", "        raise RuntimeError('lost')\n        speed = np.sqrt("
+        )
+    )
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(broken), os.environ.get("PYTHONPATH", "")])),
+    }
+    for words in (["simulate"], ["fly", "--out", str(tmp_path / "flight"), "--no-picture", "--processes", "2"]):
+        command = [sys.executable, "-m", "dtsa_bench", *words, "--agents", "4", "--policy", "least-known"]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+        assert ended.returncode == 1, words
+        assert "policy least-known, choose: RuntimeError: lost (" in ended.stderr, words
+        assert "Traceback" not in ended.stderr, words
 
 
 def test_what_does_not_exist_or_does_not_import_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

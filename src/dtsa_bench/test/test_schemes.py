@@ -9,7 +9,7 @@ import pytest
 
 import dtsa
 from dtsa_agent.core import ConfigError, SwarmConfig
-from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.fly.flight import FlightOptions, check_options
@@ -188,7 +188,7 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
 
     dtsa.register("policy", "wrong-genie", Wrong)
     dtsa.register("policy", "stuck", Stuck)
-    with pytest.raises(LocalProtocolError, match=r"wrong-genie: chose \[5\] in slot 0; allowed: 1 to 4"):
+    with pytest.raises(PluginError, match="policy wrong-genie, senders: chose agent 5 in slot 0; allowed: 1 to 4"):
         simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="wrong-genie")))
-    with pytest.raises(LocalProtocolError, match="stuck: wake gave 0 ns"):
+    with pytest.raises(PluginError, match="policy stuck, wake: gave 0 ns"):
         simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="stuck")))

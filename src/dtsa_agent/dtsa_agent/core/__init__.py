@@ -3,7 +3,7 @@
 from .abstract_swarm import AbstractSwarm
 from .agent import Agent, AgentGroup, Decision
 from .config import SwarmConfig
-from .errors import ConfigError, DtsaError, LocalProtocolError, RemoteProtocolError
+from .errors import ConfigError, DtsaError, LocalProtocolError, PluginError, RemoteProtocolError
 from .frame import Frame, decode_frame, encode_frame
 from .outcome import SlotOutcome
 from .priority import priority, select
@@ -13,6 +13,6 @@ from .swarm import Swarm
 
 __all__ = [
     "REASONS", "AbstractSwarm", "Agent", "AgentGroup", "ConfigError", "Decision", "DtsaError", "Frame",
-    "LocalProtocolError", "RemoteProtocolError", "Scenario", "SlotOutcome", "Swarm", "SwarmConfig", "decode_frame",
-    "encode_frame", "make_scenario", "priority", "select",
+    "LocalProtocolError", "PluginError", "RemoteProtocolError", "Scenario", "SlotOutcome", "Swarm", "SwarmConfig",
+    "decode_frame", "encode_frame", "make_scenario", "priority", "select",
 ]  # fmt: skip

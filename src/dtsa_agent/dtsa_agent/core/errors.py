@@ -50,5 +50,33 @@ class LocalProtocolError(DtsaError):
     """We broke the protocol ourselves: a bug on this side."""
 
 
+class PluginError(DtsaError):
+    """A part from another package raised an error, or gave what it may not give.
+
+    :param part: what it is: kind, name and method.
+    :param fault: what is wrong with it.
+    """
+
+    def __init__(self, part: str, fault: str) -> None:
+        super().__init__(f"{part}: {fault}")
+
+    @classmethod
+    def raised(cls, part: str, error: Exception) -> PluginError:
+        """An error that the part raised, with the place in it.
+
+        :param part: what it is: kind, name and method.
+        :param error: what it raised.
+        """
+        trace = error.__traceback__
+        while trace is not None and trace.tb_next is not None:
+            trace = trace.tb_next
+        place = f" ({trace.tb_frame.f_code.co_filename}:{trace.tb_lineno})" if trace else ""
+        return cls(part, f"{type(error).__name__}: {error}{place}")
+
+    def __reduce__(self) -> tuple[type[PluginError], tuple[str, str]]:
+        part, _, fault = str(self).partition(": ")
+        return (PluginError, (part, fault))
+
+
 class RemoteProtocolError(DtsaError):
     """A frame from outside is not usable: never stops a node, it is counted."""

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from .abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
 from .compiled import COMPILED
 from .config import SwarmConfig
-from .errors import LocalProtocolError
 from .flight_models import AVOIDERS
 from .frame import decode_frame
 from .outcome import SlotOutcome
+from .plugin_guard import Guarded
 from .registry import ESTIMATORS, POLICIES, REASONS, Registry
 from .scenario import Scenario
 from .swarm import Swarm
@@ -219,16 +219,19 @@ class PluginSwarm(SwarmWrapper):
 
     def _make_parts(self) -> None:
         everybody = self.config.policy_row.needs_everybody and bool(self.ids)
-        self._genie = POLICIES.factory(self.config.policy)(self.config, 0) if everybody else None
+        self._genie = self._guarded(POLICIES, 0) if everybody else None
         self._policies, self._estimators, self._avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
         self._list_speakers()
 
-    def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Any]:
+    def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
         name = getattr(self.config, registry.kind)
         if name in registry.rows or getattr(registry.row(name), "needs_everybody", False):
             return []
-        factory = registry.factory(name)
-        return [factory(self.config, agent) for agent in ids]
+        return [self._guarded(registry, agent) for agent in ids]
+
+    def _guarded(self, registry: Registry[Any], agent: int) -> Guarded:
+        name = getattr(self.config, registry.kind)
+        return Guarded(registry.kind, name, registry.factory(name), self.config, agent)
 
     def _list_speakers(self) -> None:
         """Notes the parts of each observer that may say something, with the size of it, in the frame's order."""
@@ -238,7 +241,7 @@ class PluginSwarm(SwarmWrapper):
         self._listen_to_outcome = any(hasattr(part, "slot_over") for row in self._speakers for part, _ in row)
 
     @property
-    def policies(self) -> list[Any]:
+    def policies(self) -> list[Guarded]:
         """The policy of each observer; empty if it is built in, or one looks into all agents."""
         return self._policies
 
@@ -255,21 +258,14 @@ class PluginSwarm(SwarmWrapper):
             self.inner.decide(slot)
             return
         for index, agent in enumerate(self.ids):
-            chosen = self._policies[index].choose(self._tables[index], slot)
-            if not 0 <= chosen <= self.config.agents:
-                raise LocalProtocolError(
-                    f"policy {self.config.policy}: chose agent {chosen} in slot {slot}; "
-                    f"allowed: 0 (nobody) to {self.config.agents}"
-                )
+            policy = self._policies[index]
+            chosen = policy.chosen(policy.choose(self._tables[index], slot), slot, self.config.agents)
             self.chosen[index] = chosen
             self.sends[index] = chosen == agent and self.present[index]
         self._note_decision()
 
-    def _ask_genie(self, genie: Genie, slot: int) -> None:
-        senders = [int(agent) for agent in genie.senders(self, slot)]
-        if not all(1 <= agent <= self.config.agents for agent in senders):
-            allowed = f"1 to {self.config.agents}"
-            raise LocalProtocolError(f"policy {self.config.policy}: chose {senders} in slot {slot}; allowed: {allowed}")
+    def _ask_genie(self, genie: Guarded, slot: int) -> None:
+        senders = [genie.sender(agent, slot, self.config.agents) for agent in genie.senders(self, slot)]
         self.chosen[:] = senders[0] if senders else 0
         self.sends[:] = 0
         for agent in senders:
@@ -293,10 +289,8 @@ class PluginSwarm(SwarmWrapper):
 
     def _say(self, index: int, slot: int) -> Iterator[bytes]:
         for part, size in self._speakers[index]:
-            data = bytes(part.say(self._tables[index], slot)) if size else b""
-            if len(data) != size:
-                raise LocalProtocolError(f"{type(part).__name__}.say: gave {len(data)} bytes, declared {size}")
-            yield data
+            if size:
+                yield part.bytes_said(part.say(self._tables[index], slot), size)
 
     def frame(self, local_index: int) -> bytes:
         data = self.inner.frame(local_index)
@@ -327,6 +321,7 @@ class PluginSwarm(SwarmWrapper):
         for index, table in enumerate(self._tables):
             position, velocity = self.estimate_position[index], self.estimate_velocity[index]
             self._estimators[index].estimate(table, slot, step, position, velocity)
+            self._estimators[index].estimated(position, velocity, slot=slot)
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
         self.inner.end(slot, collided)
@@ -363,7 +358,7 @@ class PluginSwarm(SwarmWrapper):
         self.inner.steer(slot, step, estimate and not self._estimators)
         for index, avoider in enumerate(self._avoiders):
             if index < len(self.ids) and self.active[index] and self.present[index]:
-                self.command[:, index] = avoider.command(self._tables[index], slot, step)
+                self.command[:, index] = avoider.commanded(avoider.command(self._tables[index], slot, step), slot)
 
     def fly(self, slot: int) -> None:
         if not (self._estimators or self._avoiders):
