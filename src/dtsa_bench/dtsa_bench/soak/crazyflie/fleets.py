@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.ros.common.priority import take_priority
 from dtsa_bench.fake_crazyflie.control import send_fault
 from dtsa_bench.fake_crazyflie.ports import free_base_port
 from dtsa_bench.fake_crazyflie.truth import read_truth
@@ -19,6 +20,17 @@ from dtsa_bench.fake_crazyflie.truth import read_truth
 from ..item import NotMet
 
 CHANNELS = (20, 50, 80)  # one a dongle
+STATION_PRIORITY = 20
+
+
+@contextmanager
+def station_priority() -> Iterator[None]:
+    """This process is a ground station meanwhile: it runs before ordinary work, where that is allowed."""
+    take_priority(STATION_PRIORITY)
+    try:
+        yield
+    finally:
+        take_priority(0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from dtsa_bench.fake_crazyflie.truth import read_truth
 
 from ..checks import met
 from ..item import Item
-from .fleets import RunningFleet, running
+from .fleets import RunningFleet, running, station_priority
 
 COUNT = 6
 FLIGHTS = 5  # for each phase: 30 gaps, 0.1 to 3 s
@@ -45,7 +45,7 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
 
     station = {"toc_cache": str(directory / "cache"), "safety": {"geofence": False}}
     options = ["--radio-seed", str(item.seed), "--seed", str(item.seed)]
-    with running(directory, COUNT, 0.01, options, station) as fleet:
+    with running(directory, COUNT, 0.01, options, station) as fleet, station_priority():
         before = os.environ.get(SIMULATED_RADIO)
         os.environ[SIMULATED_RADIO] = str(fleet.radio)
         try:
