@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from dtsa_bench.simulate import simulate
 from dtsa_bench.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.airtime import Airtime
+
+LEAGUE = Path(__file__).resolve().parents[3] / "docs" / "league.md"
 
 
 def steady(
@@ -192,3 +195,17 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
         simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="wrong-genie")))
     with pytest.raises(PluginError, match="policy stuck, wake: gave 0 ns"):
         simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="stuck")))
+
+
+def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
+    rows = [line.split("|")[1:-1] for line in LEAGUE.read_text().splitlines() if line.startswith("| nRF51")]
+    assert len(rows) == 4
+    for radio, policy, turn, frame, guard, links, decision, shortest in (map(str.strip, row) for row in rows):
+        airtime = Airtime(bitrate=2_000_000 if "2 Mbit" in radio else 1_000_000)
+        length = int(policy.split(", ")[1])
+        assert length == SwarmConfig(policy=policy.split(",")[0]).frame_length
+        assert float(turn.split()[0]) == airtime.ramp_up_ns / 1e6
+        assert float(frame.split()[0]) == pytest.approx(airtime.on_air_ns(length) / 1e6, abs=5e-4)
+        parts = {"guard_ns": guard, "link_delay_ns": links, "decide_ns": decision}
+        given = {name: round(float(text.split("x ")[-1].split()[0]) * 1e6) for name, text in parts.items() if text}
+        assert float(shortest.split()[0]) == pytest.approx(airtime.shortest_slot_ns(length, **given) / 1e6, abs=6e-3)

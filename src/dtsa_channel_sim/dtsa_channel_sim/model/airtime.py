@@ -35,3 +35,16 @@ class Airtime:
     def total_ns(self, length: int) -> int:
         """Return the time from the order to send until the last bit has left, ns."""
         return self.ramp_up_ns + self.on_air_ns(length)
+
+    def shortest_slot_ns(self, length: int, *, guard_ns: int, link_delay_ns: int = 0, decide_ns: int = 0) -> int:
+        """Return the shortest slot in which frames do not overlap, ns.
+
+        Who needs the frame of a slot to know whether the next one is its own has to wait for it: the last two are for
+        such policies. Others can order their frame ahead of time.
+
+        :param length: bytes of a frame.
+        :param guard_ns: ns, largest difference of any clock from the common one, either way.
+        :param link_delay_ns: ns, between radio and flight processor, on each side.
+        :param decide_ns: ns, longest time to decide and to make a frame.
+        """
+        return self.total_ns(length) + 2 * guard_ns + 2 * link_delay_ns + decide_ns
