@@ -24,6 +24,7 @@ from dtsa_agent.crazyflie.budget import check_budget, radio_loads, radio_of
 from dtsa_agent.crazyflie.claims import Claims
 from dtsa_agent.crazyflie.config import StationSettings, load_swarm, parse_swarm
 from dtsa_agent.crazyflie.limits import check_stream, outside_fence
+from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.mailbox import Mailbox
 from dtsa_agent.crazyflie.safety import Action, SafetyMonitor, SafetySettings, Watched
 from dtsa_agent.crazyflie.state_machine import State, StateMachine
@@ -480,5 +481,8 @@ def test_a_crazyflie_belongs_to_one_bridge(tmp_path: Path, monkeypatch: pytest.M
         Claims([("cf9", "radio://0/80/2M/E7E7E7E709"), ("a2", "radio://0/80/2M/e7e7e7e702?rate_limit=50")])
     assert error.value.field == "robots.a2.uri"
     Claims([("cf9", "radio://0/80/2M/E7E7E7E709")]).release()  # what it had taken before it was refused is free
+    monkeypatch.setenv(SIMULATED_RADIO, str(tmp_path / "radio"))
+    Claims([("cf2", "radio://0/80/2M/E7E7E7E702")]).release()  # on another air
+    monkeypatch.delenv(SIMULATED_RADIO)
     first.release()
     Claims([("cf2", "radio://0/80/2M/E7E7E7E702")]).release()

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 
 
 class Claims:
@@ -26,7 +27,8 @@ class Claims:
         with suppress(FileExistsError):
             directory.mkdir(mode=0o700)
         for name, uri in robots:
-            address = uri.partition("?")[0].lower()
+            air = os.environ.get(SIMULATED_RADIO, "") if uri.startswith("radio://") else ""  # one of several
+            address = air + uri.partition("?")[0].lower()
             file = os.open(directory / hashlib.sha256(address.encode()).hexdigest(), os.O_CREAT | os.O_RDWR, 0o600)
             self._files.append(file)
             try:

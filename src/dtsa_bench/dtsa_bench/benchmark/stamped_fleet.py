@@ -21,7 +21,8 @@ from dtsa_agent.crazyflie.config import load_swarm
 from dtsa_agent.ros.common.priority import take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
 from dtsa_bench.fake_crazyflie import crtp
-from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig
+from dtsa_bench.fake_crazyflie.fleet import Fleet
+from dtsa_bench.fake_crazyflie.fleet_config import FleetConfig
 from dtsa_bench.fake_crazyflie.radio.settings import RadioSettings, Station
 
 PRIORITY = 30

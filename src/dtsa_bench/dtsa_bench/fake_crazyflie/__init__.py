@@ -5,6 +5,7 @@ watchdogs, and fail on command. For tests of the bridge, and a training ground f
 """
 
 from dtsa_bench.fake_crazyflie.control import send_fault
-from dtsa_bench.fake_crazyflie.fleet import Fleet, FleetConfig
+from dtsa_bench.fake_crazyflie.fleet import Fleet
+from dtsa_bench.fake_crazyflie.fleet_config import FleetConfig
 
 __all__ = ["Fleet", "FleetConfig", "send_fault"]

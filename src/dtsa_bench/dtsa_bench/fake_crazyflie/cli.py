@@ -16,7 +16,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.priority import take_priority
 from dtsa_bench.fake_crazyflie import layout
 from dtsa_bench.fake_crazyflie.control import FAULTS, send_fault
-from dtsa_bench.fake_crazyflie.fleet import NUMBERS, Fleet, FleetConfig
+from dtsa_bench.fake_crazyflie.fleet import NUMBERS, Fleet
+from dtsa_bench.fake_crazyflie.fleet_config import FleetConfig
 from dtsa_bench.fake_crazyflie.ports import free_port
 from dtsa_bench.fake_crazyflie.radio.settings import RadioSettings, Station
 from dtsa_bench.options import add_options, given, whole_number
