@@ -294,7 +294,8 @@ class Link:
 
     def _quality(self, percent: float) -> None:
         self.radio_quality = percent / 100
-        self._heard.acknowledge(time.monotonic())
+        if self._heard.acknowledge(time.monotonic()) and self.guarded:  # its watchdog has not much time left
+            self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
 
     def _rssi(self, value: float) -> None:
         self.rssi = int(value)

@@ -193,11 +193,13 @@ class Heard:
         """Seconds since something was acknowledged; infinite over other ways than the air."""
         return now - self._acknowledged
 
-    def acknowledge(self, now: float) -> None:
-        """Something was acknowledged at a time (s, monotonic)."""
-        if self.age(now) > GAP_S:
+    def acknowledge(self, now: float) -> bool:
+        """Something was acknowledged at a time (s, monotonic); whether that ends a gap."""
+        gap = self.age(now) > GAP_S
+        if gap:
             self.since = now
         self._acknowledged = now
+        return gap
 
     def sampled(self, stamp_ms: int, now: float) -> float:
         """When a log packet's values were taken, s, monotonic.
