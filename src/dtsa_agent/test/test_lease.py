@@ -328,3 +328,22 @@ def test_open_turns_visit_all_owners() -> None:
         assert period >= 11
         assert np.gcd(period, agents) == 1
     assert SwarmConfig(policy="lease", open_every=0).open_period == 0
+
+
+@pytest.mark.parametrize(("agents", "every"), [(3, 5), (5, 2), (2, 8)])
+def test_small_swarms_that_hear_late_relay_no_turn_that_nobody_gave_away(agents: int, every: int) -> None:
+    """24 slots reach beyond their memory of (M + 2) N turns."""
+    swarm = make(agents, 1, open_every=0, adoption=False, anchor_every=every)
+    relayed, heard = set(), None
+    for slot in range(200):
+        senders = swarm.begin(slot)
+        assert len(senders) < 2
+        if heard is not None and slot % 3:
+            swarm.hear(slot, heard)  # a slot late
+        heard = swarm.frame(senders[0]) if senders else None
+        if heard is not None:
+            relayed |= {ahead for ahead, _ in decode_extended(heard).relay}
+            if not slot % 3:
+                swarm.hear(slot, heard)
+        swarm.end(slot)
+    assert 0 < max(relayed) < (every + 2) * agents

@@ -10,7 +10,7 @@ import pytest
 from dtsa_bench.native.embedded import fly_here, fly_on_cortex
 from dtsa_bench.native.fuzz import Found, build, fuzz
 from dtsa_bench.native.library import LIBRARY, NotHere
-from dtsa_bench.native.prove import MUTANTS, World, explore, mutate
+from dtsa_bench.native.prove import MUTANTS, World, explore
 from dtsa_bench.native.prove import build as build_prover
 
 
@@ -62,11 +62,18 @@ def test_code_for_software_doubles_gives_the_same_bits(tmp_path: Path) -> None:
     assert [flight.digest for flight in soft] == [flight.digest for flight in plain]
 
 
-def test_every_state_of_two_agents_keeps_the_rules_and_broken_rules_are_found(tmp_path: Path) -> None:
-    whole = explore(build_prover(tmp_path), World("two agents", 2))
+@pytest.mark.parametrize("adoption", [False, True])
+def test_every_state_of_three_agents_keeps_the_rules(adoption: bool, tmp_path: Path) -> None:
+    """Through a restart, a death and what it leads to, for all patterns of loss."""
+    claims = 1 if adoption else 0
+    world = World("three agents", 3, adoption=adoption, restarts=1, deaths=1, returns=0, claims=claims)
+    whole = explore(build_prover(tmp_path), world)
     assert whole.closed
     assert not whole.broken
-    assert whole.states > 10_000
-    found = {mutant.rule: explore(mutate(mutant, tmp_path), mutant.world).broken for mutant in MUTANTS}
+    assert whole.states > 1_000
+
+
+def test_every_broken_rule_is_found(tmp_path: Path) -> None:
+    found = {mutant.rule: explore(build_prover(tmp_path, mutant), mutant.world).broken for mutant in MUTANTS}
     assert all(found.values()), [rule for rule, broken in found.items() if not broken]
     assert len({mutant.right for mutant in MUTANTS}) >= 8

@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     import tempfile
     from pathlib import Path
 
-    from dtsa_bench.native.prove import MUTANTS, WORLDS, build, explore, mutate
+    from dtsa_bench.native.prove import MUTANTS, WORLDS, build, explore
 
     failed = 0
     with tempfile.TemporaryDirectory() as directory:
@@ -29,9 +29,9 @@ def run(args: argparse.Namespace) -> int:
             found = explore(program, world)
             failed += bool(found.broken)
             end = found.broken or ("all states" if found.closed else "holds so far, not all states")
-            print(f"{world.name:44} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
+            print(f"{world.name:36} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
         for mutant in MUTANTS:
-            found = explore(mutate(mutant, Path(directory)), mutant.world)
+            found = explore(build(Path(directory), mutant), mutant.world)
             failed += not found.broken
             print(f"without {mutant.rule!r}: {found.broken or 'NOT FOUND'}; {found.states} states", flush=True)
     return 1 if failed else 0

@@ -1,14 +1,23 @@
 /* Explores policy lease state by state: libdtsa's own code, with every choice of the world tried in every slot.
  *
- * A state is what the agents remember (slot numbers relative to now and cut off where nothing looks at them any more), and
- * a ledger of what was given away in frames. In a slot each agent may have something to say or not, may give all of its
- * turns away or none, may take an OPEN turn or not, believes that many wake or not; each receiver hears any one of those
- * that send, or nothing; restarts, deaths and returns happen as often as the budgets say. Draws are choices: draw.c is left
- * out. Breadth first, states compared byte by byte, until there are no new ones.
+ * A state is what the agents remember and what can make a difference: who is there, in probation, past an own anchor, waking
+ * (with OPEN turns only), and what is known of turns that can be leased; and a ledger of what was given away in frames. What
+ * rests on ages and contents is free, in every slot and for each agent on its own, and so covers all that ages and contents
+ * can be:
  *
- *     prove AGENTS M S ADOPTION PATIENCE RESTARTS DEATHS RETURNS MOST_STATES
+ *   who has something to say, and who knows that it will rest          (goals)
+ *   whether a turn is given away, and to whom of those not thought dead (contents; choose_lessee is prove_lessee)
+ *   whom a speaker thinks dead, and whether a hearer thought it dead   (all that absence, silence and gossip can lead to)
+ *   whether the wait that ends probation with adoption is over         (ages)
+ *   whether an OPEN turn is taken, whether gossip names a waker        (draws, gossip)
+ *   which one of those that send each receiver hears, or nothing       (loss)
+ *   restarts, deaths (or leaving), returns, frames that claim somebody dead: as often as the budgets say
  *
- * prints one line of words and numbers, or the rule that is broken and how it came about; exit code 1 then.
+ * Breadth first, states compared byte by byte, until there are no new ones.
+ *
+ *     prove AGENTS M S ADOPTION RESTARTS DEATHS RETURNS CLAIMS MOST_STATES
+ *
+ * prints one line of words and numbers, or the rule that is broken; exit code 1 then. A budget below 0: any number.
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -16,7 +25,7 @@
 
 #include "policy/lease/lease.h"
 
-enum { MOST_AGENTS = 3, MOST_WINDOW = 64, MOST_BYTES = 512, MOST_CHOICES = 64 };
+enum { MOST_AGENTS = 5, MOST_WINDOW = 64, MOST_BYTES = 128, MOST_CHOICES = 64 };
 
 /* ---- choices: a tape that is wound through all its values ---- */
 
@@ -39,6 +48,17 @@ static int wind(void)
     return 1;
 }
 
+int prove_lessee(const uint8_t *able, int count);
+
+/* In the place of choose_lessee; -1: a turn is not given away. */
+int prove_lessee(const uint8_t *able, int count)
+{
+    int who[MOST_WINDOW] = {-1}, found = 1;
+    for (int k = 0; k < count; k++)
+        if (able[k]) who[found++] = k;
+    return who[choose(found)];
+}
+
 uint64_t mix64(uint64_t x) { return x; } /* digests of tables do not count */
 
 double draw_uniform(uint64_t key, uint64_t what)
@@ -50,6 +70,9 @@ double draw_uniform(uint64_t key, uint64_t what)
 
 /* ---- the world ---- */
 
+enum { RESTART, DEATH, RETURN, CLAIM }; /* budgets */
+enum { PATIENCE = 6 };                  /* slots; only whether it is over counts */
+
 typedef struct ledger {
     uint8_t owner;  /* what its owner gave the turn away as */
     uint8_t others; /* bit k: an adopter gave it to agent k */
@@ -57,10 +80,12 @@ typedef struct ledger {
 
 static dtsa_config config;
 static dtsa_agent *agents[MOST_AGENTS];
-static int n, window, period, restarts, deaths, returns;
-static int64_t slot, base, reach; /* reach: ages beyond it are one */
-static int left[3];               /* restarts, deaths, returns still to come */
-static ledger book[MOST_WINDOW];  /* of turn t: book[t % MOST_WINDOW] */
+static uint8_t *memory; /* of all agents */
+static size_t each;
+static int n, period, reach; /* reach: leases speak of turns less far than this */
+static int64_t slot, base;
+static int left[4];              /* of each budget; below 0: any number */
+static ledger book[MOST_WINDOW]; /* of turn t: book[t % MOST_WINDOW] */
 static const char *broken;
 
 static void start(void)
@@ -68,7 +93,7 @@ static void start(void)
     static double places[6 * MOST_AGENTS];
     config.agents = n;
     config.slot_s = 0.01;
-    config.steps = config.c_r = config.gossip = 1;
+    config.steps = config.c_r = 1;
     config.policy = DTSA_POLICY_LEASE;
     config.estimator = DTSA_ESTIMATE_LINEAR;
     config.avoider = DTSA_AVOID_NONE;
@@ -76,13 +101,15 @@ static void start(void)
     config.r_min = 0.3;
     config.position_step = 0.002;
     config.lease.share = 1.0;
+    config.lease.patience = PATIENCE;
     config.start = places;
     config.target = places + 3 * n;
-    const size_t bytes = dtsa_agent_bytes(&config);
-    for (int k = 0; k < n; k++) agents[k] = dtsa_agent_start(malloc(bytes), bytes, &config, k + 1);
-    left[0] = restarts;
-    left[1] = deaths;
-    left[2] = returns;
+    each = dtsa_agent_bytes(&config);
+    memory = malloc(each * (size_t)n);
+    for (int k = 0; k < n; k++) {
+        agents[k] = dtsa_agent_start(memory + each * (size_t)k, each, &config, k + 1);
+        agents[k]->goal[0] = 5.0;
+    }
 }
 
 static int anchor(int64_t turn) { return (turn / n + turn % n) % config.lease.anchor_every == 0; }
@@ -93,88 +120,56 @@ static uint8_t *at;
 
 static void put(int64_t value) { *at++ = (uint8_t)value; }
 
-static int64_t clip(int64_t age) { return age < reach ? age : reach; }
-
-/* 0: never (-1), 1: gone (any other negative), else 2 + age */
-static void put_time(int64_t time) { put(time == -1 ? 0 : time < 0 ? 1 : 2 + clip(slot - time)); }
-
 static int pack(uint8_t *out)
 {
     at = out;
     put(slot < n ? slot : n + slot % period);
-    for (int i = 0; i < 3; i++) put(left[i]);
-    for (int64_t t = slot; t < slot + window; t++) {
+    for (int i = 0; i < 4; i++) put(left[i]);
+    for (int64_t t = slot; t < slot + reach; t++) {
+        if (anchor(t)) continue;
         put(book[t % MOST_WINDOW].owner);
         if (config.lease.adoption) put(book[t % MOST_WINDOW].others);
     }
     for (int k = 0; k < n; k++) {
         const lease_scope v = lease_of(agents[k]);
         const lease_agent *a = v.a;
-        put(agents[k]->present | a->started << 2 | a->probation << 3 | a->anchored << 4 |
-            (a->idle_since >= 0) << 5 | a->leaving << 6);
-        if (!a->started) continue;
-        put_time(a->woke);
-        put_time(a->claimed);
-        put_time(a->born);
-        put(a->deaf);
-        for (int64_t t = slot - 1; t < slot - 1 + window; t++)
-            put(v.lessee[(t + window) % v.window]);
-        for (int i = 0; i < n; i++) {
-            put_time(v.heard[i]);
-            put_time(agents[k]->table->sent_slot[i]);
-            put(v.miss[i] | v.quiet[i] << 4 | agents[k]->table->in_ap[i] << 5);
-        }
+        const int waking = config.lease.open_every && a->woke >= 0;
+        put(agents[k]->present | a->started << 2 | a->probation << 3 |
+            (a->probation && a->anchored) << 4 | (a->started && waking) << 5);
+        for (int64_t t = slot; t < slot + reach; t++) put(a->started ? v.lessee[t % v.window] : 0);
     }
     return (int)(at - out);
 }
 
 static int64_t take(void) { return *at++; }
 
-static int64_t take_time(int64_t gone)
-{
-    const int64_t value = take();
-    return value == 0 ? -1 : value == 1 ? gone : slot - (value - 2);
-}
-
 static void unpack(const uint8_t *in)
 {
     at = (uint8_t *)(uintptr_t)in;
     slot = take();
     if (slot >= n) slot = base + (slot - n);
-    for (int i = 0; i < 3; i++) left[i] = (int)take();
+    for (int i = 0; i < 4; i++) left[i] = (int8_t)take();
     memset(book, 0, sizeof book);
-    for (int64_t t = slot; t < slot + window; t++) {
+    for (int64_t t = slot; t < slot + reach; t++) {
+        if (anchor(t)) continue;
         book[t % MOST_WINDOW].owner = (uint8_t)take();
         if (config.lease.adoption) book[t % MOST_WINDOW].others = (uint8_t)take();
     }
     for (int k = 0; k < n; k++) {
         agent_forget(agents[k]);
-        lease_scope v = lease_of(agents[k]);
+        const lease_scope v = lease_of(agents[k]);
         lease_agent *a = v.a;
         const int flags = (int)take();
         agents[k]->present = flags & 3;
         agents[k]->frame_length = 0;
-        if (!(flags & 4)) continue;
-        a->started = 1;
+        a->started = flags >> 2 & 1;
         a->probation = flags >> 3 & 1;
         a->anchored = flags >> 4 & 1;
-        a->leaving = flags >> 6 & 1;
-        a->idle_since = flags >> 5 & 1 ? slot - 1 : -1;
-        a->woke = take_time(-1);
-        a->claimed = take_time(-1);
-        a->born = take_time(-1);
-        a->deaf = (int32_t)take();
-        a->now = slot - 1;
-        for (int64_t t = slot - 1; t < slot - 1 + window; t++)
-            v.lessee[(t + window) % v.window] = (uint8_t)take();
-        for (int i = 0; i < n; i++) {
-            v.heard[i] = take_time(INT64_MIN / 4);
-            agents[k]->table->sent_slot[i] = take_time(-1);
-            const int bits = (int)take();
-            v.miss[i] = bits & 15;
-            v.quiet[i] = bits >> 4 & 1;
-            agents[k]->table->in_ap[i] = bits >> 5 & 1;
-        }
+        a->woke = flags >> 5 & 1 ? slot - 1 : -1;
+        a->idle_since = -1;
+        a->born = a->now = a->claimed = slot - 1;
+        for (int64_t t = slot; t < slot + reach; t++) v.lessee[t % v.window] = (uint8_t)take();
+        for (int i = 0; i < n; i++) v.heard[i] = slot - 1;
     }
 }
 
@@ -215,7 +210,7 @@ static void judge(int sender, int probation, int64_t woke)
 {
     const ledger *entry = &book[slot % MOST_WINDOW];
     const int owner = slot % n == sender, lent = entry->others >> sender & 1;
-    if (entry->owner == LEASE_OPEN) rule(woke >= 0, "2: only who wakes takes OPEN turns");
+    if (entry->owner == LEASE_OPEN && !lent) rule(woke >= 0, "2: only who wakes takes OPEN turns");
     rule(entry->owner != LEASE_OPEN || config.lease.open_every, "2: OPEN where there is none");
     if (owner)
         rule(!entry->owner || entry->owner == sender + 1 || lent || entry->owner == LEASE_OPEN,
@@ -229,39 +224,84 @@ static void judge(int sender, int probation, int64_t woke)
 
 /* ---- one slot ---- */
 
+/* A choice that happens as often as a budget says. */
+static int befalls(int budget)
+{
+    if (!left[budget] || !choose(2)) return 0;
+    if (left[budget] > 0) left[budget]--;
+    return 1;
+}
+
 static void happen(int k)
 {
-    lease_scope v = lease_of(agents[k]);
+    const lease_scope v = lease_of(agents[k]);
     if (!agents[k]->present) {
-        if (left[2] && choose(2)) {
-            left[2]--;
-            agents[k]->present = 1;
-        }
-        return;
-    }
-    if (left[0] && v.a->started && choose(2)) {
-        left[0]--;
+        agents[k]->present = (uint8_t)befalls(RETURN);
+    } else if (v.a->started && befalls(RESTART)) {
         agent_forget(agents[k]);
-    } else if (left[1] && choose(2)) {
-        left[1]--;
-        agents[k]->present = 0;
-        agent_forget(agents[k]);
-        return;
+    } else if (agents[k]->present == 1 && befalls(DEATH)) {
+        if (choose(2))
+            dtsa_agent_leave(agents[k]);
+        else
+            dtsa_agent_switch(agents[k], 0);
+    } else if (config.lease.open_every && v.a->started && v.a->woke < 0 && choose(2)) {
+        v.a->idle_since = slot - 1; /* it wakes in this slot */
     }
-    agents[k]->goal[0] = choose(2) ? 5.0 : 0.0; /* something to say */
+}
+
+/* What a speaker believes, and how it is. */
+static void speak(int k, uint8_t *frame)
+{
+    dtsa_agent *a = agents[k];
+    const lease_scope v = lease_of(a);
+    const int own = slot % n == k;
+    int dead = 0;
+    if (!v.a->probation && left[CLAIM]) dead = choose(n);
+    if (dead && left[CLAIM] > 0) left[CLAIM]--;
+    for (int i = 1; i < n; i++) {
+        const int other = (k - i + n) % n;
+        v.heard[other] = i <= dead ? slot - PATIENCE - 1 : slot - 1;
+        a->table->in_ap[other] = 1;
+        v.miss[other] = v.quiet[other] = 0;
+    }
+    /* moving; idle, all of its turns given away; idle, none of them */
+    const int mood = own && !v.a->probation ? choose(dead ? 3 : 2) : 0;
+    v.a->moving = mood == 0;
+    v.a->idle_since = mood ? slot : -1;
+    a->final = mood == 1;
+    v.a->wakers = own && config.lease.open_every > 1 ? choose(2) : 0.0;
+    v.a->deaf = 0;
+    a->frame_length = (uint8_t)agent_speak(a, slot, frame);
+    memcpy(a->frame, frame, DTSA_FRAME_MAX);
+    v.a->idle_since = -1;
+    write_down(k, frame);
 }
 
 static void hear(int k, const int *senders, int count, uint8_t frames[][DTSA_FRAME_MAX])
 {
+    const lease_scope v = lease_of(agents[k]);
     const int heard = choose(count + 1);
     if (!heard) return;
     const int sender = senders[heard - 1];
     const uint8_t *data = frames[sender];
     const int c_s = data[2], claimed = c_s != 255 && (sender - k + n) % n <= c_s;
+    const int absent = config.lease.adoption && left[CLAIM] && !(data[3] & 2) && choose(2);
+    if (absent && left[CLAIM] > 0) left[CLAIM]--;
+    v.heard[sender] = absent ? slot - PATIENCE - 1 : slot - 1;
     dtsa_agent_hear(agents[k], slot, data, EXTENDED_LENGTH);
-    const lease_scope v = lease_of(agents[k]);
+    if (config.lease.open_every && v.a->woke >= 0 && choose(2)) v.a->woke = -1; /* gossip of it */
     if (config.lease.adoption && claimed && v.a->started)
         rule(v.a->probation, "8: who hears itself claimed is in probation");
+}
+
+static void finish(int k)
+{
+    const lease_scope v = lease_of(agents[k]);
+    const int past = v.a->anchored || (slot % n == k && anchor(slot));
+    if (config.lease.adoption && agents[k]->present && v.a->probation && past)
+        v.a->claimed = choose(2) ? slot - 2 * n * config.lease.anchor_every : slot;
+    v.a->deaf = 0;
+    dtsa_agent_end(agents[k], slot);
 }
 
 static void step(void)
@@ -274,44 +314,32 @@ static void step(void)
         a->frame_length = 0;
         a->decision.sends = 0;
         if (!a->present) continue;
-        lease_scope v = lease_of(a);
-        const int64_t woke = v.a->woke;
+        const lease_scope v = lease_of(a);
         agent_decide(a, slot);
-        v.a->wakers = 0.0;
         v.a->attempts = 0;
         if (!a->decision.sends) continue;
-        judge(k, v.a->probation, v.a->woke >= 0 ? v.a->woke : woke);
-        if (slot % n == k) {
-            a->final = (uint8_t)choose(2);
-            if (config.lease.open_every > 1) v.a->wakers = choose(2);
-        }
-        a->frame_length = (uint8_t)agent_speak(a, slot, a->frame);
-        v.a->wakers = 0.0;
-        memcpy(frames[k], a->frame, DTSA_FRAME_MAX);
+        judge(k, v.a->probation, v.a->woke);
+        speak(k, frames[k]);
         senders[count++] = k;
-        write_down(k, frames[k]);
     }
     const ledger *entry = &book[slot % MOST_WINDOW];
     rule(count < 2 || entry->owner == LEASE_OPEN || entry->others, "1: at most one sends");
     for (int k = 0; k < n && count; k++)
         if (agents[k]->present && !agents[k]->decision.sends) hear(k, senders, count, frames);
-    for (int k = 0; k < n; k++) {
-        dtsa_agent_end(agents[k], slot);
-        lease_of(agents[k]).a->wakers = 0.0;
-    }
+    for (int k = 0; k < n; k++) finish(k);
     book[slot % MOST_WINDOW] = (ledger){0, 0};
     slot++;
 }
 
 /* ---- the search ---- */
 
-static uint8_t *states;   /* one after the other, `size` bytes each */
-static uint32_t *table;   /* index of a state + 1 by hash */
-static uint32_t *parents; /* from which state */
-static long known, most, places_in_table;
+static uint8_t *states; /* one after the other, `size` bytes each */
+static uint32_t *table; /* index of a state + 1 by hash */
+static long known, most, places_in_table, steps;
 static int size;
 
-static int is_new(const uint8_t *state, uint32_t parent)
+/* Unless it is known. */
+static void add(const uint8_t *state)
 {
     uint64_t hash = 14695981039346656037ULL;
     for (int i = 0; i < size; i++) hash = (hash ^ state[i]) * 1099511628211ULL;
@@ -320,19 +348,53 @@ static int is_new(const uint8_t *state, uint32_t parent)
          place = (place + 1) % places_in_table) {
         if (!table[place]) {
             table[place] = (uint32_t)known + 1;
-            parents[known] = parent;
             memcpy(states + known++ * size, state, (size_t)size);
-            return 1;
+            return;
         }
-        if (!memcmp(states + (long)(table[place] - 1) * size, state, (size_t)size)) return 0;
+        if (!memcmp(states + (long)(table[place] - 1) * size, state, (size_t)size)) return;
     }
 }
 
-static long slots_from_start(long state)
+/* -> slots from the start; 0 in *closed: there are states that were not looked at. */
+static long search(int *closed)
 {
-    long length = 0;
-    for (; state; state = parents[state]) length++;
-    return length;
+    uint8_t state[MOST_BYTES] = {0};
+    long depth = 0, level_end = 1;
+    size_t bytes = each * (size_t)n;
+    uint8_t *before = malloc(bytes);
+    *closed = 0;
+    if (!before) return 0;
+    size = pack(state);
+    add(state);
+    for (long i = 0; i < known && !broken; i++) {
+        if (i == level_end) {
+            depth++;
+            level_end = known;
+        }
+        memset(chosen, 0, sizeof chosen);
+        unpack(states + i * size);
+        memcpy(before, memory, bytes);
+        const int64_t now = slot;
+        ledger pages[MOST_WINDOW];
+        int budgets[4];
+        memcpy(pages, book, sizeof book);
+        memcpy(budgets, left, sizeof left);
+        do {
+            used = 0;
+            memcpy(memory, before, bytes);
+            memcpy(book, pages, sizeof book);
+            memcpy(left, budgets, sizeof left);
+            slot = now;
+            step();
+            steps++;
+            if (broken) return depth;
+            pack(state);
+            if (known == most) return depth;
+            add(state);
+        } while (wind());
+    }
+    *closed = 1;
+    return depth;
 }
 
 int main(int argc, char **argv)
@@ -341,56 +403,25 @@ int main(int argc, char **argv)
     if (argc != 10) return 2;
     for (int i = 0; i < 9; i++) numbers[i] = strtol(argv[i + 1], NULL, 10);
     n = (int)numbers[0];
-    config.lease = (dtsa_lease_config){(int)numbers[1], (int)numbers[2], (int)numbers[3], 0.0, 1.0,
-                                       numbers[4]};
-    restarts = (int)numbers[5];
-    deaths = (int)numbers[6];
-    returns = (int)numbers[7];
+    if (n < 2 || n > MOST_AGENTS) return 2;
+    config.lease = (dtsa_lease_config){.anchor_every = (int)numbers[1],
+                                       .open_every = (int)numbers[2],
+                                       .adoption = (int)numbers[3]};
+    for (int i = 0; i < 4; i++) left[i] = (int)numbers[4 + i];
     most = numbers[8];
-    const int every = config.lease.anchor_every, open = config.lease.open_every;
-    window = (every + 2) * n;
-    period = n * every * (open ? open : 1);
-    const int64_t quiet = 2 * (int64_t)n * every;
-    reach = numbers[4] > quiet ? numbers[4] + 1 : quiet + 1;
+    reach = config.lease.anchor_every * n;
+    period = reach * (config.lease.open_every ? config.lease.open_every : 1);
     base = (1000 / period + 1) * (int64_t)period;
-    if (n < 2 || n > MOST_AGENTS || window > MOST_WINDOW || reach > 120 || period + n > 250)
-        return 2;
+    if (reach > MOST_WINDOW / 2 || period + n > 250) return 2;
     start();
-    uint8_t state[MOST_BYTES] = {0};
-    /* the largest state: all have started */
-    size = 4 + window * (config.lease.adoption ? 2 : 1) + n * (5 + window + 3 * n);
+    size = 5 + reach * (1 + config.lease.adoption) + n * (1 + reach); /* at most */
     places_in_table = 2 * most + 7;
     states = malloc((size_t)most * (size_t)size);
-    parents = malloc(sizeof *parents * (size_t)most);
     table = calloc((size_t)places_in_table, sizeof *table);
-    if (size > MOST_BYTES || !states || !parents || !table) return 2;
-    pack(state);
-    is_new(state, 0);
-    long steps = 0, depth = 0, level_end = 1;
-    for (long i = 0; i < known; i++) {
-        if (i == level_end) {
-            depth++;
-            level_end = known;
-        }
-        memset(chosen, 0, sizeof chosen);
-        do {
-            used = 0;
-            unpack(states + i * size);
-            step();
-            steps++;
-            if (broken) {
-                printf("broken %s; states %ld depth %ld\n", broken, known, slots_from_start(i));
-                return 1;
-            }
-            memset(state, 0, sizeof state);
-            pack(state);
-            if (known == most) {
-                printf("states %ld depth %ld steps %ld open\n", known, depth, steps);
-                return 0;
-            }
-            is_new(state, (uint32_t)i);
-        } while (wind());
-    }
-    printf("states %ld depth %ld steps %ld closed\n", known, depth, steps);
-    return 0;
+    if (size > MOST_BYTES || !states || !table) return 2;
+    int closed;
+    const long depth = search(&closed);
+    if (broken) printf("broken %s; ", broken);
+    printf("states %ld depth %ld steps %ld %s\n", known, depth, steps, closed ? "closed" : "open");
+    return broken != NULL;
 }

@@ -151,15 +151,12 @@ def choose_lessee(memory: Memory, rows: Sequence[Row], who: Electorate, slot: in
 def relay(memory: Memory, self_index: int, slot: int, own_is_said: bool) -> tuple[tuple[int, int], ...]:
     """The next leases that an agent knows of, so that who missed them learns of them in time.
 
-    The agents' memory is a ring of :attr:`Memory.window` turns. In swarms so small that 24 slots reach beyond it, its
-    first entries are said again for the turns after its end; receivers ignore those, they are too far ahead.
-
     :param own_is_said: the frame's lease bytes speak of the own turns already.
     :returns: (slots ahead, lessee), at most eight.
     """
     known = []
-    for ahead in range(1, RELAY_REACH + 1):
-        lease = memory.leases.get(slot + ahead % memory.window)
+    for ahead in range(1, min(RELAY_REACH, memory.window - 1) + 1):
+        lease = memory.leases.get(slot + ahead)
         if lease is None or (own_is_said and memory.owner(slot + ahead) == self_index):
             continue
         known.append((ahead, lease.lessee))

@@ -116,7 +116,7 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
 static void relay(const lease_scope *v, int self, int64_t slot, extended_frame *e)
 {
     int count = 0;
-    for (int d = 1; d <= RELAY_REACH && count < RELAY_IDS; d++) {
+    for (int d = 1; d <= RELAY_REACH && d < v->window && count < RELAY_IDS; d++) {
         const int64_t turn = slot + d;
         const int given = v->lessee[turn % v->window];
         if (given == LEASE_NONE || (e->lease_count && turn % v->n == self)) continue;
