@@ -39,7 +39,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("runs/a --to csv --tables slots frames --out tables", "two of them as CSV"),
     ),
     "bridge": (
-        ("--config swarm.yaml --check", "is the file good, is the radio fast enough?"),
+        ("--config swarm.yaml --check", "is everything there that a flight needs?"),
         ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
     ),
     "fake-crazyflie": (("--count 12", "twelve vehicles for the official library"),),

@@ -21,6 +21,8 @@ pytest.importorskip("cflib")
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
+from bridge_helpers import fake_fleet
+from bridge_helpers import settings as fleet_settings
 from builtin_interfaces.msg import Duration
 from dtsa_msgs.msg import Status
 from dtsa_msgs.srv import Arm, Land, Takeoff
@@ -143,6 +145,33 @@ def test_take_off_landing_and_ctrl_c(tmp_path: Path) -> None:
         assert started.end() == 0, started.text()
         assert gone(fleet)
         assert "Traceback" not in started.text()
+
+
+def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 3) as fleet:
+        data = fleet_settings(fleet, {"safety": {"geofence_max": [1.0, 2.3, 0.95]}, "priority": 0})
+        data["robots"]["cf1"]["initial_position"] = [1.2, 0.0, 0.0]
+        data["robots"]["cf3"]["uri"] = "radio://0/80/2M/E7E7E7E703"
+        data["all"] |= {"connect_attempts": 1, "connect_timeout_s": 2.0, "command_rate_hz": 100, "log_rate_hz": 100}
+        data["station"]["force_budget"] = True
+        config = tmp_path / "swarm.yaml"
+        config.write_text(yaml.safe_dump(data))
+        fleet.fault("battery", 2, voltage=3.1)
+        with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--check") as started:
+            assert started.end() == 1, started.text()
+            lines = [line.split(maxsplit=2) for line in started.lines]
+        for level, item, words in (
+            ("FAIL", "links", "cf3: disconnected (attempt 1 of 1: "),
+            ("ok", "firmware", "all 2: protocol 12, revision d75a0001"),
+            ("FAIL", "batteries", "cf2: 3.10 V, critical 3.2 V"),
+            ("warn", "positions", "cf2: at (-0.60, 1.73, "),
+            ("ok", "clocks", "one clock"),
+            ("FAIL", "geofence", "cf1: (1.2"),
+            ("ok", "budget", "radio 0: 1 Crazyflies"),
+            ("warn", "priority", "none"),
+        ):
+            assert any(line[:2] == [level, item] and line[2].startswith(words) for line in lines), started.text()
+        assert not [e for e in fleet.events(name="state") if e["state"] in ("flying", "locked")]
 
 
 def test_a_closed_terminal_lands_all_and_sigterm_is_no_second_ctrl_c(tmp_path: Path) -> None:

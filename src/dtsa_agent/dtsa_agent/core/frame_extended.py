@@ -100,8 +100,8 @@ def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
 def decode_head(data: bytes, extent_m: float = EXTENT_M) -> Frame:
     """The sender's own state from the beginning of an extended frame.
 
-    A ground radio that listens to a Crazyflie's peer-to-peer traffic hears about 30 bytes of a frame. They hold the
-    whole state of the sender; what it says about others is lost, and the frame cannot be authenticated.
+    For listeners that get the beginning of a frame alone. It holds the whole state of the sender; what that says about
+    others is lost, and the frame cannot be authenticated.
 
     :param data: 23 bytes or more.
     :param extent_m: largest coordinate that fits, m, as the swarm has agreed.

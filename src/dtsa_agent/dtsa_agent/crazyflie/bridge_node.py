@@ -30,6 +30,7 @@ from dtsa_agent.crazyflie.bridge_outputs import Outputs
 from dtsa_agent.crazyflie.bridge_positions import subscribe_positions
 from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
 from dtsa_agent.crazyflie.positions import PositionSettings
+from dtsa_agent.crazyflie.preflight import FAIL, preflight
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.ros.common.parameters import declare_settings
@@ -37,6 +38,7 @@ from dtsa_agent.ros.common.priority import stay_on_one_processor, take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
 
 STATUS_HZ = 5.0
+SETTLE_S = 1.2  # of a check before flight
 SWITCH_S = 0.0005
 
 
@@ -188,6 +190,26 @@ def run_node(node: BridgeNode) -> int:
     return code
 
 
+def check_node(node: BridgeNode, say: Callable[[str], None]) -> int:
+    """Connect, look at everything that a flight needs, and close; exit code 1 if something is missing.
+
+    No motor turns, and the emergency watchdog is not fed: afterwards everybody can fly as before.
+    """
+    interrupts = _Interrupts()
+    level = node.settings.station.priority
+    problem = take_priority(level) if level else ""
+    if node.positions is not None:
+        node.positions.start()
+    node.bridge.connect(stop=interrupts.event.is_set)
+    interrupts.event.wait(SETTLE_S)  # rates and qualities are counted over a second
+    firmware = {v.name: v.link.firmware for v in node.bridge.vehicles.values() if v.link.firmware is not None}
+    findings = preflight(node.settings, node.bridge.snapshots(), firmware, problem)
+    node.bridge.close()
+    for finding in findings:
+        say(str(finding))
+    return int(any(finding.level == FAIL for finding in findings))
+
+
 def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
     bridge = node.bridge
     bridge.end_heartbeat()  # from here on the bridge alone brings them down
@@ -205,8 +227,11 @@ def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
     return 0 if interrupts.count == 1 and not flying else 1
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of the executable `crazyflie_bridge`."""
+def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = run_node) -> int:
+    """Entry point of the executable `crazyflie_bridge`.
+
+    :param use: what is done with the node; returns the exit code.
+    """
     argv = list(sys.argv if args is None else args)
     follow_supervisor()
     try:
@@ -217,7 +242,7 @@ def main(args: Sequence[str] | None = None) -> int:
     node = None
     try:
         node = BridgeNode()
-        code = run_node(node)
+        code = use(node)
     except ConfigError as error:
         print(f"crazyflie_bridge: {error}", file=sys.stderr)
         code = 2

@@ -8,6 +8,11 @@ from dtsa_agent.crazyflie.config import StationSettings
 from dtsa_agent.crazyflie.units import FULL_STATE, HOVER, POSITION, VELOCITY_WORLD, Setpoint, Vector, to_map
 
 
+def place_text(place: Vector) -> str:
+    """A place (m) for people."""
+    return "(" + ", ".join(f"{round(v, 2) + 0.0:.2f}" for v in place) + ")"  # no -0.00
+
+
 def outside_fence(place: Vector, station: StationSettings) -> str:
     """How a place is outside the geofence; empty if it is not, or if there is no fence.
 
@@ -21,8 +26,7 @@ def outside_fence(place: Vector, station: StationSettings) -> str:
     for axis, p, low, high in zip("xyz", here, fence.geofence_min, fence.geofence_max, strict=True):
         away = max(low - p, p - high)
         if away > fence.geofence_tolerance_m:
-            where = ", ".join(f"{v:.2f}" for v in here)
-            return f"({where}) is {away:.2f} m outside the geofence in {axis}"
+            return f"{place_text(here)} is {away:.2f} m outside the geofence in {axis}"
     return ""
 
 

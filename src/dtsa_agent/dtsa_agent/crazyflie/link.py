@@ -109,6 +109,7 @@ class Link:
         self._on_broken = on_broken
         self._on_answer = on_answer
         self._settling, self._seen = settling, seen
+        self.firmware: tuple[int, str] | None = None  # version of its protocol, and revision; None: never connected
         self._cf: Any = None
         self._radio: RadioPort | None = None
         self._heard = Heard()
@@ -282,6 +283,7 @@ class Link:
                 raise LinkError(f"firmware parameter {name}: {error}") from error
         if self.robot.reset_estimator and not again:
             settle(cf, self._settling, self._seen, self.mailbox.take_position, self.robot.estimator_timeout_s)
+        self.firmware = _firmware(cf)
         self._start_log(cf, max(deadline, time.monotonic() + 2.0))
         if radio is not None:
             cf.link_statistics.latency.stop()  # its pings would wait behind a stuck packet, and have the link closed
@@ -366,3 +368,13 @@ class Link:
         """Wait for the worker to end (s); False if it has not."""
         self._thread.join(timeout)
         return not self._thread.is_alive()
+
+
+def _firmware(cf: Any) -> tuple[int, str]:
+    """Version of the protocol and revision of the firmware."""
+    try:
+        revision = f"{int(cf.param.get_value('firmware.revision0')):08x}"
+        modified = int(cf.param.get_value("firmware.modified"))
+    except (KeyError, AttributeError, TypeError, ValueError):
+        return int(cf.platform.get_protocol_version()), "unknown"
+    return int(cf.platform.get_protocol_version()), revision + (" modified" if modified else "")

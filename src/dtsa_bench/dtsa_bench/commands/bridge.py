@@ -11,6 +11,7 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
+FILE, ALL = "file", "all"
 DESCRIPTION = """\
 The bridge to the Crazyflies of a swarm.yaml: topics /cfN/..., services /cfN/... and /all/..., as in Crazyswarm2.
 The first Ctrl-C lands all, the second stops all motors."""
@@ -31,7 +32,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="cflib: the Crazyflies of the file; sim: simulated ones in their place (default %(default)s)",
     )
     add_simulated_radio(parser)
-    parser.add_argument("--check", action="store_true", help="check the file, print the radio budget, and end")
+    parser.add_argument(
+        "--check",
+        nargs="?",
+        const=ALL,
+        choices=(FILE, ALL),
+        help="connect, list what a flight needs (links, firmware, batteries, positions, clocks, geofence, budget, "
+        "priority), and end; exit code 1 if something is missing. file: the file and the budget alone",
+    )
 
 
 def add_simulated_radio(parser: argparse._ActionsContainer) -> None:
@@ -60,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
     use_simulated_radio(args)
     settings = load_swarm(args.config)
-    if args.check:
+    if args.check == FILE:
         loads = radio_loads(settings.radio_rates())
         print(f"{args.config}: {len(settings.robots)} Crazyflies")
         for load in loads:
@@ -70,17 +78,23 @@ def run(args: argparse.Namespace) -> int:
     require_cflib()
     with ExitStack() as stack:
         config = simulated(args.config, stack) if args.backend == "sim" else args.config
-        return run_bridge(config)
+        return run_bridge(config, check=args.check == ALL)
 
 
-def run_bridge(config: Path) -> int:
+def run_bridge(config: Path, *, check: bool = False) -> int:
     """The bridge in this process.
 
     :param config: the swarm's YAML.
+    :param check: only connect, and say what a flight would lack.
     """
     from dtsa_agent.crazyflie import bridge_node
 
-    return bridge_node.main(["crazyflie_bridge", "--ros-args", "-p", f"config:={config.resolve()}"])
+    arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config.resolve()}"]
+    if check:
+        # Too many for a radio is a line of the list here, not the end.
+        arguments += ["--log-level", "error"]
+        return bridge_node.main(arguments, lambda node: bridge_node.check_node(node, print))
+    return bridge_node.main(arguments)
 
 
 def simulated(config: Path, stack: ExitStack) -> Path:
