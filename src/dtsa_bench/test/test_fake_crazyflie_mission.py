@@ -23,6 +23,8 @@ pytest.importorskip("dtsa_msgs.srv")
 
 from bridge_helpers import FakeFleet, fake_fleet, settings, wait_for
 from metronome import flown_again_when_overloaded
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
@@ -32,6 +34,7 @@ from dtsa_bench.fake_crazyflie.truth import read_truth
 from dtsa_bench.fly.bringing import plan_moves
 from dtsa_bench.fly.domain import ros_domain
 from dtsa_bench.fly.places import MissionError, assign_places, check_standing, crossings
+from dtsa_bench.report.data import run_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 COUNT = 4
@@ -83,6 +86,63 @@ def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
         check_standing(names, measured, fence)
 
 
+def check_records(out: Path) -> None:
+    """The whole mission is in its own bag, in mission.json, and in the report."""
+    mission = json.loads((out / "mission.json").read_text())
+    texts = [event["text"] for event in mission["events"]]
+    assert mission["cut_short"] == ""
+    for words in ("order /all/arm (arm True): done", "order /all/takeoff (", "order /cf1/go_to (", "order /all/land ("):
+        assert any(text.startswith(words) for text in texts), texts
+    one = mission["vehicles"]["cf1"]
+    assert [s["state"] for s in one["states"]][-4:] == ["armed", "flying", "landing", "ready"]
+    assert 3.0 < one["battery_least_v"] <= one["battery_first_v"] < 4.3
+    assert "commands [Hz]" in one["last"]
+    with AnyReader([out / "mission_bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        counts = {name: topic.msgcount for name, topic in bag.topics.items()}
+    assert set(counts) >= {"/all/events", "/diagnostics"}
+    for cf in range(1, COUNT + 1):
+        assert counts[f"/cf{cf}/status"] > 20
+        assert counts[f"/cf{cf}/odom"] > 50
+        assert counts[f"/cf{cf}/cmd_velocity_world"] > 20
+    assert counts["/all/events"] >= len(texts) > 20
+    data = run_data(out)
+    assert data["mission"]["vehicles"][0][0] == "cf1"
+    assert any("order /all/takeoff" in text for _, _, text in data["mission"]["events"])
+
+
+@flown_again_when_overloaded
+def test_a_bridge_that_dies_leaves_records_and_a_summary(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
+        out = tmp_path / "out"
+        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(out), "--tail-s", "60"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            wait_for(lambda: len(fleet.events(name="streaming")) == COUNT, 60)
+            (bridge,) = (
+                int(child)
+                for task in Path(f"/proc/{process.pid}/task").iterdir()
+                for child in (task / "children").read_text().split()
+                if b"bridge_node" in Path(f"/proc/{child}/cmdline").read_bytes()
+            )
+            time.sleep(1.0)
+            os.kill(bridge, signal.SIGKILL)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.wait()
+        assert process.returncode == 1
+        assert "bridge" in errors
+        assert "not known to have landed: cf1, cf2, cf3, cf4" in errors
+        summary = json.loads((out / "summary.json").read_text())
+        mission = json.loads((out / "mission.json").read_text())
+        assert "bridge" in summary["cut_short"] == mission["cut_short"]
+        assert summary["slots"]["total"] > 10
+        assert mission["vehicles"]["cf1"]["states"][-1]["state"] == "flying"
+        assert (out / "bag" / "metadata.yaml").is_file()
+        assert (out / "mission_bag" / "metadata.yaml").is_file()
+        assert run_data(out)["mission"]["cut_short"] == mission["cut_short"]
+
+
 @flown_again_when_overloaded
 def test_take_off_exchange_landing(tmp_path: Path) -> None:
     """Over simulated radios, on which a twentieth of all packets is lost."""
@@ -104,6 +164,7 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
         begun = json.loads(fleet.truth.read_text().partition("\n")[0])["fleet"]["unix_time"]
         assert (out / "summary.json").stat().st_mtime > begun + last_landed  # drawn and written once all stood
         assert (out / "bag" / "metadata.yaml").is_file()
+        check_records(out)
         times, track, events = read_truth(fleet.truth)
         assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
         # Who stood opposite each other have changed places, and everybody stands on the floor.

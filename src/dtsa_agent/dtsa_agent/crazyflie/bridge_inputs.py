@@ -11,6 +11,7 @@ from typing import Any
 from builtin_interfaces.msg import Duration as DurationMsg
 from dtsa_msgs.msg import FullState, Hover, Position, VelocityWorld
 from dtsa_msgs.srv import Arm, GoTo, Land, NotifySetpointsStop, Takeoff
+from geometry_msgs.msg import Point
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Empty as EmptyMsg
@@ -31,15 +32,26 @@ def _seconds(duration: DurationMsg) -> float:
     return duration.sec + duration.nanosec * 1e-9
 
 
+def _short(value: Any) -> str:
+    """A field of a request for people."""
+    if isinstance(value, DurationMsg):
+        return f"{_seconds(value):g} s"
+    if isinstance(value, Point):
+        return f"({value.x:.2f}, {value.y:.2f}, {value.z:.2f})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 class Inputs:
     """Topics and services of all vehicles.
 
     :param node: offers the services.
     :param bridge: the swarm.
     :param pump: takes the streamed commands; not started yet.
+    :param say: called with a level and a line about each order.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, pump: CommandPump) -> None:
+    def __init__(self, node: Node, bridge: Bridge, pump: CommandPump, say: Callable[[str, str], None]) -> None:
+        self._say = say
         self._node, self._bridge, self._pump = node, bridge, pump
         self._origin = bridge.settings.station.room_origin_in_world
 
@@ -62,12 +74,24 @@ class Inputs:
         self._create_services("all", list(self._bridge.vehicles))
 
     def _create_services(self, prefix: str, names: list[str]) -> None:
-        self._node.create_service(Takeoff, f"{prefix}/takeoff", partial(self._takeoff, names))
-        self._node.create_service(Land, f"{prefix}/land", partial(self._land, names))
-        self._node.create_service(GoTo, f"{prefix}/go_to", partial(self._go_to, names))
-        self._node.create_service(Arm, f"{prefix}/arm", partial(self._arm, names))
-        self._node.create_service(NotifySetpointsStop, f"{prefix}/notify_setpoints_stop", partial(self._notify, names))
-        self._node.create_service(Empty, f"{prefix}/emergency", partial(self._emergency, names))
+        for kind, service, callback in (
+            (Takeoff, "takeoff", self._takeoff),
+            (Land, "land", self._land),
+            (GoTo, "go_to", self._go_to),
+            (Arm, "arm", self._arm),
+            (NotifySetpointsStop, "notify_setpoints_stop", self._notify),
+            (Empty, "emergency", self._emergency),
+        ):
+            name = f"{prefix}/{service}"
+            self._node.create_service(kind, name, partial(self._ordered, name, partial(callback, names)))
+
+    def _ordered(self, name: str, callback: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        """Carry out an order, and say so: what an operator did belongs to what happened."""
+        result = callback(request, response)
+        fields = ", ".join(f"{key} {_short(getattr(request, key))}" for key in request.get_fields_and_field_types())
+        answer = "" if getattr(result, "success", True) else f": {result.message}"
+        self._say("info" if not answer else "warn", f"order /{name} ({fields}){answer or ': done'}")
+        return result
 
     # -- commands ---------------------------------------------------------------------------------------------------
     def _command(

@@ -111,7 +111,8 @@ class BridgeNode(Node):
         self.destroy_node()
 
     def say(self, level: str, line: str) -> None:
-        """One line in the log."""
+        """One line in the log, and on the topic of events."""
+        self.outputs.publish_event(level, line)
         logger = self.get_logger()  # rclpy wants each place in the code to keep to one level
         if level == "error":
             logger.error(line)
@@ -138,7 +139,7 @@ class BridgeNode(Node):
             self.say("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:
             return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
-        Inputs(self, self.bridge, self.pump).offer()
+        Inputs(self, self.bridge, self.pump, self.say).offer()
         self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.snapshots()))
         self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.snapshots()))
         return ""

@@ -9,8 +9,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from dtsa_msgs.msg import Status
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.config import SwarmSettings
@@ -23,6 +24,9 @@ from dtsa_agent.ros.common.covariances import UNKNOWN, diagonal
 
 LATEST_ONLY = QoSProfile(depth=1)
 FRAME = "map"
+EVENTS = "/all/events"  # what the bridge does, and what it was ordered to do: its log
+EVENTS_QOS = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for those who come late
+LEVELS = {"info": 20, "warn": 30, "error": 40}
 # The firmware logs no variances: standard deviations of 3 cm, 0.1 rad and 0.1 m/s are cautious for its estimator with a
 # positioning system. Body rates are not logged.
 POSE_COVARIANCE = diagonal(0.03**2, 0.1**2)
@@ -51,6 +55,7 @@ class Outputs:
             if not positions.on or positions.topic_of(name).lstrip("/") != f"{name}/pose":  # motion capture's own
                 self._pose[name] = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
             self._status[name] = node.create_publisher(Status, f"{name}/status", QoSProfile(depth=10))
+        self._events = node.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
     def publish_state(self, vehicle: Vehicle, state: VehicleState) -> None:
@@ -77,6 +82,12 @@ class Outputs:
             self._odom[name].publish(message)
         if pose:
             self._pose[name].publish(PoseStamped(header=message.header, pose=message.pose.pose))
+
+    def publish_event(self, level: str, line: str) -> None:
+        """One line of the log, for those who record a mission."""
+        self._events.publish(
+            Log(stamp=self._clock.now().to_msg(), level=LEVELS.get(level, 20), name="crazyflie_bridge", msg=line)
+        )
 
     def publish_status(self, snapshots: list[Snapshot]) -> None:
         """Status of all; also looks who listens to odometry and pose."""

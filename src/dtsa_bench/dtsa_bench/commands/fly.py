@@ -166,7 +166,9 @@ def run_crazyflies(args: argparse.Namespace) -> int:
         flight, cut_short = fly_crazyflies(config, settings, path, args.out, options, stop, attach=args.attach)
     _tell(args, flight)
     if cut_short:
-        print(f"dtsa: the exchange was cut short: {cut_short}; all have landed", file=sys.stderr)
+        left = ", ".join(flight.summary["not_landed"])
+        end = f"not known to have landed: {left}" if left else "all have landed"
+        print(f"dtsa: the exchange was cut short: {cut_short}; {end}", file=sys.stderr)
         return 1
     return INTERRUPTED if stop else 0
 

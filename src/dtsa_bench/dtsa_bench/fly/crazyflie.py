@@ -24,6 +24,7 @@ from dtsa_msgs.msg import Status
 from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -32,7 +33,8 @@ from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.crazyflie.bridge_outputs import EVENTS, EVENTS_QOS
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.paths import shortest_s
@@ -44,17 +46,19 @@ from dtsa_agent.ros.common.priority import give_way, take_priority
 from dtsa_bench.options import new_directory, whole_number
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim.ros.channel_node import declare_channel
+from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .bringing import plan_moves
-from .children import Child, Children, describe_end
+from .children import Child, Children, NodeError, describe_end
 from .domain import LAST_DOMAIN, ros_domain
 from .flight import END_S, QUIET, Flight, run_environment
+from .mission_log import MissionLog
 from .options import FlightOptions
 from .places import MissionError, assign_places, check_places, check_standing, crossings
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
-from .supervisor import RealtimeSupervisor, Supervisor
+from .supervisor import RealtimeSupervisor
 
 ARRIVED_M = 0.12  # m: at its start when this close
 CLIMB_MPS = 0.4
@@ -62,6 +66,9 @@ SHIFT_MPS = 0.3
 BRING_MPS = 0.8  # of one that is brought to its place, at most
 KEEP_M = 0.3  # nobody comes closer to one that is brought to its place
 BRIDGE_SILENT_S = 3.0
+IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
+RECORDER_END_S = 10.0
+MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange
 BRIDGE_S = 60.0  # s, for the connections
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
 
@@ -92,6 +99,16 @@ class _Ended:
         return bool(self.stop) or bool(self.reason)
 
 
+class _BridgeWatch(ChannelObserver):
+    """Ends the exchange when the bridge has died."""
+
+    def __init__(self, mission: Mission) -> None:
+        self._mission = mission
+
+    def idle(self, status: ChannelStatus) -> None:
+        self._mission.bridge_alive()
+
+
 class Mission:
     """What the ground station does: it calls the bridge's services, watches the vehicles, and is alive.
 
@@ -107,7 +124,7 @@ class Mission:
     ) -> None:
         self.node, self.settings, self.scenario, self.ended, self.say = node, settings, scenario, ended, say
         self.status: dict[str, Status] = {}
-        self.diagnostics: dict[str, dict[str, float | str]] = {}  # what the bridge says about each, once a second
+        self.log = MissionLog()
         self.place: dict[str, tuple[float, float, float]] = {}
         self.crossing: list[str] = []  # whose ways to the starts cross: they are brought there one by one
         self.heard = time.monotonic()  # s, monotonic, the last status of anybody
@@ -119,6 +136,7 @@ class Mission:
             subscription = node.create_subscription(Odometry, f"/{robot.name}/odom", self._keep_place(robot.name), 1)
             self._odometry.append(subscription)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._keep_diagnostics, 10)
+        node.create_subscription(Log, EVENTS, self.log.event, EVENTS_QOS)
         self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
         self._beating = threading.Event()
         self._over = threading.Event()
@@ -143,6 +161,7 @@ class Mission:
         def keep(message: Status) -> None:
             self.status[name] = message
             self.heard = time.monotonic()
+            self.log.status(name, message)
             if self.exchanging and message.state != Status.STATE_FLYING and not self.ended.reason:
                 self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
 
@@ -151,7 +170,7 @@ class Mission:
     def _keep_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.startswith("crazyflie_bridge: "):
-                self.diagnostics[status.hardware_id] = {v.key: _number(v.value) for v in status.values}
+                self.log.diagnostics[status.hardware_id] = {v.key: _number(v.value) for v in status.values}
 
     def _keep_place(self, name: str) -> Callable[[Odometry], None]:
         def keep(message: Odometry) -> None:
@@ -318,6 +337,11 @@ class Mission:
         ]
         return max(away) < ARRIVED_M
 
+    @property
+    def flying(self) -> list[str]:
+        """Who was in the air, or may have been, when it was last heard of."""
+        return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
+
     def land(self, urgent: threading.Event) -> None:
         """Land whoever is in the air and wait until all stand.
 
@@ -333,6 +357,9 @@ class Mission:
             )
             end = time.monotonic() + self.settings.station.landing_timeout_s
             while time.monotonic() < end and any(s.state in flying for s in self.status.values()):
+                if time.monotonic() - self.heard > BRIDGE_SILENT_S:
+                    self.say("the bridge is silent: what flies is left to its own watchdogs")
+                    break
                 if urgent.is_set():
                     self.say("EMERGENCY STOP")
                     self._clients["/all/emergency"].call_async(Empty.Request())
@@ -400,7 +427,10 @@ def fly_crazyflies(
         environment = run_environment(domain, logs)
         context = Context()
         progress = ProgressLine("fly")
-        bridge, agents = Children(logs, environment), Children(logs, environment)
+        bridge, agents, recorder = (Children(logs, environment) for _ in range(3))
+        robots = [robot.name for robot in settings.robots]
+        arguments = ["--bag", str(directory / MISSION_BAG), "--names", *robots]
+        recorder.start("recorder", [], "dtsa_bench.fly.mission_recorder", arguments)
         if not attach:
             bridge.start("bridge", [], "dtsa_agent.crazyflie.bridge_node",
                          ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
@@ -424,14 +454,22 @@ def fly_crazyflies(
             _start_agents(agents, run, settings, directory)
             flight = _exchange(context, run, directory, agents, bridge, progress, options, ended, mission)
             return flight, ended.reason
+        except DtsaError as error:
+            ended.reason = ended.reason or str(error)
+            raise
         finally:
             with _second_interrupt() as urgent:
                 agents.stop()
                 if mission is not None:
                     mission.land(urgent)
                     mission.close()
-                if not attach:
-                    _end_bridge(bridge.all[0])
+                try:
+                    if not attach:
+                        _end_bridge(bridge.all[0])
+                finally:
+                    _end_recorder(recorder)
+                    if mission is not None:
+                        mission.log.write(directory, ended.reason)
             progress.end()
             context.try_shutdown()
 
@@ -468,11 +506,13 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         channel, measurement = flight.channel, flight.measurement
         assert isinstance(channel, RealtimeChannel)
         shown = FlightProgress(progress, measurement, channel)
-        channel.observe(Supervisor(bridge), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
+        channel.observe(_BridgeWatch(mission), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
         try:
             channel.run(ended)
             ended.reason = ended.reason or channel.fell_behind
             shown.show()
+        except (NodeError, MissionError) as error:  # the bridge has died: what was flown is there all the same
+            ended.reason = str(error)
         finally:
             channel.close()
             progress.end()
@@ -482,10 +522,28 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
             mission.land(urgent)
         give_way()  # the bridge does not: it has to watch them
         pictures = options.pictures and not ended
-        summary = flight.write_results(pictures, backend="cflib", cut_short=ended.reason, vehicles=mission.diagnostics)
+        summary = flight.write_results(
+            pictures,
+            backend="cflib",
+            cut_short=ended.reason,
+            not_landed=mission.flying,
+            vehicles=mission.log.diagnostics,
+        )
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         node.destroy_node()
+
+
+def _end_recorder(recorder: Children) -> None:
+    """It closes its bag; if it does not, the bag is recovered as any other."""
+    child = recorder.all[0]
+    if child.process.poll() is None:
+        child.process.send_signal(signal.SIGINT)
+    try:
+        child.process.wait(RECORDER_END_S)
+    except subprocess.TimeoutExpired:
+        child.process.kill()
+        child.process.wait()
 
 
 def _end_bridge(child: Child) -> None:

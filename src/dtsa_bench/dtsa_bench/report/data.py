@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
 SCENE_VALUES = 600_000  # most numbers in the replay: longer runs of larger swarms get fewer frames
 CRASHES = 50  # most that are shown
 PAIRS = 5  # closest pairs whose distance is drawn
+MISSION_VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
+MISSION_EVENTS = 1000  # most that are shown
 BLOCK = 512  # moments whose pair distances are computed at once
 
 Array = NDArray[np.float64]
@@ -58,6 +61,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         summary["min_distance_m"] = float(np.nanmin(distances.least))
     return {
         "name": run.name,
+        "mission": mission_data(path),
         "version": version,
         "notes": notes,
         "config": flatten(run.config),
@@ -76,6 +80,34 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "ages": _ages(ages, run),
         "table": _table(run, ages, distances, scenario),
     }
+
+
+def mission_data(path: str | Path) -> dict[str, Any] | None:
+    """What `mission.json` beside a bag says of a mission with Crazyflies; None: there is none.
+
+    :param path: run directory, bag directory or .mcap file.
+    """
+    place = Path(path)
+    for directory in (place, place.parent, place.parent.parent):
+        file = directory / "mission.json"
+        if (directory == place or directory / "bag" in (place, place.parent)) and file.is_file():
+            break
+    else:
+        return None
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        vehicles = [
+            [
+                str(name),
+                *(values.get(key) for key in MISSION_VALUES),
+                " → ".join(str(s["state"]) for s in values["states"]),
+            ]
+            for name, values in found["vehicles"].items()
+        ]
+        events = [[float(e["t_s"]), str(e["level"]), str(e["text"])] for e in found["events"]]
+        return {"cut_short": str(found["cut_short"]), "vehicles": vehicles, "events": events[:MISSION_EVENTS]}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
 
 
 def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:

@@ -96,6 +96,19 @@ function shareBars(rows) {
   return bars;
 }
 
+section("Mission", "With Crazyflies, from take-off to landing, as the ground station heard it. Loss, collisions and ages on this page are simulated on the PC: the slots were kept there.", {
+  has: run => run.mission,
+  draw: run => el("div", {},
+    run.mission.cut_short ? el("p", {class: "note"}, `Cut short: ${run.mission.cut_short}`) : null,
+    el("div", {class: "scroll"}, el("table", {},
+      el("thead", {}, el("tr", {}, ...["", "Battery, first", "least", "Link, least", "Log age, most", "Command latency, most", "States"].map(name => el("th", {}, name)))),
+      el("tbody", {}, ...run.mission.vehicles.map(([name, first, least, quality, age, latency, states]) => el("tr", {}, el("td", {}, name), el("td", {}, num(first, 2, "V")), el("td", {}, num(least, 2, "V")),
+        el("td", {}, percent(quality)), el("td", {}, num(age, 2, "s")), el("td", {}, num(latency, 1, "ms")), el("td", {style: "white-space:normal"}, states)))))),
+    el("details", {}, el("summary", {}, `${run.mission.events.length} events: orders, states, safety actions`),
+      el("div", {class: "scroll", style: "max-height:420px;overflow:auto"}, el("table", {}, el("tbody", {}, ...run.mission.events.map(([time, level, text]) =>
+        el("tr", {}, el("td", {}, num(time, 2, "s")), el("td", {class: level === "error" ? "bad" : ""}, level), el("td", {style: "white-space:normal;text-align:left"}, text)))))))),
+}, "wide");
+
 const lines = {reasons: true, lines: []};
 section("Slots", "Who sent in which slot, and why. The strip on top says what became of each slot. Click to go there.", {
   has: run => run.slots.count, draw: run => new SlotLine(run, lines).node,
