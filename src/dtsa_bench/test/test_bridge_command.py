@@ -152,7 +152,7 @@ def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
         data = fleet_settings(fleet, {"safety": {"geofence_max": [1.0, 2.3, 0.95]}, "priority": 0})
         data["robots"]["cf1"]["initial_position"] = [1.2, 0.0, 0.0]
         data["robots"]["cf3"]["uri"] = "radio://0/80/2M/E7E7E7E703"
-        data["all"] |= {"connect_attempts": 1, "connect_timeout_s": 2.0, "command_rate_hz": 100, "log_rate_hz": 100}
+        data["all"] |= {"connect_attempts": 1, "connect_timeout_s": 20.0, "command_rate_hz": 100, "log_rate_hz": 100}
         data["station"]["force_budget"] = True
         config = tmp_path / "swarm.yaml"
         config.write_text(yaml.safe_dump(data))
