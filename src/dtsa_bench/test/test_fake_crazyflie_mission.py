@@ -254,6 +254,30 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
 
 
 @flown_again_when_overloaded
+def test_a_dry_run_flies_from_where_they_stand_and_nobody_moves(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2, *MIXED) as fleet:
+        data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
+        for cf, x in (("cf1", -1.2), ("cf2", 1.2)):  # at each other's places
+            data["robots"][cf]["initial_position"] = [-x, 0.0, 0.0]
+            data["robots"][cf]["uri"] = fleet.uri(1 if x > 0 else 2)
+        config, out = tmp_path / "swarm.yaml", tmp_path / "out"
+        config.write_text(yaml.safe_dump(data))
+        command = [*FLY, "--config", str(config), "--out", str(out), "--dry-run"]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+        assert result.returncode == 0, result.stderr
+        assert "exchange of roles, places 2 1" in result.stderr
+        assert json.loads((out / "summary.json").read_text())["end"] == "completed"
+        assert not [e for e in fleet.events(name="state") if e["state"] in ("flying", "locked")]
+        # Somebody who cannot be asked is named, and nothing is flown.
+        fleet.fault("close", 1)
+        data["all"] |= {"connect_attempts": 1, "connect_timeout_s": 2.0}
+        config.write_text(yaml.safe_dump(data))
+        command[command.index(str(out))] = str(tmp_path / "again")
+        result = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+        assert (result.returncode, "where cf2 stand is not known" in result.stderr) == (1, True)
+
+
+@flown_again_when_overloaded
 def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out"), "--tail-s", "60"]
