@@ -23,6 +23,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--preset loss --set slot_ms=20 --out runs/slow", "with a setting changed"),
         ("--file own.yaml --json", "a sweep of your own, its groups as JSON"),
     ),
+    "new-plugin": (("my-policy --out plugins/my-policy", "then as its README.md says"),),
     "soak": (("--list", "what there is"), ("kill --sample", "a few minutes' part of one")),
     "benchmark": (("--json", "all parts, as JSON"),),
     "prove": (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only")),

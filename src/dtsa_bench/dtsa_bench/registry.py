@@ -10,6 +10,7 @@ COMMANDS = {
     "fly": "one flight with real ROS 2 nodes, recorded to a bag",
     "simulate": "one or many flights without ROS, as fast as the machine allows",
     "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
+    "new-plugin": "a package to begin with: a policy of your own, its test and a sweep",
     "soak": "what is too long for the tests: kills, faults, load and memory over hours",
     "prove": "policy lease explored state by state, for all patterns of loss",
     "embedded": "the protocol on a simulated microcontroller: the same bits, and what it costs",

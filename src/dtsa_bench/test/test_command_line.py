@@ -58,7 +58,7 @@ def test_no_command_takes_abbreviations(command: str) -> None:
         (["simulate", "--agnets", "3"], "option --agnets: unknown; did you mean --agents?"),
         (["simulate", "--polic", "tdma"], "option --polic: unknown; did you mean --policy?"),
         (["simulate", "--sed=3"], "option --sed=3: unknown; did you mean --seed?"),
-        (["simulate", "--policy", "dsta"], "lease; did you mean dtsa?"),
+        (["simulate", "--policy", "dsta"], "; did you mean dtsa?"),
         (["simulate", "--scenario", "way-points"], "did you mean waypoints?"),
         (["fly", "--ot", "a"], "required: --out; option --ot: unknown; did you mean --out?"),
         (["bridge", "--config", "a", "--backend", "cflb"], "did you mean cflib?"),

@@ -1,0 +1,27 @@
+"""`dtsa new-plugin`: a package to begin with."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+DESCRIPTION = """\
+Writes a package with a policy of your own that works: the policy, a test, a sweep that sets it against the league's
+best and the bound, and the lines that install and run it. docs/bench.md says what a policy is given and returns."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    text = "a package to begin with: a policy of your own, its test and a sweep"
+    parser = subparsers.add_parser("new-plugin", help=text, description=DESCRIPTION)
+    parser.add_argument("name", metavar="NAME", help="what the policy will be called, as in my-policy")
+    parser.add_argument("--out", metavar="DIR", help="where the package goes (default: a directory of that name here)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the package."""
+    from dtsa_bench.new_plugin import write_package
+
+    for path in write_package(args.name, Path(args.out or args.name)):
+        print(path)
+    return 0
