@@ -120,6 +120,16 @@ def test_numbers_of_one_publisher_are_taken_whatever_a_stranger_counts(steps: li
     assert publisher.admits(1, now_s + 1.0)  # after a silence, or a restart
 
 
+def test_the_sender_counts_more_than_its_numbers() -> None:
+    known, first = OnePublisher(b"one"), OnePublisher()
+    for publisher in (known, first):
+        assert publisher.admits(7, 1.0, b"one")
+        assert not publisher.admits(8, 1.1, b"two")
+        assert publisher.admits(5000, 1.2, b"one")
+    assert not known.admits(5001, 9.0, b"two")
+    assert first.admits(1, 9.0, b"two")  # where nobody is given, after a silence: a process started again
+
+
 def test_only_the_channel_can_end_its_run() -> None:
     run = Run.draw()
     call = Call.from_bytes(run.call("/swarm/channel"))

@@ -24,7 +24,10 @@ import dtsa_msgs.msg
 from dtsa_msgs.msg import Frame, Process, Report, Slot, Transmission
 from rclpy.serialization import serialize_message
 
+from dtsa_agent.core import Frame as OwnState
+from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.stamps import header_of
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.soak.flights import children, end_all
 from dtsa_bench.verify import verify_bag
@@ -228,6 +231,45 @@ def test_malformed_messages_of_every_kind_end_and_freeze_nobody_in_real_time(tmp
     assert summary["end"] == "completed"
     assert summary["lost_agents"] == []
     assert sum(summary["not_taken_in"].values()) > 60
+
+
+def test_well_formed_messages_of_a_stranger_with_the_live_run_id_are_not_believed(tmp_path: Path) -> None:
+    forged = []
+
+    def attack(stranger: Stranger, process: subprocess.Popen[str]) -> None:
+        """Frames in the name of agent 1, as they will be due, and deliveries of them that the channel never made."""
+        stranger.listen(3, process)
+        run, begun = stranger.last.run, stranger.last.slot
+        for _ in range(400):
+            slot = stranger.last.slot + 2
+            said = OwnState(sender=1, slot=slot, c_r=1, position=(9.0, 9.0, 1.0), velocity=(0.0, 0.0, 0.0))
+            data = array("B", encode_extended(ExtendedFrame(said)))
+            header = header_of(names.slot_time_ns(slot, 20_000_000))
+            stranger.publishers[names.AIR_FRAME].publish(Frame(header=header, run=run, slot=slot, agent=1, data=data))
+            stranger.publishers[names.SLOT].publish(
+                Slot(
+                    header=header,
+                    run=run,
+                    slot=slot,
+                    phase=Slot.RUN,
+                    heard_slot=slot,
+                    sender=array("H", [1]),
+                    length=array("B", [len(data)]),
+                    data=data,
+                    received=array("B", [15]),
+                )
+            )
+            forged.append(bytes(data))
+            stranger.graph.executor.spin_once(timeout_sec=0.005)
+            if stranger.last.slot > begun + 40:
+                return
+
+    shape = ("--mode", "realtime", "--slot-ms", "20", "--policy", "lease", "--tail-s", "4")
+    summary = disturbed(tmp_path, attack, *SHAPE, *shape)
+    assert summary["not_taken_in"]["other sender"] >= len(forged)
+    with Bag(tmp_path / "flight" / "bag") as bag:
+        sent = {bytes(record.data) for record in bag.messages() if record.topic == "/swarm/frame"}
+    assert not [data for data in forged if any(data in message for message in sent)]
 
 
 # -- the handshake

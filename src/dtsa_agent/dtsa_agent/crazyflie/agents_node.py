@@ -81,19 +81,19 @@ class StationNode(RealtimeNode):
             message = feed.take()
             if message is not None:
                 with self.membership.intake.guard():
-                    self._check(index, message, feed.number)
+                    self._check(index, message, feed)
                     self._note(index, message)
         # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
         age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
         self._vehicles.place(self._measured + self.swarm.velocity * age)
 
-    def _check(self, index: int, message: Odometry, number: int | None) -> None:
+    def _check(self, index: int, message: Odometry, feed: Feed) -> None:
         """Whether odometry can be that of a vehicle, and of the bridge that has told of it so far.
 
         :raises Unusable: if it cannot. Without any for a while the vehicle gets no commands, and the bridge holds it.
         """
         check_odometry(message)
-        if not self._bridges[index].admits(number, time.monotonic()):
+        if not self._bridges[index].admits(feed.number, time.monotonic(), feed.sender):
             raise Unusable(OTHER_SENDER, f"odometry of cf{self.swarm.ids[index]} from two publishers")
 
     def _note(self, index: int, message: Odometry) -> None:

@@ -37,16 +37,16 @@ _TELL_S = 0.5  # counts are told that often at most
 _REFUSED_S = 10.0  # who has taken part for so long is not sent away any more
 _MOST_CALLERS = 16
 # A process that comes late shows itself on so many calls, one a second: it may find the channel before that finds it.
-_INTRODUCTIONS = 5
+_INTRODUCTIONS = 30
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last counts
 
 
 class _Caller:
     """A channel that has called."""
 
-    def __init__(self, call: Call) -> None:
+    def __init__(self, call: Call, sender: bytes | None) -> None:
         self.call = call
-        self.publisher = OnePublisher()
+        self.publisher = OnePublisher(sender)
         self.introductions = 0  # on calls of a run under way
 
 
@@ -84,21 +84,22 @@ class Membership:
         self._node = node.get_fully_qualified_name()
         self._ids = list(ids)
 
-    def admits(self, message: SlotFields, number: int | None) -> bool:
+    def admits(self, message: SlotFields, number: int | None, sender: bytes | None) -> bool:
         """Whether a slot message is one of this run; others are counted. A channel that calls is answered.
 
         :param message: the message.
         :param number: its number, as its publisher counts.
+        :param sender: who sent it; None: not known.
         :raises ConfigError: when the channel refuses this process.
         """
         try:
-            self._check(message, number)
+            self._check(message, number, sender)
         except Unusable as error:
             self.intake.drop(error.reason, str(error))
             return False
         return True
 
-    def _check(self, message: SlotFields, number: int | None) -> None:
+    def _check(self, message: SlotFields, number: int | None, sender: bytes | None) -> None:
         check_slot(message, self._agents)
         run, phase = message.run, message.phase
         calls = phase in (Slot.PREPARE, Slot.START)
@@ -111,7 +112,7 @@ class Membership:
         if caller is None:
             if not calls:
                 raise Unusable(OTHER_RUN, f"slot message of run {run_text(run)}, which has not called this process")
-            caller = self._meet(run, message.data)
+            caller = self._meet(run, message.data, sender)
         if phase == Slot.END:
             if not caller.call.ended_by(message.data):
                 raise Unusable(FORGED_END, f"an end of run {run_text(run)} that is not its channel's")
@@ -119,8 +120,8 @@ class Membership:
             self._tell()
             return
         self._plausible(message)
-        if not caller.publisher.admits(number, time.monotonic()):
-            raise Unusable(OTHER_SENDER, f"slot message {number} of run {run_text(run)}, not of its channel's series")
+        if not caller.publisher.admits(number, time.monotonic(), sender):
+            raise Unusable(OTHER_SENDER, f"slot message {number} of run {run_text(run)}, not of its channel")
         if phase == Slot.REFUSE:
             self._refused(message.data)
         if phase == Slot.PREPARE:
@@ -130,7 +131,7 @@ class Membership:
             caller.introductions += 1
             self._introduce(run)
 
-    def _meet(self, run: int, data: bytes) -> _Caller:
+    def _meet(self, run: int, data: bytes, sender: bytes | None) -> _Caller:
         """A channel calls for the first time."""
         if not run:
             raise Unusable(OTHER_RUN, "a call without a run")
@@ -140,7 +141,7 @@ class Membership:
             raise Unusable(RANGE, f"a call of nobody: {error}") from None
         while len(self._callers) >= _MOST_CALLERS:
             del self._callers[next(run for run in self._callers if run != self.run)]
-        caller = self._callers[run] = _Caller(call)
+        caller = self._callers[run] = _Caller(call, sender)
         return caller
 
     def begin(self, run: int) -> None:

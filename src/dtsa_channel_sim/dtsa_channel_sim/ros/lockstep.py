@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.checks import OTHER_RUN, SLOT, UNREADABLE, Unusable
+from dtsa_agent.ros.common.checks import OTHER_RUN, OTHER_SENDER, SLOT, UNREADABLE, Unusable
 from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of
 from dtsa_agent.ros.common.transmission_fields import TransmissionFields, read_transmission
@@ -134,7 +134,8 @@ class LockstepChannel(RosChannel):
             fresh = self.answers.add(message)
         except Unusable as error:
             self.intake.drop(error.reason, str(error))
-            self._complaint, self._complaint_time = str(error), time.monotonic()
+            if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent is to blame
+                self._complaint, self._complaint_time = str(error), time.monotonic()
             return
         if fresh:
             self._observers.answer_received(slot, message.agent.tobytes(), data)
@@ -153,5 +154,5 @@ class LockstepChannel(RosChannel):
             raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no Transmission ({said})") from None
         if message.run != self.run_id:
             raise Unusable(OTHER_RUN, f"an answer of run {run_text(message.run)}")
-        self.roster.check_sender(message.agent, self.loop.number, time.monotonic())
+        self.roster.check_sender(message.agent, self.loop.number, time.monotonic(), self.loop.sender)
         return message

@@ -298,7 +298,7 @@ class RealtimeChannel(RosChannel):
         """
         message = self._decoded(data, Frame)
         slot, agent, length = message.slot, message.agent, len(message.data)
-        self.roster.check_frame(agent, self.loop.number, time.monotonic())
+        self.roster.check_frame(agent, self.loop.number, time.monotonic(), self.loop.sender)
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
         if not 1 <= length <= LONGEST_FRAME:
             raise Unusable(SIZES, f"a frame of {length} bytes")
@@ -364,7 +364,7 @@ class RealtimeChannel(RosChannel):
 
         :raises Unusable: if it cannot be one.
         """
-        self.roster.check_sender(message.agent, self._reports.number, time.monotonic())
+        self.roster.check_sender(message.agent, self._reports.number, time.monotonic(), self._reports.sender)
         now = self._now()
         self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
         heard = np.array(message.agent, dtype=np.intp) - 1

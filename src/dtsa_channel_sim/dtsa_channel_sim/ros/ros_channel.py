@@ -215,7 +215,7 @@ class RosChannel:
                 return
             with self.intake.guard():
                 try:
-                    self.roster.hear(message, time.monotonic())
+                    self.roster.hear(message, time.monotonic(), self._processes.sender)
                 except ConfigError as error:
                     self._refuse(message.process, error)
                     if not self.roster.closed:

@@ -41,9 +41,13 @@ class Member:
     node: str
     ids: tuple[int, ...]
     heard_s: float  # monotonic, when it last told about itself
+    sender: bytes | None  # participant of all its messages; None: not known
     dropped: dict[str, int] = field(default_factory=dict)
-    publisher: OnePublisher = field(default_factory=OnePublisher)
-    frames: OnePublisher = field(default_factory=OnePublisher)  # likewise of frames, in real time
+    publisher: OnePublisher = field(init=False)
+    frames: OnePublisher = field(init=False)  # likewise of frames, in real time
+
+    def __post_init__(self) -> None:
+        self.publisher, self.frames = OnePublisher(self.sender), OnePublisher(self.sender)
 
 
 class Roster:
@@ -107,11 +111,12 @@ class Roster:
         """Slot 0 begins: from now on nobody's settings end the run."""
         self.closed = True
 
-    def hear(self, message: Process, now_s: float) -> None:
+    def hear(self, message: Process, now_s: float, sender: bytes | None = None) -> None:
         """Takes in what a process says about itself.
 
         :param message: the message.
         :param now_s: s, monotonic.
+        :param sender: who sent it; None: not known.
         :raises ConfigError: if it cannot take part, naming setting, both values and node.
         :raises Unusable: for a message that cannot be, or of another run.
         """
@@ -122,19 +127,21 @@ class Roster:
             raise Unusable(OTHER_RUN, f"{message.node} belongs to run {run_text(message.run)}")
         member = self._members.get(message.process)
         if member is None:
-            member = self._meet(message, now_s)
-        elif member.ids != tuple(message.agent):
+            member = self._meet(message, now_s, sender)
+        if member.sender != sender:
+            raise Unusable(OTHER_SENDER, f"a message about {message.node} that is not its own")
+        if member.ids != tuple(message.agent):
             raise Unusable(UNKNOWN, f"{message.node} for other agents than before")
         member.heard_s = now_s
         member.dropped = dict(zip(message.dropped_reason, message.dropped, strict=True))
         self._check_rivals(member)
 
-    def _meet(self, message: Process, now_s: float) -> Member:
+    def _meet(self, message: Process, now_s: float, sender: bytes | None) -> Member:
         """A process tells about itself for the first time."""
         rival = self._rivals.get(message.process)
         if rival is not None:
             return rival[0]
-        member = Member(message.process, message.node, tuple(message.agent), now_s)
+        member = Member(message.process, message.node, tuple(message.agent), now_s, sender)
         self._compare(message)
         if any(agent in self._of for agent in member.ids):
             if len(self._rivals) >= _MOST_STRANGERS:
@@ -212,33 +219,35 @@ class Roster:
                 f"no process of another run on these topics; it has {named(message.agent)}",
             )
 
-    def check_sender(self, ids: Any, number: int | None, now_s: float) -> None:
+    def check_sender(self, ids: Any, number: int | None, now_s: float, sender: bytes | None = None) -> None:
         """Whether a message can be from the process that has some agents.
 
         :param ids: ids of the agents, an array as messages carry it.
         :param number: the message's number, as its publisher counts.
         :param now_s: s, monotonic.
+        :param sender: who sent it; None: not known.
         :raises Unusable: if it cannot.
         """
         member = self._groups.get(ids.tobytes())
         if member is None:
             raise Unusable(UNKNOWN, f"a message for agents {list(ids[:8])}, which no process has")
-        if not member.publisher.admits(number, now_s):
-            raise Unusable(OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}'s series")
+        if not member.publisher.admits(number, now_s, sender):
+            raise Unusable(OTHER_SENDER, f"a message for {named(ids)} that is not of {member.node}")
 
-    def check_frame(self, agent: int, number: int | None, now_s: float) -> None:
+    def check_frame(self, agent: int, number: int | None, now_s: float, sender: bytes | None = None) -> None:
         """Whether a frame can be from the process that has its sender.
 
         :param agent: id of the sender.
         :param number: the message's number, as its publisher counts.
         :param now_s: s, monotonic.
+        :param sender: who sent it; None: not known.
         :raises Unusable: if it cannot.
         """
         member = self._of.get(agent)
         if member is None:
             raise Unusable(UNKNOWN, f"a frame of cf{agent}, which no process has")
-        if not member.frames.admits(number, now_s):
-            raise Unusable(OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}'s series")
+        if not member.frames.admits(number, now_s, sender):
+            raise Unusable(OTHER_SENDER, f"a frame of cf{agent} that is not of {member.node}")
 
     def dropped(self) -> dict[str, int]:
         """What all processes have not taken in, by reason."""

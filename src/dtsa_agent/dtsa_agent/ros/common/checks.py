@@ -181,24 +181,33 @@ def plain(text: str) -> str:
 
 
 class OnePublisher:
-    """Tells the messages of one publisher from others' by their numbers, which each publisher counts for itself.
+    """Tells the messages of one publisher from others', by who sent them.
 
-    A ROS 2 message does not say who sent it. Its number does as far as possible: another publisher's numbers lie
-    elsewhere unless both have sent about as much. After a silence any number is taken, so that nobody can take the
-    place of the right one for long. Middlewares that give no numbers switch this off.
+    Where a middleware does not say that, by their numbers, which each publisher counts for itself: another publisher's
+    lie elsewhere unless both have sent about as much. After a silence any number is taken, and any sender where none
+    was given: nobody can take the place of the right one for long. Without senders and numbers this is off.
+
+    :param sender: the only one whose messages are ever taken; None: whoever is heard first.
     """
 
-    __slots__ = ("_last", "_time_s")
+    __slots__ = ("_last", "_only", "_sender", "_time_s")
 
-    def __init__(self) -> None:
+    def __init__(self, sender: bytes | None = None) -> None:
+        self._only = self._sender = sender
         self._last, self._time_s = 0, 0.0
 
-    def admits(self, number: int | None, now_s: float) -> bool:
-        """Whether a message with this number can be the next of the same publisher; it is taken for that then.
+    def admits(self, number: int | None, now_s: float, sender: bytes | None = None) -> bool:
+        """Whether a message can be the next of the same publisher; it is taken for that then.
 
         :param number: the message's number; 0 or None: not known.
         :param now_s: s, monotonic.
+        :param sender: who sent it; None: not known.
         """
+        if sender is not None:
+            if sender != self._sender and (self._only is not None or now_s - self._time_s < _SILENT_S):
+                return False
+            self._sender, self._time_s = sender, now_s
+            return True
         if not number:
             return True
         if not 0 < number - self._last <= _WINDOW and now_s - self._time_s < _SILENT_S:

@@ -12,6 +12,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -20,11 +21,13 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
 
 from .checks import UNREADABLE
 from .intake import Intake
+from .taking import Taker
 
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
 HOUSEKEEPING_S = 0.1
@@ -100,7 +103,7 @@ class Feed:
     :param raw: messages are taken as serialised bytes.
     :param read: makes messages of serialised bytes, in place of rclpy.
     :param intake: counts messages that cannot be read; None: they are errors.
-    :param admits: says by a message and its publisher's number for it whether it is taken in; None: all are.
+    :param admits: says by a message, its number and its sender whether it is taken in; None: all are.
     """
 
     def __init__(
@@ -111,40 +114,48 @@ class Feed:
         qos: QoSProfile,
         raw: bool = False,
         intake: Intake | None = None,
-        admits: Callable[[Any, int | None], bool] | None = None,
+        admits: Callable[[Any, int | None, bytes | None], bool] | None = None,
         read: Callable[[bytes], Any] | None = None,
     ) -> None:
-        raw = raw or read is not None
         self.subscription = node.create_subscription(
-            msg_type, topic, self._never, qos, callback_group=_OwnHands(), raw=raw
+            msg_type, topic, self._never, qos, callback_group=_OwnHands(), raw=True
         )
         self.handle = self.subscription.handle
-        self.number: int | None = None  # of the message taken last, as its publisher counts
-        self._type, self._raw = msg_type, raw
-        self._intake, self._admits, self._read = intake, admits, read
+        self._type, self._intake, self._admits = msg_type, intake, admits
+        self._read = read or (bytes if raw else partial(deserialize_message, message_type=msg_type))
         self._stack = ExitStack()
         self._stack.enter_context(self.handle)
+        self._taker = Taker(self.handle)
+        self._stack.callback(self._taker.close)
+
+    @property
+    def number(self) -> int | None:
+        """Number of the message taken last, as its publisher counts; None: not known."""
+        return self._taker.number
+
+    @property
+    def sender(self) -> bytes | None:
+        """Participant of DDS that sent the message taken last, which is a process; None: not known."""
+        return self._taker.sender
 
     def _never(self, message: Any) -> None:
         raise LocalProtocolError("an executor took a message that is not its own")
 
     def take(self) -> Any:
         """A message that is there already, or None; also None after many that were not taken in."""
+        taker = self._taker
         for _ in range(_MOST_DROPPED):
             try:
-                taken = self.handle.take_message(self._type, self._raw)
-                if taken is None:
+                data = taker.take()
+                if data is None:
                     return None
-                message, info = taken
-                if self._read is not None:
-                    message = self._read(message)
+                message = self._read(data)
             except Exception as error:  # rclpy has no common base for what a message can do to it
                 if self._intake is None:
                     raise
                 self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
                 continue
-            self.number = info["publication_sequence_number"]
-            if self._admits is None or self._admits(message, self.number):
+            if self._admits is None or self._admits(message, taker.number, taker.sender):
                 return message
         return None
 
