@@ -48,7 +48,7 @@ def update(metrics: Metrics, slot: int, track: Array, tables: Swarm | None, /) -
 
 # Frames: a record is the structure of libdtsa/frame.h; its size says which one.
 
-def encode(record: Array, position_step: float, out: Array, /) -> int: ...  # length, 0: not encodable
+def encode(record: Array, position_step: float, /) -> bytes: ...  # none: not encodable
 def decode(data: Array, position_step: float, record: Array, /) -> int: ...  # 0, or a negative fault
 def frame_length(profile: int, /) -> int: ...  # 0 for an unknown profile
 def lease_state_bytes(agents: int, anchor_every: int, /) -> int: ...

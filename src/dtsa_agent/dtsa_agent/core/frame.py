@@ -83,8 +83,7 @@ def encode_record(record: bytes, extent_m: float) -> bytes:
     :param record: the structure.
     :param extent_m: largest coordinate that fits, m.
     """
-    data = bytearray(_kernel.FRAME_MAX)
-    return bytes(data[: _kernel.encode(record, position_step(extent_m), data)])
+    return _kernel.encode(record, position_step(extent_m))
 
 
 def decode_record(data: bytes, extent_m: float, size: int) -> bytearray:

@@ -115,12 +115,16 @@ static PyObject *update(const call *c)
 
 static PyObject *encode(const call *c)
 {
+    uint8_t out[DTSA_FRAME_MAX];
+    int length = 0;
     if (!(c->real[1] > 0.0)) return refused("position_step", 0);
     if (c->items[0] == sizeof(dtsa_frame))
-        return PyLong_FromLong(frame_encode(c->at[0], c->real[1], c->at[2]));
-    if (c->items[0] == sizeof(extended_frame))
-        return PyLong_FromLong(extended_encode(c->at[0], c->real[1], c->at[2]));
-    return refused("record", c->items[0]);
+        length = frame_encode(c->at[0], c->real[1], out);
+    else if (c->items[0] == sizeof(extended_frame))
+        length = extended_encode(c->at[0], c->real[1], out);
+    else
+        return refused("record", c->items[0]);
+    return PyBytes_FromStringAndSize((const char *)out, length);
 }
 
 static PyObject *decode(const call *c)
@@ -220,7 +224,7 @@ static const function FUNCTIONS[] = {
     {"lease_status", lease_status, 2, {SWARM, WHOLE("index")}},
     {"metrics", new_metrics, 2, {OBJECT("values"), OBJECT("arrays")}},
     {"update", update, 4, {{"metrics", 'M', 0, 0, 0, 0}, WHOLE("slot"), READ("track", 8, 0), {"tables", 'S', 0, 0, 0, 1}}},
-    {"encode", encode, 3, {READ("record", 1, 0), REAL("position_step"), {"out", 'w', 1, 0, DTSA_FRAME_MAX, 0}}},
+    {"encode", encode, 2, {READ("record", 1, 0), REAL("position_step")}},
     {"decode", decode, 3, {READ("data", 1, 0), REAL("position_step"), WRITE("record", 1, 0)}},
     {"frame_length", length, 1, {WHOLE("profile")}},
     {"lease_state_bytes", lease_bytes, 2, {WHOLE("agents"), WHOLE("anchor_every")}},
