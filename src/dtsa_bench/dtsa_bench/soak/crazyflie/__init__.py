@@ -25,8 +25,9 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
 
 def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     figures: dict[str, Any] = {}
+    found = [row["summary"] for row in rows]
     for name, part in (("mission", missions), ("gap", gaps), ("stream", streams)):
-        figures.update(part.figures([row for row in rows if row.get("part") == name]))
+        figures.update(part.figures([summary for summary in found if summary["part"] == name]))
     return figures
 
 
