@@ -86,6 +86,24 @@ def test_one_that_was_carried_is_believed_again_on_the_ground_only() -> None:
     assert all(offer(t, (1.2, (-1) ** k, 0.0), 1.0 + 0.001 * k) for k in range(1, 60))
 
 
+def test_poses_that_come_late_are_not_believed() -> None:
+    t = tracker()
+
+    def at(stamp: float, arrival: float, *, flying: bool = True) -> str:
+        return t.offer((0.0, 0.0, 0.0), LEVEL, "world", 77000.0 + stamp, arrival, flying=flying)  # another clock
+
+    assert [at(0.01 * k, 5.004 + 0.01 * k) for k in range(20)] == [""] * 20
+    backlog = [at(0.2 + 0.01 * k, 5.5 + 0.0005 * k) for k in range(28)]  # nothing for 0.3 s, then all at once
+    assert "it comes 296 ms later than the fastest one" in backlog[0]
+    assert [bool(answer) for answer in backlog] == [True] * 25 + [False] * 3
+    assert t.refused == {"late": 25}
+    assert at(0.48, 5.484) == ""
+    # The clock of motion capture was set back: on the ground its poses are believed again, in flight they are not.
+    assert all(at(0.49 + 0.01 * k, 7.0 + 0.01 * k) for k in range(60))
+    answers = [at(1.2 + 0.01 * k, 8.0 + 0.01 * k, flying=False) for k in range(MOVED_AGAIN + 5)]
+    assert answers == [""] * len(answers)  # they have agreed with each other for long
+
+
 def test_latency_and_rate() -> None:
     t = tracker()
     for k in range(150):

@@ -16,6 +16,7 @@ NONE, POSE, NAMED_POSES = "none", "pose", "named_poses"
 EXTPOS, EXTPOSE = "extpos", "extpose"
 FASTEST_MPS = 3.0  # no vehicle is carried or flies faster from one pose to the next
 NORM_TOLERANCE = 0.05  # of a quaternion's length
+DRIFT = 1e-3  # s/s, by which two clocks may drift apart
 MOVED_AGAIN = 20  # poses in a row that agree with each other: on the ground it was carried, or a clock was set
 WINDOW_S = 1.0  # over which the rate is counted
 ROOM_MARGIN_M = 0.3  # outside the geofence a pose or an estimate may be this far and still be meant
@@ -51,6 +52,11 @@ class PositionSettings(Settings):
     jump_m: float = setting(
         0.3, f"a pose farther than this, and {FASTEST_MPS:g} m/s, from the one before is not believed",
         unit="m", minimum=0.01, maximum=10,
+    )  # fmt: skip
+
+    late_s: float = setting(
+        0.06, "a pose that takes so much longer than the fastest one is not believed: the vehicle has moved on",
+        unit="s", minimum=0.005, maximum=10,
     )  # fmt: skip
 
     @property
@@ -114,6 +120,7 @@ class Tracker:
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=500))  # s
     _times: deque[float] = field(default_factory=lambda: deque(maxlen=512))
     _candidate: _Candidate | None = None
+    _least_lag: float = math.inf  # s, from the stamp to the arrival, of the fastest one; two clocks: of any size
     _next_send: float = -math.inf
 
     def offer(
@@ -130,6 +137,9 @@ class Tracker:
         """
         found = self._check(position, orientation, frame, stamp, now, flying=flying)
         if isinstance(found, Seen):
+            waited = 0.0 if self.last is None else now - self.last.time
+            if stamp:
+                self._least_lag = min(self._least_lag + DRIFT * waited, now - stamp)
             self.last, self.reason, self._candidate = found, "", None
             self._times.append(now)
         else:
@@ -159,12 +169,20 @@ class Tracker:
         if self.last is None:
             return seen
         problem = self._follows(self.last, seen)
-        return problem if problem and not self._settled_elsewhere(seen, flying=flying) else seen
+        if problem is None:
+            return seen
+        if not self._settled_elsewhere(seen, flying=flying):
+            return problem
+        self._least_lag = math.inf  # perhaps the clock was set
+        return seen
 
     def _follows(self, last: Seen, seen: Seen) -> tuple[str, str] | None:
         """What keeps a pose from following the one before."""
         if seen.stamp and last.stamp and seen.stamp <= last.stamp:
             return "stamp", f"its stamp is {last.stamp - seen.stamp:.3f} s before that of the last one"
+        late = seen.time - seen.stamp - self._least_lag
+        if seen.stamp and late > self.settings.late_s + DRIFT * (seen.time - last.time):
+            return "late", f"it comes {late * 1000:.0f} ms later than the fastest one"
         jump = math.dist(seen.position, last.position)
         if jump > self.settings.jump_m + FASTEST_MPS * (seen.time - last.time):
             return "jump", f"it jumps by {jump:.2f} m within {seen.time - last.time:.2f} s"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from dtsa_bench.batch.task import Row
 from dtsa_bench.fake_crazyflie.truth import read_truth
+from dtsa_bench.fly.domain import ros_domain
 
 from ..checks import met
 from ..flights import dtsa
@@ -22,7 +24,8 @@ COUNT = 12
 EACH = 5
 CLOSEST_M = 0.25
 FLYING_M = 0.1  # above the floor
-_LOSSES: dict[str, float | None] = {"udp": None, "radio 1 %": 0.01, "radio 5 %": 0.05}
+CAMERAS = "udp, motion capture at 100 Hz"
+_LOSSES: dict[str, float | None] = {"udp": None, "radio 1 %": 0.01, "radio 5 %": 0.05, CAMERAS: None}
 _PATIENCE_S = 180.0
 
 
@@ -46,8 +49,13 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     over, flights = str(item.settings["over"]), int(item.settings["flights"])
     options = ["--arming", str(item.settings["arming"]), "--seed", str(item.seed), "--radio-seed", str(item.seed)]
     # What follows each other without a restart of the Crazyflies must not be locked by the first one's end.
-    station = {"toc_cache": str(directory / "cache"), "safety": {"emergency_watchdog": flights == 1}}
-    completed = []
+    station: dict[str, Any] = {"toc_cache": str(directory / "cache"), "safety": {"emergency_watchdog": flights == 1}}
+    completed, latencies = [], []
+    if over == CAMERAS:
+        station["positions"] = {"source": "pose"}
+        options.append("--motion-capture")
+        with ros_domain() as domain:  # free: the cameras' and the mission's now
+            os.environ |= {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with busy_machine(1), running(directory, COUNT, _LOSSES[over], options, station) as fleet:
         for number in range(flights):
             out = directory / f"out{number}"
@@ -57,10 +65,13 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
             result = dtsa("fly", "--backend", "cflib", *words, patience_s=_PATIENCE_S)
             said = result.stderr.strip()[-300:]
             met(result.returncode == 0, f"flight {number + 1}: exit code {result.returncode}: {said}")
-            completed.append(json.loads((out / "summary.json").read_text())["completion_time_s"])
+            summary = json.loads((out / "summary.json").read_text())
+            completed.append(summary["completion_time_s"])
+            latencies += [values.get("position latency, median [ms]", 0.0) for values in summary["vehicles"].values()]
     closest = closest_m(fleet.truth)
     met(closest >= CLOSEST_M, f"two came to {closest:.3f} m")
-    return {**item.settings, "closest_m": round(closest, 3), "completion_s": completed}
+    latency = round(float(np.max(latencies, initial=0.0)), 1)
+    return {**item.settings, "closest_m": round(closest, 3), "completion_s": completed, "position_latency_ms": latency}
 
 
 def closest_m(path: Path) -> float:
@@ -88,5 +99,6 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
             "completed": sum(len(row["completion_s"]) for row in mine),
             "closest_m": min(row["closest_m"] for row in mine),
             "completion_s": [min(times), max(times)],
+            "position_latency_ms": max(row["position_latency_ms"] for row in mine),  # median, of the slowest vehicle
         }
     return found
