@@ -28,6 +28,7 @@ from dtsa_agent.core.compiled import MISSING, kernel
 from dtsa_agent.core.flight_models import FLIGHT_MODELS, flight_model
 from dtsa_agent.core.frame import position_step
 from dtsa_agent.core.frame_extended import ExtendedFrame, Gossip, decode_extended, encode_extended
+from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.reference import arithmetic, frame, frame_extended, selection, tag, timebase
 from dtsa_agent.core.reference import priority as plain_priority
 from dtsa_agent.core.reference_swarm import ReferenceSwarm
@@ -313,3 +314,25 @@ def test_frames_get_the_same_tags(library: ctypes.CDLL, key: bytes, session: int
     session_c, slot_c, length = ctypes.c_uint64(session), ctypes.c_uint64(slot), ctypes.c_long(len(data))
     library.dtsa_tag(key, len(key), session_c, slot_c, data, length, said)
     assert said.raw == tag.tag(tag.keyed(key, session), slot, data)
+
+
+@pytest.mark.skipif(bool(MISSING), reason="the core is not compiled")
+@pytest.mark.parametrize("estimator", ["hold", "linear", "intent"])
+def test_a_state_from_the_next_slot_is_estimated_within_its_memory(estimator: str) -> None:
+    """A clock that is ahead: its frame is heard before the receiver's slot is over. Found by fuzzing."""
+    config = SwarmConfig(agents=3, estimator=estimator, policy="tdma")
+    swarms = [make_swarm(config, core=core) for core in ("compiled", "reference")]
+    for swarm in swarms:
+        swarm.velocity[:] = 0.5
+        swarm.begin(0)
+        swarm.command[:] = 1.0
+        swarm.sends[:] = 1
+        swarm.emit(7)
+        for place in range(3):
+            assert swarm.hear(7, swarm.frame(place))
+        for slot in (7, 6, 3):
+            swarm.estimate(slot)
+    compiled, plain = swarms
+    assert np.array_equal(compiled.estimate_position, plain.estimate_position)
+    assert np.array_equal(compiled.estimate_velocity, plain.estimate_velocity)
+    assert np.abs(compiled.estimate_velocity[0, :, 1]).max() <= 0.51  # nothing has decayed yet

@@ -17,7 +17,9 @@ static void estimate_intent(const dtsa_table *t, int64_t slot, int step, double 
     const int n = c->agents;
     for (int k = 0; k < n; k++) {
         const int64_t ago = t->sent_slot[k] < 0 ? 0 : (slot - t->sent_slot[k]) * c->steps + step;
-        const int at = ago < c->decay_len ? (int)ago : c->decay_len - 1;
+        /* A frame of the next slot may be heard before this one is over: nothing has decayed then. */
+        const int64_t decayed = ago > 0 ? ago : 0;
+        const int at = decayed < c->decay_len ? (int)decayed : c->decay_len - 1;
         const double q = c->decay[at], w = c->decay[c->decay_len + at];
         for (int i = 0; i < 3; i++) {
             const int e = i * n + k;

@@ -37,7 +37,7 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
 def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     for target in TARGETS:
-        mine = [row for row in rows if row.get("target") == target]
+        mine = [row["summary"] for row in rows if row["summary"]["target"] == target]
         figures[f"{target}: inputs"] = sum(int(row["runs"]) for row in mine)
         figures[f"{target}: edges reached"] = max((int(row["covered"]) for row in mine), default=0)
     return figures

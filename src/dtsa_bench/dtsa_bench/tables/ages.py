@@ -143,8 +143,11 @@ def _steps(
             if not shared:
                 mask = run.frames.received[index].astype(np.uint8)
                 mask[run.frames.sender[index] - 1] = 1  # who sends knows what it said
-            if run.frames.data[index]:
-                tables.hear(slot, run.frames.data[index], mask)
+            data = run.frames.data[index]
+            if data:
+                tables.hear(slot, data, mask)
+            if metrics is not None:
+                metrics.frames[len(data)] += 1
         tables.end(slot)
         last = max(1, moments[slot + 1])
         track = np.ascontiguousarray(run.motion.position[min(moments[slot], last - 1) : last])

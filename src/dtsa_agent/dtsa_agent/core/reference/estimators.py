@@ -44,7 +44,7 @@ def intent(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Ve
     age = age_s(row, rules, slot, step)
     ago = 0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.steps + step
     powers, ways = decay_table(rules.tau, rules.dt)
-    at = min(ago, DECAY_STEPS - 1)
+    at = max(0, min(ago, DECAY_STEPS - 1))  # a frame of the next slot may be heard before this one is over
     q, way = powers[at], ways[at]
     position, velocity = [], []
     for axis in range(3):
