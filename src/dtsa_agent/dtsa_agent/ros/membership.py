@@ -144,6 +144,10 @@ class Membership:
         caller = self._callers[run] = _Caller(call, sender)
         return caller
 
+    def is_heard(self) -> bool:
+        """Whether a channel receives what this process says about itself."""
+        return bool(self._publisher.get_subscription_count())
+
     def begin(self, run: int) -> None:
         """The run begins for this process: from now on it belongs to no other.
 

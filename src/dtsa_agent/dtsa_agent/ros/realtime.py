@@ -216,7 +216,7 @@ class RealtimeNode(SwarmNode):
             self._called = True
             self._reporter.add_slot(message.slot, self.starts(0))
             self._reporter.publish(message.run)
-        elif message.phase == Slot.START:
+        elif message.phase == Slot.START and (self._called or self._is_heard()):
             self._begin(message.run)
             self._zero = message.time_ns
             if not self._called:
@@ -227,6 +227,15 @@ class RealtimeNode(SwarmNode):
                     self.swarm.position[:] = self._resume_at
                     self.swarm.track[:] = self._resume_at
         return message.phase != Slot.END
+
+    def _is_heard(self) -> bool:
+        """Whether the channel has found all that this process sends; who comes late waits for that.
+
+        What is published before is lost, above all what it says about itself. The start is told again and again.
+        """
+        return self.membership.is_heard() and bool(
+            self._air.get_subscription_count() and self._telemetry.get_subscription_count()
+        )
 
     def _listen(self) -> bool:
         """Waits for frames that say what time it is; False when the run is over."""

@@ -31,6 +31,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         self._agents = run.swarm.agents
         self._oracle = run.swarm.estimator_row.needs_everybody
         self._outcome = 0
+        self._lengths: list[int] = []  # of the frames of the slot that is being flown
         self._compared = self._tables.digest, self._tables.chosen  # of the slot that is being flown
 
     @property
@@ -49,6 +50,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         self.metrics.compare_tables(slot - 1, *self._compared)
         if self._oracle:
             self._tables.estimate_position[:] = answers.position
+        self.metrics.frames.update(self._lengths)
         if self.metrics.update(slot - 1, answers.track, self._tables, self._outcome):
             self.end_s = time.monotonic()
 
@@ -62,7 +64,7 @@ class FlightMeasurement(ChannelObserver, Referee):
     def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         self._outcome = verdict.outcome
         self._compared = answers.digest.copy(), answers.chosen.copy()
-        self.metrics.frames.update(len(frames[sender]) for sender in verdict.senders)
+        self._lengths = [len(frames[sender]) for sender in verdict.senders]
         self.scenario.advance(slot, self._tables)  # what all know about each other's goals
         if answers.taken_in is not None:  # in real time the receivers themselves know best
             for taken in answers.taken_in:
