@@ -17,7 +17,7 @@ from rclpy.task import Future
 from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
-from dtsa_agent.core.joining import Listeners
+from dtsa_agent.core.joining import Listeners, check_joinable
 from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 
@@ -216,7 +216,7 @@ class RealtimeNode(SwarmNode):
             self._called = True
             self._reporter.add_slot(message.slot, self.starts(0))
             self._reporter.publish(message.run)
-        elif message.phase == Slot.START and (self._called or self._is_heard()):
+        elif message.phase == Slot.START and (self._called or self._may_join()):
             self._begin(message.run)
             self._zero = message.time_ns
             if not self._called:
@@ -228,11 +228,14 @@ class RealtimeNode(SwarmNode):
                     self.swarm.track[:] = self._resume_at
         return message.phase != Slot.END
 
-    def _is_heard(self) -> bool:
+    def _may_join(self) -> bool:
         """Whether the channel has found all that this process sends; who comes late waits for that.
 
         What is published before is lost, above all what it says about itself. The start is told again and again.
+
+        :raises ConfigError: with a policy whose tables all have to be equal.
         """
+        check_joinable(self.config.policy)
         return self.membership.is_heard() and bool(
             self._air.get_subscription_count() and self._telemetry.get_subscription_count()
         )
