@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -79,22 +80,27 @@ class FlightMetrics:
         if self._course is not None:
             self._course.advance(0, start)
         self._last = start  # (3, N) m, positions at the end of the last slot
-        self.frames: Counter[int] = Counter()  # frames on the air, by their lengths in bytes: whoever sends counts them
+        self._frames: Counter[int] = Counter()  # frames on the air, by their lengths in bytes
         self._tail = math.ceil(limits.tail_s * 1e9 / swarm.slot_ns - 1e-6)
         # First number of slots at which the flight is over whatever happens.
         self._limit = max(1, math.ceil(limits.timeout_s * 1e9 / swarm.slot_ns - 1e-6))
 
-    def update(self, slot: int, track: Array, tables: AbstractSwarm | None, outcome: int) -> str:
+    def update(
+        self, slot: int, track: Array, tables: AbstractSwarm | None, outcome: int, lengths: Iterable[int] = ()
+    ) -> str:
         """Takes in a slot that has just ended.
 
         :param slot: its number; slots come one after the other from 0.
         :param track: (S, 3, N) m, frame map: true positions at its control instants, the last at its end.
         :param tables: what the agents (or :func:`metrics_tables`) know after ``end(slot)``; None: ages are left out.
         :param outcome: the channel's verdict on it, IDLE, SUCCESS or COLLISION.
+        :param lengths: bytes of each frame that was sent in it, whether or not anybody received it.
         :returns: why the flight is over now, or "" if it goes on.
         """
         self.slots = done = slot + 1
         self._outcomes[outcome] += 1
+        for length in lengths:
+            self._frames[length] += 1
         if self.lost:
             track = track.copy()
             for agent in self.lost:  # its vehicle hovers where it was last known
@@ -203,7 +209,7 @@ class FlightMetrics:
         news = sums["age_count"]
         efficiency = list(self.efficiencies().values())
         airtime = self.run.air.airtime
-        on_air_s = sum(airtime.on_air_ns(length) * count for length, count in self.frames.items()) / 1e9
+        on_air_s = sum(airtime.on_air_ns(length) * count for length, count in self._frames.items()) / 1e9
         return {
             "agents": swarm.agents,
             "moving": swarm.movers,
@@ -238,8 +244,8 @@ class FlightMetrics:
             "age_max_slots": sums["age_max"] if news else None,
             "age_mean_ms": sums["age_sum"] / news * swarm.slot_ms if news else None,
             "age_max_ms": sums["age_max"] * swarm.slot_ms if news else None,
-            "frames_per_s": self.frames.total() / flown if flown else None,
-            "bytes_per_s": sum(length * count for length, count in self.frames.items()) / flown if flown else None,
+            "frames_per_s": self._frames.total() / flown if flown else None,
+            "bytes_per_s": sum(length * count for length, count in self._frames.items()) / flown if flown else None,
             "channel_load": on_air_s / flown if flown else None,
             "estimate_error_mean_m": sums["error_sum"] / news if news else None,
             "estimate_error_max_m": sums["error_max"] if news else None,

@@ -122,7 +122,7 @@ def _fly(
 ) -> None:
     """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
     advance, begin, fly, hear, end = swarm.scenario.advance, swarm.begin, swarm.fly, swarm.hear, swarm.end
-    frame, arbitrate, update, frames = swarm.frame, channel.arbitrate, metrics.update, metrics.frames
+    frame, arbitrate, update = swarm.frame, channel.arbitrate, metrics.update
     ids, track, position = swarm.ids, swarm.track, swarm.position
     tables = swarm if ages else None
     table = 0 if swarm.shared else observer - 1
@@ -135,8 +135,6 @@ def _fly(
             compare(slot, swarm.digest, swarm.chosen)
         lengths = [len(data) for _, data in heard]
         verdict = arbitrate(slot, [i for i, _ in heard], lengths, position)
-        for length in lengths:
-            frames[length] += 1
         fly(slot)
         received = verdict.received
         if received is not None:
@@ -146,7 +144,7 @@ def _fly(
             for _, data in heard:
                 hear(slot, data)
         end(slot)
-        over = update(slot, track, tables, verdict.outcome)
+        over = update(slot, track, tables, verdict.outcome, lengths)
         if kept is not None:
             _keep(kept, swarm, slot, verdict.senders, verdict.outcome, table)
         if over:
@@ -164,12 +162,11 @@ def _fly_unslotted(
         swarm.scenario.advance(slot, swarm)
         carried = traffic.slot(slot)
         metrics.compare_tables(slot, swarm.digest, swarm.chosen)
-        metrics.frames.update(carried.lengths)
         swarm.fly(slot)
         for frame, mask in carried.heard:
             swarm.hear(slot, frame, mask)
         swarm.end(slot)
-        over = metrics.update(slot, swarm.track, swarm if ages else None, carried.outcome)
+        over = metrics.update(slot, swarm.track, swarm if ages else None, carried.outcome, carried.lengths)
         if kept is not None:
             _keep(kept, swarm, slot, carried.senders, carried.outcome, observer - 1)
         slot += 1

@@ -68,14 +68,15 @@ def test_the_tdma_of_the_dynamic_program_is_that_of_the_simulation() -> None:
     assert simulated == pytest.approx(optimum(0.2, cap=4, tolerance=1e-3).tdma, rel=0.03)
 
 
+def mean_error(policy: str) -> float:
+    """Of flights in which half of the agents move, m."""
+    flights = [dtsa.simulate(agents=12, moving=6, policy=policy, slot_ms=30, seed=seed) for seed in range(1, 5)]
+    return float(np.mean([flight.summary["estimate_error_mean_m"] for flight in flights]))
+
+
 def test_the_genie_by_error_has_the_least_errors() -> None:
     """Squared errors, which it weighs: of few that move, those that turn are worth more than those that do not."""
-
-    def error(policy: str) -> float:
-        flights = [dtsa.simulate(agents=12, moving=6, policy=policy, slot_ms=30, seed=seed) for seed in range(1, 5)]
-        return float(np.mean([flight.summary["estimate_error_mean_m"] for flight in flights]))
-
-    assert error("genie-error") < error("genie-age") < error("tdma")
+    assert mean_error("genie-error") < mean_error("genie-age") < mean_error("tdma")
 
 
 def test_threshold_aloha_has_the_age_of_its_source() -> None:
@@ -144,11 +145,7 @@ def test_sotdma_finds_slots_of_its_own() -> None:
 
 
 def test_dominance_prefers_those_who_turn() -> None:
-    def error(policy: str) -> float:
-        flights = [dtsa.simulate(agents=12, moving=6, policy=policy, slot_ms=30, seed=seed) for seed in range(1, 5)]
-        return float(np.mean([flight.summary["estimate_error_mean_m"] for flight in flights]))
-
-    assert error("dominance") < error("tdma")
+    assert mean_error("dominance") < mean_error("tdma")
 
 
 def test_every_scheme_flies_and_the_same_seed_gives_the_same_flight() -> None:

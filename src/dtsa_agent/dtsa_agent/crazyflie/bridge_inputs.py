@@ -37,7 +37,7 @@ def _short(value: Any) -> str:
     if isinstance(value, DurationMsg):
         return f"{_seconds(value):g} s"
     if isinstance(value, Point):
-        return f"({value.x:.2f}, {value.y:.2f}, {value.z:.2f})"
+        return units.place_text((value.x, value.y, value.z))
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -156,8 +156,12 @@ class Inputs:
     def _land(self, names: list[str], request: Any, response: Any) -> Any:
         duration = _seconds(request.duration)
         notes: list[str] = []
-        order = lambda v: v.land("service", request.height, duration, notes.append)  # noqa: E731
-        self._each(names, order, response, request.group_mask)
+        self._each(
+            names,
+            lambda v: v.land("service", request.height, duration, notes.append),
+            response,
+            request.group_mask,
+        )
         response.message = "; ".join(filter(None, (response.message, *notes)))
         return response
 
@@ -169,15 +173,19 @@ class Inputs:
             return response
         if not request.relative:
             place = to_world(place, self._origin)
-        order = lambda v: v.go_to(place, request.yaw, duration, request.relative)  # noqa: E731
-        return self._each(names, order, response, request.group_mask)
+        return self._each(
+            names,
+            lambda v: v.go_to(place, request.yaw, duration, request.relative),
+            response,
+            request.group_mask,
+        )
 
     def _arm(self, names: list[str], request: Any, response: Any) -> Any:
         return self._each(names, lambda v: v.arm(request.arm), response)
 
     def _notify(self, names: list[str], request: Any, response: Any) -> Any:
-        order = lambda v: v.notify_setpoints_stop(request.remain_valid_millisecs)  # noqa: E731
-        return self._each(names, order, response, request.group_mask)
+        valid_ms = request.remain_valid_millisecs
+        return self._each(names, lambda v: v.notify_setpoints_stop(valid_ms), response, request.group_mask)
 
     def _emergency(self, names: list[str], request: Any, response: Any) -> Any:
         for name in names:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 
 from dtsa_agent.crazyflie.config import StationSettings
-from dtsa_agent.crazyflie.units import FULL_STATE, HOVER, POSITION, VELOCITY_WORLD, Setpoint, Vector, to_map
-
-
-def place_text(place: Vector) -> str:
-    """A place (m) for people."""
-    return "(" + ", ".join(f"{round(v, 2) + 0.0:.2f}" for v in place) + ")"  # no -0.00
+from dtsa_agent.crazyflie.units import (
+    FULL_STATE,
+    HOVER,
+    POSITION,
+    VELOCITY_WORLD,
+    Setpoint,
+    Vector,
+    outside_by,
+    place_text,
+    to_map,
+)  # fmt: skip
 
 
 def outside_fence(place: Vector, station: StationSettings) -> str:
@@ -23,8 +28,7 @@ def outside_fence(place: Vector, station: StationSettings) -> str:
     if not fence.geofence:
         return ""
     here = to_map(place, station.room_origin_in_world)
-    for axis, p, low, high in zip("xyz", here, fence.geofence_min, fence.geofence_max, strict=True):
-        away = max(low - p, p - high)
+    for away, axis in outside_by(here, fence.geofence_min, fence.geofence_max):
         if away > fence.geofence_tolerance_m:
             return f"{place_text(here)} is {away:.2f} m outside the geofence in {axis}"
     return ""

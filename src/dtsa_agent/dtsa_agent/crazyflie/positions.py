@@ -10,7 +10,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 
 from dtsa_agent.core.settings import Settings, setting
-from dtsa_agent.crazyflie.units import Quaternion, Vector, to_world
+from dtsa_agent.crazyflie.units import Quaternion, Vector, outside_by, place_text, to_map, to_world
 
 NONE, POSE, NAMED_POSES = "none", "pose", "named_poses"
 EXTPOS, EXTPOSE = "extpos", "extpose"
@@ -53,7 +53,6 @@ class PositionSettings(Settings):
         0.3, f"a pose farther than this, and {FASTEST_MPS:g} m/s, from the one before is not believed",
         unit="m", minimum=0.01, maximum=10,
     )  # fmt: skip
-
     late_s: float = setting(
         0.06, "a pose that takes so much longer than the fastest one is not believed: the vehicle has moved on",
         unit="s", minimum=0.005, maximum=10,
@@ -248,9 +247,7 @@ def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
     """
     if room is None:
         return ""
-    for axis, p, o, low, high in zip("xyz", place, origin, *room, strict=True):
-        away = max(low - (p - o), (p - o) - high)
+    for away, axis in outside_by(to_map(place, origin), *room):
         if away > ROOM_MARGIN_M:
-            x, y, z = place
-            return f"({x:.2f}, {y:.2f}, {z:.2f}) in the world is {away:.2f} m outside the room in {axis}"
+            return f"{place_text(place)} in the world is {away:.2f} m outside the room in {axis}"
     return ""

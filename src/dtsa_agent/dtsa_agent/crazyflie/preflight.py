@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 from dtsa_agent.crazyflie.budget import radio_loads
 from dtsa_agent.crazyflie.config import RobotSettings, SwarmSettings
-from dtsa_agent.crazyflie.limits import outside_fence, place_text
+from dtsa_agent.crazyflie.limits import outside_fence
 from dtsa_agent.crazyflie.snapshot import Snapshot
 from dtsa_agent.crazyflie.state_machine import State
+from dtsa_agent.crazyflie.units import place_text
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 FAR_M = 0.25  # from its initial_position

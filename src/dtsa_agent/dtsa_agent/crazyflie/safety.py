@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import Settings, check, setting
 from dtsa_agent.crazyflie.state_machine import IN_AIR, State
-from dtsa_agent.crazyflie.units import Vector
+from dtsa_agent.crazyflie.units import Vector, outside_by
 
 ESTIMATE_HOLD_S = 1.0  # a vehicle whose estimate is wrong stands still that long, then it sinks
 
@@ -169,10 +169,7 @@ class SafetyMonitor:
         s = self.settings
         if not s.geofence or v.state not in IN_AIR or v.position is None:
             return []
-        worst, axis = max(
-            (max(low - p, p - high), name)
-            for p, low, high, name in zip(v.position, s.geofence_min, s.geofence_max, "xyz", strict=True)
-        )
+        worst, axis = max(outside_by(v.position, s.geofence_min, s.geofence_max))
         if worst <= s.geofence_tolerance_m:
             return []
         where = ", ".join(f"{p:.2f}" for p in v.position)
@@ -205,24 +202,13 @@ class SafetyMonitor:
         return [Verdict(v.name, Action.LOST, "link", f"no log packet for {v.log_age:.2f} s (limit {limit:.2f} s)")]
 
     def _commands(self, v: Watched) -> list[Verdict]:
-        limit, age = self.settings.command_age_s, v.command_age
-        if not limit or age is None or v.state != State.FLYING or age <= limit:
-            return []
-        reason = f"no command for {age:.2f} s"
-        verdicts = [Verdict(v.name, Action.HOLD, "commands", reason)]
-        if age > self.settings.command_land_s:
-            verdicts.append(Verdict(v.name, Action.LAND, "commands", reason))
-        return verdicts
+        s = self.settings
+        return _waiting(v, v.command_age, s.command_age_s, s.command_land_s, "commands", "no command")
 
     def _positions(self, v: Watched) -> list[Verdict]:
-        limit, age = self.settings.position_age_s, v.position_age
-        if not limit or age is None or v.state != State.FLYING or age <= limit:
-            return []
-        reason = f"not seen by motion capture for {age:.2f} s"
-        verdicts = [Verdict(v.name, Action.HOLD, "positions", reason)]
-        if age > self.settings.position_land_s:
-            verdicts.append(Verdict(v.name, Action.LAND, "positions", reason))
-        return verdicts
+        s = self.settings
+        what = "not seen by motion capture"
+        return _waiting(v, v.position_age, s.position_age_s, s.position_land_s, "positions", what)
 
     def _estimate(self, v: Watched) -> list[Verdict]:
         if not v.wrong or v.state not in IN_AIR:
@@ -257,3 +243,19 @@ class SafetyMonitor:
         if not any(v.state in (State.ARMED, State.FLYING, State.LANDING, State.LOST) for v in vehicles):
             return []
         return [Verdict("", Action.STOP_ALL, "heartbeat", f"no heartbeat of the ground station for {age:.2f} s")]
+
+
+def _waiting(v: Watched, age: float | None, hold_s: float, land_s: float, rule: str, what: str) -> list[Verdict]:
+    """What to do with one that flies and waits for something.
+
+    :param age: s, since it came last; None: never.
+    :param hold_s: age at which it is held; 0: never. :param land_s: age at which it lands.
+    :param rule: the rule's name. :param what: what is missing.
+    """
+    if not hold_s or age is None or v.state != State.FLYING or age <= hold_s:
+        return []
+    reason = f"{what} for {age:.2f} s"
+    verdicts = [Verdict(v.name, Action.HOLD, rule, reason)]
+    if age > land_s:
+        verdicts.append(Verdict(v.name, Action.LAND, rule, reason))
+    return verdicts

@@ -163,6 +163,19 @@ def to_map(place: Vector, origin: Vector) -> Vector:
     return place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
 
 
+def outside_by(place: Vector, low: Vector, high: Vector) -> list[tuple[float, str]]:
+    """How far a place is outside a box along each axis, m (negative: inside), with the axis's name.
+
+    :param place: m. :param low: lower corner, m, same frame. :param high: upper corner.
+    """
+    return [(max(a - p, p - b), axis) for p, a, b, axis in zip(place, low, high, "xyz", strict=True)]
+
+
+def place_text(place: Vector) -> str:
+    """A place (m) for people."""
+    return "(" + ", ".join(f"{round(v, 2) + 0.0:.2f}" for v in place) + ")"  # no -0.00
+
+
 def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
     """A vector of the world as the body sees it.
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
-import subprocess
-import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -107,8 +104,8 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     import yaml
 
     from dtsa_agent.crazyflie.config import load_swarm
-    from dtsa_agent.ros.common.process import SUPERVISOR
     from dtsa_bench.fake_crazyflie.ports import FIRST, free_base_port
+    from dtsa_bench.fake_crazyflie.process import FleetError, running_fleet
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))
     robots = load_swarm(config).robots
@@ -118,28 +115,9 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dtsa-bridge-")))
     path = folder / config.name
     path.write_text(yaml.safe_dump(data), encoding="utf-8")
-    command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--config", str(path), "--quiet"]
-    # A session of its own: Ctrl-C is for the bridge, which still has to land them. They end when this process does.
-    process = subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env=os.environ | {SUPERVISOR: str(os.getpid())},
-    )
-    stack.callback(_end, process)
-    assert process.stdout is not None
-    for line in process.stdout:  # the addresses, then one line that says that they are there
-        if "Ctrl-C" in line:
-            print(line.partition("; Ctrl-C")[0], flush=True)
-            return path
-    raise SystemExit(process.wait())
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    process.send_signal(signal.SIGINT)
     try:
-        process.wait(5)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+        line = stack.enter_context(running_fleet(["--config", str(path)]))
+    except FleetError as error:  # their process has said why
+        raise SystemExit(error.code) from None
+    print(line.partition("; Ctrl-C")[0], flush=True)
+    return path

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.crazyflie.safety import SafetySettings
 
-from .places import APART_M, MissionError
+from .places import APART_M, MissionError, close_pairs
 
 CLEAR_M = 0.45  # m: a straight way, and a place aside, keep this distance from everybody who hovers
 LAYER_M = 0.6  # m above those who hover: the one who moves is no danger to them there
@@ -66,12 +66,7 @@ def _check(names: Sequence[str], here: Array, goal: Array, layer: float, fence: 
         problems.append(
             f"{layer:.2f} m, the height over the others, is above the geofence's {fence.geofence_max[2]:g} m"
         )
-    for a in range(len(names)):
-        for b in range(a):
-            for what, place in (("hover", here), ("would begin", goal)):
-                distance = float(np.linalg.norm(place[:2, a] - place[:2, b]))
-                if distance < APART_M:
-                    problems.append(f"{names[b]} and {names[a]} {what} {distance:.2f} m apart")
+    problems += close_pairs(names, here, "hover") + close_pairs(names, goal, "would begin")
     if problems:
         raise MissionError(f"nobody can be brought to its place (at least {APART_M} m apart): {'; '.join(problems)}")
 

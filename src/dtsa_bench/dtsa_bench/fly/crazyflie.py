@@ -6,7 +6,6 @@ import dataclasses
 import math
 import os
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -50,7 +49,7 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .bringing import plan_moves
-from .children import Child, Children, NodeError, describe_end
+from .children import Child, Children, NodeError, describe_end, end_process
 from .domain import LAST_DOMAIN, ros_domain
 from .flight import END_S, QUIET, Flight, run_environment
 from .mission_log import MissionLog
@@ -536,23 +535,10 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
 
 def _end_recorder(recorder: Children) -> None:
     """It closes its bag; if it does not, the bag is recovered as any other."""
-    child = recorder.all[0]
-    if child.process.poll() is None:
-        child.process.send_signal(signal.SIGINT)
-    try:
-        child.process.wait(RECORDER_END_S)
-    except subprocess.TimeoutExpired:
-        child.process.kill()
-        child.process.wait()
+    end_process(recorder.all[0].process, RECORDER_END_S)
 
 
 def _end_bridge(child: Child) -> None:
     """The bridge lands whoever may still fly, then closes its links: it gets the time for that."""
-    if child.process.poll() is None:
-        child.process.send_signal(signal.SIGINT)
-    try:
-        child.process.wait(BRIDGE_END_S)
-    except subprocess.TimeoutExpired:
-        child.process.kill()
-        child.process.wait()
-        raise MissionError(f"{describe_end(child)}: it did not end by itself") from None
+    if not end_process(child.process, BRIDGE_END_S):
+        raise MissionError(f"{describe_end(child)}: it did not end by itself")

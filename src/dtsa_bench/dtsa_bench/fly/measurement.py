@@ -50,8 +50,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         self.metrics.compare_tables(slot - 1, *self._compared)
         if self._oracle:
             self._tables.estimate_position[:] = answers.position
-        self.metrics.frames.update(self._lengths)
-        if self.metrics.update(slot - 1, answers.track, self._tables, self._outcome):
+        if self.metrics.update(slot - 1, answers.track, self._tables, self._outcome, self._lengths):
             self.end_s = time.monotonic()
 
     def over(self, slot: int, answers: Answers) -> bool:

@@ -83,13 +83,25 @@ def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings)
             outside = float(max((low - (x, y)).max(), ((x, y) - high).max()))
             if outside > fence.geofence_tolerance_m:
                 problems.append(f"{name} stands {outside:.2f} m outside the geofence at ({x:.2f}, {y:.2f})")
-    for a in range(len(names)):
-        for b in range(a):
-            standing = float(np.linalg.norm(measured[:2, a] - measured[:2, b]))
-            if standing < APART_M:
-                problems.append(f"{names[b]} and {names[a]} stand {standing:.2f} m apart")
+    problems += close_pairs(names, measured, "stand")
     if problems:
         raise MissionError(f"no take-off (at least {APART_M} m apart): {'; '.join(problems)}")
+
+
+def close_pairs(names: Sequence[str], place: Array, what: str) -> list[str]:
+    """Who is too close to whom, and how close.
+
+    :param names: of the vehicles.
+    :param place: (3, N), m.
+    :param what: what they do there.
+    """
+    found = []
+    for a in range(len(names)):
+        for b in range(a):
+            distance = float(np.linalg.norm(place[:2, a] - place[:2, b]))
+            if distance < APART_M:
+                found.append(f"{names[b]} and {names[a]} {what} {distance:.2f} m apart")
+    return found
 
 
 def crossings(scenario: Scenario, names: Sequence[str], measured: Array) -> list[str]:

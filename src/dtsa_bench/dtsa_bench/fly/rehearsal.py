@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.config import SwarmSettings, parse_swarm
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_bench.fake_crazyflie.ports import free_base_port
+from dtsa_bench.fake_crazyflie.process import FleetError, running_fleet
 from dtsa_bench.run_config import RunConfig
 
 from .crazyflie import fly_crazyflies
@@ -87,18 +87,8 @@ def _fleet(places: list[list[float]], folder: Path) -> Iterator[int]:
     }
     config = folder / "fleet.yaml"
     config.write_text(yaml.safe_dump({"robots": robots}), encoding="utf-8")
-    command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--config", str(config), "--quiet"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    assert process.stdout is not None
     try:
-        if not any("Ctrl-C" in line for line in process.stdout):
-            raise MissionError("the simulated Crazyflies do not start")
-        yield base
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        process.stdout.close()
+        with running_fleet(["--config", str(config)]):
+            yield base
+    except FleetError as error:
+        raise MissionError(str(error)) from error

@@ -7,6 +7,8 @@ import math
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.plugins import Table
 
+from .knowledge import has_arrived
+
 
 class EventTdma:
     """TDMA in which the owner is silent while its last frame, moved on, is right to within some distance.
@@ -34,12 +36,10 @@ class EventTdma:
         sent = int(table.sent_slot[own])
         if sent < 0 or slot - sent >= self._silence:
             return True
-        assert table.own_position is not None
-        assert table.goal is not None
-        arrived = math.dist(table.own_position, table.goal) <= self._r_min
-        if arrived == bool(table.in_ap[own]):
+        if has_arrived(table, self._r_min) == bool(table.in_ap[own]):
             return True  # has set out, or has arrived, and not said so yet
         moved = table.sent_position[:, own]
         if not self._hold:
             moved = moved + table.sent_velocity[:, own] * ((slot - sent) * self._slot_s)
+        assert table.own_position is not None
         return math.dist(table.own_position, moved) > self._error

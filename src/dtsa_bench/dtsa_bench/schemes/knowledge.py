@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core.plugins import Table
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -19,6 +22,17 @@ def moves(swarm: AbstractSwarm) -> Mask:
     away = swarm.goal - swarm.position
     far = (away * away).sum(axis=0) > swarm.config.r_min**2
     return np.asarray(far & (swarm.present > 0))
+
+
+def has_arrived(table: Table, r_min: float) -> bool:
+    """Whether an agent is where it flies to: what it can tell by itself.
+
+    :param table: what it knows.
+    :param r_min: m, distance at which it has arrived.
+    """
+    assert table.own_position is not None
+    assert table.goal is not None
+    return math.dist(table.own_position, table.goal) <= r_min
 
 
 def counts(swarm: AbstractSwarm) -> Mask:

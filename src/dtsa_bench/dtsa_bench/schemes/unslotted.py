@@ -8,6 +8,8 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.plugins import Radio, Table
 from dtsa_channel_sim.model.airtime import Airtime
 
+from .knowledge import has_arrived
+
 _MS = 1_000_000  # ns
 
 
@@ -98,11 +100,6 @@ class Csma:
             return now_ns + 1 + int(self._random.random() * self._window_ns / periods_old)
         radio.send()
         self._sent_ns = now_ns
-        rest = 1.0 if self._has_something_to_say(table) else 10.0
+        moves = not has_arrived(table, self._r_min) or bool(table.in_ap[self._agent - 1])
+        rest = 1.0 if moves else 10.0
         return now_ns + 1 + int(self._random.uniform(0.5, 1.5) * self._period_ns * rest)
-
-    def _has_something_to_say(self, table: Table) -> bool:
-        assert table.own_position is not None
-        assert table.goal is not None
-        away = float(((table.own_position - table.goal) ** 2).sum())
-        return away > self._r_min**2 or bool(table.in_ap[self._agent - 1])

@@ -143,16 +143,14 @@ def _steps(
             if not shared:
                 mask = run.frames.received[index].astype(np.uint8)
                 mask[run.frames.sender[index] - 1] = 1  # who sends knows what it said
-            data = run.frames.data[index]
-            if data:
-                tables.hear(slot, data, mask)
-            if metrics is not None:
-                metrics.frames[len(data)] += 1
+            if run.frames.data[index]:
+                tables.hear(slot, run.frames.data[index], mask)
         tables.end(slot)
         last = max(1, moments[slot + 1])
         track = np.ascontiguousarray(run.motion.position[min(moments[slot], last - 1) : last])
         if metrics is not None:
-            metrics.update(slot, track, tables, int(run.outcome[slot]))
+            lengths = [len(data) for data in run.frames.data[starts[slot] : starts[slot + 1]]]
+            metrics.update(slot, track, tables, int(run.outcome[slot]), lengths)
         tables.estimate(slot + 1)
         yield slot, track[-1]
 

@@ -111,8 +111,8 @@ class LockstepCheck:
         swarm = rebuild.swarm
         self.agreement = self.agreement and bool((swarm.chosen == swarm.chosen[0]).all())
         self.metrics.compare_tables(slot, swarm.digest, swarm.chosen)
-        self.metrics.frames.update(len(swarm.frame(int(index))) for index in swarm.frame_length.nonzero()[0])
-        self.metrics.update(slot, swarm.track, swarm, verdict.outcome)
+        lengths = [len(swarm.frame(int(index))) for index in swarm.frame_length.nonzero()[0]]
+        self.metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)
         return True
 
     def _transmissions(self, slot: int, begin: int) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from heapq import heappop, heappush
 from typing import Any
 
@@ -161,9 +160,6 @@ class RealtimeChannel(RosChannel):
         """Takes agents back that were lost and have reported for a slot."""
         again = [a for a in sorted(self.lost) if book.answered[a - 1] and slot > self._given_up[a] + _AFTERLIFE]
         if again:
-            # A new process has told about itself before it reported: it takes the place of the lost one, not of one
-            # that is back.
-            self._meet_processes()
             self.lost.difference_update(again)
             self.returned.update(again)
             self._observers.agents_back(again)
@@ -299,8 +295,9 @@ class RealtimeChannel(RosChannel):
         """
         message = self._decoded(data, Frame)
         slot, agent, length = message.slot, message.agent, len(message.data)
-        number, sender = self.loop.number, self.loop.sender
-        self._check_process({agent}, lambda now_s: self.roster.check_frame(agent, number, now_s, sender))
+        if agent in self.lost:
+            self._meet_processes()  # a new process tells about itself before it sends anything else
+        self.roster.check_frame(agent, self.loop.number, time.monotonic(), self.loop.sender)
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
         if not 1 <= length <= LONGEST_FRAME:
             raise Unusable(SIZES, f"a frame of {length} bytes")
@@ -320,21 +317,6 @@ class RealtimeChannel(RosChannel):
         if slot > self.slot:
             self.accounts[slot].frames[agent] = frame
         self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns))
-
-    def _check_process(self, agents: set[int], check: Callable[[float], None]) -> None:
-        """Whether a message is of the process that has some agents: of lost ones, a new one may have come just now.
-
-        :param agents: ids of the agents.
-        :param check: looks it up; called with the time, s, monotonic.
-        :raises Unusable: if it is not.
-        """
-        try:
-            check(time.monotonic())
-        except Unusable:
-            if not agents & self.lost:
-                raise
-            self._meet_processes()  # it tells about itself before it sends anything else
-            check(time.monotonic())
 
     def _settle(self, now: int) -> None:
         """Delivers all frames whose time has come."""
@@ -381,9 +363,9 @@ class RealtimeChannel(RosChannel):
 
         :raises Unusable: if it cannot be one.
         """
-        number, sender = self._reports.number, self._reports.sender
-        ids = set(message.agent[: self.agents])
-        self._check_process(ids, lambda now_s: self.roster.check_sender(message.agent, number, now_s, sender))
+        if self.lost and not self.lost.isdisjoint(message.agent[: self.agents]):
+            self._meet_processes()
+        self.roster.check_sender(message.agent, self._reports.number, time.monotonic(), self._reports.sender)
         now = self._now()
         self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
         heard = np.array(message.agent, dtype=np.intp) - 1

@@ -12,9 +12,8 @@ from dtsa_msgs.msg import Slot
 from rclpy.serialization import deserialize_message
 
 from .cdr import FRAME, REPRESENTATION, Layout, sequence_at
-from .stamps import ns_of
+from .stamps import SECOND, ns_of
 
-_SECOND = 1_000_000_000
 _MOST = 254  # senders of a message that a struct reads
 _head = Layout().header().numbers("IIBII")
 _HEAD, _HEAD_END = _head.struct(), _head.end
@@ -58,9 +57,7 @@ def _read_usual(data: bytes) -> SlotFields | None:
         return None
     if lengths != count:
         return None
-    return SlotFields(
-        seconds * _SECOND + ns, run, slot, phase, heard_slot, array("H", sender), length, frames, received
-    )
+    return SlotFields(seconds * SECOND + ns, run, slot, phase, heard_slot, array("H", sender), length, frames, received)
 
 
 @lru_cache(_MOST + 1)

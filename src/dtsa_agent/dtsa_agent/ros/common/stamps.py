@@ -7,7 +7,7 @@ from std_msgs.msg import Header
 
 from . import names
 
-_SECOND = 1_000_000_000
+SECOND = 1_000_000_000  # ns
 
 
 def time_of(time_ns: int) -> Time:
@@ -15,7 +15,7 @@ def time_of(time_ns: int) -> Time:
 
     :param time_ns: ns.
     """
-    seconds, nanoseconds = divmod(time_ns, _SECOND)
+    seconds, nanoseconds = divmod(time_ns, SECOND)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
@@ -29,4 +29,4 @@ def header_of(time_ns: int) -> Header:
 
 def ns_of(time: Time) -> int:
     """A message's time, ns."""
-    return int(time.sec) * _SECOND + int(time.nanosec)
+    return int(time.sec) * SECOND + int(time.nanosec)

@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from .cdr import FRAME, REPRESENTATION, Layout
+from .stamps import SECOND
 
-_SECOND = 1_000_000_000
 _AT_COUNT = struct.Struct("<28xI")  # the number of agents
 
 
@@ -57,7 +57,7 @@ class TransmissionLayout:
         """
         f = fields
         representation, length, frame, n, _ = self._fixed
-        seconds, ns = divmod(f.time_ns, _SECOND)
+        seconds, ns = divmod(f.time_ns, SECOND)
         head = self._head.pack(
             representation, seconds, ns, length, frame, f.run, f.slot, n, f.agent.tobytes(), n, f.length, len(f.data)
         )
@@ -101,7 +101,7 @@ class TransmissionLayout:
             if goals != self._goal or len(goal) != 8 * goals:
                 return None
         return TransmissionFields(
-            seconds * _SECOND + ns, run, slot, array("H", agent), lengths, frames,
+            seconds * SECOND + ns, run, slot, array("H", agent), lengths, frames,
             chosen, reason, digest, score, track, velocity, command, goal,
         )  # fmt: skip
 

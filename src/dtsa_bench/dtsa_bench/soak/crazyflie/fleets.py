@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +12,7 @@ from typing import Any
 from dtsa_agent.ros.common.priority import take_priority
 from dtsa_bench.fake_crazyflie.control import send_fault
 from dtsa_bench.fake_crazyflie.ports import free_base_port
+from dtsa_bench.fake_crazyflie.process import FleetError, running_fleet
 from dtsa_bench.fake_crazyflie.truth import read_truth
 
 from ..item import NotMet
@@ -88,25 +86,15 @@ def running(
     data = swarm(count, radio=loss is not None, base_port=base, station=station)
     config, truth = directory / "swarm.yaml", directory / "truth.jsonl"
     config.write_text(yaml.safe_dump(data), encoding="utf-8")
-    words = ["--config", str(config), "--base-port", str(base), "--truth", str(truth), "--quiet", *options]
+    words = ["--config", str(config), "--base-port", str(base), "--truth", str(truth), *options]
     radio = None
     if loss is not None:
         radio = directory / "radio"
         words += ["--simulated-radio", str(radio), "--radio-loss", str(loss)]
     else:
         words = [word for word in words if word not in ("--base-port", str(base))]  # the URIs say it
-    command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", *words]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     try:
-        if not any("Ctrl-C" in line for line in process.stdout):
-            raise NotMet("the simulated Crazyflies do not start")
-        yield RunningFleet(config, radio, truth, base - 1)
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        process.stdout.close()
+        with running_fleet(words):
+            yield RunningFleet(config, radio, truth, base - 1)
+    except FleetError as error:
+        raise NotMet(str(error)) from error
