@@ -109,3 +109,32 @@ def test_only_what_nobody_has_locked_and_is_not_young_is_removed(tmp_path: Path)
     assert not port.exists()
     assert not mutex.exists()
     assert all(file.exists() for file in (young, held, fresh_port, other))
+
+
+def test_what_a_living_process_has_made_anew_meanwhile_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two clean up at once: one has removed the dead one's port, and a new process has made its own of that name."""
+    port, lock = tmp_path / "fastrtps_port7411", tmp_path / "fastrtps_port7411_sl"
+    for file in (port, lock):
+        file.write_bytes(b"dead")
+        os.utime(file, (1.0, 1.0))
+    flock = fcntl.flock
+
+    def late(descriptor: int, how: int) -> None:
+        for file in (port, lock):
+            file.unlink()
+            file.write_bytes(b"living")
+        flock(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    assert clean_shared_memory(tmp_path) == []
+    assert port.read_bytes() == lock.read_bytes() == b"living"
+
+
+def test_what_is_young_is_not_even_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its owner is about to lock it, and does not wait."""
+    for name in ("fastrtps_port7411", "fastrtps_port7411_sl"):
+        (tmp_path / name).write_bytes(b"")
+    locked: list[int] = []
+    monkeypatch.setattr(fcntl, "flock", lambda descriptor, how: locked.append(descriptor))
+    assert clean_shared_memory(tmp_path) == []
+    assert not locked

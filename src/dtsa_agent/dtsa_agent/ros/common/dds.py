@@ -8,7 +8,7 @@ import re
 import struct
 import time
 from collections.abc import Iterator, MutableMapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -119,18 +119,19 @@ def _age_s(path: Path) -> float:
 @contextmanager
 def _dead(locks: list[Path]) -> Iterator[bool]:
     """Whether nobody holds any of some lock files; while the context lasts, we do."""
-    descriptors: list[int] = []
+    with ExitStack() as stack:
+        yield bool(locks) and all(_take(lock, stack) for lock in locks)
+
+
+def _take(lock: Path, stack: ExitStack) -> bool:
+    """Takes a lock file that nobody holds, until the stack is closed; whether that could be done."""
     try:
-        free = bool(locks)
-        for lock in locks:
-            descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
-            descriptors.append(descriptor)
-            free = free and time.time() - os.fstat(descriptor).st_mtime >= _YOUNG_S
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        descriptor = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
+        stack.callback(os.close, descriptor)
+        if time.time() - os.fstat(descriptor).st_mtime < _YOUNG_S:  # its owner may be about to lock it
+            return False
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Somebody else may have removed it before we had it, and a living process made one of the same name.
+        return os.path.samestat(os.fstat(descriptor), os.stat(lock))
     except OSError:  # locked, another user's, or gone meanwhile
-        free = False
-    try:
-        yield free
-    finally:
-        for descriptor in descriptors:
-            os.close(descriptor)
+        return False

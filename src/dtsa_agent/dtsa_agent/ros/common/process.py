@@ -58,7 +58,8 @@ def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence
     """
     supervised = follow_supervisor()
     limit_to_machine(os.environ)
-    clean_shared_memory()  # of the process, killed, whose place this one may take
+    if not supervised:  # a supervisor does that for all of them
+        clean_shared_memory()  # of the process, killed, whose place this one may take
     with Stop() as stop:
         try:
             rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
