@@ -164,7 +164,7 @@ def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
             ("FAIL", "links", "cf3: disconnected (attempt 1 of 1: "),
             ("ok", "firmware", "all 2: protocol 12, revision d75a0001"),
             ("FAIL", "batteries", "cf2: 3.10 V, critical 3.2 V"),
-            ("warn", "positions", "cf2: at (-0.60, 1.73, "),
+            ("warn", "positions", "cf2: at (-0.60, 1.7"),
             ("ok", "clocks", "one clock"),
             ("FAIL", "geofence", "cf1: (1.2"),
             ("ok", "budget", "radio 0: 1 Crazyflies"),
