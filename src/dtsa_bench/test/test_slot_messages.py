@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,24 @@ def test_decisions(slot: int, reasons: list[int]) -> None:
     names = {"reason_name": message.reason_name, "reason_index": message.reason_index}
     assert message == Decision(**head(slot, slot), agent=range(1, AGENTS + 1), reason=reasons, **expected, **names)
     assert len(set(message.reason_name)) == len(message.reason_name) == len(set(reasons))
+
+
+def test_combinations_of_reasons_are_not_kept_for_ever() -> None:
+    packed, answers = SlotMessages(make_scenario(SwarmConfig(agents=AGENTS)), SLOT_NS, RUN), Answers(AGENTS, 1)
+
+    def pack(first: int) -> int:
+        for slot in range(first, first + 700):
+            answers.reason[:] = [(slot >> bit) & 1 for bit in range(AGENTS)][::-1]
+            answers.reason[0] = slot % 7
+            packed.decision(slot, answers)
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    try:
+        before = pack(0)
+        assert pack(700) < before + 50_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_receptions() -> None:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common.process import SUPERVISOR
-from dtsa_bench.fly.children import end_process
+from dtsa_bench.processes import end_process
 
 _START_S = 60.0
 _END_S = 10.0

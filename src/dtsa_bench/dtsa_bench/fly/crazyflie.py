@@ -27,12 +27,13 @@ from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.common.priority import give_way, take_priority
 from dtsa_bench.options import new_directory, whole_number
+from dtsa_bench.processes import end_process
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .children import Child, Children, NodeError, describe_end, end_process
+from .children import Child, Children, NodeError, describe_end
 from .domain import LAST_DOMAIN, ros_domain
 from .flight import END_S, QUIET, Flight, run_environment
 from .mission import Ended, Mission

@@ -22,6 +22,8 @@ from dtsa_bench.bag.cdr import COLLIDED, QUIET, SECOND, SENDING, WAITING, Marker
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
 from dtsa_channel_sim.ros.answers import Answers
 
+_KNOWN = 256  # combinations of reasons whose texts are kept
+
 
 @dataclass(frozen=True, slots=True)
 class _Reasons:
@@ -101,6 +103,8 @@ class SlotMessages:
         key, n = answers.reason.tobytes(), self._agents
         known = self._reasons.get(key)
         if known is None:
+            if len(self._reasons) >= _KNOWN:  # in a long flight agents that disagree decide in ever new combinations
+                self._reasons.clear()
             known = self._reasons[key] = self._describe(answers.reason)
         return known.layout.pack(
             *self._begin(slot), slot, n, self._ids, n, answers.chosen.tobytes(), *known.names, n, known.index, n, key,
