@@ -16,8 +16,8 @@ def with_key(swarm: AbstractSwarm) -> AbstractSwarm:
     :param swarm: as it was made.
     :raises ConfigError: if there is no key, or none that is usable.
     """
-    authenticator = _authenticator(swarm.config)
-    return AuthenticatedSwarm(swarm, authenticator) if authenticator else swarm
+    found = authenticator(swarm.config)
+    return AuthenticatedSwarm(swarm, found) if found else swarm
 
 
 def check_key(config: SwarmConfig) -> None:
@@ -26,10 +26,15 @@ def check_key(config: SwarmConfig) -> None:
     :param config: the swarm's settings.
     :raises ConfigError: if there is none.
     """
-    _authenticator(config)
+    authenticator(config)
 
 
-def _authenticator(config: SwarmConfig) -> Authenticator | None:
+def authenticator(config: SwarmConfig) -> Authenticator | None:
+    """What seals and opens the frames of a swarm; None if its settings do not ask for that.
+
+    :param config: the swarm's settings.
+    :raises ConfigError: if there is no key, or none that is usable.
+    """
     if not config.auth:
         return None
     text = os.environ.get(VARIABLE, "")

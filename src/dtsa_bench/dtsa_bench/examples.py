@@ -13,6 +13,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--out runs/c --mode realtime --policy lease --respawn 1", "clocks of their own; the dead come back"),
         ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
     ),
+    "agent": (
+        ("--id 3 --interface eth0", "the third of twelve; the key is in DTSA_AUTH_KEY"),
+        ("--id 1 --agents 4 --interface lo --no-seal --duration-s 10 --out runs/cf1", "ten seconds, with a bag"),
+    ),
     "simulate": (
         ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),
         ("--moving 2 --policy lease --json", "the same as JSON"),
@@ -33,6 +37,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),
     ),
     "verify": (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON")),
+    "sniff": (("--interface eth0 --out runs/sniffed", "twelve agents; until Ctrl-C"),),
+    "merge": (("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"), ("runs/cf* --json", "all of them, as JSON")),
     "recover": (("runs/a", "into runs/a/bag_recovered"),),
     "report": (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side")),
     "export": (

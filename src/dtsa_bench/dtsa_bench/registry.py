@@ -8,6 +8,7 @@ from pathlib import Path
 COMMANDS = {
     "demo": "who speaks next, in nine recorded flights, a page and a picture; under a minute",
     "fly": "one flight with real ROS 2 nodes, recorded to a bag",
+    "agent": "one agent on a real network: frames over UDP, no channel node, no ROS",
     "simulate": "one or many flights without ROS, as fast as the machine allows",
     "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
     "new-plugin": "a package to begin with: a policy of your own, its test and a sweep",
@@ -17,6 +18,8 @@ COMMANDS = {
     "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
     "replay": "play a bag back into the ROS graph",
     "verify": "check a bag: was every decision what the protocol says?",
+    "sniff": "listen to agents on a real network, record and judge what they send",
+    "merge": "the bags of agents on a real network as one flight: one time line, results, decisions made again",
     "recover": "make a readable bag of what a killed recorder left behind",
     "report": "one web page about one or several recorded runs",
     "export": "a bag's contents as CSV or Parquet",

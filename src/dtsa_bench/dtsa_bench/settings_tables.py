@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
+from dtsa_agent.air.udp.settings import AgentSettings, UdpSettings
 from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, VehicleParams
@@ -125,9 +126,15 @@ def _allowed(spec: Setting) -> str:
 
 
 def _node(name: str) -> str:
-    from dtsa_bench.node_tables import node_tables  # needs ROS, as no other table does
+    from dtsa_bench.node_tables import node_tables  # needs ROS
 
     return node_tables(name)
+
+
+def _vehicle() -> str:
+    from dtsa_agent.ros.udp_vehicle import VehicleSettings  # needs ROS, too
+
+    return settings_table(VehicleSettings)
 
 
 #: What a page may ask for, and what makes it.
@@ -139,6 +146,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "RunConfig": partial(settings_table, RunConfig),
     "ClockConfig": partial(settings_table, ClockConfig),
     **{f"flight models, {kind}": partial(model_values, kind) for kind in KINDS},
+    "AgentSettings": partial(settings_table, AgentSettings),
+    "VehicleSettings": _vehicle,
+    "UdpSettings": partial(settings_table, UdpSettings),
     "robots": partial(settings_table, RobotSettings, skip=("name", "id")),
     "battery": partial(settings_table, BatterySettings),
     "station": partial(settings_table, StationSettings),

@@ -17,11 +17,11 @@ from dtsa_msgs.msg import Frame, Process, Report
 from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.agreement import settings_hash
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.agreement import settings_hash
 from dtsa_agent.ros.common.stamps import header_of
 from dtsa_bench.fly.recorded_channel import RecordedFlight
 from dtsa_bench.run_config import RunConfig, RunLimits

@@ -20,6 +20,11 @@ from .hosting import declare_swarm, host_agents
 
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
 
+CHANNEL, UDP = "channel", "udp"
+_AIR = Setting(
+    "air", "text", CHANNEL, "what carries the frames: the channel's node, or a network", words=(CHANNEL, UDP)
+)
+
 
 def _make_node(supervised: bool) -> tuple[Node, int, str]:
     """The node in its agent's namespace, the agent's id (parameter ``id``, or the namespace's number), its swarm."""
@@ -42,13 +47,18 @@ def _own_id(node: Node, default: int) -> int:
     return int(declare_setting(node, Setting("id", "int", default, text, minimum=1, maximum=MAX_AGENTS)))
 
 
-def _body(stop: Stop, supervised: bool) -> None:
+def _body(stop: Stop, supervised: bool) -> int | None:
     node, agent, space = _make_node(supervised)
     try:
+        if _AIR.check(declare_setting(node, _AIR)) == UDP:
+            from .udp_node import fly_over_udp  # other agents need no sockets
+
+            return fly_over_udp(node, agent, stop)
         config = declare_swarm(node)
         if agent > config.agents:
             raise ConfigError("id", agent, f"1 to {config.agents}, the number of agents")
         host_agents(node, [agent], config, stop, space, spaces=[node.get_namespace()])
+        return None
     finally:
         node.destroy_node()
 

@@ -13,10 +13,10 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Header
 
+from dtsa_agent.core.agreement import settings_hash
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 
 from .common import names
-from .common.agreement import settings_hash
 from .common.checks import (
     FORGED_END,
     OTHER_RUN,

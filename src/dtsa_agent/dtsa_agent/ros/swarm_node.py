@@ -17,10 +17,10 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from dtsa_agent.core import AbstractSwarm, AgentGroup
+from dtsa_agent.core.agreement import agreed_settings
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
 from .common import names
-from .common.agreement import agreed_settings
 from .common.checks import SLOT, Unusable
 from .common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
 from .common.loop import HOUSEKEEPING_S, Loop, Stop

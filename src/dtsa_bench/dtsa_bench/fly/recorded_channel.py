@@ -12,10 +12,10 @@ from typing import Any
 from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core.agreement import agreed_settings
 from dtsa_agent.core.settings import Setting, settings_of
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.agreement import agreed_settings
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_setting, declare_settings

@@ -9,8 +9,8 @@ from typing import Any
 
 from dtsa_msgs.msg import Process
 
+from dtsa_agent.core.agreement import settings_hash
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.agreement import settings_hash
 from dtsa_agent.ros.common.checks import (
     OTHER_RUN,
     OTHER_SENDER,

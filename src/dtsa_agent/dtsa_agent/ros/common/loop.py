@@ -8,12 +8,10 @@ an ordinary executor a few times a second.
 from __future__ import annotations
 
 import gc
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
-from types import FrameType
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -24,6 +22,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.stop import Stop
 
 from .checks import UNREADABLE
 from .intake import Intake
@@ -32,52 +31,6 @@ from .taking import Taker
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
 HOUSEKEEPING_S = 0.1
 _MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
-
-
-class Stop:
-    """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that whoever runs ends in good order.
-
-    A context manager that puts the old handlers back.
-    """
-
-    def __init__(self) -> None:
-        self.signal = 0  # the first one; 0: none yet
-        self.count = 0  # how many have come
-        self._raises = False
-        self._old: dict[int, Any] = {}
-
-    def __enter__(self) -> Stop:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            self._old[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def __bool__(self) -> bool:
-        return self.signal != 0
-
-    @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """What is done within looks at no flag, and ends by an exception: imports, the making of nodes.
-
-        :raises KeyboardInterrupt: on a signal, or if there was one before.
-        """
-        if self:
-            raise KeyboardInterrupt
-        self._raises = True
-        try:
-            yield
-        finally:
-            self._raises = False
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.signal = self.signal or number
-        self.count += 1
-        if self._raises:
-            self._raises = False
-            raise KeyboardInterrupt
 
 
 class _OwnHands(CallbackGroup):

@@ -1,4 +1,4 @@
-"""The settings that all nodes of a flight must share."""
+"""The settings that all agents of a flight must share."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from dtsa_agent.core.config import SwarmConfig
+from .config import SwarmConfig
 
 
 def agreed_settings(config: SwarmConfig, mode: str) -> dict[str, Any]:
-    """The settings that all nodes of a flight must share, as plain values.
+    """The settings that all processes of a flight must share, as plain values.
 
     :param config: the swarm's settings.
-    :param mode: lockstep or realtime.
+    :param mode: lockstep, realtime, or udp: over a network.
     """
     values = {**config.to_dict(), "steps": config.steps, "mode": mode}
     return dict(json.loads(json.dumps(values, sort_keys=True, default=str)))

@@ -1,0 +1,41 @@
+"""``ros2 run dtsa_agent agent`` with ``air:=udp``: frames over a network, a vehicle on the graph. docs/vehicles.md."""
+
+from __future__ import annotations
+
+import json
+
+from rclpy.node import Node
+
+from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.stop import Stop
+
+from .common.parameters import declare_settings
+from .udp_vehicle import ODOMETRY, OdometryVehicle, VehicleSettings
+
+_DEFAULTS = {"policy": "lease", "auth": True}  # as of `tools/dtsa agent`
+
+
+def fly_over_udp(node: Node, agent: int, stop: Stop) -> int:
+    """Declares the rest of the parameters and flies until a signal.
+
+    :param node: the ROS node.
+    :param agent: id of the agent.
+    :param stop: the signal flag.
+    :returns: exit code.
+    :raises ConfigError: for settings that are not usable.
+    """
+    config = SwarmConfig.from_dict(declare_settings(node, SwarmConfig, defaults=_DEFAULTS))
+    own = AgentSettings(id=agent, **declare_settings(node, AgentSettings, skip=("id",)))
+    udp = UdpSettings.from_dict(declare_settings(node, UdpSettings, defaults={"interface": ""}))
+    settings = VehicleSettings.from_dict(declare_settings(node, VehicleSettings))
+    vehicle = OdometryVehicle(node, settings, config.slot_s) if settings.vehicle == ODOMETRY else None
+    logger = node.get_logger()
+    try:
+        with UdpAgent(own, config, udp, vehicle=vehicle) as flying:
+            flying.run(stop)
+            logger.info(f"ends: {json.dumps(flying.summary())}")
+    finally:
+        if vehicle is not None:
+            vehicle.close()
+    return 0

@@ -1,0 +1,55 @@
+"""Signals that end a process, as a flag: whoever runs ends in good order."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+
+class Stop:
+    """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that whoever runs ends in good order.
+
+    A context manager that puts the old handlers back.
+    """
+
+    def __init__(self) -> None:
+        self.signal = 0  # the first one; 0: none yet
+        self.count = 0  # how many have come
+        self._raises = False
+        self._old: dict[int, Any] = {}
+
+    def __enter__(self) -> Stop:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            self._old[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def __bool__(self) -> bool:
+        return self.signal != 0
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """What is done within looks at no flag, and ends by an exception: imports, the making of nodes.
+
+        :raises KeyboardInterrupt: on a signal, or if there was one before.
+        """
+        if self:
+            raise KeyboardInterrupt
+        self._raises = True
+        try:
+            yield
+        finally:
+            self._raises = False
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.signal = self.signal or number
+        self.count += 1
+        if self._raises:
+            self._raises = False
+            raise KeyboardInterrupt

@@ -1,0 +1,122 @@
+"""An agent over UDP that flies a vehicle of somebody else: odometry in, velocities out. The test is the vehicle."""
+
+from __future__ import annotations
+
+import math
+import random
+import signal
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from node_helpers import Graph, end_of, ros_graph
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+
+from dtsa_agent.ros.udp_vehicle import turned
+
+AGENT = "dtsa_agent.ros.agent_node"
+STEP_S = 0.02
+# Its body looks to the left: what is ahead of it is the map's y.
+ATTITUDE = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+
+
+class Vehicle:
+    """A point that flies as it is told, on topics as MAVROS has them."""
+
+    def __init__(self, graph: Graph, place: tuple[float, float, float]) -> None:
+        self.graph = graph
+        self.position, self.velocity = np.array(place), np.zeros(3)
+        self.commands: list[np.ndarray] = []
+        self.speaks, self.jump = True, 0.0
+        self._next = time.monotonic()
+        self._publisher = graph.node.create_publisher(Odometry, "/uav1/local_position/odom", 1)
+        graph.node.create_subscription(TwistStamped, "/uav1/setpoint_velocity/cmd_vel", self._take, 1)
+
+    def _take(self, message: TwistStamped) -> None:
+        assert message.header.frame_id == "map"
+        v = message.twist.linear
+        self.velocity = np.array((v.x, v.y, v.z))
+        self.commands.append(self.velocity)
+
+    def act(self) -> None:
+        """Time goes on."""
+        if time.monotonic() < self._next:
+            return
+        self._next = time.monotonic() + STEP_S
+        self.position = self.position + self.velocity * STEP_S
+        if self.speaks:
+            message = Odometry()
+            place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
+            place.x, place.y, place.z = (self.position + self.jump).tolist()
+            q.x, q.y, q.z, q.w = ATTITUDE
+            speed.x, speed.y, speed.z = (self.velocity[1], -self.velocity[0], self.velocity[2])
+            self._publisher.publish(message)
+
+    def until_commands(self, still: bool) -> None:
+        """Waits for ten commands in a row that hold the vehicle, or fly it."""
+        self.commands.clear()
+
+        def there() -> bool:
+            last = [float(np.linalg.norm(command)) for command in self.commands[-10:]]
+            return len(last) == 10 and (max(last) == 0.0 if still else min(last) > 0.1)
+
+        self.graph.until(there, self.act)
+
+
+def parameters(values: Mapping[str, object]) -> list[str]:
+    """Words that give parameters to a node."""
+    return [word for name, value in values.items() for word in ("-p", f"{name}:={str(value).lower()}")]
+
+
+def test_axes_of_the_body_are_turned_into_those_of_the_map() -> None:
+    assert turned(ATTITUDE, np.array((1.0, 0.0, 0.0))) == pytest.approx((0.0, 1.0, 0.0))
+    assert turned(ATTITUDE, np.array((0.0, 1.0, 3.0))) == pytest.approx((-1.0, 0.0, 3.0))
+
+
+@pytest.mark.ros
+def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_path: Path) -> None:
+    group = f"239.255.{random.randrange(256)}.{random.randrange(256)}:{random.randrange(20_000, 30_000)}"
+    with ros_graph(tmp_path) as graph:
+        vehicle = Vehicle(graph, (3.0, -1.0, 0.0))
+        values = {
+            "id": 1, "agents": 2, "air": "udp", "interface": "lo", "group": group, "auth": False, "axis_x_m": 50.0,
+            "vehicle": "odometry", "odometry_topic": "/uav1/local_position/odom", "odometry_origin": "[1.0, 2.0, 0.5]",
+            "command_topic": "/uav1/setpoint_velocity/cmd_vel", "slot_ms": 20.0,
+        }  # fmt: skip
+        process = graph.start(AGENT, *parameters(values))
+        vehicle.until_commands(still=False)
+        first = vehicle.position.copy()
+        graph.until(lambda: float(np.linalg.norm(vehicle.position - first)) > 0.3, vehicle.act)
+        vehicle.speaks = False
+        vehicle.until_commands(still=True)  # stale
+        vehicle.speaks, vehicle.jump = True, 1000.0
+        vehicle.until_commands(still=True)  # wild
+        vehicle.jump = 0.0
+        vehicle.until_commands(still=False)
+        vehicle.commands.clear()
+        code, said = end_of(process, signal.SIGTERM)
+        assert (code, said) == (0, "")
+        graph.until(lambda: bool(vehicle.commands) and not vehicle.commands[-1].any(), vehicle.act)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"air": "smoke"}, "air: got 'smoke'"),
+        ({"air": "udp", "auth": "false"}, "interface: got ''"),
+        ({"air": "udp", "auth": "false", "interface": "lo", "id": 13}, "id: got 13"),
+    ],
+)
+def test_what_cannot_be_flown_ends_with_one_line(tmp_path: Path, values: dict[str, object], said: str) -> None:
+    with ros_graph(tmp_path) as graph:
+        code, line = end_of(graph.start(AGENT, *parameters(values)))
+    assert code == 2
+    assert said in line
+    assert len(line.splitlines()) == 1

@@ -1,0 +1,118 @@
+"""Computers for trials of a real air: network namespaces, each with an address and a cable of its own.
+
+The cable is a TAP device: what a host sends on it is read here as Ethernet frames, and what is written here arrives at
+the host. Whoever holds the other ends of all cables is the switch between them. This process stays where it is; only
+while a host is made it looks in.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import socket
+import struct
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from dtsa_agent.core.errors import DtsaError
+
+CABLE = "air0"  # the interface of each host
+_NET = "10.68"
+_CLONE_NEWNET = 0x40000000
+_TUNSETIFF, _IFF_TAP, _IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
+_SIOCSIFADDR, _SIOCSIFNETMASK, _SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8916, 0x891C, 0x8913, 0x8914
+_IFF_UP = 1
+_OWN = "/proc/self/ns/net"
+
+
+class Unavailable(DtsaError):
+    """Hosts cannot be made on this machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """One computer."""
+
+    number: int  # from 1
+    address: str
+    cable: int  # file descriptor of the switch's end
+    namespace: int  # file descriptor
+
+    def start(self, command: Sequence[str], **more: Any) -> subprocess.Popen[str]:
+        """Starts a process on it.
+
+        :param command: its command line.
+        :param more: as for ``subprocess.Popen``.
+        """
+        libc, namespace = _libc(), self.namespace
+
+        def enter() -> None:
+            if libc.setns(namespace, _CLONE_NEWNET):
+                os._exit(126)
+
+        return subprocess.Popen(command, preexec_fn=enter, text=True, **more)
+
+
+@contextmanager
+def hosts(count: int) -> Iterator[list[Host]]:
+    """Some hosts, until the end of the context; processes on them have ended by then.
+
+    :param count: how many, up to 254.
+    :raises Unavailable: if this machine does not let us.
+    """
+    with ExitStack() as stack:
+        home = _opened(stack, _OWN, os.O_RDONLY)
+        try:
+            found = [_made(stack, number) for number in range(1, count + 1)]
+        finally:
+            if _libc().setns(home, _CLONE_NEWNET):
+                os._exit(1)  # whatever this process did from here on would be in the wrong place
+        yield found
+
+
+def why_not() -> str:
+    """Why no hosts can be made here; empty: they can."""
+    try:
+        with hosts(1):
+            return ""
+    except Unavailable as error:
+        return str(error)
+
+
+def _made(stack: ExitStack, number: int) -> Host:
+    """A host; this thread is in it afterwards."""
+    try:
+        if _libc().unshare(_CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        cable = _opened(stack, "/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
+        fcntl.ioctl(cable, _TUNSETIFF, struct.pack("16sH", CABLE.encode(), _IFF_TAP | _IFF_NO_PI))
+        address = f"{_NET}.{number >> 8}.{number & 255}"
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+            _set(asked, _SIOCSIFADDR, CABLE, address)
+            _set(asked, _SIOCSIFNETMASK, CABLE, "255.255.0.0")
+            for name in (CABLE, "lo"):
+                flags = fcntl.ioctl(asked, _SIOCGIFFLAGS, struct.pack("16sH14x", name.encode(), 0))
+                up = struct.unpack_from("H", flags, 16)[0] | _IFF_UP
+                fcntl.ioctl(asked, _SIOCSIFFLAGS, struct.pack("16sH14x", name.encode(), up))
+        return Host(number, address, cable, _opened(stack, _OWN, os.O_RDONLY))
+    except OSError as error:
+        raise Unavailable(f"no network namespaces with TAP devices here: {error.strerror or error}") from None
+
+
+def _set(asked: socket.socket, request: int, name: str, address: str) -> None:
+    inner = struct.pack("HH4s8x", socket.AF_INET, 0, socket.inet_aton(address))
+    fcntl.ioctl(asked, request, struct.pack("16s16s", name.encode(), inner))
+
+
+def _opened(stack: ExitStack, path: str, flags: int) -> int:
+    descriptor = os.open(path, flags | os.O_CLOEXEC)
+    stack.callback(os.close, descriptor)
+    return descriptor
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)

@@ -1,0 +1,74 @@
+"""Whether frames on the air are what the protocol allows: two senders in a slot, out of turn, turns given twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.frame import TAG_LENGTH
+from dtsa_bench.protocol_bench.ledger import Ledger
+
+_TOLD = 10  # broken rules
+
+
+class Judge:
+    """Reads the frames of a swarm slot by slot.
+
+    What was given away before it began it cannot know: for as long as leases reach it only listens.
+
+    :param config: the settings that all agents share.
+    """
+
+    def __init__(self, config: SwarmConfig) -> None:
+        self._config = config
+        self._tail = config.own_bytes + (TAG_LENGTH if config.auth else 0)
+        self._ledger = Ledger(config.agents, config.anchor_every) if config.policy == "lease" else None
+        self._window = (config.anchor_every + 2) * config.agents if self._ledger else 0
+        self._from: int | None = None  # slot
+        self.broken: list[str] = []
+        self.slots = self.frames = 0
+        self.double = 0  # slots with two senders or more
+
+    def slot(self, slot: int, frames: Mapping[int, bytes]) -> None:
+        """A slot in which frames were sent.
+
+        :param slot: its number; slots come in ascending order.
+        :param frames: the frames as they were on the air, by sender.
+        """
+        if self._from is None:
+            self._from = slot + self._window
+        if self._ledger is not None:
+            self._ledger.slot(slot, {agent: data[: len(data) - self._tail] for agent, data in frames.items()})
+            found, self._ledger.broken = self._ledger.broken, []
+        else:
+            found = self._turns(slot, frames)
+        if slot < self._from:
+            return
+        self.slots += 1
+        self.frames += len(frames)
+        self.double += len(frames) > 1
+        self.broken += found
+
+    def _turns(self, slot: int, frames: Mapping[int, bytes]) -> list[str]:
+        """With a policy of fixed turns, who has sent out of turn; with others nobody can."""
+        owner = slot % self._config.agents + 1
+        if self._config.policy != "tdma":
+            return []
+        return [f"slot {slot}: agent {agent} sends in a turn of {owner}" for agent in frames if agent != owner]
+
+    def summary(self) -> dict[str, Any]:
+        """What was found."""
+        ledger = self._ledger
+        shared = {} if ledger is None else {
+            "two_senders_in_open_turns": ledger.open_collisions,
+            "two_senders_in_adopted_turns": ledger.adopted_collisions,
+        }  # fmt: skip
+        return {
+            "slots_judged": self.slots,
+            "frames_judged": self.frames,
+            "slots_with_two_senders": self.double,
+            **shared,
+            "rules_broken": len(self.broken),
+            "which": self.broken[:_TOLD],
+        }

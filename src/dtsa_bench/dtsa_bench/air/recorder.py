@@ -1,0 +1,118 @@
+"""Records what one agent did and heard: MCAP with JSON messages, which needs no ROS (docs/several-computers.md)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from time import monotonic_ns
+from typing import Any
+
+from dtsa_agent.air.udp import AgentSettings, Heard, SlotRecord, UdpSettings
+from dtsa_agent.core import SwarmConfig
+
+from .json_bag import JsonBag, described
+
+SLOT, REFUSED = "slot", "refused"  # topics
+METADATA, SUMMARY = "dtsa_agent", "dtsa_summary"  # metadata records
+_MOST_REFUSED = 50  # kept from one flush to the next: strangers cannot fill the disk
+
+
+_HEARD = {
+    "type": "array",
+    "description": "frames of others heard in time, in this order",
+    "items": described(
+        "heard",
+        sender=("integer", "id"),
+        slot=("integer", "in which it was sent"),
+        arrival_ns=("integer", "when it arrived, ns, own clock"),
+        frame=("string", "as it was on the air, hexadecimal"),
+        accepted=("boolean", "whether the table took it"),
+    ),
+}
+SLOT_SCHEMA = described(
+    "dtsa.AgentSlot",
+    slot=("integer", "number of the slot"),
+    start_ns=("integer", "when it started, ns, own clock"),
+    opened_ns=("integer", "when it was decided, ns, own clock"),
+    anew=("boolean", "the agent began with this slot, or began anew, knowing nothing"),
+    present=("integer", "1; 2: it is leaving"),
+    chosen=("integer", "id taken for the sender; 0: nobody"),
+    reason=("integer", "why: REASON_* of dtsa_msgs/Decision"),
+    digest=("integer", "of the agent's table"),
+    score=("number", "priority value g of the chosen, 0 where the policy has none"),
+    track=("array", "m, frame map: true positions at the control instants of the slot before, (S, 3)"),
+    velocity=("array", "m/s, at the slot's start"),
+    command=("array", "m/s, commanded velocity then"),
+    goal=("array", "m, where it flies to"),
+    frame=("string", "what it was to send, as on the air, hexadecimal; empty: silent"),
+    sent_ns=("integer", "when that was handed to the network, ns, own clock; -1: not at all"),
+)
+SLOT_SCHEMA["properties"] |= {"before": _HEARD, "heard": _HEARD}
+REFUSED_SCHEMA = described(
+    "dtsa.AgentRefused",
+    reason=("string", "why a datagram was not taken in"),
+    data=("string", "the datagram, hexadecimal"),
+    arrival_ns=("integer", "ns, own clock"),
+)
+
+
+class AgentRecorder(JsonBag):
+    """The bag of one agent, written while it flies: a watcher of the agent.
+
+    :param path: the file; must not exist.
+    :param own: the agent.
+    :param config: the settings that all agents share.
+    :param udp: the network.
+    :raises BagError: if the file cannot be made.
+    """
+
+    def __init__(self, path: Path, own: AgentSettings, config: SwarmConfig, udp: UdpSettings) -> None:
+        started = monotonic_ns() + own.clock_offset_ns  # own clock
+        sections = {"own": own, "swarm": config, "udp": udp}
+        about = {name: json.dumps(section.to_dict(), sort_keys=True) for name, section in sections.items()}
+        about |= {"id": str(own.id), "started_ns": str(started)}
+        super().__init__(path, {SLOT: SLOT_SCHEMA, REFUSED: REFUSED_SCHEMA}, METADATA, about)
+        self._refused = 0  # since the last flush
+        self.left_out = 0  # refused datagrams of which no record is kept
+
+    def slot(self, record: SlotRecord) -> None:
+        """A slot of the agent is over.
+
+        :param record: all of it.
+        """
+        self.write(SLOT, record.opened_ns, {
+            "slot": record.slot, "start_ns": record.start_ns, "opened_ns": record.opened_ns, "anew": record.anew,
+            "present": record.present, "chosen": record.chosen, "reason": record.reason, "digest": record.digest,
+            "score": record.score, "track": record.track.tolist(), "velocity": record.velocity.tolist(),
+            "command": record.command.tolist(), "goal": record.goal.tolist(), "frame": record.frame.hex(),
+            "sent_ns": record.sent_ns, "before": _heard(record.before), "heard": _heard(record.heard),
+        })  # fmt: skip
+        if self.flush_if_due():
+            self._refused = 0
+
+    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
+        """A datagram has not been taken in.
+
+        :param reason: why.
+        :param data: its bytes.
+        :param arrival_ns: ns, own clock.
+        """
+        self._refused += 1
+        if self._refused > _MOST_REFUSED:
+            self.left_out += 1
+            return
+        self.write(REFUSED, arrival_ns, {"reason": reason, "data": data.hex(), "arrival_ns": arrival_ns})
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """The flight is over.
+
+        :param summary: the agent's own.
+        """
+        self.add_metadata(SUMMARY, {"summary": json.dumps(summary), "refused_left_out": str(self.left_out)})
+
+
+def _heard(frames: list[Heard]) -> list[dict[str, Any]]:
+    return [
+        {"sender": h.sender, "slot": h.slot, "arrival_ns": h.arrival_ns, "frame": h.frame.hex(), "accepted": h.accepted}
+        for h in frames
+    ]

@@ -1,0 +1,109 @@
+"""`dtsa agent`: one agent whose frames go over a network."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dtsa_agent.core import SwarmConfig
+
+DESCRIPTION = """\
+Flies one agent, with a simulated vehicle, whose frames go to a multicast group: one process a computer, no channel
+node, no start signal, no ROS. Who is first begins; groups that meet become one. Frames are sealed: the key is in the
+environment, DTSA_AUTH_KEY. See docs/several-computers.md."""
+_DEFAULT_POLICY = "lease"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    from dtsa_agent.air.udp.settings import AgentSettings
+    from dtsa_bench.options import add_options
+
+    parser = subparsers.add_parser("agent", help="one agent on a real network", description=DESCRIPTION)
+    parser.usage = "%(prog)s --id N --interface NAME [OPTIONS]"
+    parser.add_argument("--air", choices=("udp",), default="udp", help="what carries the frames [udp]")
+    parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
+    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    add_options(parser.add_argument_group("this agent"), AgentSettings, "own")
+    add_network(parser)
+    add_swarm(parser)
+
+
+def add_network(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of the network, and whether frames are sealed."""
+    from dtsa_agent.air.udp.settings import UdpSettings
+    from dtsa_bench.options import add_options
+
+    network = parser.add_argument_group("the network")
+    add_options(network, UdpSettings, "udp")
+    network.add_argument(
+        "--seal",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="frames carry a code that only holders of the key can make; the key is in the environment: DTSA_AUTH_KEY",
+    )
+
+
+def add_swarm(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of the swarm, with the defaults of this air."""
+    from dtsa_agent.core import SwarmConfig
+    from dtsa_agent.core.settings import settings_of
+    from dtsa_bench.options import add_options
+
+    swarm = parser.add_argument_group("the swarm: what all agents share")
+    swarm.add_argument("--policy", metavar="NAME", default=_DEFAULT_POLICY, help=f"who sends next [{_DEFAULT_POLICY}]")
+    skip = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
+    add_options(swarm, SwarmConfig, "swarm", skip=skip)
+
+
+def swarm_of(args: argparse.Namespace) -> SwarmConfig:
+    """The swarm that the options describe.
+
+    :param args: parsed options.
+    :raises ConfigError: for one that cannot be.
+    """
+    from dtsa_agent.core import SwarmConfig
+    from dtsa_bench.options import given
+
+    return SwarmConfig.from_dict({**given(args, SwarmConfig, "swarm"), "policy": args.policy, "auth": args.seal})
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly until Ctrl-C, and print what came of it."""
+    from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+    from dtsa_agent.keys import check_key
+    from dtsa_agent.stop import Stop
+    from dtsa_bench.air.recorder import AgentRecorder
+    from dtsa_bench.bag.errors import BagError
+    from dtsa_bench.commands.simulate import describe
+    from dtsa_bench.options import given, new_directory
+
+    own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
+    udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
+    config = swarm_of(args)
+    check_key(config)  # before anything is made
+    if args.seal and not config.auth_session:
+        print("dtsa: with --auth-session 0 frames of earlier flights with this key are believed", file=sys.stderr)
+    failure = ""
+    with Stop() as stop, UdpAgent(own, config, udp) as agent:
+        directory = None if args.out is None else new_directory(args.out)
+        if directory is None:
+            agent.run(stop)
+        else:
+            with AgentRecorder(directory / f"cf{own.id}.mcap", own, config, udp) as recorder:
+                agent.watcher = recorder
+                agent.run(stop)
+                recorder.finish(agent.summary())
+            failure = recorder.failure
+    summary = agent.summary()
+    text = json.dumps(summary, indent=2) + "\n"
+    if directory is not None:
+        Path(directory / "summary.json").write_text(text, encoding="utf-8")
+    print(text if args.json else describe(summary), end="")
+    if failure:
+        raise BagError(failure)
+    return 0

@@ -1,0 +1,54 @@
+"""`dtsa sniff`: listens to agents on a network without taking part."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+DESCRIPTION = """\
+Listens to a swarm on a network without taking part, records what it hears, and judges it: two senders in a slot, frames
+out of turn, turns given away twice or by others. Exit code 1 if a rule was broken. Who listens may miss frames: then a
+lease that it does not know looks like a broken rule."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    from dtsa_bench.commands.agent import add_network, add_swarm
+
+    parser = subparsers.add_parser("sniff", help="listen to agents on a real network", description=DESCRIPTION)
+    parser.usage = "%(prog)s --interface NAME [OPTIONS]"
+    parser.add_argument("--air", choices=("udp",), default="udp", help="what carries the frames [udp]")
+    parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
+    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    parser.add_argument("--duration-s", metavar="X", default="0", help="for so long; 0: until Ctrl-C [0]")
+    add_network(parser)
+    add_swarm(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Listen until Ctrl-C, and print what came of it."""
+    from dtsa_agent.air.udp import UdpSettings
+    from dtsa_agent.core.settings import Setting
+    from dtsa_agent.keys import check_key
+    from dtsa_agent.stop import Stop
+    from dtsa_bench.air.sniffer import Sniffer
+    from dtsa_bench.bag.errors import BagError
+    from dtsa_bench.commands.agent import swarm_of
+    from dtsa_bench.commands.merge import lines
+    from dtsa_bench.options import given, new_directory
+
+    duration = Setting("duration_s", "float", 0.0, "how long", unit="s", minimum=0, maximum=1e6).read(args.duration_s)
+    udp, config = UdpSettings.from_dict(given(args, UdpSettings, "udp")), swarm_of(args)
+    check_key(config)
+    directory = None if args.out is None else new_directory(args.out)
+    path = None if directory is None else directory / "sniffed.mcap"
+    with Stop() as stop, Sniffer(config, udp, path) as sniffer:
+        sniffer.run(stop, duration)
+    summary = sniffer.summary()
+    text = json.dumps(summary, indent=2) + "\n"
+    if directory is not None:
+        (directory / "summary.json").write_text(text, encoding="utf-8")
+    print(text if args.json else "\n".join(lines(summary)) + "\n", end="")
+    if sniffer.bag is not None and sniffer.bag.failure:
+        raise BagError(sniffer.bag.failure)
+    return 1 if summary["rules_broken"] else 0

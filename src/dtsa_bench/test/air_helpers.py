@@ -1,0 +1,110 @@
+"""Agents over UDP on the loopback interface, in threads of the test, with a bag each."""
+
+from __future__ import annotations
+
+import os
+import random
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from dtsa_agent.air.udp import AgentSettings, MulticastSocket, SlotRecord, UdpAgent, UdpSettings
+from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.stop import Stop
+from dtsa_bench.air.recorder import AgentRecorder
+
+_PATIENCE_S = 60.0
+
+
+def own_group() -> str:
+    """A multicast group that no other test uses."""
+    draw = random.Random(f"{os.getpid()} {time.monotonic_ns()}")
+    return f"239.255.{draw.randrange(256)}.{draw.randrange(1, 255)}:{draw.randrange(20_000, 30_000)}"
+
+
+def need_multicast() -> None:
+    """Skips the test where the loopback interface carries no multicast."""
+    try:
+        with MulticastSocket(UdpSettings(interface="lo", group=own_group())) as end:
+            end.send(b"x")
+            for _ in range(100):
+                if end.receive(1):
+                    return
+                time.sleep(0.01)
+    except ConfigError as error:
+        pytest.skip(str(error))
+    pytest.skip("the loopback interface carries no multicast")
+
+
+class Flying:
+    """One agent in a thread; a watcher of it beside its recorder."""
+
+    def __init__(self, own: AgentSettings, config: SwarmConfig, udp: UdpSettings, path: Path) -> None:
+        self.agent = UdpAgent(own, config, udp)
+        self.recorder = AgentRecorder(path, own, config, udp)
+        self.agent.watcher = self
+        self.stop = Stop()
+        self.heard: Counter[int] = Counter()  # frames by sender, since it began anew
+        self.slots: list[int] = []
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def slot(self, record: SlotRecord) -> None:
+        """See Watcher."""
+        if record.anew:
+            self.heard.clear()
+        self.heard.update(frame.sender for frame in record.heard)
+        self.slots.append(record.slot)
+        self.recorder.slot(record)
+
+    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
+        """See Watcher."""
+        self.recorder.other(reason, data, arrival_ns)
+
+    def _run(self) -> None:
+        with self.recorder, self.agent:
+            self.agent.run(self.stop)
+            self.recorder.finish(self.agent.summary())
+
+    def end(self) -> None:
+        """As by a signal."""
+        self.stop.signal = self.stop.count = 1
+        self._thread.join(_PATIENCE_S)
+        assert not self._thread.is_alive()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Waits until something is so."""
+    end = time.monotonic() + _PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+class Stranger:
+    """Sends what it likes to a group of the loopback interface, and hears what is said there."""
+
+    def __init__(self, group: str) -> None:
+        self.socket = MulticastSocket(UdpSettings(interface="lo", group=group))
+
+    def hear(self, count: int) -> list[bytes]:
+        """Datagrams of others."""
+        found: list[bytes] = []
+
+        def enough() -> bool:
+            found.extend(datagram.data for datagram in self.socket.receive(16) if not datagram.own)
+            return len(found) >= count
+
+        wait_for(enough)
+        return found
+
+    def close(self) -> None:
+        """Leaves."""
+        with suppress(socket.error):
+            self.socket.close()

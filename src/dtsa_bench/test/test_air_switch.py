@@ -1,0 +1,182 @@
+"""The switch of trials: the channel model's medium between cables; and agents on hosts of their own, joined by it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dtsa_agent.air.udp.datagram import Wrapping
+from dtsa_agent.core import Frame, SwarmConfig, encode_frame
+from dtsa_bench.air.hosts import Host, why_not
+from dtsa_bench.air.merge import merge, verified
+from dtsa_bench.air.switch import Links, Switch
+from dtsa_bench.air.trial import NotFlown, Trial, flight_time, under_way
+from dtsa_channel_sim import ChannelConfig
+
+GROUP = ("239.1.2.3", 4567)
+CONFIG = SwarmConfig(agents=3, policy="tdma")
+
+
+def ethernet(payload: bytes, group: tuple[str, int] = GROUP, protocol: int = 17) -> bytes:
+    """A datagram as it is on a cable."""
+    udp = struct.pack("!HHHH", 5000, group[1], 8 + len(payload), 0) + payload
+    head = struct.pack("!BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 1, protocol, 0, b"\x0a\0\0\1",
+                       socket.inet_aton(group[0]))  # fmt: skip
+    return bytes(12) + b"\x08\x00" + head + udp
+
+
+def frame(sender: int, slot: int) -> bytes:
+    """A frame of an agent on a cable."""
+    state = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    return ethernet(Wrapping(CONFIG).wrap(encode_frame(Frame(sender, slot, 1, *state))))
+
+
+class Cables:
+    """Three cables, and a switch between them that needs no hosts."""
+
+    def __init__(self, links: Links | None = None, **channel: Any) -> None:
+        self.pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(3)]
+        for pair in self.pairs:
+            for end in pair:
+                end.setblocking(False)
+        joined = [Host(k + 1, "", pair[0].fileno(), -1) for k, pair in enumerate(self.pairs)]
+        self.switch = Switch(joined, GROUP, ChannelConfig(agents=3, link_delay_ns=0, **channel), links)
+
+    def send(self, host: int, data: bytes) -> None:
+        """A host sends."""
+        self.pairs[host - 1][1].send(data)
+
+    def carry(self, frames: int) -> None:
+        """Carries until so many frames have left the air, and a little longer."""
+        assert self.switch.run(lambda: len(self.switch.log) >= frames, 30.0)
+        self.switch.run(lambda: False, 0.02)
+
+    def heard(self, host: int) -> list[bytes]:
+        """What has arrived at a host."""
+        found: list[bytes] = []
+        with suppress(BlockingIOError):
+            while True:
+                found.append(self.pairs[host - 1][1].recv(4096))
+        return found
+
+    def close(self) -> None:
+        """All cables are pulled."""
+        for pair in self.pairs:
+            for end in pair:
+                end.close()
+
+
+@pytest.fixture
+def cables() -> Iterator[Cables]:
+    joined = Cables()
+    yield joined
+    joined.close()
+
+
+def test_a_frame_reaches_all_others_as_it_was_sent(cables: Cables) -> None:
+    cables.send(2, frame(2, 7))
+    cables.carry(1)
+    assert [cables.heard(host) for host in (1, 2, 3)] == [[frame(2, 7)], [], [frame(2, 7)]]
+    (seen,) = cables.switch.log
+    assert (seen.sender, seen.agent, seen.slot, seen.received, seen.lost, seen.collided) == (2, 2, 7, 2, 0, 0)
+    # 27 bytes at 2 Mbit/s and the radio's way to sending
+    assert seen.end_ns - seen.start_ns == 130_000 + (73 + 8 * 29) * 500
+
+
+def test_frames_that_overlap_destroy_each_other(cables: Cables) -> None:
+    cables.send(1, frame(1, 3))
+    cables.send(2, frame(2, 3))
+    cables.carry(2)
+    assert [cables.heard(host) for host in (1, 2, 3)] == [[], [], []]
+    assert [seen.collided > 0 for seen in cables.switch.log] == [True, True]
+
+
+def test_a_cut_medium_carries_to_one_side(cables: Cables) -> None:
+    cables.switch.set(partition="1-2 | 3")
+    cables.send(1, frame(1, 3))
+    cables.carry(1)
+    assert [len(cables.heard(host)) for host in (1, 2, 3)] == [0, 1, 0]
+
+
+def test_what_is_no_frame_is_not_on_the_air(cables: Cables) -> None:
+    good = frame(1, 1)
+    strange = (b"", bytes(60), good[:30], good[:50], ethernet(b"x" * 40), frame(1, 1)[:12] + b"\x86\xdd" + good[14:])
+    for data in strange:
+        cables.send(1, data)
+    for other in (ethernet(good[42:], ("239.1.2.4", 4567)), ethernet(good[42:], ("239.1.2.3", 1))):
+        cables.send(1, other)
+    cables.send(1, ethernet(good[42:], protocol=6))
+    cables.send(3, good)
+    cables.carry(1)
+    assert [len(cables.heard(host)) for host in (1, 2, 3)] == [1, 1, 0]
+    assert cables.switch.left_out >= len(strange) + 2
+
+
+def test_links_delay_and_double() -> None:
+    cables = Cables(Links(delay_ns=50_000_000, double=1.0))
+    try:
+        cables.send(1, frame(1, 1))
+        assert cables.switch.run(lambda: len(cables.switch.log) == 1, 30.0)
+        assert cables.heard(2) == []
+        cables.switch.run(lambda: False, 0.1)
+        assert cables.heard(2) == [frame(1, 1)] * 2
+    finally:
+        cables.close()
+
+
+def test_a_datagram_takes_as_long_as_agents_are_told() -> None:
+    config = ChannelConfig(agents=3)
+    fixed, byte = flight_time(config.airtime)
+    assert fixed + byte * 68 == config.airtime.total_ns(68)
+
+
+SWARM = SwarmConfig(
+    agents=4, policy="lease", slot_ms=20.0, open_every=0, adoption=False, auth=True, auth_session=5,
+    scenario="waypoints",
+)  # fmt: skip
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_path: Path) -> None:
+    """Cold start in random order, drifts, losses; one is killed and comes back; the air is cut in two for a while."""
+    trial = Trial(SWARM, {"loss": 0.1}, seconds=2.0, spread_s=0.3, drift_ppm=50.0)
+    home = os.readlink("/proc/self/ns/net")
+    with under_way(trial, tmp_path) as flight:
+        assert os.readlink("/proc/self/ns/net") == home
+        flight.carry(1.0)
+        flight.signal(2, signal.SIGKILL)
+        flight.switch.set(partition="1-2 | 3-4")
+        flight.start(2)
+        flight.carry(1.0)
+        flight.switch.set(partition="")
+        frames = len([seen for seen in flight.switch.log if seen.sender == 2])
+
+        def back() -> bool:
+            return len([seen for seen in flight.switch.log if seen.sender == 2]) > frames + 3
+
+        assert flight.switch.run(back, 60.0)
+        flight.end()
+        found = merge(flight.bags())
+    assert os.readlink("/proc/self/ns/net") == home
+    assert found["broken_off"] == ["cf2"]
+    assert (found["bags"], found["missing"], found["not_on_the_time_line"]) == (5, [], [])
+    assert verified(found), found["decisions_again"]
+    assert found["slots_with_two_senders"] == 0
+    assert found["flight"] is not None
+    assert found["flight"]["min_distance_m"] > 0.2
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+def test_an_agent_that_does_not_begin_says_why(tmp_path: Path) -> None:
+    wrong = dataclasses.replace(SWARM, agents=1, policy="dtsa", moving=None)
+    with pytest.raises(NotFlown, match="policy: got 'dtsa'"), under_way(Trial(wrong, spread_s=0.0), tmp_path):
+        pass

@@ -1,0 +1,247 @@
+"""Agents over UDP: real sockets on the loopback interface, bags of their own, merged and judged."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import air_helpers as helpers
+import numpy as np
+import pytest
+
+from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.stop import Stop
+from dtsa_bench.air.agent_bag import read
+from dtsa_bench.air.merge import merge, verified
+from dtsa_bench.air.timeline import Crossing, fit
+
+KEY = "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4"
+# Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
+CONFIG = SwarmConfig(agents=4, policy="lease", slot_ms=20.0, open_every=0, adoption=False, auth=True, auth_session=7)
+OFFSET_NS = 700_000_000
+
+
+@dataclass
+class Flight:
+    """Three of four agents, strangers among them."""
+
+    bags: list[Path]
+    summaries: dict[int, dict[str, Any]]
+    merged: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Agents start one after the other, with clocks that differ; a stranger talks in between; one leaves early."""
+    helpers.need_multicast()
+    old = os.environ.get("DTSA_AUTH_KEY")
+    os.environ["DTSA_AUTH_KEY"] = KEY
+    directory, group = tmp_path_factory.mktemp("udp"), helpers.own_group()
+    udp = UdpSettings(interface="lo", group=group)
+    paths = [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
+    flying: list[helpers.Flying] = []
+    stranger = helpers.Stranger(group)
+    try:
+        for agent, path in enumerate(paths, 1):
+            own = AgentSettings(id=agent, clock_offset_ns=OFFSET_NS * agent, clock_drift_ppb=40_000 * (agent - 2))
+            flying.append(helpers.Flying(own, CONFIG, udp, path))
+        helpers.wait_for(lambda: all(len(one.heard) == 2 and min(one.heard.values()) > 10 for one in flying))
+        _disturb(stranger, flying)
+        seen = [len(one.slots) for one in flying]
+        helpers.wait_for(lambda: all(len(one.slots) > before + 25 for one, before in zip(flying, seen, strict=True)))
+    finally:
+        for one in flying:
+            one.end()
+        stranger.close()
+        if old is None:
+            del os.environ["DTSA_AUTH_KEY"]
+        else:
+            os.environ["DTSA_AUTH_KEY"] = old
+    merged = merge([read(path) for path in reversed(paths)])
+    return Flight(paths, {one.agent.own.id: one.agent.summary() for one in flying}, merged)
+
+
+def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
+    """Noise, frames of another swarm, changed frames, the same ones again at once and much later."""
+
+    def repeats() -> bool:
+        stranger.socket.send(stranger.hear(1)[-1])
+        return all(one.agent.tally.refused["repeated"] for one in flying)
+
+    helpers.wait_for(repeats)
+    first = stranger.hear(1)[0]
+    for data in (b"", b"noise" * 50, b"x" * 2000, first[:30], first[:4] + b"abcd" + first[8:], first[:8] + bytes(60)):
+        stranger.socket.send(data)
+    stranger.socket.send(first[:20] + bytes([first[20] ^ 1]) + first[21:])
+    time.sleep(3 * CONFIG.slot_s)
+    stranger.socket.send(first)
+
+
+def test_groups_become_one(flight: Flight) -> None:
+    assert flight.merged["common_slot"] is not None
+    assert flight.merged["clock_spread_ms"]["end"] < CONFIG.slot_ms / 2
+    for agent, summary in flight.summaries.items():
+        assert summary["state"] == "joined"
+        assert summary["heard_of"] == [other for other in (1, 2, 3) if other != agent]
+
+
+def test_nobody_speaks_in_the_turn_of_another(flight: Flight) -> None:
+    assert flight.merged["slots_with_two_senders"] == 0
+    assert flight.merged["frames_sent"] > 60
+
+
+def test_what_is_not_ours_is_counted_by_reason(flight: Flight) -> None:
+    for summary in flight.summaries.values():
+        found = summary["not_taken_in"]
+        assert found["not ours"] >= 2
+        assert {"length", "other settings", "no frame", "rejected", "repeated", "other time"} <= found.keys()
+
+
+def test_bags_lie_on_one_time_line(flight: Flight) -> None:
+    line = flight.merged["time_line"]
+    assert flight.merged["not_on_the_time_line"] == []
+    assert flight.merged["missing"] == [4]
+    for agent in (2, 3):
+        assert line["clocks"][f"cf{agent}"]["offset_ms"] == pytest.approx(OFFSET_NS / 1e6 * (agent - 1), abs=2.0)
+    assert line["residual_us"]["p50"] < 1000
+
+
+def test_the_same_receptions_give_the_same_decisions(flight: Flight) -> None:
+    again = flight.merged["decisions_again"]
+    assert again["differences"] == []
+    assert again["equal"] == again["of"] > 150
+    assert flight.merged["frames_heard_not_as_sent"] == 0
+    assert verified(flight.merged)
+
+
+def test_a_merged_flight_has_the_results_of_a_flight(flight: Flight) -> None:
+    found = flight.merged["flight"]
+    assert found["slots"]["success"] > 20
+    assert found["slots"]["collision"] == 0
+    assert found["min_distance_m"] > 0.2
+    assert 0 < found["age_mean_slots"] < 4 * CONFIG.agents * CONFIG.anchor_every
+
+
+def test_a_bag_that_lies_is_found(flight: Flight) -> None:
+    bags = [read(path) for path in flight.bags]
+    said = bags[0].slots[-20]
+    said.chosen = 4 if said.chosen != 4 else 1
+    found = merge(bags)
+    assert not verified(found)
+    assert [(one["agent"], one["slot"], one["field"]) for one in found["decisions_again"]["differences"]] == [
+        (1, said.slot, "chosen")
+    ]
+    bags = [read(path) for path in flight.bags]
+    spoken = next(record for record in bags[1].slots[-60:] if record.sent_ns >= 0)
+    spoken.frame = spoken.frame[:-5] + bytes([spoken.frame[-5] ^ 1]) + spoken.frame[-4:]
+    assert merge(bags)["frames_heard_not_as_sent"] > 0
+
+
+def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> None:
+    whole = flight.bags[0].read_bytes()
+    cut = tmp_path / "cf1.mcap"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    bag = read(cut)
+    assert bag.broken_off
+    assert 0 < len(bag.slots) < len(read(flight.bags[0]).slots)
+    found = merge([bag, *(read(path) for path in flight.bags[1:])])
+    assert found["broken_off"] == ["cf1"]
+    assert verified(found)
+    for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
+        cut.write_bytes(bad)
+        with pytest.raises(DtsaError):
+            merge([read(cut)])
+
+
+def test_bags_that_do_not_belong_together_are_refused(flight: Flight) -> None:
+    one = read(flight.bags[0])
+    with pytest.raises(ConfigError, match="one process of cf1 at a time"):
+        merge([one, read(flight.bags[0])])
+    with pytest.raises(ConfigError, match="bags"):
+        merge([])
+
+
+def test_offsets_and_drifts_are_found_among_frames_that_were_held_up() -> None:
+    draw = np.random.default_rng(3)
+    offset, drift = {1: 0, 2: 5 * 10**15, 3: -3_000_000}, {1: 0.0, 2: 60e-6, 3: -40e-6}
+
+    def shown(agent: int, at_ns: float) -> int:
+        return round(offset[agent] + at_ns * (1 + drift[agent]))
+
+    crossings = []
+    for at in range(0, 20_000_000_000, 10_000_000):
+        sender = int(draw.integers(1, 4))
+        for receiver in {1, 2, 3} - {sender}:
+            under_way = 250_000 + draw.normal(0, 5_000) + (draw.random() < 0.1) * 4_000_000
+            crossings.append(
+                Crossing((sender, 0), (receiver, 0), shown(sender, at + 10**9), shown(receiver, at + 10**9 + under_way))
+            )
+    line = fit(crossings, 30_000)
+    found = line.summary()
+    assert found["clocks"]["cf2"]["drift_ppm"] - found["clocks"]["cf1"]["drift_ppm"] == pytest.approx(60, abs=0.2)
+    assert found["clocks"]["cf3"]["drift_ppm"] == pytest.approx(-40, abs=0.2)
+    assert found["flight_time_us"] == pytest.approx(250, abs=2)
+    assert found["frames_left_out"] == pytest.approx(len(crossings) / 10, rel=0.2)
+    at = 10**10
+    here = [line.clocks[(agent, 0)].common_ns(shown(agent, at)) for agent in (1, 2, 3)]
+    assert max(here) - min(here) < 3_000
+
+
+def test_a_second_agent_of_the_same_id_does_not_begin(tmp_path: Path) -> None:
+    helpers.need_multicast()
+    config = SwarmConfig(agents=2, policy="tdma")
+    udp = UdpSettings(interface="lo", group=helpers.own_group())
+    first = helpers.Flying(AgentSettings(id=1), config, udp, tmp_path / "cf1.mcap")
+    other = helpers.Flying(AgentSettings(id=2), config, udp, tmp_path / "cf2.mcap")
+    try:
+        helpers.wait_for(lambda: len(first.slots) > 5 and len(other.slots) > 5)
+        other.end()
+        other = helpers.Flying(AgentSettings(id=2), config, udp, tmp_path / "again.mcap")
+        helpers.wait_for(lambda: len(other.slots) > 5)  # who comes back is welcome
+        with pytest.raises(ConfigError, match="id: got 1"), UdpAgent(AgentSettings(id=1), config, udp) as twin:
+            twin.run(Stop())
+    finally:
+        other.end()
+        first.end()
+
+
+def _command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "dtsa_bench", *words]
+
+
+def test_the_command_flies_until_a_signal_and_merges(tmp_path: Path) -> None:
+    helpers.need_multicast()
+    out = tmp_path / "cf2"
+    words = ["agent", "--id", "2", "--agents", "2", "--interface", "lo", "--group", helpers.own_group(), "--no-seal"]
+    with subprocess.Popen(_command(*words, "--json", "--out", str(out)), stdout=subprocess.PIPE, text=True) as process:
+        helpers.wait_for(lambda: (out / "cf2.mcap").exists() and (out / "cf2.mcap").stat().st_size > 4000)
+        process.send_signal(signal.SIGTERM)
+        said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    summary = json.loads(said)
+    assert summary == json.loads((out / "summary.json").read_text())
+    assert (summary["state"], summary["sealed"], summary["heard_of"]) == ("alone", False, [])
+    merged = subprocess.run(_command("merge", str(out), "--json"), capture_output=True, text=True, timeout=60)
+    assert merged.returncode == 0, merged.stderr
+    found = json.loads(merged.stdout)
+    assert found["missing"] == [1]
+    assert found["decisions_again"]["equal"] == found["decisions_again"]["of"] > 0
+
+
+def test_an_agent_needs_no_ros(tmp_path: Path) -> None:
+    helpers.need_multicast()
+    words = ["agent", "--id", "1", "--interface", "lo", "--group", helpers.own_group(), "--no-seal"]
+    words += ["--duration-s", "0.1", "--out", str(tmp_path / "cf1")]
+    known = "sorted({name.partition('.')[0] for name in sys.modules} & {'rclpy', 'dtsa_msgs', 'matplotlib', 'pandas'})"
+    program = f"import sys; from dtsa_bench import cli; code = cli.main({words!r}); print({known}); sys.exit(code)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "[]"), done.stderr
