@@ -57,7 +57,11 @@ def test_answers_of_the_connection() -> None:
     assert craft.ask(15, 0, b"echo") == b"echo"
     assert craft.ask(13, 1, b"\x00") == b"\x00\x0c"
     assert Craft(10).ask(13, 1, b"\x00") == b"\x00\x0a"
-    assert craft.ask(4, 0, b"\x01") == b"\x01\x00"
+    assert craft.ask(4, 0, b"\x01") == b"\x01\x01"  # one memory, that of trajectories
+    assert craft.ask(4, 0, b"\x02\x00") == struct.pack("<BBBI8x", 2, 0, 0x12, 4096)
+    assert craft.ask(4, 2, b"\x00" + struct.pack("<I", 4095) + b"ab") == b"\x00" + struct.pack("<IB", 4095, 5)
+    assert craft.ask(4, 2, b"\x00" + struct.pack("<I", 4094) + b"ab") == b"\x00" + struct.pack("<IB", 4094, 0)
+    assert craft.ask(4, 1, b"\x00" + struct.pack("<IB", 4093, 3)) == b"\x00" + struct.pack("<IB", 4093, 0) + b"\x00ab"
     assert Craft(10).ask(9, 1, b"\x01\x01") is None  # the supervisor's port came with protocol 12
     assert Craft(10).ask(13, 0, b"\x01\x01") == b"\x01\x01\x01"
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from dtsa_bench.fake_crazyflie.battery import Battery
 from dtsa_bench.fake_crazyflie.planner import Goal, Planner, Triple
 from dtsa_bench.fake_crazyflie.supervisor import LEVEL_OUT, Supervisor
+from dtsa_bench.fake_crazyflie.trajectories import Trajectory, TrajectoryMemory
 
 # What the vehicle does during a step.
 OFF = "off"  # motors stopped: it falls, or stands
@@ -109,6 +110,8 @@ class Firmware:
         """Power on."""
         self.supervisor = Supervisor(self._report, auto_arming=self._auto_arming)
         self.planner = Planner()
+        self.trajectories = TrajectoryMemory()
+        self.groups = 0  # a bit each
         self.battery = Battery()
         self.setpoint: Setpoint | None = None
         self._priority = PRIORITY_NONE
@@ -152,16 +155,22 @@ class Firmware:
     def high_level(self, data: bytes, t: float) -> int:
         """A packet of the high-level commander; 0, or an error number of the firmware's."""
         kind = data[0] if data else -1
+        lengths = {3: 2, 6: 9, 7: 15, 8: 15, 12: 24, 13: 10}
+        if len(data) < lengths.get(kind, math.inf):
+            return errno.ENOEXEC
+        if kind == 6:
+            return self.trajectories.define(data[1:])
+        if kind != 3 and not self.supervisor.motors_allowed:
+            return errno.EBUSY
+        if data[1] and not data[1] & self.groups:
+            return 0
         if kind == 3:
             self.planner.stop()
             self._report("high-level stop")
             return 0
-        lengths = {7: 15, 8: 15, 12: 24}
-        if len(data) < lengths.get(kind, math.inf):
-            return errno.ENOEXEC
-        if not self.supervisor.motors_allowed:
-            return errno.EBUSY
         here = self._here
+        if kind == 13:
+            return self._start_trajectory(data, t, here)
         if kind == 12:
             _, relative, _, x, y, z, yaw, duration = struct.unpack_from("<B??5f", data, 1)
             if relative:
@@ -175,6 +184,22 @@ class Firmware:
         if not order(t, here, height, self.yaw if keep_yaw else yaw, duration):
             return 1
         self._report(name, height=round(height, 3))
+        return 0
+
+    def _start_trajectory(self, data: bytes, t: float, here: Goal) -> int:
+        """Fly an uploaded trajectory; as in the firmware nothing happens, and nobody is told, if there is none."""
+        _, relative, _, reverse, number, timescale = struct.unpack_from("<B???Bf", data, 1)
+        if self.trajectories.compressed(number) and (reverse or timescale != 1.0):
+            return errno.ENOEXEC
+        pieces = self.trajectories.pieces(number)
+        if pieces is None or not timescale > 0.0:
+            return 0
+        way = Trajectory(t, pieces, timescale, reverse)
+        if relative:
+            x, y, z = (a - b for a, b in zip(here.position, way.goal(t).position, strict=True))
+            way = Trajectory(t, pieces, timescale, reverse, (x, y, z))
+        self.planner.follow(way)
+        self._report("trajectory", id=number, duration=round(way.duration, 3))
         return 0
 
     # -- one step of control ----------------------------------------------------------------------------------------

@@ -62,7 +62,9 @@ class Peer:
             (crtp.PARAM, 1): self._param_read,
             (crtp.PARAM, 2): self._param_write,
             (crtp.PARAM, 3): self._param_misc,
-            (crtp.MEMORY, 0): lambda data, t: b"\x01\x00" if data[:1] == b"\x01" else None,
+            (crtp.MEMORY, 0): lambda data, t: self.firmware.trajectories.info(data),
+            (crtp.MEMORY, 1): lambda data, t: self.firmware.trajectories.read(data),
+            (crtp.MEMORY, 2): lambda data, t: self.firmware.trajectories.write(data),
             (crtp.COMMANDER, 0): self._manual,
             (crtp.LOCALIZATION, 0): self._ext_position,
             (crtp.LOCALIZATION, 1): self._localization,
@@ -268,5 +270,7 @@ class Peer:
             if self.estimate.filter is not None:
                 x, y, z = (self.values[toc.PARAM_ID[f"kalman.initial{axis}"]] for axis in "XYZ")
                 self.estimate.filter.reset((x, y, z))
+        elif entry.full_name == "hlCommander.groupmask":
+            self.firmware.groups = int(value)
         elif entry.full_name == "stabilizer.stop" and value:
             self.firmware.supervisor.stop("parameter stabilizer.stop")

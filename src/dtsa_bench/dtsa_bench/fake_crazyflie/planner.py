@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 Triple = tuple[float, float, float]
 
@@ -65,13 +66,32 @@ class Path:
     axes: tuple[tuple[float, ...], ...]  # x, y, z
     end: Goal
 
+    def goal(self, t: float) -> Goal:
+        """Where it leads at t (s); after its end: the end, at rest."""
+        if t >= self.start + self.duration:
+            return self.end
+        x, y, z = (evaluate(axis, t - self.start) for axis in self.axes)
+        return Goal((x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2]), self.end.yaw)
+
+
+class Way(Protocol):
+    """Anything that the planner can follow."""
+
+    @property
+    def start(self) -> float: ...
+
+    @property
+    def duration(self) -> float: ...
+
+    def goal(self, t: float) -> Goal: ...
+
 
 class Planner:
     """Paths between high-level commands. Time is an argument."""
 
     def __init__(self) -> None:
         self.state = IDLE
-        self.path: Path | None = None
+        self.path: Way | None = None
 
     def stop(self) -> None:
         """Motors off, and the path is forgotten."""
@@ -98,6 +118,11 @@ class Planner:
         self._plan(t, here, place, yaw, duration)
         self.state = FLYING
 
+    def follow(self, way: Way) -> None:
+        """Fly a trajectory, and hold its end."""
+        self.path = way
+        self.state = FLYING
+
     def _from_rest(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> None:
         x, y, _ = here.position
         self._plan(t, Goal(here.position), (x, y, height), yaw, duration)
@@ -117,8 +142,4 @@ class Planner:
             self.state = IDLE
         if self.state == IDLE or self.path is None:
             return None
-        if self.finished(t):
-            return self.path.end
-        s = t - self.path.start
-        x, y, z = (evaluate(axis, s) for axis in self.path.axes)
-        return Goal((x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2]), self.path.end.yaw)
+        return self.path.goal(t)
