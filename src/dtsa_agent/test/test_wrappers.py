@@ -10,6 +10,7 @@ import pytest
 from dtsa_agent.core import AbstractSwarm, Swarm, SwarmConfig
 from dtsa_agent.core.abstract_swarm import SwarmWrapper
 from dtsa_agent.core.authentication import AuthenticatedSwarm, Authenticator
+from dtsa_agent.core.flight_models import VehicleParams
 from dtsa_agent.core.plugins import PluginSwarm
 from dtsa_agent.crazyflie.external_vehicles import HOLD_GAIN, HOLD_MPS, ExternalVehicles
 
@@ -116,3 +117,45 @@ def test_wrappers_hand_on_every_step_of_the_interface() -> None:
     assert steps <= {name for name, _ in inspect.getmembers(SwarmWrapper, inspect.isfunction)}
     assert steps <= {name for name, _ in inspect.getmembers(Swarm, inspect.isfunction)}
     assert not [name for name in steps if name in vars(Swarm(SwarmConfig(agents=2)))]  # methods, not attributes
+
+
+def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple[float, float]:
+    """Twelve exchange places; smallest distance after a slot, m, and the largest speed 2 s later, m/s.
+
+    :param stop_here: they are told to come to rest; otherwise their commands break off for 0.4 s, and then they brake.
+    """
+    config = SwarmConfig(
+        agents=12, moving=12, policy="tdma", estimator="linear", avoider="crazyflie", seed=seed, slot_ms=20.0,
+        shape="ellipse", axis_x_m=1.2, axis_y_m=2.0, permute=False,
+    )  # fmt: skip
+    commands = np.zeros((3, 12))
+    swarm = ExternalVehicles(Swarm(config), 1, lambda c: np.copyto(commands, c))
+    swarm.scenario.advance(0, swarm)
+    place, velocity, closest = swarm.scenario.start.copy(), np.zeros((3, 12)), np.inf
+    for now in range(slot + 100):
+        swarm.place(place)
+        swarm.velocity[:] = velocity
+        if now == slot and stop_here:
+            swarm.stop_here()
+        swarm.begin(now)
+        for index in np.flatnonzero(swarm.sends):
+            swarm.hear(now, swarm.frame(index))
+        if now < slot or stop_here:
+            swarm.fly(now)
+        elif now >= slot + 20:
+            commands[:] = 0.0
+        swarm.end(now)
+        for _ in range(2):
+            VehicleParams().step(0.01, place, velocity, commands)
+        gaps = np.linalg.norm(place[:, :, None] - place[:, None, :], axis=0) + 10 * np.eye(12)
+        closest = min(closest, gaps.min()) if now >= slot else closest
+    assert np.array_equal(swarm.goal, swarm.scenario.target)  # the protocol's goals are what they were
+    return closest, float(np.abs(velocity).max())
+
+
+def test_vehicles_that_are_told_to_stop_in_the_midst_of_an_exchange_come_to_rest_apart() -> None:
+    assert closest_once_told_to_stop(3, 36, stop_here=False)[0] < 0.2
+    for seed, slot in ((3, 36), (1, 44), (1, 84)):
+        closest, speed = closest_once_told_to_stop(seed, slot, stop_here=True)
+        assert closest > 0.33
+        assert speed < 0.02

@@ -298,6 +298,12 @@ def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -
             assert fleet.flown(k)[:3] == ["ready to fly", "flying", "landed"]
         assert fleet.state_event(2, "level out")
         assert not [e for e in fleet.events() if e["event"] in ("collision", "crash") and e["cf"] != 2]
+        # They come to rest before they land, out of each other's way.
+        _, track, _ = read_truth(fleet.truth)
+        others = track[:, :, [0, 2, 3]]
+        others = others[others[:, 2].min(axis=1) > 0.5]
+        gap = np.linalg.norm(others[:, :, :, None] - others[:, :, None, :], axis=1) + 10 * np.eye(3)
+        assert gap.min() > 0.25
 
 
 def fly(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Empty
 
 from dtsa_agent.core import AbstractSwarm
 from dtsa_agent.core.plugins import make_swarm
@@ -43,6 +44,7 @@ from dtsa_agent.ros.swarm_node import parse_ids
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 STALE_S = 0.3  # an agent that does not know where it is gives no commands: the bridge then holds its vehicle
 LONGEST_PREDICTION_S = 0.15
+STOP_HERE = "/all/stop_here"  # of the ground station: nobody flies on to its goal
 
 
 class StationNode(RealtimeNode):
@@ -64,6 +66,7 @@ class StationNode(RealtimeNode):
         self._inputs: list[Feed] = []
         self._bridges: list[OnePublisher] = []  # who tells where each vehicle is
         self._outputs = []
+        self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=self.membership.intake)
         for agent in self.swarm.ids:
             space = names.agent_namespace(agent, self._namespace)
             topic = f"{space}/{names.ODOMETRY}"
@@ -77,6 +80,8 @@ class StationNode(RealtimeNode):
         return bool(np.isinf(self._heard).any())
 
     def _sense(self) -> None:
+        if self._stop_here.take() is not None:
+            self._vehicles.stop_here()
         for index, feed in enumerate(self._inputs):
             message = feed.take()
             if message is not None:

@@ -25,6 +25,7 @@ class ExternalVehicles(SwarmWrapper):
         super().__init__(inner)
         self._every, self._send = every, send
         self._hold = self.scenario.start[:, self.local].copy()  # (3, L) m, frame map
+        self._stopping = False
 
     def place(self, position: NDArray[np.float64]) -> None:
         """Takes in where the vehicles are.
@@ -34,12 +35,23 @@ class ExternalVehicles(SwarmWrapper):
         self.position[:] = position
         self.track[:] = position
 
+    def stop_here(self) -> None:
+        """From now on nobody flies to its goal: all come to rest, and keep out of each other's way as before."""
+        self._stopping = True
+
     def fly(self, slot: int) -> None:
         if slot % self._every:
             return
-        self.steer(slot, 0)
+        self._steer(slot)
         still = self.active == 0
         if still.any():
             away = self._hold[:, still] - self.position[:, still]
             self.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
         self._send(self.command)
+
+    def _steer(self, slot: int) -> None:
+        goal = self.goal.copy()  # the protocol still counts with it
+        if self._stopping:
+            self.goal[:] = self.position  # nothing else to wish for than to be at rest
+        self.steer(slot, 0)
+        self.goal[:] = goal

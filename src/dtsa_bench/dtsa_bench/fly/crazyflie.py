@@ -63,6 +63,20 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
     return {name: value for name, value in defaults.items() if given.get(name) is None}
 
 
+class _Rest:
+    """True once the exchange has to end and all have come to rest: they avoid each other until then.
+
+    :param ended: why it has to end.
+    :param mission: tells them.
+    """
+
+    def __init__(self, ended: Ended, mission: Mission) -> None:
+        self._ended, self._mission = ended, mission
+
+    def __bool__(self) -> bool:
+        return bool(self._ended) and (self._ended.stop.count > 1 or self._mission.at_rest())
+
+
 class _BridgeWatch(ChannelObserver):
     """Ends the exchange when the bridge has died."""
 
@@ -193,7 +207,7 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         shown = FlightProgress(progress, measurement, channel)
         channel.observe(_BridgeWatch(mission), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
         try:
-            channel.run(ended)
+            channel.run(_Rest(ended, mission))
             ended.reason = ended.reason or channel.fell_behind
             shown.show()
         except (NodeError, MissionError) as error:  # the bridge has died: what was flown is there all the same
@@ -203,6 +217,10 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
             progress.end()
         mission.exchanging = False
         with _second_interrupt() as urgent:  # first they land: what follows takes seconds
+            if ended.stop.count > 1:
+                urgent.set()
+            if ended:
+                mission.order_landing()  # before the agents end: nobody flies on without them
             agents.stop()
             mission.land(urgent)
         give_way()  # the bridge does not: it has to watch them

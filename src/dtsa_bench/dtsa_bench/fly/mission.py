@@ -24,6 +24,7 @@ from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
+from dtsa_agent.crazyflie.agents_node import STOP_HERE
 from dtsa_agent.crazyflie.bridge_outputs import EVENTS, EVENTS_QOS
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.paths import shortest_s
@@ -39,6 +40,7 @@ SHIFT_MPS = 0.3
 BRING_MPS = 0.8  # of one that is brought to its place, at most
 KEEP_M = 0.3  # nobody comes closer to one that is brought to its place
 BRIDGE_SILENT_S = 3.0
+STOPPING_S = 1.2  # all come to rest within that time, and keep out of each other's way
 IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
 BRIDGE_S = 60.0  # s, for the connections
 
@@ -83,6 +85,9 @@ class Mission:
         node.create_subscription(DiagnosticArray, "/diagnostics", self._keep_diagnostics, 10)
         node.create_subscription(Log, EVENTS, self.log.event, EVENTS_QOS)
         self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
+        self._stop_here = node.create_publisher(EmptyMessage, STOP_HERE, 1)
+        self._stopping: float | None = None  # s, monotonic, since when they are told to come to rest
+        self._landing: Any = None  # the answer to the order to land
         self._beating = threading.Event()
         self._over = threading.Event()
         # Made long before they are used: a server drops the answer to a client that it has not discovered yet.
@@ -128,6 +133,8 @@ class Mission:
         while not self._over.wait(0.1):
             if self._beating.is_set():
                 self._heartbeat.publish(EmptyMessage())
+            if self._stopping is not None:
+                self._stop_here.publish(EmptyMessage())
 
     def check_bridge(self) -> None:
         """For a bridge that is not a child of this process.
@@ -287,6 +294,22 @@ class Mission:
         """Who was in the air, or may have been, when it was last heard of."""
         return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
 
+    def at_rest(self) -> bool:
+        """Tell all that fly to come to rest where they are; True once they have had the time for that."""
+        now = time.monotonic()
+        if self._stopping is None:
+            self._stopping = now
+            self._stop_here.publish(EmptyMessage())
+        return now - self._stopping > STOPPING_S
+
+    def order_landing(self) -> None:
+        """Have all land that are in the air; does not wait. They brake at once, all at the same time."""
+        self.exchanging = False
+        if self._landing is None:
+            height = self.settings.station.room_origin_in_world[2]
+            request = Land.Request(duration=_duration(max(2.0, height / CLIMB_MPS)))
+            self._landing = self._clients["/all/land"].call_async(request)
+
     def land(self, urgent: threading.Event) -> None:
         """Land whoever is in the air and wait until all stand.
 
@@ -296,10 +319,7 @@ class Mission:
         flying = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)
         if any(s.state in flying for s in self.status.values()):
             self.say("landing")
-            height = self.settings.station.room_origin_in_world[2]
-            future = self._clients["/all/land"].call_async(
-                Land.Request(duration=_duration(max(2.0, height / CLIMB_MPS)))
-            )
+            self.order_landing()
             end = time.monotonic() + self.settings.station.landing_timeout_s
             while time.monotonic() < end and any(s.state in flying for s in self.status.values()):
                 if time.monotonic() - self.heard > BRIDGE_SILENT_S:
@@ -311,7 +331,8 @@ class Mission:
                     time.sleep(0.5)
                     break
                 time.sleep(0.05)
-            future.cancel()
+            self._landing.cancel()
+            self._landing = None
         end_heartbeat = self._clients["/all/end_heartbeat"]
         if end_heartbeat.service_is_ready():
             future = end_heartbeat.call_async(Trigger.Request())
