@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -28,17 +29,33 @@ MAX_CLOCK_S = 0.1
 LATEST_ONLY = QoSProfile(depth=1)
 
 
-def _seconds(duration: DurationMsg) -> float:
+def seconds(duration: DurationMsg) -> float:
+    """A duration of a message, s."""
     return duration.sec + duration.nanosec * 1e-9
 
 
 def _short(value: Any) -> str:
     """A field of a request for people."""
     if isinstance(value, DurationMsg):
-        return f"{_seconds(value):g} s"
+        return f"{seconds(value):g} s"
     if isinstance(value, Point):
         return units.place_text((value.x, value.y, value.z))
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Types:
+    """Messages of the streamed commands and services: ours, or others with the same fields."""
+
+    full_state: Any = FullState
+    position: Any = Position
+    velocity_world: Any = VelocityWorld
+    hover: Any = Hover
+    takeoff: Any = Takeoff
+    land: Any = Land
+    go_to: Any = GoTo
+    arm: Any = Arm
+    notify_setpoints_stop: Any = NotifySetpointsStop
 
 
 class Inputs:
@@ -50,6 +67,8 @@ class Inputs:
     :param say: called with a level and a line about each order.
     """
 
+    types = Types()
+
     def __init__(self, node: Node, bridge: Bridge, pump: CommandPump, say: Callable[[str, str], None]) -> None:
         self._say = say
         self._node, self._bridge, self._pump = node, bridge, pump
@@ -60,10 +79,10 @@ class Inputs:
         for vehicle in self._bridge.vehicles.values():
             name = vehicle.name
             for kind, topic, callback in (
-                (FullState, "cmd_full_state", self._full_state),
-                (Position, "cmd_position", self._position),
-                (VelocityWorld, "cmd_velocity_world", self._velocity_world),
-                (Hover, "cmd_hover", self._hover),
+                (self.types.full_state, "cmd_full_state", self._full_state),
+                (self.types.position, "cmd_position", self._position),
+                (self.types.velocity_world, "cmd_velocity_world", self._velocity_world),
+                (self.types.hover, "cmd_hover", self._hover),
             ):
                 self._pump.subscribe(kind, f"{name}/{topic}", partial(self._command, vehicle, callback), LATEST_ONLY)
             self._create_services(name, [name])
@@ -73,17 +92,24 @@ class Inputs:
         self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
         self._create_services("all", list(self._bridge.vehicles))
 
+    def close(self) -> None:
+        """End of what this added to the node."""
+
     def _create_services(self, prefix: str, names: list[str]) -> None:
-        for kind, service, callback in (
-            (Takeoff, "takeoff", self._takeoff),
-            (Land, "land", self._land),
-            (GoTo, "go_to", self._go_to),
-            (Arm, "arm", self._arm),
-            (NotifySetpointsStop, "notify_setpoints_stop", self._notify),
-            (Empty, "emergency", self._emergency),
-        ):
+        for kind, service, callback in self._services():
             name = f"{prefix}/{service}"
             self._node.create_service(kind, name, partial(self._ordered, name, partial(callback, names)))
+
+    def _services(self) -> list[tuple[Any, str, Callable[[list[str], Any, Any], Any]]]:
+        """Type, name and callback of each service that takes an order to one or all; `emergency` is the last."""
+        return [
+            (self.types.takeoff, "takeoff", self._takeoff),
+            (self.types.land, "land", self._land),
+            (self.types.go_to, "go_to", self._go_to),
+            (self.types.arm, "arm", self._arm),
+            (self.types.notify_setpoints_stop, "notify_setpoints_stop", self._notify),
+            (Empty, "emergency", self._emergency),
+        ]
 
     def _ordered(self, name: str, callback: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
         """Carry out an order, and say so: what an operator did belongs to what happened."""
@@ -115,28 +141,32 @@ class Inputs:
     def _world(self, frame: str, x: float, y: float, z: float) -> units.Vector:
         return (x, y, z) if frame == "world" else to_world((x, y, z), self._origin)
 
-    def _full_state(self, m: FullState, stamp: float) -> units.Setpoint:
+    def _full_state(self, m: Any, stamp: float) -> units.Setpoint:
         p, q, v, w, a = m.pose.position, m.pose.orientation, m.twist.linear, m.twist.angular, m.acc
         place = self._world(m.header.frame_id, p.x, p.y, p.z)
         return units.full_state(place, (v.x, v.y, v.z), (a.x, a.y, a.z), (q.x, q.y, q.z, q.w), (w.x, w.y, w.z), stamp)
 
-    def _position(self, m: Position, stamp: float) -> units.Setpoint:
+    def _position(self, m: Any, stamp: float) -> units.Setpoint:
         return units.position(self._world(m.header.frame_id, m.x, m.y, m.z), m.yaw, stamp)
 
-    def _velocity_world(self, m: VelocityWorld, stamp: float) -> units.Setpoint:
+    def _velocity_world(self, m: Any, stamp: float) -> units.Setpoint:
         return units.velocity_world((m.vel.x, m.vel.y, m.vel.z), m.yaw_rate, stamp)
 
-    def _hover(self, m: Hover, stamp: float) -> units.Setpoint:
+    def _hover(self, m: Any, stamp: float) -> units.Setpoint:
         return units.hover(m.vx, m.vy, m.yaw_rate, m.z_distance, stamp)
 
     # -- services ---------------------------------------------------------------------------------------------------
+    def _groups(self, name: str) -> int:
+        """The groups that a vehicle belongs to, a bit each."""
+        return self._bridge.vehicles[name].robot.group_mask
+
     def _each(self, names: list[str], order: Callable[[Vehicle], str | None], response: Any, group: int = 0) -> Any:
         """Give an order to those that are addressed.
 
         :param group: 0: to all of them; else to those in one of these groups.
         """
         if group:
-            members = [name for name in names if self._bridge.vehicles[name].robot.group_mask & group]
+            members = [name for name in names if self._groups(name) & group]
             if not members:
                 response.success, response.message = False, f"nobody of {', '.join(names)} is in a group of {group}"
                 return response
@@ -150,11 +180,14 @@ class Inputs:
             self._node.get_logger().error(f"no take-off: {problem}")
             response.success, response.message = False, problem
             return response
-        seconds = _seconds(request.duration)
-        return self._each(names, lambda v: v.takeoff(request.height, seconds), response, request.group_mask)
+        duration = seconds(request.duration)
+        return self._each(names, lambda v: self._climb(v, request.height, duration), response, request.group_mask)
+
+    def _climb(self, vehicle: Vehicle, height: float, duration: float) -> str:
+        return vehicle.takeoff(height, duration)
 
     def _land(self, names: list[str], request: Any, response: Any) -> Any:
-        duration = _seconds(request.duration)
+        duration = seconds(request.duration)
         notes: list[str] = []
         self._each(
             names,
@@ -166,13 +199,13 @@ class Inputs:
         return response
 
     def _go_to(self, names: list[str], request: Any, response: Any) -> Any:
-        goal, duration = request.goal, _seconds(request.duration)
+        goal, duration = request.goal, seconds(request.duration)
         place = (goal.x, goal.y, goal.z)
         if not all(math.isfinite(v) for v in (*place, request.yaw)):
             response.success, response.message = False, "the goal is not finite"
             return response
         if not request.relative:
-            place = to_world(place, self._origin)
+            place = self._world("", *place)
         return self._each(
             names,
             lambda v: v.go_to(place, request.yaw, duration, request.relative),

@@ -37,9 +37,14 @@ from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.priority import stay_on_one_processor, take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
 
+DTSA, CRAZYSWARM2 = "dtsa", "crazyswarm2"
+NODES = {DTSA: "crazyflie_bridge", CRAZYSWARM2: "crazyflie_server"}  # by the interfaces that are offered
 STATUS_HZ = 5.0
 SETTLE_S = 1.2  # of a check before flight
 SWITCH_S = 0.0005
+INTERFACES_DESCRIPTOR = ParameterDescriptor(
+    description="whose messages, names and units: dtsa or crazyswarm2", read_only=True, dynamic_typing=True
+)
 
 
 def safety_parameters(node: Node, given: SafetySettings) -> SafetySettings:
@@ -62,15 +67,45 @@ def position_parameters(node: Node, given: PositionSettings) -> PositionSettings
         return PositionSettings(**values)
 
 
+def wanted_interfaces(argv: Sequence[str]) -> str:
+    """Whose messages, names and units the command line asks for; it says so before the node has its name.
+
+    :raises ConfigError: nobody's.
+    """
+    if not any("interfaces" in argument or "params-file" in argument for argument in argv):
+        return DTSA
+    probe = Node(NODES[DTSA], enable_rosout=False, start_parameter_services=False)
+    try:
+        value = probe.declare_parameter("interfaces", DTSA, INTERFACES_DESCRIPTOR).value
+    finally:
+        probe.destroy_node()
+    if value not in NODES:
+        raise ConfigError("interfaces", value, "one of " + ", ".join(NODES))
+    return str(value)
+
+
+def _load_crazyswarm2() -> Any:
+    """What offers Crazyswarm2's interfaces.
+
+    :raises ConfigError: its messages are not in the workspace.
+    """
+    from dtsa_agent.crazyflie.crazyswarm2.server import server
+
+    return server()
+
+
 class BridgeNode(Node):
     """ROS side of the bridge.
 
     :param config: the swarm's YAML; None: the node's parameter `config`.
-    :raises ConfigError: the configuration is not usable.
+    :param interfaces: whose messages, names and units: `DTSA` or `CRAZYSWARM2`.
+    :raises ConfigError: the configuration is not usable, or the messages are not there.
     """
 
-    def __init__(self, config: Path | None = None, **node_options: Any) -> None:
-        super().__init__("crazyflie_bridge", enable_rosout=False, **node_options)
+    def __init__(self, config: Path | None = None, interfaces: str = DTSA, **node_options: Any) -> None:
+        foreign = _load_crazyswarm2() if interfaces == CRAZYSWARM2 else None
+        super().__init__(NODES[interfaces], enable_rosout=False, **node_options)
+        self.declare_parameter("interfaces", interfaces, INTERFACES_DESCRIPTOR)
         given = self.declare_parameter(
             "config", str(config or ""), ParameterDescriptor(description="the swarm's YAML file", read_only=True)
         ).value
@@ -81,10 +116,11 @@ class BridgeNode(Node):
         positions = position_parameters(self, settings.station.positions)
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
         self.settings = SwarmSettings(settings.robots, station)
-        self.outputs = Outputs(self, self.settings)
+        self.outputs = Outputs(self, self.settings) if foreign is None else foreign.outputs(self, self.settings)
         self._commands = self._listener("commands")
         self.pump = CommandPump(self._commands)
         self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
+        self._inputs = (Inputs if foreign is None else foreign.inputs)(self, self.bridge, self.pump, self.say)
         self._cameras = self._listener("positions") if positions.on else None
         self.positions = CommandPump(self._cameras) if self._cameras is not None else None
         if self.positions is not None:
@@ -93,7 +129,7 @@ class BridgeNode(Node):
     def _listener(self, name: str) -> Node:
         """A node whose topics are taken by a thread of their own."""
         return Node(
-            f"crazyflie_bridge_{name}",
+            f"{self.get_name()}_{name}",
             namespace=self.get_namespace(),
             context=self.context,
             enable_rosout=False,
@@ -103,6 +139,7 @@ class BridgeNode(Node):
 
     def close(self) -> None:
         """End of what this node added to itself."""
+        self._inputs.close()
         self.pump.close()
         self._commands.destroy_node()
         if self.positions is not None and self._cameras is not None:
@@ -139,7 +176,7 @@ class BridgeNode(Node):
             self.say("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:
             return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
-        Inputs(self, self.bridge, self.pump, self.say).offer()
+        self._inputs.offer()
         self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.snapshots()))
         self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.snapshots()))
         return ""
@@ -242,7 +279,7 @@ def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = r
         return 2
     node = None
     try:
-        node = BridgeNode()
+        node = BridgeNode(interfaces=wanted_interfaces(argv))
         code = use(node)
     except ConfigError as error:
         print(f"crazyflie_bridge: {error}", file=sys.stderr)

@@ -40,8 +40,12 @@ class Outputs:
     :param settings: the swarm's.
     """
 
+    frame = FRAME
+    status_type: Any = Status
+
     def __init__(self, node: Node, settings: SwarmSettings) -> None:
         self._clock = node.get_clock()
+        self._name = node.get_name()
         self._origin = settings.station.room_origin_in_world
         self._odom: dict[str, Any] = {}
         self._pose: dict[str, Any] = {}
@@ -54,9 +58,13 @@ class Outputs:
             self._odom[name] = node.create_publisher(Odometry, f"{name}/odom", LATEST_ONLY)
             if not positions.on or positions.topic_of(name).lstrip("/") != f"{name}/pose":  # motion capture's own
                 self._pose[name] = node.create_publisher(PoseStamped, f"{name}/pose", LATEST_ONLY)
-            self._status[name] = node.create_publisher(Status, f"{name}/status", QoSProfile(depth=10))
+            self._status[name] = node.create_publisher(self.status_type, f"{name}/status", QoSProfile(depth=10))
         self._events = node.create_publisher(Log, EVENTS.lstrip("/"), EVENTS_QOS)
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+
+    def _place(self, state: VehicleState) -> units.Vector:
+        """Where a vehicle is, m, in the frame of what is published."""
+        return to_map(state.position, self._origin)
 
     def publish_state(self, vehicle: Vehicle, state: VehicleState) -> None:
         """Odometry and pose of one log packet, in the link's thread; only what somebody listens to."""
@@ -65,12 +73,12 @@ class Outputs:
         if not (odom or pose):
             return
         stamp = self._clock.now().to_msg()
-        x, y, z = to_map(state.position, self._origin)
+        x, y, z = self._place(state)
         qx, qy, qz, qw = state.orientation
         message = self._odom_message.get(name)
         if message is None:
             message = self._odom_message[name] = Odometry(child_frame_id=f"{name}/base_link")
-            message.header.frame_id = FRAME
+            message.header.frame_id = self.frame
             message.pose.covariance, message.twist.covariance = POSE_COVARIANCE, TWIST_COVARIANCE
         message.header.stamp = stamp
         p, q = message.pose.pose.position, message.pose.pose.orientation
@@ -86,7 +94,7 @@ class Outputs:
     def publish_event(self, level: str, line: str) -> None:
         """One line of the log, for those who record a mission."""
         self._events.publish(
-            Log(stamp=self._clock.now().to_msg(), level=LEVELS.get(level, 20), name="crazyflie_bridge", msg=line)
+            Log(stamp=self._clock.now().to_msg(), level=LEVELS.get(level, 20), name=self._name, msg=line)
         )
 
     def publish_status(self, snapshots: list[Snapshot]) -> None:
@@ -97,7 +105,10 @@ class Outputs:
                 self._odom[s.name].get_subscription_count() > 0,
                 s.name in self._pose and self._pose[s.name].get_subscription_count() > 0,
             )
-            self._status[s.name].publish(status_message(s, stamp))
+            self._status[s.name].publish(self._status_message(s, stamp))
+
+    def _status_message(self, s: Snapshot, stamp: Any) -> Any:
+        return status_message(s, stamp)
 
     def publish_diagnostics(self, snapshots: list[Snapshot]) -> None:
         """Diagnostics of all."""

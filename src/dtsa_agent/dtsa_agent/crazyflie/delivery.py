@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-TAKEOFF, LAND, GO_TO = "take-off", "landing", "go_to"
-KINDS = {7: TAKEOFF, 8: LAND, 4: GO_TO, 12: GO_TO}  # by the first byte of the firmware's packets
+TAKEOFF, LAND, GO_TO, TRAJECTORY = "take-off", "landing", "go_to", "trajectory"
+KINDS = {7: TAKEOFF, 8: LAND, 4: GO_TO, 12: GO_TO, 13: TRAJECTORY}  # by the first byte of the firmware's packets
 ACCEPTED = (0, 1)  # 1: it takes off or lands already
 REPEAT_S = 0.15
 ENDS = 2  # the end of a stream of setpoints is not answered: it is sent this often again
@@ -34,7 +34,7 @@ class Delivery:
     def begin(self, kind: str, send: Send, end: Send | None, now: float) -> None:
         """An order was sent; it replaces the one before.
 
-        :param kind: `TAKEOFF`, `LAND` or `GO_TO`.
+        :param kind: `TAKEOFF`, `LAND`, `GO_TO` or `TRAJECTORY`.
         :param send: sends it once more, all of it.
         :param end: ends a stream of setpoints; None: there was none.
         :param now: s, monotonic.

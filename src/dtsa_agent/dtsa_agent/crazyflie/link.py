@@ -1,4 +1,4 @@
-"""The link to one Crazyflie: with `radio_link` and `emergency_radio` the only module that talks to cflib.
+"""The link to one Crazyflie: with `radio_link`, `emergency_radio` and `onboard` all that talks to cflib.
 
 Each link has one worker thread. It connects, and it alone sends: cflib's send can block for seconds under a lock, so
 nothing else may wait for it. cflib's own threads only deliver log packets. A link that ends by itself is opened again,
@@ -196,6 +196,11 @@ class Link:
             self.mailbox.put_order(order, urgent=urgent)
 
     # -- connection -------------------------------------------------------------------------------------------------
+    @property
+    def crazyflie(self) -> Any:
+        """The connected `Crazyflie` object; None: there is none."""
+        return self._cf if self.connected else None
+
     def connect(self, done: Callable[[str], None]) -> None:
         """Connect in the worker; `done` is called with an empty text, or with why it failed."""
 

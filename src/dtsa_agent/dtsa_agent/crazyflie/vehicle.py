@@ -11,16 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
-from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, Delivery
+from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, TRAJECTORY, Delivery
 from dtsa_agent.crazyflie.estimates import EstimateWatch, Settling
 from dtsa_agent.crazyflie.limits import outside_fence
 from dtsa_agent.crazyflie.link import Link
+from dtsa_agent.crazyflie.onboard import Onboard
 from dtsa_agent.crazyflie.paths import shortest_s, too_short
 from dtsa_agent.crazyflie.positions import Room
 from dtsa_agent.crazyflie.safety import Watched
 from dtsa_agent.crazyflie.sightings import Sightings
 from dtsa_agent.crazyflie.snapshot import Snapshot
 from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, IS_FLYING, State, StateMachine
+from dtsa_agent.crazyflie.trajectories import Trajectory, why_not
 from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, to_map, velocity_world, yaw_of
 
 # A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
@@ -99,6 +101,8 @@ class Vehicle:
         self.link = Link(
             robot, cache, self._received, self._broken, self._answered, settling, lambda: self.seen_at(time.monotonic())
         )
+        self.onboard = Onboard(self.link)
+        self._trajectories: dict[int, Trajectory] = {}  # in its memory, by their numbers
 
     # -- what comes in ----------------------------------------------------------------------------------------------
     def _changed(self, before: State, state: State, reason: str) -> None:
@@ -143,6 +147,7 @@ class Vehicle:
             self._brake_then(self._sink)
 
     def _answered(self, code: int, result: int) -> None:
+        self.onboard.answered(code, result)
         with self.lock:
             problem = self._delivery.answered(code, result)
         if problem:
@@ -188,6 +193,8 @@ class Vehicle:
             self._command_time = None
             self._blind.clear()
             self._delivery.cancel()
+            self._trajectories.clear()
+            self.onboard.forget()
 
         def finished(reason: str) -> None:
             try:
@@ -241,7 +248,7 @@ class Vehicle:
 
         The other way round the high-level commander would have nothing to fly for a moment, and would stop the motors.
 
-        :param kind: `TAKEOFF`, `LAND` or `GO_TO`.
+        :param kind: `TAKEOFF`, `LAND`, `GO_TO` or `TRAJECTORY`.
         :param again: the order may be given more than once: it is, until the firmware has answered.
         """
         streaming, self._streaming, self._held = self._streaming, False, False
@@ -277,9 +284,16 @@ class Vehicle:
                 self.link.order(lambda cf: cf.supervisor.send_arming_request(arm))
             return ""
 
-    def takeoff(self, height: float, duration: float) -> str:
-        """Climb to a height (m above the floor) within a duration (s); why not, or an empty text."""
+    def takeoff(self, height: float, duration: float, *, arm: bool = False) -> str:
+        """Climb to a height (m above the floor) within a duration (s); why not, or an empty text.
+
+        :param arm: one that arms itself need not be armed before.
+        """
         with self.lock:
+            if arm and self.state == State.READY and self.machine.arms_itself and self.last is not None:
+                if problem := self.arm(True):
+                    return problem
+                self.machine.observe(self.last.info)
             if self.state not in (State.ARMED, State.FLYING, State.LANDING):
                 return f"{self.name} is {self.standing}, not armed"
             if self.last is not None and self.last.battery < self.robot.battery.voltage_critical:
@@ -332,6 +346,55 @@ class Vehicle:
                 lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative),
                 duration,
                 again=not relative,
+            )
+            return ""
+
+    def upload_trajectory(self, trajectory: Trajectory) -> str:
+        """Write a trajectory to its memory, on the ground; waits; why not, or an empty text."""
+        with self.lock:
+            if self.state not in (State.READY, State.ARMED):  # in the air it might be flying what is there
+                return f"{self.name} is {self.standing}: trajectories are uploaded on the ground"
+            for number in [n for n, other in self._trajectories.items() if other.overlaps(trajectory)]:
+                del self._trajectories[number]
+            self._trajectories.pop(trajectory.number, None)
+        if problem := self.onboard.upload(trajectory):
+            return f"{self.name}: trajectory {trajectory.number}: {problem}"
+        with self.lock:
+            self._trajectories[trajectory.number] = trajectory
+        return ""
+
+    def trajectory_problem(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> str:
+        """Why it must not start a trajectory; empty if it may."""
+        with self.lock:
+            if self.state != State.FLYING or self._deaf or self.last is None:
+                return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
+            if self.watch.wrong:
+                return f"{self.name}: {self.watch.wrong}"
+            trajectory = self._trajectories.get(number)
+            if trajectory is None:
+                return f"{self.name}: trajectory {number} was not uploaded"
+            here = self.last.position
+            problem = why_not(trajectory, here, self.station, timescale, reverse=reverse, relative=relative)
+            return f"{self.name}: {problem}" if problem else ""
+
+    def start_trajectory(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> str:
+        """Fly a trajectory of its memory, then hold its end; why not, or an empty text.
+
+        :param timescale: it takes that many times as long as it says.
+        :param reverse: from its end to its beginning.
+        :param relative: moved so that it begins where the vehicle is.
+        """
+        with self.lock:
+            if problem := self.trajectory_problem(number, timescale, reverse=reverse, relative=relative):
+                return problem
+            self.action = f"trajectory {number}"
+            self._high_level(
+                TRAJECTORY,
+                lambda cf: cf.high_level_commander.start_trajectory(
+                    number, timescale, relative_position=relative, reversed=reverse
+                ),
+                timescale * self._trajectories[number].duration,
+                again=False,  # it would begin once more
             )
             return ""
 
