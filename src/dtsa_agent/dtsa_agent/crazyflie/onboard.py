@@ -69,6 +69,7 @@ class Onboard:
     def __init__(self, link: Link) -> None:
         self._link = link
         self._blocks: dict[str, Any] = {}
+        self.trajectories: dict[int, Trajectory] = {}  # in the memory, by their numbers
         self._defined = threading.Event()
         self._refusal = 0
 
@@ -150,6 +151,15 @@ class Onboard:
     # -- trajectories -----------------------------------------------------------------------------------------------
     def upload(self, trajectory: Trajectory) -> str:
         """Write a trajectory to the memory and define it; waits; why not, or an empty text."""
+        for number in [n for n, other in self.trajectories.items() if other.overlaps(trajectory)]:
+            del self.trajectories[number]
+        self.trajectories.pop(trajectory.number, None)
+        problem = self._write(trajectory) or self._define(trajectory)
+        if not problem:
+            self.trajectories[trajectory.number] = trajectory
+        return problem
+
+    def _write(self, trajectory: Trajectory) -> str:
         done = threading.Event()
         problems: list[str] = []
 
@@ -175,7 +185,7 @@ class Onboard:
         self._link.order(write, background=True)
         if not done.wait(UPLOAD_S):
             return f"the upload was not over after {UPLOAD_S:g} s"
-        return problems[0] if problems else self._define(trajectory)
+        return problems[0] if problems else ""
 
     def _define(self, trajectory: Trajectory) -> str:
         def define(cf: Any) -> None:
@@ -202,3 +212,4 @@ class Onboard:
     def forget(self) -> None:
         """A new connection: the Crazyflie may have been switched on again."""
         self._blocks.clear()
+        self.trajectories.clear()

@@ -5,30 +5,24 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
-from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, TRAJECTORY, Delivery
-from dtsa_agent.crazyflie.estimates import EstimateWatch, Settling
+from dtsa_agent.crazyflie.controls import SLOW_MPS, Controls, end_of_stream
+from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, TRAJECTORY
 from dtsa_agent.crazyflie.limits import outside_fence
 from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.onboard import Onboard
 from dtsa_agent.crazyflie.paths import shortest_s, too_short
-from dtsa_agent.crazyflie.positions import Room
 from dtsa_agent.crazyflie.safety import Watched
-from dtsa_agent.crazyflie.sightings import Sightings
+from dtsa_agent.crazyflie.senses import QUALITY_WINDOW_S, Senses
 from dtsa_agent.crazyflie.snapshot import Snapshot
-from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, IS_FLYING, State, StateMachine
+from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 from dtsa_agent.crazyflie.trajectories import Trajectory, why_not
-from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, to_map, velocity_world, yaw_of
+from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, to_map, yaw_of
 
-# A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
-# landing and before holding a place the vehicle is first braked by streamed setpoints of zero velocity.
-SLOW_MPS = 0.25
-BRAKE_LIMIT_S = 1.5
 HOLD_S = 0.5  # s, duration of the path to the place that is held
 MIN_LAND_S = 1.0
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
@@ -38,8 +32,6 @@ SINK_MPS = 0.3  # of a vehicle that does not know where it is
 SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
 LOW_M = 0.1  # this close to the floor there is nothing left to land from
-QUALITY_WINDOW_S = 1.0
-DOWN_M = 0.04  # m: it stands, by motion capture
 WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
 ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
 
@@ -68,41 +60,27 @@ class Vehicle:
         self.lock = threading.RLock()
         self.machine = StateMachine(self._changed)
         self.action = "not connected yet"  # the last action taken with it, and why
-        self.last: VehicleState | None = None
         self.refused = 0
         self.guarded = False  # the firmware's emergency watchdog is running
         self._log = log
         self._publish = on_state
-        self._log_times: deque[float] = deque(maxlen=200)
         self._command_time: float | None = None
-        self._streaming = False  # the firmware follows streamed commands, not the high-level commander
         self._moved = False  # something that makes it fly was sent since it was armed
-        self._held = False  # the stream of commands broke off and the place is being held
-        self._brake: tuple[float, Callable[[], None]] | None = None  # until when to brake, and what comes then
-        self._guard_until = 0.0  # a take-off or go-to is flown to its end before streamed commands count again
         self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
         self._blind: list[float] = []  # when to repeat a landing that may not have been heard
-        self._delivery = Delivery()
-        safety, positions = station.safety, station.positions
-        room: Room | None = (safety.geofence_min, safety.geofence_max) if safety.geofence else None
-        self.sightings = (
-            Sightings(self.name, positions, station.room_origin_in_world, room, log) if positions.on else None
-        )
-        self.watch = EstimateWatch(safety.estimate_jump_m, safety.estimate_freeze_s, safety.estimate_error_m)
-        self._blind_steering: tuple[Vector, float] | None = None  # velocity that needs no place, and until when (s)
-        self._trusted_height = 0.0  # m, the last one before the estimate was wrong
         self._paused = False  # held because it is not seen: streamed commands do not count until it is
-        settling = Settling(
-            robot.estimator_variance_m2,
-            station.room_origin_in_world,
-            room,
-            positions.agree_m if positions.on else None,
-        )
+        self._senses = Senses(robot, station, log)
         self.link = Link(
-            robot, cache, self._received, self._broken, self._answered, settling, lambda: self.seen_at(time.monotonic())
+            robot,
+            cache,
+            self._received,
+            self._broken,
+            self._answered,
+            self._senses.settling,
+            lambda: self._senses.seen_at(time.monotonic()),
         )
+        self._controls = Controls(self.link)
         self.onboard = Onboard(self.link)
-        self._trajectories: dict[int, Trajectory] = {}  # in its memory, by their numbers
 
     # -- what comes in ----------------------------------------------------------------------------------------------
     def _changed(self, before: State, state: State, reason: str) -> None:
@@ -114,14 +92,10 @@ class Vehicle:
 
     def _received(self, state: VehicleState, now: float) -> None:
         with self.lock:
-            self.last = state
-            self._log_times.append(now)
+            self._senses.note(state, now)
             if self.machine.state == State.LOST and time.monotonic() - now > FRESH_S:
                 return  # it delivers what it logged in the gap; what comes next is new
-            if not self.watch.wrong:
-                self._trusted_height = max(state.position[2], 0.0)
-            if self.watch.update(state, now, self.seen_at(now), flying=bool(state.info & IS_FLYING)):
-                self._log("error", f"{self.name}: {self.watch.wrong}")
+            self._senses.judge(state, now)
             if self.machine.state not in (State.DISCONNECTED, State.CONNECTING):
                 before = self.machine.state
                 self.machine.observe(state.info)
@@ -139,17 +113,18 @@ class Vehicle:
             return
         drifts = math.hypot(*state.velocity[:2]) > SLOW_MPS
         if state.position[2] < LOW_M and not state.info & HL_ACTIVE:
-            self._delivery.cancel()  # down, or about to be: with nothing to fly the end of the stream stops the motors
-            self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop())
-        elif drifts or not self._delivery.landing:
+            # Down, or about to be: with nothing to fly the end of the stream stops the motors.
+            self._controls.delivery.cancel()
+            self.link.order(end_of_stream)
+        elif drifts or not self._controls.delivery.landing:
             self._log("info", f"{self.name}: heard again: brakes and lands")
-            self._streaming = True
+            self._controls.streaming = True
             self._brake_then(self._sink)
 
     def _answered(self, code: int, result: int) -> None:
         self.onboard.answered(code, result)
         with self.lock:
-            problem = self._delivery.answered(code, result)
+            problem = self._controls.delivery.answered(code, result)
         if problem:
             self._log("warn", f"{self.name}: {problem}")
 
@@ -157,43 +132,25 @@ class Vehicle:
         with self.lock:
             self.machine.silent(reason)
 
-    # -- motion capture ---------------------------------------------------------------------------------------------
     def see(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> None:
         """A pose from motion capture: checked, and passed on to the Crazyflie.
 
         :param position: m, in `frame` (world or map). :param stamp: s, Unix time of the measurement; 0: not said.
         """
-        if self.sightings is None:
-            return
-        now = time.monotonic()
         with self.lock:
-            flying = self.last is not None and bool(self.last.info & IS_FLYING)
-            packet = self.sightings.see(position, orientation, frame, stamp, now, flying=flying)
+            packet = self._senses.see(position, orientation, frame, stamp)
         if packet is not None:
             self.link.mailbox.put_position(packet)
-
-    def seen_at(self, now: float) -> Vector | None:
-        """Where motion capture sees it (m, world); None: not at all, or not any more."""
-        return None if self.sightings is None else self.sightings.place(now)
-
-    def _misplaced(self) -> str:
-        """Why its motors may not start: it does not know where it stands. Empty if it does."""
-        if self.sightings is None or self.last is None:
-            return ""
-        problem = self.sightings.disagrees(self.last.position, time.monotonic())
-        return f"{self.name} {problem}" if problem else ""
 
     # -- connection -------------------------------------------------------------------------------------------------
     def connect(self, done: Callable[[], None]) -> None:
         """Connect in the background; `done` is called when it has worked out or not."""
         with self.lock:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
-            self._streaming = self._held = self._deaf = self._paused = self.guarded = False
-            self._blind_steering = None
+            self._deaf = self._paused = self.guarded = False
             self._command_time = None
             self._blind.clear()
-            self._delivery.cancel()
-            self._trajectories.clear()
+            self._controls.reset()
             self.onboard.forget()
 
         def finished(reason: str) -> None:
@@ -212,6 +169,11 @@ class Vehicle:
         self.link.connect(finished)
 
     @property
+    def last(self) -> VehicleState | None:
+        """What it has reported last; None: nothing yet."""
+        return self._senses.last
+
+    @property
     def state(self) -> State:
         """Where the state machine stands."""
         return self.machine.state
@@ -225,57 +187,32 @@ class Vehicle:
 
     def log_age(self, now: float) -> float:
         """Seconds since the last log packet; infinite before the first one."""
-        return now - self._log_times[-1] if self._log_times else math.inf
+        return self._senses.log_age(now)
 
     # -- orders -----------------------------------------------------------------------------------------------------
     def command(self, setpoint: Setpoint) -> bool:
         """Stream a command; False when it is not for the present state."""
         with self.lock:
-            if self.state not in ACCEPTS_COMMANDS or self._deaf or self._paused or setpoint.stamp < self._guard_until:
+            early = setpoint.stamp < self._controls.guard_until
+            if self.state not in ACCEPTS_COMMANDS or self._deaf or self._paused or early:
                 self.refused += 1
                 return False
             self._command_time = setpoint.stamp
             self._moved = True
-            self._delivery.cancel()  # the stream is in charge now
-            if self._held:
+            if self._controls.held:
                 self._log("info", f"{self.name}: commands again")
-            self._streaming, self._held, self._brake = True, False, None
-            self.link.mailbox.put_setpoint(setpoint)
+            self._controls.stream(setpoint)
             return True
 
     def _high_level(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
-        """An order to the high-level commander, and only then the end of the stream of setpoints.
-
-        The other way round the high-level commander would have nothing to fly for a moment, and would stop the motors.
-
-        :param kind: `TAKEOFF`, `LAND`, `GO_TO` or `TRAJECTORY`.
-        :param again: the order may be given more than once: it is, until the firmware has answered.
-        """
-        streaming, self._streaming, self._held = self._streaming, False, False
-        self._guard_until = time.monotonic() + duration
-        self._brake = None
-
-        def end(cf: Any) -> None:
-            cf.commander.send_notify_setpoint_stop()
-
-        def run(cf: Any) -> None:
-            action(cf)
-            if streaming:
-                end(cf)
-                if again:
-                    action(cf)
-
-        self.link.order(run)
-        self._delivery.cancel()
-        if again:
-            self._delivery.begin(kind, run, end if streaming else None, time.monotonic())
+        self._controls.fly(kind, action, duration, time.monotonic(), again=again)
 
     def arm(self, arm: bool) -> str:
         """Let the motors run, or lock them; why not, or an empty text."""
         with self.lock:
             if self.state not in (State.READY, State.ARMED):
                 return f"{self.name} is {self.standing}"
-            if arm and (problem := self._misplaced()):
+            if arm and (problem := self._senses.misplaced()):
                 return problem
             self.action = "arming" if arm else "disarming"
             self.machine.arm(arm)
@@ -298,9 +235,9 @@ class Vehicle:
                 return f"{self.name} is {self.standing}, not armed"
             if self.last is not None and self.last.battery < self.robot.battery.voltage_critical:
                 return f"{self.name}: battery {self.last.battery:.2f} V"
-            if problem := self.watch.wrong and f"{self.name}: {self.watch.wrong}":
+            if problem := self._senses.wrong and f"{self.name}: {self._senses.wrong}":
                 return problem
-            if self.state == State.ARMED and (problem := self._misplaced()):
+            if self.state == State.ARMED and (problem := self._senses.misplaced()):
                 return problem
             if not math.isfinite(height):
                 return f"{self.name}: height {height} m is not finite"
@@ -310,12 +247,13 @@ class Vehicle:
             z = 0.0 if self.last is None else max(self.last.position[2], 0.0)
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
-            self._deaf, self._moved, self._blind_steering = False, True, None
+            self._deaf, self._moved = False, True
+            self._controls.see_again()
             on_ground = self.state == State.ARMED
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
             if on_ground or self.last is None:
-                self._streaming = True  # the zero setpoint that closed the link before may still be in force
+                self._controls.streaming = True  # the zero setpoint that closed the link before may still be in force
                 self._high_level(
                     TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration
                 )
@@ -351,26 +289,19 @@ class Vehicle:
 
     def upload_trajectory(self, trajectory: Trajectory) -> str:
         """Write a trajectory to its memory, on the ground; waits; why not, or an empty text."""
-        with self.lock:
-            if self.state not in (State.READY, State.ARMED):  # in the air it might be flying what is there
-                return f"{self.name} is {self.standing}: trajectories are uploaded on the ground"
-            for number in [n for n, other in self._trajectories.items() if other.overlaps(trajectory)]:
-                del self._trajectories[number]
-            self._trajectories.pop(trajectory.number, None)
-        if problem := self.onboard.upload(trajectory):
-            return f"{self.name}: trajectory {trajectory.number}: {problem}"
-        with self.lock:
-            self._trajectories[trajectory.number] = trajectory
-        return ""
+        if self.state not in (State.READY, State.ARMED):  # in the air it might be flying what is there
+            return f"{self.name} is {self.standing}: trajectories are uploaded on the ground"
+        problem = self.onboard.upload(trajectory)
+        return f"{self.name}: trajectory {trajectory.number}: {problem}" if problem else ""
 
     def trajectory_problem(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> str:
         """Why it must not start a trajectory; empty if it may."""
         with self.lock:
             if self.state != State.FLYING or self._deaf or self.last is None:
                 return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
-            if self.watch.wrong:
-                return f"{self.name}: {self.watch.wrong}"
-            trajectory = self._trajectories.get(number)
+            if self._senses.wrong:
+                return f"{self.name}: {self._senses.wrong}"
+            trajectory = self.onboard.trajectories.get(number)
             if trajectory is None:
                 return f"{self.name}: trajectory {number} was not uploaded"
             here = self.last.position
@@ -393,7 +324,7 @@ class Vehicle:
                 lambda cf: cf.high_level_commander.start_trajectory(
                     number, timescale, relative_position=relative, reversed=reverse
                 ),
-                timescale * self._trajectories[number].duration,
+                timescale * self.onboard.trajectories[number].duration,
                 again=False,  # it would begin once more
             )
             return ""
@@ -410,7 +341,7 @@ class Vehicle:
             if self.state != State.FLYING or self.last is None:
                 return
             self.action = f"hold: {reason}"
-            if self.watch.wrong:
+            if self._senses.wrong:
                 self._steer_blindly((0.0, 0.0, 0.0), math.inf)
                 return
             self._paused = until_seen
@@ -421,60 +352,25 @@ class Vehicle:
                 x, y, z = self.last.position
                 z, yaw = max(z, 0.1), yaw_of(self.last.orientation)
                 self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
-                self._held = stale
+                self._controls.held = stale
 
-            self._held = stale
+            self._controls.held = stale
             self._brake_then(stay)
 
     def _steer_blindly(self, velocity: Vector, until: float) -> None:
-        """Stream a velocity, whatever the estimate says, and nothing else.
-
-        :param velocity: m/s, world. :param until: s, monotonic: then the motors stop.
-        """
-        self._deaf, self._brake, self._blind_steering = True, None, (velocity, until)
-        self._held, self._streaming = False, True
-        self._delivery.cancel()
-        self.link.mailbox.put_setpoint(velocity_world(velocity, 0.0, time.monotonic()))
-
-    def _go_on_blindly(self, now: float) -> None:
-        """The next packet of a stream that needs no place; the motors stop once the vehicle must be down."""
-        assert self._blind_steering is not None
-        velocity, until = self._blind_steering
-        if self.state not in IN_AIR:
-            self._blind_steering = None
-            return
-        seen = self.seen_at(now)
-        if velocity[2] < 0.0 and (now > until or (seen is not None and seen[2] < DOWN_M)):
-            self._blind_steering, self._streaming = None, False
-            # With nothing to fly the end of the stream stops the motors.
-            self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop())
-        else:
-            self.link.mailbox.put_setpoint(velocity_world(velocity, 0.0, now))
+        self._deaf = True
+        self._controls.steer_blindly(velocity, until, time.monotonic())
 
     def _sink_blindly(self) -> None:
-        seen = self.seen_at(time.monotonic())
-        height = self._trusted_height if seen is None else seen[2]
-        self._steer_blindly((0.0, 0.0, -SINK_MPS), time.monotonic() + height / SINK_MPS + SINK_MORE_S)
+        now = time.monotonic()
+        self._steer_blindly((0.0, 0.0, -SINK_MPS), now + self._senses.sinking_height(now) / SINK_MPS + SINK_MORE_S)
 
     def _brake_then(self, action: Callable[[], None]) -> None:
         """Slow down, then do something."""
         if self.last is None or self.state not in (State.FLYING, State.LANDING):
             action()
         else:
-            self._delivery.cancel()
-            self._brake = (time.monotonic() + BRAKE_LIMIT_S, action)
-            self._slow_down(time.monotonic())
-
-    def _slow_down(self, now: float) -> None:
-        if self._brake is None or self.last is None:
-            return
-        end, action = self._brake
-        if math.hypot(*self.last.velocity) < SLOW_MPS or now > end:
-            self._brake = None
-            action()
-        else:
-            self._streaming = True
-            self.link.mailbox.put_setpoint(velocity_world((0.0, 0.0, 0.0), 0.0, now))
+            self._controls.brake_then(action, self._senses.speed, time.monotonic())
 
     def land(
         self, reason: str, height: float = 0.0, duration: float = 0.0, note: Callable[[str], None] | None = None
@@ -494,22 +390,19 @@ class Vehicle:
             if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
             self._deaf = True
-            sinks = self._blind_steering is not None and self._blind_steering[0][2] < 0.0
-            if self.state == State.LANDING and (not self.watch.wrong or sinks):
+            if self.state == State.LANDING and (not self._senses.wrong or self._controls.sinks_blindly):
                 return ""
             self.action = f"land: {reason}"
-            if self.watch.wrong:
+            if self._senses.wrong:
                 self.machine.land(self.action)
                 self._sink_blindly()
                 return ""
             # A blind landing must end a stream that the firmware may still follow.
-            self._streaming = self._streaming or self.state == State.LOST
+            self._controls.streaming |= self.state == State.LOST
             self.machine.land(f"land: {reason}")
             seconds, limit = self._landing_s(height, duration), self.station.max_speed_mps
             if 0.0 < duration < seconds:
-                longer = (
-                    f"{self.name}: landing takes {seconds:.2f} s: {too_short(duration, self._height() - height, limit)}"
-                )
+                longer = f"{self.name}: landing takes {seconds:.2f} s: {too_short(duration, self._senses.height - height, limit)}"
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)
@@ -520,13 +413,9 @@ class Vehicle:
         seconds = self._landing_s(height, duration)
         self._high_level(LAND, lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
 
-    def _height(self) -> float:
-        """Last known height above the floor, m."""
-        return self.last.position[2] if self.last is not None else 1.0
-
     def _landing_s(self, height: float, duration: float) -> float:
         """Duration (s) of a landing to a height (m) that was wanted to take `duration` (s; 0: as the station says)."""
-        way = abs(self._height() - height)
+        way = abs(self._senses.height - height)
         wanted = duration if duration > 0.0 else max(MIN_LAND_S, way / self.station.land_speed_mps)
         return max(wanted, shortest_s(way, self.station.max_speed_mps))
 
@@ -537,8 +426,7 @@ class Vehicle:
                 return
             self.action = f"emergency stop: {reason}"
             self._deaf = True
-            self._brake = self._blind_steering = None
-            self._delivery.cancel()
+            self._controls.stop()
 
             def run(cf: Any) -> None:
                 for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
@@ -555,8 +443,8 @@ class Vehicle:
             if self.state == State.FLYING:
                 self.hold("the stream of commands was declared over")  # tells the firmware, too
             else:
-                self._streaming = False
-                self._delivery.cancel()
+                self._controls.streaming = False
+                self._controls.delivery.cancel()
                 self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop(remain_ms))
             return ""
 
@@ -566,23 +454,23 @@ class Vehicle:
             was_in_air = self.state in IN_AIR
             self.machine.silent(reason)
             if not was_in_air:
-                self._delivery.cancel()  # a take-off that comes late takes nobody by surprise
-            elif self.link.connected and not self._delivery.landing:
+                self._controls.delivery.cancel()  # a take-off that comes late takes nobody by surprise
+            elif self.link.connected and not self._controls.delivery.landing:
                 self.land(reason)
                 self._blind = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
 
     def tick(self, now: float) -> None:
         """Called 50 times a second: goes on braking, and sends again what has not been answered."""
         with self.lock:
-            if self._paused and self.sightings is not None:
-                self._paused = self.sightings.tracker.age(now) > self.station.safety.position_age_s
-            if self._blind_steering is not None:
-                self._go_on_blindly(now)
-            elif self._brake is not None:
-                self._slow_down(now)
+            if self._paused and (unseen := self._senses.unseen_s(now)) is not None:
+                self._paused = unseen > self.station.safety.position_age_s
+            if self._controls.blind:
+                self._controls.go_on_blindly(self.state in IN_AIR, self._senses.seen_at(now), now)
+            elif self.last is not None:
+                self._controls.slow_down(self._senses.speed, now)
             if self.state not in (State.DISCONNECTED, State.CONNECTING):
                 self.link.order_log(now)
-            if self.state in WATCHED_OVER and (order := self._delivery.due(now)) is not None:
+            if self.state in WATCHED_OVER and (order := self._controls.delivery.due(now)) is not None:
                 self.link.order(order)
 
     def keep_alive(self, now: float, watchdog: bool) -> None:
@@ -590,7 +478,7 @@ class Vehicle:
         with self.lock:
             if self._blind and now >= self._blind[0]:
                 self._blind.pop(0)
-                self._streaming = True
+                self._controls.streaming = True
                 seconds = self._landing_s(0.0, BLIND_LAND_S)
                 self._high_level(LAND, lambda cf: cf.high_level_commander.land(0.0, seconds, yaw=None), math.inf)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
@@ -605,8 +493,8 @@ class Vehicle:
         with self.lock:
             last = self.last
             place = None if last is None else last.position
-            if self.watch.wrong:
-                place = self.seen_at(now)
+            if self._senses.wrong:
+                place = self._senses.seen_at(now)
             return Watched(
                 self.name,
                 self.state,
@@ -616,18 +504,19 @@ class Vehicle:
                 self.robot.battery.voltage_critical,
                 self.log_age(now),
                 now - self._command_time
-                if (self._streaming or self._held) and not self.watch.wrong and self._command_time is not None
+                if (self._controls.streaming or self._controls.held)
+                and not self._senses.wrong
+                and self._command_time is not None
                 else None,
-                None if self.sightings is None else self.sightings.tracker.age(now),
-                self.watch.wrong,
-                now - self.watch.since,
+                self._senses.unseen_s(now),
+                self._senses.wrong,
+                self._senses.wrong_s(now),
             )
 
     def snapshot(self, now: float) -> Snapshot:
         """Everything for the status."""
         with self.lock:
-            recent = sum(1 for t in self._log_times if now - t <= QUALITY_WINDOW_S)
-            quality = min(1.0, recent / (self.robot.log_rate_hz * QUALITY_WINDOW_S))
+            quality = self._senses.logged(now)
             if self.link.radio_quality is not None:
                 quality = min(quality, self.link.radio_quality)
             delays = sorted(self.link.latencies.copy())
@@ -648,5 +537,5 @@ class Vehicle:
                 self.link.mailbox.replaced,
                 delays[int(0.99 * (len(delays) - 1))] if delays else 0.0,
                 len(sends) / QUALITY_WINDOW_S,
-                None if self.sightings is None else self.sightings.tracker.numbers(now),
+                self._senses.sightings(now),
             )
