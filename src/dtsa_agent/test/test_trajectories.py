@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.crazyflie.config import StationSettings
-from dtsa_agent.crazyflie.trajectories import COMPRESSED, PLAIN, Piece, Trajectory, why_not
+from dtsa_agent.crazyflie.trajectories import COMPRESSED, PLAIN, Piece, Planned, Trajectory, meeting, why_not
 from dtsa_bench.fake_crazyflie.trajectories import Trajectory as Flown
 from dtsa_bench.fake_crazyflie.trajectories import TrajectoryMemory
 
@@ -88,3 +88,20 @@ def test_trajectories_that_leave_the_room_or_hurry_are_not_started() -> None:
     assert start(waves(40), 0.0) == ""
     for how in ({"timescale": 2.0}, {"reverse": True}):
         assert "forwards and at its own pace only" in start(waves(40), 0.0, **how)  # type: ignore[arg-type]
+
+
+def test_those_that_would_meet_are_named() -> None:
+    east, west = Trajectory(0, 0, (line(0.0, 1.0), line(1.0, 1.0))), Trajectory(0, 0, (line(0.0, -1.0),))
+
+    def plan(name: str, trajectory: Trajectory, x: float, y: float, timescale: float = 1.0) -> Planned:
+        return Planned(name, trajectory, (x, y, 1.0), timescale, False, True)
+
+    both = [plan("cf1", east, -0.5, 0.0), plan("cf2", west, 0.5, 0.05)]
+    assert meeting(both, {}, 0.2) == "cf1 and cf2 would come within 0.05 m after 1.0 s"
+    assert meeting(both, {}, 0.0) == meeting([both[0], plan("cf2", west, 0.5, 0.25)], {}, 0.2) == ""
+    assert meeting([plan("cf1", east, -0.5, 0.0, 2.0)], {"cf9": (0.25, 0.0, 1.0)}, 0.2).startswith("cf1 and cf9 ")
+    assert meeting([plan("cf1", east, -0.5, 0.0)], {"cf9": (0.75, 0.0, 1.0)}, 0.2) == ""
+    back = Planned("cf1", east, (0.0, 0.0, 1.0), 1.0, True, False)
+    assert back.places(np.array([0.0, 2.0, 3.0, 9.0]))[:, 0] == pytest.approx([1.0, 1.0, 0.5, 0.0])
+    bent = Planned("cf1", Trajectory(0, 0, waves(40, step=0.2)), (0.0, 0.0, 0.0), 1.0, False, True)
+    assert np.abs(np.diff(bent.places(np.linspace(0.0, 36.0, 3601)), axis=0)).max() < 0.03

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ DEGREE = COEFFICIENTS - 1
 MM, DECIDEGREES = 1000.0, 1800.0 / math.pi  # a metre and a radian in control points
 FULL = 3  # kind of a coordinate with seven control points after the first; 0: none, it stays
 SAMPLES = 100  # of each piece
+EVERY_S, MOST_TIMES = 0.05, 5000  # of several that are compared
 STEP_M = 0.5  # the firmware flies a step between two pieces as fast as it can: a larger one is refused
 START_M = 0.5  # farther from where the vehicle is no trajectory begins
 
@@ -191,6 +192,56 @@ def why_not(
     for corner in (*flat.argmin(axis=0), *flat.argmax(axis=0)):
         if problem := outside_fence(_vector(flat[corner]), station):
             return f"trajectory {trajectory.number}: {problem}"
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A trajectory that a vehicle is about to fly. Parameters as for `why_not`."""
+
+    name: str  # the vehicle's
+    trajectory: Trajectory
+    here: Vector
+    timescale: float
+    reverse: bool
+    relative: bool
+
+    @property
+    def duration(self) -> float:
+        """How long it takes, s."""
+        return self.trajectory.duration * self.timescale
+
+    def places(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 3) m, world: where it leads at times (s) since its beginning; after its end: its end."""
+        pieces = self.trajectory.flown()
+        ends = np.cumsum([piece.duration for piece in pieces])
+        t = np.clip(times / self.timescale, 0.0, ends[-1])
+        t = ends[-1] - t if self.reverse else t
+        index = np.minimum(np.searchsorted(ends, t), len(pieces) - 1)
+        since = (t - np.concatenate([[0.0], ends[:-1]])[index])[:, None]
+        coefficients = np.array([(piece.x, piece.y, piece.z) for piece in pieces])[index]
+        places = np.zeros((len(times), 3))
+        for power in range(COEFFICIENTS - 1, -1, -1):
+            places = places * since + coefficients[:, :, power]
+        return places + (np.asarray(self.here) - places[0]) if self.relative else places
+
+
+def meeting(planned: Sequence[Planned], hovering: Mapping[str, Vector], least_m: float) -> str:
+    """Who would come too close to whom if all started now; empty: nobody.
+
+    :param planned: what is flown. :param hovering: m, world: where others hover, by name.
+    :param least_m: m, smallest distance.
+    """
+    longest = max((plan.duration for plan in planned), default=0.0)
+    times = np.linspace(0.0, longest, min(MOST_TIMES, max(2, round(longest / EVERY_S))))
+    names = [*(plan.name for plan in planned), *hovering]
+    ways = [plan.places(times) for plan in planned] + [np.tile(place, (len(times), 1)) for place in hovering.values()]
+    for a in range(len(planned)):
+        for b in range(a + 1, len(ways)):
+            gaps = np.linalg.norm(ways[a] - ways[b], axis=1)
+            if gaps.min() < least_m:
+                when = float(times[gaps.argmin()])
+                return f"{names[a]} and {names[b]} would come within {gaps.min():.2f} m after {when:.1f} s"
     return ""
 
 

@@ -20,7 +20,7 @@ from dtsa_agent.crazyflie.safety import Watched
 from dtsa_agent.crazyflie.senses import QUALITY_WINDOW_S, Senses
 from dtsa_agent.crazyflie.snapshot import Snapshot
 from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
-from dtsa_agent.crazyflie.trajectories import Trajectory, why_not
+from dtsa_agent.crazyflie.trajectories import Planned, Trajectory, why_not
 from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, to_map, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
@@ -308,6 +308,14 @@ class Vehicle:
             problem = why_not(trajectory, here, self.station, timescale, reverse=reverse, relative=relative)
             return f"{self.name}: {problem}" if problem else ""
 
+    def planned(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> Planned | None:
+        """Where a trajectory would lead it; None: it has none of that number, or does not know where it is."""
+        with self.lock:
+            trajectory = self.onboard.trajectories.get(number)
+            if trajectory is None or self.last is None:
+                return None
+            return Planned(self.name, trajectory, self.last.position, timescale, reverse, relative)
+
     def start_trajectory(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> str:
         """Fly a trajectory of its memory, then hold its end; why not, or an empty text.
 
@@ -402,7 +410,8 @@ class Vehicle:
             self.machine.land(f"land: {reason}")
             seconds, limit = self._landing_s(height, duration), self.station.max_speed_mps
             if 0.0 < duration < seconds:
-                longer = f"{self.name}: landing takes {seconds:.2f} s: {too_short(duration, self._senses.height - height, limit)}"
+                way = self._senses.height - height
+                longer = f"{self.name}: landing takes {seconds:.2f} s: {too_short(duration, way, limit)}"
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)

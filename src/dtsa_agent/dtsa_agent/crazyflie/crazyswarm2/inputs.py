@@ -24,7 +24,8 @@ from dtsa_agent.crazyflie.crazyswarm2.interfaces import Interfaces
 from dtsa_agent.crazyflie.crazyswarm2.logs import Logs
 from dtsa_agent.crazyflie.crazyswarm2.parameters import FirmwareParameters
 from dtsa_agent.crazyflie.pump import CommandPump
-from dtsa_agent.crazyflie.trajectories import Piece, Trajectory
+from dtsa_agent.crazyflie.state_machine import State
+from dtsa_agent.crazyflie.trajectories import Piece, Trajectory, meeting
 from dtsa_agent.crazyflie.vehicle import Vehicle
 
 
@@ -124,9 +125,21 @@ class Crazyswarm2Inputs(Inputs):
         number, timescale, group = request.trajectory_id, request.timescale, request.group_mask
         how = {"reverse": request.reversed, "relative": request.relative}
         self._each(names, lambda v: v.trajectory_problem(number, timescale, **how), response, group)
+        if response.success and (problem := self._meeting(names, number, timescale, how, group)):
+            response.success, response.message = False, problem
         if response.success:
             self._each(names, lambda v: v.start_trajectory(number, timescale, **how), response, group)
         return response
+
+    def _meeting(self, names: list[str], number: int, timescale: float, how: dict[str, bool], group: int) -> str:
+        """Who would come too close to whom; empty: nobody."""
+        station = self._bridge.settings.station
+        flying = {n: v for n, v in self._bridge.vehicles.items() if v.state == State.FLYING and v.last is not None}
+        led = [name for name in names if name in flying and (not group or self._groups(name) & group)]
+        plans = [plan for name in led if (plan := flying[name].planned(number, timescale, **how)) is not None]
+        hovering = {n: v.last.position for n, v in flying.items() if n not in led and v.last is not None}
+        problem = meeting(plans, hovering, station.safety.min_distance_m)
+        return f"{problem} (station.safety.min_distance_m is {station.safety.min_distance_m:g})" if problem else ""
 
     def _upload(self, vehicle: Vehicle, request: Any, response: Any) -> Any:
         number, count = request.trajectory_id, len(request.pieces)
