@@ -138,6 +138,8 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
         data = settings(fleet, {"safety": {"link_age_s": 3.0}})
         for k, robot in enumerate(data["robots"].values()):
             robot["initial_position"] = [(1.2, -1.2)[k], 0.0, 0.0]
+        volts = {"frequency": 10, "vars": ["pm.vbat"]}
+        data["all"]["firmware_logging"] = {"enabled": True, "custom_topics": {"volts": volts}}
         config.write_text(yaml.safe_dump(data))
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), "--interfaces", "crazyswarm2"]
@@ -164,7 +166,8 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
             assert program.call(AddLogging, "/cf1/add_logging", topic_name="own", frequency=20, vars=names).success
             assert not program.call(AddLogging, "/cf1/add_logging", topic_name="x", frequency=20, vars=["a.b"]).success
             logged = program.listen(LogDataGeneric, "/cf1/own")
-            wait_for(lambda: len(logged) > 2)
+            volts_of_two = program.listen(LogDataGeneric, "/cf2/volts")
+            wait_for(lambda: len(logged) > 2 and len(volts_of_two) > 2)
             assert 3.0 < logged[-1].values[0] < 4.3
             # Nobody is armed: they arm themselves. Groups by the firmware's parameter.
             smooth = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]

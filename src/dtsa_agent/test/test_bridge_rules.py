@@ -22,7 +22,7 @@ from dtsa_agent.crazyflie import state_machine as sm
 from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.budget import check_budget, radio_loads, radio_of
 from dtsa_agent.crazyflie.claims import Claims
-from dtsa_agent.crazyflie.config import StationSettings, load_swarm, parse_swarm
+from dtsa_agent.crazyflie.config import LogTopic, StationSettings, load_swarm, parse_swarm
 from dtsa_agent.crazyflie.limits import check_stream, outside_fence
 from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.mailbox import Mailbox
@@ -52,6 +52,11 @@ def test_robot_beats_type_beats_all() -> None:
                 "log_rate_hz": 30,
                 "battery": {"voltage_critical": 3.1},
                 "firmware_params": {"stabilizer": {"estimator": 2}},
+                "firmware_logging": {
+                    "enabled": True,
+                    "default_topics": {"pose": {"frequency": 10}},
+                    "custom_topics": {"volts": {"frequency": 5, "vars": ["pm.vbat"]}},
+                },
             },
         }
     )
@@ -60,6 +65,8 @@ def test_robot_beats_type_beats_all() -> None:
     assert (second.command_rate_hz, second.log_rate_hz) == (20, 20)
     assert (second.battery.voltage_warning, second.battery.voltage_critical) == (3.6, 3.1)
     assert second.firmware_params == {"stabilizer.estimator": 2}
+    assert second.firmware_logging == {"volts": LogTopic("volts", 5.0, ("pm.vbat",))}
+    assert parse_swarm(settings.to_dict()) == settings
 
 
 @pytest.mark.parametrize(
@@ -427,6 +434,9 @@ TWELVE_WRONG_FILES = {
     "a list of robots": ("robots: [cf1, cf2]", "a mapping"),
     "a parameter that is no number": (
         "robots: {cf1: {uri: 'udp://h:1', firmware_params: {locSrv: {extPosStdDev: .nan}}}}", "extPosStdDev"
+    ),
+    "a log without a rate": (
+        "robots: {cf1: {uri: 'udp://h:1', firmware_logging: {custom_topics: {a: {vars: [pm.vbat]}}}}}", "a.frequency"
     ),
     "a fence without an end": (
         "robots: {cf1: {uri: 'udp://h:1'}}\nstation: {safety: {geofence_max: [1.5, .inf, 1]}}", "geofence_max"

@@ -30,10 +30,12 @@ from dtsa_agent.crazyflie.units import Vector
 NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*?(\d+)$")
 CHANNEL = re.compile(r"radio://[^/]+/(\d+)")
 PORT = re.compile(r"udp://.*:(\d+)$")
+VARIABLE = re.compile(r"^\w+\.\w+$")
 LAST_CHANNEL, LAST_PORT = 125, 65535
 SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
 # Keys that Crazyswarm2's files have and that mean nothing here: its files can be used as they are.
-IGNORED = frozenset({"motion_capture", "big_quad", "firmware_logging", "reference_frame", "broadcasts", "marker"})
+IGNORED = frozenset({"motion_capture", "big_quad", "reference_frame", "broadcasts", "marker"})
+LOGGING = ("enabled", "default_topics", "custom_topics")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,15 @@ class BatterySettings(Settings):
         if self.voltage_critical > self.voltage_warning:
             allowed = f"at most voltage_warning, {self.voltage_warning} V"
             raise ConfigError("voltage_critical", self.voltage_critical, allowed)
+
+
+@dataclass(frozen=True, slots=True)
+class LogTopic:
+    """Variables of the firmware that are published together."""
+
+    name: str
+    frequency: float  # Hz
+    variables: tuple[str, ...]  # group.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +107,12 @@ class RobotSettings(Settings):
     firmware_params: Mapping[str, float] = setting(
         {}, "parameters of the firmware, {group: {name: value}}, set after connecting", custom=True
     )
+    firmware_logging: Mapping[str, LogTopic] = setting(
+        {},
+        "topics with variables of the firmware, {custom_topics: {name: {frequency: Hz, vars: [group.name]}}}; "
+        "with Crazyswarm2's interfaces only",
+        custom=True,
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -103,6 +120,7 @@ class RobotSettings(Settings):
         radio_of(self.uri)
         _check_numbers(self.uri)
         object.__setattr__(self, "firmware_params", _params(self.firmware_params))
+        object.__setattr__(self, "firmware_logging", _log_topics(self.firmware_logging))
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as a swarm's YAML has them under the robot's name, which says the id as well."""
@@ -112,8 +130,14 @@ class RobotSettings(Settings):
         for name, value in self.firmware_params.items():
             group, _, parameter = name.partition(".")
             groups.setdefault(group, {})[parameter] = value
-        position = list(self.initial_position)
-        return {**result, "initial_position": position, "battery": self.battery.to_dict(), "firmware_params": groups}
+        topics = {t.name: {"frequency": t.frequency, "vars": list(t.variables)} for t in self.firmware_logging.values()}
+        return {
+            **result,
+            "initial_position": list(self.initial_position),
+            "battery": self.battery.to_dict(),
+            "firmware_params": groups,
+            "firmware_logging": {"custom_topics": topics},
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,4 +302,27 @@ def _params(groups: object) -> dict[str, float]:
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise ConfigError(f"firmware_params.{group}.{name}", value, "a number")
             result[f"{group}.{name}"] = value
+    return result
+
+
+def _log_topics(given: object) -> dict[str, LogTopic]:
+    """The topics in a robot's `firmware_logging`, by their names; its default topics are always there."""
+    logging = _mapping("firmware_logging", given)
+    if logging and all(isinstance(topic, LogTopic) for topic in logging.values()):
+        return logging
+    for key in logging:
+        if key not in LOGGING:
+            raise ConfigError(f"firmware_logging.{key}", logging[key], "one of " + ", ".join(LOGGING))
+    if logging.get("enabled", True) is False:
+        return {}
+    result = {}
+    for name, topic in _mapping("firmware_logging.custom_topics", logging.get("custom_topics")).items():
+        field = f"firmware_logging.custom_topics.{name}"
+        own = _mapping(field, topic)
+        frequency, variables = own.get("frequency"), own.get("vars")
+        if isinstance(frequency, bool) or not isinstance(frequency, (int, float)) or not 0.4 <= frequency <= 100:
+            raise ConfigError(f"{field}.frequency", frequency, "a rate from 0.4 to 100 Hz")
+        if not isinstance(variables, list) or not variables or not all(VARIABLE.match(str(v)) for v in variables):
+            raise ConfigError(f"{field}.vars", variables, "a list of variables, group.name")
+        result[str(name)] = LogTopic(str(name), float(frequency), tuple(map(str, variables)))
     return result

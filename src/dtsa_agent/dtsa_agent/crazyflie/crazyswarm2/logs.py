@@ -39,6 +39,9 @@ class Logs:
         for name, vehicle in self._bridge.vehicles.items():
             self._node.create_service(srv.AddLogging, f"{name}/add_logging", partial(self._add, vehicle))
             self._node.create_service(srv.RemoveLogging, f"{name}/remove_logging", partial(self._remove, vehicle))
+            for topic in vehicle.robot.firmware_logging.values():
+                if problem := self._begin(vehicle, topic.name, topic.frequency, list(topic.variables)):
+                    self._say("warn", f"{name}: firmware_logging: {problem}")
         if self._node.declare_parameter(STATISTICS, False).value:
             self._statistics = {
                 name: self._node.create_publisher(msg.ConnectionStatisticsArray, f"{name}/connection_statistics", 10)
@@ -53,9 +56,9 @@ class Logs:
         response.success = not problem
         return response
 
-    def _begin(self, vehicle: Vehicle, topic: str, rate: int, variables: list[str]) -> str:
-        if rate < 1:
-            return f"{rate} Hz"
+    def _begin(self, vehicle: Vehicle, topic: str, rate: float, variables: list[str]) -> str:
+        if not rate > 0.0:
+            return f"{topic}: {rate} Hz"
         path = f"{vehicle.name}/{topic}"
         new = path not in self._publishers  # it stays when the link ends
         if new:
