@@ -79,7 +79,7 @@ def wanted_interfaces(argv: Sequence[str]) -> str:
         value = probe.declare_parameter("interfaces", DTSA, INTERFACES_DESCRIPTOR).value
     finally:
         probe.destroy_node()
-    if value not in NODES:
+    if value not in tuple(NODES):
         raise ConfigError("interfaces", value, "one of " + ", ".join(NODES))
     return str(value)
 

@@ -92,9 +92,21 @@ class Onboard:
                 found[full] = Parameter(full, element.ctype, element.access == element.RO_ACCESS, value)
         return found
 
+    @property
+    def settable(self) -> bool:
+        """Whether parameters can be set now: it is connected, and its values are known."""
+        cf = self._link.crazyflie
+        return cf is not None and bool(cf.param.is_updated)
+
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter that exists to a value that it can have; does not wait."""
-        self._link.order(lambda cf: cf.param.set_value(name, value), background=True)
+
+        def send(cf: Any) -> None:
+            parameters = cf.param
+            if parameters.is_updated:  # else cflib would keep the worker waiting, and all orders with it
+                parameters.set_value(name, value)
+
+        self._link.order(send, background=True)
 
     # -- log blocks -------------------------------------------------------------------------------------------------
     def add_log(self, name: str, period_ms: int, variables: Sequence[str], callback: LogCallback) -> str:

@@ -57,8 +57,8 @@ class FirmwareParameters:
             for robot in self._owners(owner, name):
                 vehicle = self._bridge.vehicles[robot]
                 problem = self._known[robot][name].problem(given.value)
-                if owner != ALL and vehicle.link.crazyflie is None:
-                    problem = f"{robot} is not connected"
+                if owner != ALL and not vehicle.onboard.settable:
+                    problem = f"{robot} is not connected, or its parameters are being read"
                 if problem:
                     self._say("warn", f"parameter {given.name}: {problem}")
                     return SetParametersResult(successful=False, reason=problem)
@@ -76,7 +76,7 @@ class FirmwareParameters:
             if not found:
                 continue
             if owner == ALL:
-                robots = self._owners(owner, name)
+                robots = [r for r in self._owners(owner, name) if self._bridge.vehicles[r].onboard.settable]
                 self._node.set_parameters([RosParameter(f"{r}{PARAMS}{name}", value=given.value) for r in robots])
                 continue
             self._bridge.vehicles[owner].onboard.set_parameter(name, given.value)
