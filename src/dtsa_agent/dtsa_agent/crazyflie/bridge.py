@@ -13,6 +13,7 @@ from dtsa_agent.crazyflie.claims import Claims
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.emergency_radio import EmergencyRadio
 from dtsa_agent.crazyflie.link import require_cflib
+from dtsa_agent.crazyflie.reports import snapshot, watched
 from dtsa_agent.crazyflie.safety import Action, SafetyMonitor, Verdict
 from dtsa_agent.crazyflie.snapshot import Snapshot
 from dtsa_agent.crazyflie.state_machine import State
@@ -168,7 +169,7 @@ class Bridge:
             last = now
             vehicles = self.vehicles.values()
             age = None if self._heartbeat is None else now - self._heartbeat
-            for verdict in self.monitor.check(now, [v.watched(now) for v in vehicles], age):
+            for verdict in self.monitor.check(now, [watched(v, now) for v in vehicles], age):
                 self._act(verdict, now)
             for vehicle in vehicles:
                 vehicle.tick(now)
@@ -201,7 +202,7 @@ class Bridge:
     def snapshots(self) -> list[Snapshot]:
         """State of all."""
         now = time.monotonic()
-        return [v.snapshot(now) for v in self.vehicles.values()]
+        return [snapshot(v, now) for v in self.vehicles.values()]
 
     def in_air(self, now: float) -> list[str]:
         """Names of those whose link must not be closed now."""

@@ -6,6 +6,7 @@ all of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -37,6 +38,7 @@ class Controls:
         self.delivery = Delivery()
         self.streaming = False  # the firmware follows streamed commands, not the high-level commander
         self.held = False  # the stream of commands broke off and the place is being held
+        self._command_time = -math.inf  # s, of the last streamed command
         self.guard_until = 0.0  # s: a take-off or go-to is flown to its end before streamed commands count again
         self._brake: tuple[float, Callable[[], None]] | None = None  # until when to brake (s), and what comes then
         self._blind: tuple[Vector, float] | None = None  # velocity that needs no place, and until when (s)
@@ -44,6 +46,7 @@ class Controls:
     def reset(self) -> None:
         """A new connection."""
         self.streaming = self.held = False
+        self._command_time = -math.inf
         self._blind = None
         self.delivery.cancel()
 
@@ -52,14 +55,20 @@ class Controls:
         self._brake = self._blind = None
         self.delivery.cancel()
 
-    @property
-    def led_by_commands(self) -> bool:
-        """Whether streamed commands lead it, or did until they broke off."""
-        return self.streaming or self.held
+    def command_age(self, now: float) -> float:
+        """Seconds since the last streamed command; infinite before the first one."""
+        return now - self._command_time
+
+    def led_for(self, now: float) -> float | None:
+        """Seconds since the last of the streamed commands that lead it, or did until they broke off; None: none do."""
+        if not (self.streaming or self.held) or self._command_time == -math.inf:
+            return None
+        return now - self._command_time
 
     # -- streams and paths ------------------------------------------------------------------------------------------
     def stream(self, setpoint: Setpoint) -> None:
         """A streamed command: it is in charge now."""
+        self._command_time = setpoint.stamp
         self.delivery.cancel()
         self.streaming, self.held, self._brake = True, False, None
         self._link.mailbox.put_setpoint(setpoint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -104,7 +105,8 @@ class Onboard:
         def send(cf: Any) -> None:
             parameters = cf.param
             if parameters.is_updated:  # else cflib would keep the worker waiting, and all orders with it
-                parameters.set_value(name, value)
+                with contextlib.suppress(KeyError, AttributeError):  # the link has just ended
+                    parameters.set_value(name, value)
 
         self._link.order(send, background=True)
 

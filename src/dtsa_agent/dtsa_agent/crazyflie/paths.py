@@ -6,8 +6,11 @@ its path, and a landing stops the motors at the end of the path, wherever the ve
 
 from __future__ import annotations
 
+from dtsa_agent.crazyflie.config import StationSettings
+
 PEAK = 35 / 16  # largest over mean speed of such a polynomial, at its middle
 SHORTEST_S = 0.1  # of any path, however short
+MIN_LAND_S = 1.0
 
 
 def shortest_s(distance: float, limit: float) -> float:
@@ -28,3 +31,13 @@ def too_short(duration: float, distance: float, limit: float) -> str:
         f"duration {duration:.2f} s is too short for {abs(distance):.2f} m: "
         f"at least {needed:.2f} s (station.max_speed_mps is {limit:g})"
     )
+
+
+def landing_s(distance: float, wanted: float, station: StationSettings) -> float:
+    """Duration (s) of a landing.
+
+    :param distance: m, how far down.
+    :param wanted: s; 0: at the station's landing speed. One that is too short is made longer.
+    """
+    seconds = wanted if wanted > 0.0 else max(MIN_LAND_S, abs(distance) / station.land_speed_mps)
+    return max(seconds, shortest_s(distance, station.max_speed_mps))

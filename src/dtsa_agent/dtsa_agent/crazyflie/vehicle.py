@@ -15,16 +15,13 @@ from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, TRAJECTORY
 from dtsa_agent.crazyflie.limits import outside_fence
 from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.onboard import Onboard
-from dtsa_agent.crazyflie.paths import shortest_s, too_short
-from dtsa_agent.crazyflie.safety import Watched
-from dtsa_agent.crazyflie.senses import QUALITY_WINDOW_S, Senses
-from dtsa_agent.crazyflie.snapshot import Snapshot
+from dtsa_agent.crazyflie.paths import landing_s, too_short
+from dtsa_agent.crazyflie.senses import Senses
 from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 from dtsa_agent.crazyflie.trajectories import Planned, Trajectory, why_not
-from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, to_map, yaw_of
+from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
-MIN_LAND_S = 1.0
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
 BLIND_REPEATS = 3
 BLIND_LAND_S = 2.0
@@ -64,22 +61,21 @@ class Vehicle:
         self.guarded = False  # the firmware's emergency watchdog is running
         self._log = log
         self._publish = on_state
-        self._command_time: float | None = None
         self._moved = False  # something that makes it fly was sent since it was armed
         self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
         self._blind: list[float] = []  # when to repeat a landing that may not have been heard
         self._paused = False  # held because it is not seen: streamed commands do not count until it is
-        self._senses = Senses(robot, station, log)
+        self.senses = Senses(robot, station, log)
         self.link = Link(
             robot,
             cache,
             self._received,
             self._broken,
             self._answered,
-            self._senses.settling,
-            lambda: self._senses.seen_at(time.monotonic()),
+            self.senses.settling,
+            lambda: self.senses.seen_at(time.monotonic()),
         )
-        self._controls = Controls(self.link)
+        self.controls = Controls(self.link)
         self.onboard = Onboard(self.link)
 
     # -- what comes in ----------------------------------------------------------------------------------------------
@@ -92,10 +88,10 @@ class Vehicle:
 
     def _received(self, state: VehicleState, now: float) -> None:
         with self.lock:
-            self._senses.note(state, now)
+            self.senses.note(state, now)
             if self.machine.state == State.LOST and time.monotonic() - now > FRESH_S:
                 return  # it delivers what it logged in the gap; what comes next is new
-            self._senses.judge(state, now)
+            self.senses.judge(state, now)
             if self.machine.state not in (State.DISCONNECTED, State.CONNECTING):
                 before = self.machine.state
                 self.machine.observe(state.info)
@@ -114,17 +110,17 @@ class Vehicle:
         drifts = math.hypot(*state.velocity[:2]) > SLOW_MPS
         if state.position[2] < LOW_M and not state.info & HL_ACTIVE:
             # Down, or about to be: with nothing to fly the end of the stream stops the motors.
-            self._controls.delivery.cancel()
+            self.controls.delivery.cancel()
             self.link.order(end_of_stream)
-        elif drifts or not self._controls.delivery.landing:
+        elif drifts or not self.controls.delivery.landing:
             self._log("info", f"{self.name}: heard again: brakes and lands")
-            self._controls.streaming = True
+            self.controls.streaming = True
             self._brake_then(self._sink)
 
     def _answered(self, code: int, result: int) -> None:
         self.onboard.answered(code, result)
         with self.lock:
-            problem = self._controls.delivery.answered(code, result)
+            problem = self.controls.delivery.answered(code, result)
         if problem:
             self._log("warn", f"{self.name}: {problem}")
 
@@ -138,7 +134,7 @@ class Vehicle:
         :param position: m, in `frame` (world or map). :param stamp: s, Unix time of the measurement; 0: not said.
         """
         with self.lock:
-            packet = self._senses.see(position, orientation, frame, stamp)
+            packet = self.senses.see(position, orientation, frame, stamp)
         if packet is not None:
             self.link.mailbox.put_position(packet)
 
@@ -148,9 +144,8 @@ class Vehicle:
         with self.lock:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
             self._deaf = self._paused = self.guarded = False
-            self._command_time = None
             self._blind.clear()
-            self._controls.reset()
+            self.controls.reset()
             self.onboard.forget()
 
         def finished(reason: str) -> None:
@@ -171,7 +166,7 @@ class Vehicle:
     @property
     def last(self) -> VehicleState | None:
         """What it has reported last; None: nothing yet."""
-        return self._senses.last
+        return self.senses.last
 
     @property
     def state(self) -> State:
@@ -187,32 +182,31 @@ class Vehicle:
 
     def log_age(self, now: float) -> float:
         """Seconds since the last log packet; infinite before the first one."""
-        return self._senses.log_age(now)
+        return self.senses.log_age(now)
 
     # -- orders -----------------------------------------------------------------------------------------------------
     def command(self, setpoint: Setpoint) -> bool:
         """Stream a command; False when it is not for the present state."""
         with self.lock:
-            early = setpoint.stamp < self._controls.guard_until
+            early = setpoint.stamp < self.controls.guard_until
             if self.state not in ACCEPTS_COMMANDS or self._deaf or self._paused or early:
                 self.refused += 1
                 return False
-            self._command_time = setpoint.stamp
             self._moved = True
-            if self._controls.held:
+            if self.controls.held:
                 self._log("info", f"{self.name}: commands again")
-            self._controls.stream(setpoint)
+            self.controls.stream(setpoint)
             return True
 
     def _high_level(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
-        self._controls.fly(kind, action, duration, time.monotonic(), again=again)
+        self.controls.fly(kind, action, duration, time.monotonic(), again=again)
 
     def arm(self, arm: bool) -> str:
         """Let the motors run, or lock them; why not, or an empty text."""
         with self.lock:
             if self.state not in (State.READY, State.ARMED):
                 return f"{self.name} is {self.standing}"
-            if arm and (problem := self._senses.misplaced()):
+            if arm and (problem := self.senses.misplaced()):
                 return problem
             self.action = "arming" if arm else "disarming"
             self.machine.arm(arm)
@@ -235,9 +229,9 @@ class Vehicle:
                 return f"{self.name} is {self.standing}, not armed"
             if self.last is not None and self.last.battery < self.robot.battery.voltage_critical:
                 return f"{self.name}: battery {self.last.battery:.2f} V"
-            if problem := self._senses.wrong and f"{self.name}: {self._senses.wrong}":
+            if problem := self.senses.wrong and f"{self.name}: {self.senses.wrong}":
                 return problem
-            if self.state == State.ARMED and (problem := self._senses.misplaced()):
+            if self.state == State.ARMED and (problem := self.senses.misplaced()):
                 return problem
             if not math.isfinite(height):
                 return f"{self.name}: height {height} m is not finite"
@@ -248,12 +242,12 @@ class Vehicle:
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
             self._deaf, self._moved = False, True
-            self._controls.see_again()
+            self.controls.see_again()
             on_ground = self.state == State.ARMED
             self.machine.takeoff(f"take-off to {height:.2f} m")
             self.action = self.machine.reason
             if on_ground or self.last is None:
-                self._controls.streaming = True  # the zero setpoint that closed the link before may still be in force
+                self.controls.streaming = True  # the zero setpoint that closed the link before may still be in force
                 self._high_level(
                     TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration
                 )
@@ -299,8 +293,8 @@ class Vehicle:
         with self.lock:
             if self.state != State.FLYING or self._deaf or self.last is None:
                 return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
-            if self._senses.wrong:
-                return f"{self.name}: {self._senses.wrong}"
+            if self.senses.wrong:
+                return f"{self.name}: {self.senses.wrong}"
             trajectory = self.onboard.trajectories.get(number)
             if trajectory is None:
                 return f"{self.name}: trajectory {number} was not uploaded"
@@ -349,7 +343,7 @@ class Vehicle:
             if self.state != State.FLYING or self.last is None:
                 return
             self.action = f"hold: {reason}"
-            if self._senses.wrong:
+            if self.senses.wrong:
                 self._steer_blindly((0.0, 0.0, 0.0), math.inf)
                 return
             self._paused = until_seen
@@ -360,25 +354,25 @@ class Vehicle:
                 x, y, z = self.last.position
                 z, yaw = max(z, 0.1), yaw_of(self.last.orientation)
                 self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
-                self._controls.held = stale
+                self.controls.held = stale
 
-            self._controls.held = stale
+            self.controls.held = stale
             self._brake_then(stay)
 
     def _steer_blindly(self, velocity: Vector, until: float) -> None:
         self._deaf = True
-        self._controls.steer_blindly(velocity, until, time.monotonic())
+        self.controls.steer_blindly(velocity, until, time.monotonic())
 
     def _sink_blindly(self) -> None:
         now = time.monotonic()
-        self._steer_blindly((0.0, 0.0, -SINK_MPS), now + self._senses.sinking_height(now) / SINK_MPS + SINK_MORE_S)
+        self._steer_blindly((0.0, 0.0, -SINK_MPS), now + self.senses.sinking_height(now) / SINK_MPS + SINK_MORE_S)
 
     def _brake_then(self, action: Callable[[], None]) -> None:
         """Slow down, then do something."""
         if self.last is None or self.state not in (State.FLYING, State.LANDING):
             action()
         else:
-            self._controls.brake_then(action, self._senses.speed, time.monotonic())
+            self.controls.brake_then(action, self.senses.speed, time.monotonic())
 
     def land(
         self, reason: str, height: float = 0.0, duration: float = 0.0, note: Callable[[str], None] | None = None
@@ -398,20 +392,21 @@ class Vehicle:
             if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
             self._deaf = True
-            if self.state == State.LANDING and (not self._senses.wrong or self._controls.sinks_blindly):
+            if self.state == State.LANDING and (not self.senses.wrong or self.controls.sinks_blindly):
                 return ""
             self.action = f"land: {reason}"
-            if self._senses.wrong:
+            if self.senses.wrong:
                 self.machine.land(self.action)
                 self._sink_blindly()
                 return ""
             # A blind landing must end a stream that the firmware may still follow.
-            self._controls.streaming |= self.state == State.LOST
+            self.controls.streaming |= self.state == State.LOST
             self.machine.land(f"land: {reason}")
-            seconds, limit = self._landing_s(height, duration), self.station.max_speed_mps
+            way = self.senses.height - height
+            seconds = landing_s(way, duration, self.station)
             if 0.0 < duration < seconds:
-                way = self._senses.height - height
-                longer = f"{self.name}: landing takes {seconds:.2f} s: {too_short(duration, way, limit)}"
+                why = too_short(duration, way, self.station.max_speed_mps)
+                longer = f"{self.name}: landing takes {seconds:.2f} s: {why}"
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)
@@ -419,14 +414,8 @@ class Vehicle:
             return ""
 
     def _sink(self, height: float = 0.0, duration: float = 0.0) -> None:
-        seconds = self._landing_s(height, duration)
+        seconds = landing_s(self.senses.height - height, duration, self.station)
         self._high_level(LAND, lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
-
-    def _landing_s(self, height: float, duration: float) -> float:
-        """Duration (s) of a landing to a height (m) that was wanted to take `duration` (s; 0: as the station says)."""
-        way = abs(self._senses.height - height)
-        wanted = duration if duration > 0.0 else max(MIN_LAND_S, way / self.station.land_speed_mps)
-        return max(wanted, shortest_s(way, self.station.max_speed_mps))
 
     def stop(self, reason: str) -> None:
         """Emergency stop: motors off for good."""
@@ -435,7 +424,7 @@ class Vehicle:
                 return
             self.action = f"emergency stop: {reason}"
             self._deaf = True
-            self._controls.stop()
+            self.controls.stop()
 
             def run(cf: Any) -> None:
                 for _ in range(3):  # the packet is not acknowledged, and it latches: more of them do no harm
@@ -452,8 +441,8 @@ class Vehicle:
             if self.state == State.FLYING:
                 self.hold("the stream of commands was declared over")  # tells the firmware, too
             else:
-                self._controls.streaming = False
-                self._controls.delivery.cancel()
+                self.controls.streaming = False
+                self.controls.delivery.cancel()
                 self.link.order(lambda cf: cf.commander.send_notify_setpoint_stop(remain_ms))
             return ""
 
@@ -463,23 +452,23 @@ class Vehicle:
             was_in_air = self.state in IN_AIR
             self.machine.silent(reason)
             if not was_in_air:
-                self._controls.delivery.cancel()  # a take-off that comes late takes nobody by surprise
-            elif self.link.connected and not self._controls.delivery.landing:
+                self.controls.delivery.cancel()  # a take-off that comes late takes nobody by surprise
+            elif self.link.connected and not self.controls.delivery.landing:
                 self.land(reason)
                 self._blind = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
 
     def tick(self, now: float) -> None:
         """Called 50 times a second: goes on braking, and sends again what has not been answered."""
         with self.lock:
-            if self._paused and (unseen := self._senses.unseen_s(now)) is not None:
+            if self._paused and (unseen := self.senses.unseen_s(now)) is not None:
                 self._paused = unseen > self.station.safety.position_age_s
-            if self._controls.blind:
-                self._controls.go_on_blindly(self.state in IN_AIR, self._senses.seen_at(now), now)
+            if self.controls.blind:
+                self.controls.go_on_blindly(self.state in IN_AIR, self.senses.seen_at(now), now)
             elif self.last is not None:
-                self._controls.slow_down(self._senses.speed, now)
+                self.controls.slow_down(self.senses.speed, now)
             if self.state not in (State.DISCONNECTED, State.CONNECTING):
                 self.link.order_log(now)
-            if self.state in WATCHED_OVER and (order := self._controls.delivery.due(now)) is not None:
+            if self.state in WATCHED_OVER and (order := self.controls.delivery.due(now)) is not None:
                 self.link.order(order)
 
     def keep_alive(self, now: float, watchdog: bool) -> None:
@@ -487,64 +476,11 @@ class Vehicle:
         with self.lock:
             if self._blind and now >= self._blind[0]:
                 self._blind.pop(0)
-                self._controls.streaming = True
-                seconds = self._landing_s(0.0, BLIND_LAND_S)
+                self.controls.streaming = True
+                seconds = landing_s(self.senses.height, BLIND_LAND_S, self.station)
                 self._high_level(LAND, lambda cf: cf.high_level_commander.land(0.0, seconds, yaw=None), math.inf)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
             self.guarded |= watchdog and self.state in WATCHED_OVER
             self.link.guarded = self.guarded
             if self.guarded and self.state not in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY):
                 self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
-
-    # -- for those who watch ----------------------------------------------------------------------------------------
-    def watched(self, now: float) -> Watched:
-        """What the safety rules need."""
-        with self.lock:
-            last = self.last
-            place = None if last is None else last.position
-            if self._senses.wrong:
-                place = self._senses.seen_at(now)
-            return Watched(
-                self.name,
-                self.state,
-                None if place is None else to_map(place, self.station.room_origin_in_world),
-                math.inf if last is None else last.battery,
-                self.robot.battery.voltage_warning,
-                self.robot.battery.voltage_critical,
-                self.log_age(now),
-                now - self._command_time
-                if (self._controls.streaming or self._controls.held)
-                and not self._senses.wrong
-                and self._command_time is not None
-                else None,
-                self._senses.unseen_s(now),
-                self._senses.wrong,
-                self._senses.wrong_s(now),
-            )
-
-    def snapshot(self, now: float) -> Snapshot:
-        """Everything for the status."""
-        with self.lock:
-            quality = self._senses.logged(now)
-            if self.link.radio_quality is not None:
-                quality = min(quality, self.link.radio_quality)
-            delays = sorted(self.link.latencies.copy())
-            sends = [t for t in self.link.send_times.copy() if now - t <= QUALITY_WINDOW_S]
-            return Snapshot(
-                self.name,
-                self.robot.id,
-                self.state,
-                self.action,
-                self.last,
-                self.log_age(now),
-                math.inf if self._command_time is None else now - self._command_time,
-                quality,
-                self.link.rssi,
-                self.link.sent,
-                self.link.received,
-                self.refused,
-                self.link.mailbox.replaced,
-                delays[int(0.99 * (len(delays) - 1))] if delays else 0.0,
-                len(sends) / QUALITY_WINDOW_S,
-                self._senses.sightings(now),
-            )

@@ -1,0 +1,67 @@
+"""What is told of one vehicle: to the safety rules, and to those who watch."""
+
+from __future__ import annotations
+
+import math
+
+from dtsa_agent.crazyflie.safety import Watched
+from dtsa_agent.crazyflie.senses import QUALITY_WINDOW_S
+from dtsa_agent.crazyflie.snapshot import Snapshot
+from dtsa_agent.crazyflie.units import to_map
+from dtsa_agent.crazyflie.vehicle import Vehicle
+
+
+def watched(vehicle: Vehicle, now: float) -> Watched:
+    """What the safety rules need.
+
+    :param now: s, monotonic.
+    """
+    with vehicle.lock:
+        senses, battery, last = vehicle.senses, vehicle.robot.battery, vehicle.last
+        place = None if last is None else last.position
+        if senses.wrong:
+            place = senses.seen_at(now)
+        return Watched(
+            vehicle.name,
+            vehicle.state,
+            None if place is None else to_map(place, vehicle.station.room_origin_in_world),
+            math.inf if last is None else last.battery,
+            battery.voltage_warning,
+            battery.voltage_critical,
+            vehicle.log_age(now),
+            None if senses.wrong else vehicle.controls.led_for(now),
+            senses.unseen_s(now),
+            senses.wrong,
+            senses.wrong_s(now),
+        )
+
+
+def snapshot(vehicle: Vehicle, now: float) -> Snapshot:
+    """Everything for the status.
+
+    :param now: s, monotonic.
+    """
+    with vehicle.lock:
+        link, quality = vehicle.link, vehicle.senses.logged(now)
+        if link.radio_quality is not None:
+            quality = min(quality, link.radio_quality)
+        delays = sorted(link.latencies.copy())
+        sends = [t for t in link.send_times.copy() if now - t <= QUALITY_WINDOW_S]
+        return Snapshot(
+            vehicle.name,
+            vehicle.robot.id,
+            vehicle.state,
+            vehicle.action,
+            vehicle.last,
+            vehicle.log_age(now),
+            vehicle.controls.command_age(now),
+            quality,
+            link.rssi,
+            link.sent,
+            link.received,
+            vehicle.refused,
+            link.mailbox.replaced,
+            delays[int(0.99 * (len(delays) - 1))] if delays else 0.0,
+            len(sends) / QUALITY_WINDOW_S,
+            vehicle.senses.sightings(now),
+        )
