@@ -112,6 +112,7 @@ class RobotSettings(Settings):
         "topics with variables of the firmware, {custom_topics: {name: {frequency: Hz, vars: [group.name]}}}; "
         "with Crazyswarm2's interfaces only",
         custom=True,
+        kind="structure",
     )
 
     def __post_init__(self) -> None:
