@@ -12,7 +12,13 @@ setup(
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*"]),
     package_data={
-        NAME: ["py.typed", *(f"**/*.{suffix}" for suffix in ASSETS), "native/*.[chl]*", "new_plugin/files/*.in"],
+        NAME: [
+            "py.typed",
+            *(f"**/*.{suffix}" for suffix in ASSETS),
+            "native/*.[chl]*",
+            "**/*.LICENSE",
+            "new_plugin/files/*.in",
+        ],
         "dtsa": ["py.typed"],
     },
     data_files=[

@@ -11,6 +11,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--out runs/a", "twelve agents, a process each, as in the paper"),
         ("--out runs/b --agents 18 --policy lease --loss 0.1 --processes 2", "lost frames, two processes"),
         ("--out runs/c --mode realtime --policy lease --respawn 1", "clocks of their own; the dead come back"),
+        ("--out runs/e --mode realtime --policy lease --view --control", "in a browser, which may kill agents and jam"),
         ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
     ),
     "agent": (
@@ -40,6 +41,11 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "sniff": (("--interface eth0 --out runs/sniffed", "twelve agents; until Ctrl-C"),),
     "merge": (("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"), ("runs/cf* --json", "all of them, as JSON")),
     "recover": (("runs/a", "into runs/a/bag_recovered"),),
+    "view": (
+        ("runs/a", "a recorded run, played; one that is being recorded is followed"),
+        ("runs/a runs/b", "two side by side"),
+        ("--domain 7", "the swarm on a ROS domain"),
+    ),
     "report": (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side")),
     "export": (
         ("runs/a", "all tables as Parquet"),

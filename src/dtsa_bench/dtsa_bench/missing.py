@@ -10,7 +10,9 @@ _HOW = {
     **dict.fromkeys(("mcap", "rosbags", "pyarrow", "lz4", "zstandard", "pandas", "distributed"), "pip install {}"),
     "rclpy": "source an installation of ROS 2 Jazzy, or use tools/dtsa",
     "yaml": "apt install python3-yaml",
-    **dict.fromkeys(("numpy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
+    **dict.fromkeys(
+        ("numpy", "matplotlib", "rich", "joblib", "aiohttp"), "apt install python3-{0}, or pip install {0}"
+    ),
 }
 
 

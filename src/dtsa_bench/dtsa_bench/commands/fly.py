@@ -6,13 +6,20 @@ import argparse
 import json
 import re
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.settings import settings_of
 from dtsa_bench.commands.bridge import add_simulated_radio, use_simulated_radio
 from dtsa_bench.fly.options import FlightOptions
 from dtsa_bench.options import add_mode_options, add_options, add_run_options, given, run_config, whole_number
+
+if TYPE_CHECKING:
+    from dtsa_agent.ros.common.loop import Stop
+    from dtsa_bench.view.link import ViewLink
 
 INTERRUPTED = 130
 _LATER = ("respawn",)  # options of a flight that concern real time alone
@@ -39,6 +46,13 @@ def add_parser(subparsers: Any) -> None:
     group.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the flight [a free one]")
     group.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
     group.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    group.add_argument(
+        "--view", action="store_true", help="show the flight in a browser on this machine, see docs/view.md"
+    )
+    group.add_argument("--view-port", metavar="N", default=None, help="port of the page [a free one]")
+    group.add_argument(
+        "--control", action="store_true", help="the page may kill and start agents and change the channel"
+    )
     add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
     crazyflies = parser.add_argument_group("Crazyflies")
     crazyflies.add_argument(
@@ -109,21 +123,52 @@ def run(args: argparse.Namespace) -> int:
         late=late_agents(args.late),
         **given(args, FlightOptions, "flight"),
     )
-    with Stop() as stop:
-        flight = fly(config, directory, options, stop)
-    _tell(args, flight)
+    with Stop() as stop, viewed(args, stop) as view:
+        flight = fly(config, directory, options, stop, view=view)
+        interrupted = bool(stop)
+        _tell(args, flight)
     if flight.summary.get("warning"):
         print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
     cut_short = flight.summary.get("cut_short")
-    if args.picture and not stop and not cut_short and not args.json:
+    if args.picture and not interrupted and not cut_short and not args.json:
         print(f"picture: {directory / 'trajectories.png'}")
-    if stop:
+    if interrupted:
         print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
         return INTERRUPTED
     if cut_short:
         print(f"dtsa: the flight was cut short: {cut_short}", file=sys.stderr)
         return 1
     return 0
+
+
+@contextmanager
+def viewed(args: argparse.Namespace, stop: Stop) -> Iterator[ViewLink | None]:
+    """The server of a flight's page, where one is wanted; on a terminal the page stays until Ctrl-C.
+
+    :param args: the command line.
+    :param stop: set by signals.
+    """
+    from dtsa_agent.core.errors import ConfigError
+
+    if not args.view:
+        for name in ("view_port", "control"):
+            if getattr(args, name):
+                raise ConfigError(name, getattr(args, name), "only with --view")
+        yield None
+        return
+    port = 0 if args.view_port is None else whole_number(args.view_port, "view_port", 0, 65535)
+    from dtsa_bench.view.link import ViewLink
+
+    view = ViewLink(port, args.control)
+    try:
+        print(f"view: {view.url}", file=sys.stderr, flush=True)
+        yield view
+        if sys.stdin.isatty() and not stop:
+            print("the flight is over; the page stays until Ctrl-C", file=sys.stderr, flush=True)
+            while not stop and view.alive():
+                time.sleep(0.1)
+    finally:
+        view.close()
 
 
 def late_agents(text: str | None) -> dict[int, float]:
@@ -153,6 +198,9 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     for name, value in {"late": args.late, **given(args, FlightOptions, "flight")}.items():
         if value is not None and name != "answer_s":
             raise ConfigError(name, value, "only with --backend sim")
+    for name in ("view", "view_port", "control"):
+        if getattr(args, name):
+            raise ConfigError(name, getattr(args, name), "only with --backend sim; `dtsa view` shows a mission")
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     use_simulated_radio(args)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rclpy
@@ -43,6 +43,9 @@ from .options import FlightOptions
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import LateStart, RealtimeSupervisor, Supervisor
+
+if TYPE_CHECKING:
+    from dtsa_bench.view.link import ViewLink
 
 ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -130,6 +133,7 @@ def fly(
     started: Callable[[Children], None] | None = None,
     observers: Sequence[ChannelObserver] = (),
     progress: ProgressLine | None = None,
+    view: ViewLink | None = None,
 ) -> Flight:
     """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
 
@@ -141,6 +145,7 @@ def fly(
     :param started: is told the processes once they are started.
     :param observers: are told what happens on the channel, after all others.
     :param progress: shows how it goes; None: a line on standard error.
+    :param view: to the server of a page that shows it.
     :returns: its results, which are also in ``out``.
     :raises ConfigError: for options that are not usable; nothing has been started then.
     :raises DtsaError: when a node dies, hangs or sends garbage; the message names it.
@@ -170,7 +175,7 @@ def fly(
             except KeyboardInterrupt:
                 rmtree(directory / BAG, ignore_errors=True)  # there is nothing in it yet
                 raise
-            return _fly(flight, node, directory, children, progress, options, stop, late, observers)
+            return _fly(flight, node, directory, children, progress, options, stop, late, observers, view)
         finally:
             children.stop(hurry=bool(stop))
             context.try_shutdown()
@@ -186,16 +191,19 @@ def _fly(
     stop: Stop,
     late: Sequence[LateStart],
     observers: Sequence[ChannelObserver],
+    view: ViewLink | None,
 ) -> Flight:
     try:
         channel, measurement = flight.channel, flight.measurement
         shown = FlightProgress(progress, measurement, channel)
+        supervisor: Supervisor | RealtimeSupervisor = Supervisor(children)
         if isinstance(channel, RealtimeChannel):
-            again = options.respawn
-            channel.observe(RealtimeSupervisor(children, channel, measurement, progress.say, again, late))
-        else:
-            channel.observe(Supervisor(children))
-        channel.observe(shown, *observers)
+            supervisor = RealtimeSupervisor(children, channel, measurement, progress.say, options.respawn, late)
+        channel.observe(supervisor, shown, *observers)
+        if view is not None:
+            from .view_observer import show_flight  # what it needs is large, and few flights are watched
+
+            show_flight(view, flight, supervisor)
         limit_s = wall_limit_s(options.wall_timeout_s, flight.run_config.limits.timeout_s)
         ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
         failure: DtsaError | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from dtsa_agent.core import Scenario
+from dtsa_agent.core import AbstractSwarm, Scenario
 from dtsa_bench.metrics import FlightMetrics, metrics_tables
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim.model.verdict import Verdict
@@ -33,6 +33,11 @@ class FlightMeasurement(ChannelObserver, Referee):
         self._outcome = 0
         self._lengths: list[int] = []  # of the frames of the slot that is being flown
         self._compared = self._tables.digest, self._tables.chosen  # of the slot that is being flown
+
+    @property
+    def tables(self) -> AbstractSwarm:
+        """What each agent knows by what it has received: one table an agent."""
+        return self._tables
 
     @property
     def wall_time_s(self) -> float:

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.ros.common.dds import clean_shared_memory
 from dtsa_channel_sim.ros.answers import named
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
@@ -105,6 +107,36 @@ class RealtimeSupervisor(ChannelObserver):
         places = [value for agent in child.agents for value in self._channel.last_place(agent)]
         self._children.again(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
         self._say(f"{child.name} is started again")
+
+    def kill(self, agent: int) -> str:
+        """Kills the process of an agent, as a fault would; says what was done.
+
+        :param agent: its id.
+        :raises ConfigError: if it has none that runs.
+        """
+        child = self._child(agent)
+        if child is None or child.process.poll() is not None:
+            raise ConfigError("agent", f"cf{agent}", "one whose process runs")
+        child.process.kill()
+        return f"{child.name} is killed"
+
+    def start(self, agent: int) -> str:
+        """Starts the process of an agent that has ended; says what was done.
+
+        :param agent: its id.
+        :raises ConfigError: if it runs, or its policy lets nobody come late.
+        """
+        child = self._child(agent)
+        if child is None or child.process.poll() is None:
+            raise ConfigError("agent", f"cf{agent}", "one whose process has ended")
+        check_joinable(self._measurement.metrics.run.swarm.policy)
+        self._dead = [entry for entry in self._dead if entry[1] is not child]
+        self._measurement.metrics.awaited.update(child.agents)
+        self._start_again(child)
+        return f"{child.name} is started"
+
+    def _child(self, agent: int) -> Child | None:
+        return next((child for child in self._children.all if agent in child.agents), None)
 
     def agents_back(self, agents: list[int]) -> None:
         again = "" if self._new.issuperset(agents) else " again"

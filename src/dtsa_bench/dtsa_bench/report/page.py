@@ -18,14 +18,14 @@ from dtsa_bench.figures import palette
 from dtsa_bench.report.data import run_data
 
 MOST = 6  # runs that are readable side by side
-_PALETTE = {
+PALETTE = {
     "agents": palette.AGENT_COLOURS,
     "dashes": palette.DASHES,
     "shapes": palette.SHAPES,
     "hovering": palette.HOVERING,
     "series": palette.SERIES,
 }
-SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js", "page.js")
+SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js", "player.js", "page.js")
 
 
 _NOTE = "This report draws itself with JavaScript; please allow it for this file."
@@ -71,7 +71,7 @@ def render(runs: Sequence[dict[str, Any]]) -> str:
 
     :param runs: what `run_data` gave for each run.
     """
-    content = {"runs": list(runs), "palette": _PALETTE, "reasons": dict(REASON_TEXTS)}
+    content = {"runs": list(runs), "palette": PALETTE, "reasons": dict(REASON_TEXTS)}
     return whole_page("report", _title(runs), asset("style.css"), _BODY, content, "\n".join(map(asset, SCRIPTS)))
 
 

@@ -8,6 +8,23 @@ function bytes(text) {
   return out.buffer;
 }
 
+/* What a scene and a slot line read of a run: arrays, and how much of them is filled. A live run has the same fields. */
+class Recording {
+  constructor({scene, slots}) {
+    if (scene) {
+      this.scale = scene.scale; this.box = null; // the places tell
+      this.times = new Float32Array(bytes(scene.time)); this.places = new Int16Array(bytes(scene.position));
+      this.frames = this.times.length;
+    }
+    this.first = slots.first; this.count = slots.count;
+    this.slot = new Uint32Array(bytes(slots.slot)); this.sender = new Uint16Array(bytes(slots.sender));
+    this.outcome = new Uint8Array(bytes(slots.outcome)); this.reason = new Uint8Array(bytes(slots.reason));
+    this.received = new Uint8Array(bytes(slots.received));
+    this.sent = this.slot.length;
+  }
+}
+const recordingOf = run => run.record ??= new Recording(run);
+
 /* An element: el("div", {class: "a", onclick: f}, child, "text"). Text is never read as HTML. */
 function el(name, attributes, ...children) {
   const svg = ["svg", "g", "path", "line", "rect", "text", "polyline"].includes(name);
@@ -60,7 +77,7 @@ function heatColor(level) {
 }
 
 /* ---- time: one clock for all runs ---- */
-const DURATION = Math.max(0.001, ...RUNS.map(run => run.duration_s));
+let DURATION = Math.max(0.001, ...RUNS.map(run => run.duration_s)); // grows while a run is under way
 const clock = {
   time: 0, playing: false, speed: 1, listeners: [], turn: 0,
   set(time) { this.time = Math.min(DURATION, Math.max(0, time)); this.tell(); },
@@ -101,12 +118,16 @@ let beforePrint = null;
 addEventListener("beforeprint", () => { beforePrint = document.documentElement.dataset.theme; setTheme("light"); });
 addEventListener("afterprint", () => { if (beforePrint) setTheme(beforePrint); });
 
+const sharpness = {ratio: Math.max(2, devicePixelRatio || 1)}; // pixels drawn for one of the page
 function prepare(canvas, width, height) {
-  const ratio = Math.max(2, devicePixelRatio || 1);
-  canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio);
-  canvas.style.aspectRatio = `${width} / ${height}`;
+  const ratio = sharpness.ratio, across = Math.round(width * ratio), down = Math.round(height * ratio);
   const context = canvas.getContext("2d");
+  if (canvas.width !== across || canvas.height !== down) {
+    canvas.width = across; canvas.height = down;
+    canvas.style.aspectRatio = `${width} / ${height}`;
+  }
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
   return context;
 }
 

@@ -187,20 +187,6 @@ function configuration() {
 main.append(configuration());
 root.append(el("footer", {}, `Made from ${single ? "the bag" : "the bags"} ${RUNS.map(run => run.name).join(", ")}${RUNS[0].version ? `, recorded by version ${RUNS[0].version}` : ""}. Times count from the start of slot 0. Lengths in metres in the frame map: x and y level, z up.`));
 
-/* ---- player ---- */
-const slider = el("input", {type: "range", min: 0, max: DURATION, step: "any", value: 0, "aria-label": "time", oninput: () => clock.set(+slider.value)});
-const play = el("button", {class: "play", type: "button", "aria-label": "play or pause", onclick: () => clock.toggle()}, "▶");
-const speed = el("select", {"aria-label": "speed", onchange: () => { clock.speed = +speed.value; }}, ...[0.1, 0.25, 0.5, 1, 2, 5].map(value => el("option", {value, selected: value === 1 ? "" : null}, `${value}×`)));
-const output = el("output");
-document.body.append(el("div", {class: "player"}, el("div", {}, play, slider, output, speed)));
-clock.listen(time => { slider.value = time; output.textContent = `${num(time, 2)} of ${num(DURATION, 2, "s")}`; play.textContent = clock.playing ? "❚❚" : clock.over ? "↻" : "▶"; });
-addEventListener("keydown", event => {
-  if (event.target instanceof HTMLSelectElement || event.ctrlKey || event.metaKey || event.altKey) return;
-  const step = event.shiftKey ? RUNS[0].slot_s : DURATION / 50;
-  if (event.key === " ") { clock.toggle(); event.preventDefault(); }
-  else if (event.key === "ArrowRight") { clock.set(clock.time + step); event.preventDefault(); }
-  else if (event.key === "ArrowLeft") { clock.set(clock.time - step); event.preventDefault(); }
-});
 /* Something to see at once, and in print: the moment of the closest approach. */
 const start = RUNS[0].distances && RUNS[0].distances.pairs.length ? RUNS[0].distances.pairs[0].time : 0;
 clock.set(Number(new URLSearchParams(location.hash.slice(1)).get("t") ?? start) || 0);

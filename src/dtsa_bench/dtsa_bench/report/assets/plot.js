@@ -82,11 +82,11 @@ const legendLine = (color, dash) => el("svg", {width: 22, height: 6, "aria-hidde
 
 /* series: [{name, values, color, width, dash}], limits: [{name, value, color}], marks: crosses, [{time, value}] */
 function lineChart({time, series, limits = [], marks = [], unit, label, digits = 3, height = 250, high, suffix = "", scale}) {
-  const most = high ?? Math.max(1e-9, ...series.flatMap(one => one.values.filter(value => value !== null)),
+  const most = typeof high === "number" ? high : Math.max(1e-9, ...series.flatMap(one => one.values.filter(value => value !== null)),
     ...limits.map(limit => limit.value));
   scales.note(scale, most);
-  const chart = timePlot({
-    height, unit, label, low: 0, high: () => scales.of(scale, most) * 1.04,
+  const chart = timePlot({ // a run under way says by a function how high its values have come
+    height, unit, label, low: 0, high: () => (typeof high === "function" ? high() : scales.of(scale, most)) * 1.04,
     paint(group, x, y, box) {
       for (const limit of limits) {
         group.append(el("line", {class: "limit", x1: box.left, x2: box.right, y1: y(limit.value), y2: y(limit.value), stroke: theme.color(limit.color)}));

@@ -5,12 +5,8 @@ const TRAIL_S = 3;
 class Scene {
   constructor(run, shared) {
     const data = run.scene;
-    this.run = run; this.shared = shared; this.count = data.ids.length; this.ids = data.ids; this.scale = data.scale;
-    this.times = new Float32Array(bytes(data.time));
-    this.places = new Int16Array(bytes(data.position));
-    this.target = data.target;
-    this.slot = new Uint32Array(bytes(run.slots.slot)); this.sender = new Uint16Array(bytes(run.slots.sender));
-    this.outcome = new Uint8Array(bytes(run.slots.outcome));
+    this.run = run; this.shared = shared; this.record = recordingOf(run);
+    this.count = data.ids.length; this.ids = data.ids; this.target = data.target;
     this.bounds();
     this.canvas = el("canvas", {tabindex: "0", role: "img", "aria-label": "Flight in three dimensions; drag to turn, wheel to zoom"});
     this.label = el("span", {class: "clock"});
@@ -26,20 +22,27 @@ class Scene {
     });
     const views = [["3D", -0.9, 0.62], ["top", -Math.PI / 2, Math.PI / 2 - 1e-3], ["side", -Math.PI / 2, 0.04]].map(([name, yaw, pitch]) =>
       el("button", {type: "button", onclick: () => { shared.yaw = yaw; shared.pitch = pitch; shared.zoom = 1; shared.draw(); }}, name));
-    this.node = el("div", {class: "scene"}, el("div", {class: "bar"}, this.label, el("span", {class: "options"}, ...views), el("span", {class: "options"}, ...buttons)), this.canvas);
+    // Where a page draws bodies by WebGL, floor and ways lie below them, names and marks above.
+    this.layer = Scene.bodies ? Scene.bodies(this) : null;
+    this.back = this.layer ? el("canvas", {"aria-hidden": "true"}) : null;
+    const stage = this.layer ? el("div", {class: "stage"}, this.back, this.layer.canvas, this.canvas) : this.canvas;
+    this.node = el("div", {class: "scene"}, el("div", {class: "bar"}, this.label, el("span", {class: "options"}, ...views), el("span", {class: "options"}, ...buttons)), stage);
     this.steer();
     shared.scenes.push(this);
     onRedraw(this.node, width => {
       this.width = width; this.height = Math.round(Math.min(560, Math.max(300, width * 0.64)));
-      this.context = prepare(this.canvas, this.width, this.height); this.draw(clock.time);
+      this.context = prepare(this.canvas, this.width, this.height);
+      this.behind = this.layer ? prepare(this.back, this.width, this.height) : this.context;
+      if (this.layer) this.layer.resize(this.width, this.height);
+      this.draw(clock.time);
     });
     clock.listen(time => this.context && this.draw(time));
   }
 
   bounds() {
-    const low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9], n = this.count;
-    for (let i = 0; i < this.places.length; i++) {
-      const axis = Math.floor(i / n) % 3, value = this.places[i] * this.scale;
+    const [low, high] = this.record.box ?? [[1e9, 1e9, 1e9], [-1e9, -1e9, -1e9]], n = this.count, {places, scale, frames} = this.record;
+    for (let i = 0; i < 3 * n * frames; i++) {
+      const axis = Math.floor(i / n) % 3, value = places[i] * scale;
       if (value < low[axis]) low[axis] = value;
       if (value > high[axis]) high[axis] = value;
     }
@@ -86,6 +89,7 @@ class Scene {
     const up = [right[1] * forward[2] * -1, right[0] * forward[2], right[1] * forward[0] - right[0] * forward[1]].map(value => -value);
     const eye = this.middle.map((value, axis) => value - forward[axis] * away);
     const focal = Math.min(this.width, this.height * 1.5) * 1.2 * zoom;
+    this.eye = {eye, right, up, forward, focal};
     this.project = (px, py, pz) => {
       const dx = px - eye[0], dy = py - eye[1], dz = pz - eye[2];
       const depth = Math.max(0.05, dx * forward[0] + dy * forward[1] + dz * forward[2]);
@@ -96,12 +100,13 @@ class Scene {
 
   /* Positions at a time, straight between two recorded moments. */
   at(time, out) {
-    const times = this.times, n = this.count;
-    let low = 0, high = times.length - 1;
+    const {times, places, scale, frames} = this.record, n = this.count;
+    let low = 0, high = frames - 1;
+    if (high < 0) return 0;
     if (time >= times[high]) low = high; else while (high - low > 1) { const middle = (low + high) >> 1; if (times[middle] <= time) low = middle; else high = middle; }
-    const next = Math.min(low + 1, times.length - 1), gap = times[next] - times[low];
+    const next = Math.min(low + 1, frames - 1), gap = times[next] - times[low];
     const part = gap > 0 ? Math.min(1, Math.max(0, (time - times[low]) / gap)) : 0;
-    for (let i = 0; i < 3 * n; i++) out[i] = (this.places[3 * n * low + i] * (1 - part) + this.places[3 * n * next + i] * part) * this.scale;
+    for (let i = 0; i < 3 * n; i++) out[i] = (places[3 * n * low + i] * (1 - part) + places[3 * n * next + i] * part) * scale;
     return low;
   }
 
@@ -127,17 +132,17 @@ class Scene {
   }
 
   drawTrails(c, time, row) {
-    const n = this.count, times = this.times, point = (frame, agent) => {
+    const n = this.count, {times, places, scale, frames} = this.record, point = (frame, agent) => {
       const base = 3 * n * frame + agent;
-      return this.project(this.places[base] * this.scale, this.places[base + n] * this.scale, this.places[base + 2 * n] * this.scale);
+      return this.project(places[base] * scale, places[base + n] * scale, places[base + 2 * n] * scale);
     };
     c.lineJoin = "round"; c.lineCap = "butt";
     for (let agent = 0; agent < n; agent++) {
       if (!this.moves(agent)) continue;
       if (this.shared.paths) {
-        const stride = Math.max(1, Math.floor(times.length / 220));
+        const stride = Math.max(1, Math.floor(frames / 220));
         c.beginPath();
-        for (let frame = 0; frame < times.length; frame += stride) { const p = point(frame, agent); frame ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1]); }
+        for (let frame = 0; frame < frames; frame += stride) { const p = point(frame, agent); frame ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1]); }
         c.setLineDash(this.dash(agent)); c.strokeStyle = this.color(agent); c.globalAlpha = n > 30 ? 0.2 : 0.38; c.lineWidth = 1; c.stroke(); c.setLineDash([]);
       }
       let first = row;
@@ -154,25 +159,25 @@ class Scene {
     c.globalAlpha = 1;
   }
 
-  moves(agent) { return this.run.moving[this.ids[agent] - 1] !== false; }
+  moves(agent) { return this.run.moving[this.ids[agent] - 1] !== false && !this.run.lost?.has(this.ids[agent]); }
   color(agent) { return agentColor(this.ids[agent], this.moves(agent)); }
   dash(agent) { return PALETTE.dashes[agentTurn(this.ids[agent])].map(length => 2 * length); }
 
   /* Who sent lately: 1 now, falling to 0 within a few slots; negative for frames that collided. */
   senders(time) {
-    const glow = new Map(), slots = this.run.slot_s, current = Math.floor(time / slots + 1e-6), fade = Math.max(1, Math.ceil(0.12 / slots));
-    let low = 0, high = this.slot.length;
-    while (low < high) { const middle = (low + high) >> 1; if (this.slot[middle] <= current) low = middle + 1; else high = middle; }
-    for (let i = low - 1; i >= 0 && this.slot[i] > current - fade; i--) {
-      const level = 1 - (current - this.slot[i]) / fade;
-      if (!glow.has(this.sender[i])) glow.set(this.sender[i], this.outcome[i] === 2 ? -level : level);
+    const glow = new Map(), record = this.record, slots = this.run.slot_s, current = Math.floor(time / slots + 1e-6), fade = Math.max(1, Math.ceil(0.12 / slots));
+    let low = 0, high = record.sent;
+    while (low < high) { const middle = (low + high) >> 1; if (record.slot[middle] <= current) low = middle + 1; else high = middle; }
+    for (let i = low - 1; i >= 0 && record.slot[i] > current - fade; i--) {
+      const level = 1 - (current - record.slot[i]) / fade;
+      if (!glow.has(record.sender[i])) glow.set(record.sender[i], record.outcome[i] === 2 ? -level : level);
     }
     return glow;
   }
 
   draw(time) {
-    const c = this.context, n = this.count;
-    c.clearRect(0, 0, this.width, this.height);
+    const front = this.context, c = this.behind, n = this.count;
+    front.clearRect(0, 0, this.width, this.height); c.clearRect(0, 0, this.width, this.height);
     this.now ??= new Float64Array(3 * n);
     const row = this.at(time, this.now), now = this.now;
     this.camera(); this.drawFloor(c); this.drawTrails(c, time, row);
@@ -193,11 +198,14 @@ class Scene {
     }
     c.globalAlpha = 1;
     order.sort((a, b) => b[0][2] - a[0][2]);
-    for (const [p, agent] of order) this.drawAgent(c, p, agent, radius * p[3], glow.get(this.ids[agent]) || 0);
-    if (this.shared.names) for (const [p, agent] of order) this.drawName(c, p, agent, radius * p[3]);
-    this.run.crashes.forEach((crash, index) => this.drawCrash(c, crash, time, radius, index));
+    const ghosts = this.run.ghosts ? this.run.ghosts(time) : null;
+    if (this.layer) this.layer.draw(radius, ghosts);
+    if (ghosts) this.drawGhosts(front, ghosts, radius);
+    for (const [p, agent] of order) this.drawAgent(front, p, agent, radius * p[3], glow.get(this.ids[agent]) || 0);
+    if (this.shared.names) for (const [p, agent] of order) this.drawName(front, p, agent, radius * p[3]);
+    this.run.crashes.forEach((crash, index) => this.drawCrash(front, crash, time, radius, index));
     const slot = Math.floor(time / this.run.slot_s + 1e-6);
-    this.label.textContent = this.run.slots.count ? `slot ${whole(Math.min(slot, this.run.slots.first + this.run.slots.count - 1))}` : "";
+    this.label.textContent = this.record.count ? `slot ${whole(Math.min(slot, this.record.first + this.record.count - 1))}` : "";
   }
 
   drawAgent(c, p, agent, size, level) {
@@ -206,10 +214,26 @@ class Scene {
       c.globalAlpha = Math.abs(level); c.lineWidth = level > 0 ? 2.2 : 3.2; c.setLineDash(level > 0 ? [] : [3, 3]);
       c.beginPath(); c.arc(p[0], p[1], size * (1.35 + 0.9 * (1 - Math.abs(level))), 0, 7); c.stroke(); c.globalAlpha = 1; c.setLineDash([]);
     }
+    if (this.layer) return; // it has drawn the body
     const color = this.color(agent), shade = c.createRadialGradient(p[0] - size * 0.35, p[1] - size * 0.4, size * 0.1, p[0], p[1], size);
     shade.addColorStop(0, mixed(color, "#ffffff", 0.45)); shade.addColorStop(0.55, color); shade.addColorStop(1, mixed(color, "#000000", 0.22));
     c.fillStyle = shade; this.outline(c, p, size, this.moves(agent) ? agentTurn(this.ids[agent]) : 0); c.fill();
     c.strokeStyle = theme.dark ? "#0b0f14" : mixed(color, "#000000", 0.45); c.lineWidth = 0.8; c.stroke();
+  }
+
+  /* What a chosen agent believes: where it takes the others to be, joined to where they are, with the age in slots. */
+  drawGhosts(c, ghosts, radius) {
+    const n = this.count, now = this.now;
+    c.font = `11px ${theme.color("sans")}`; c.textAlign = "left"; c.textBaseline = "top"; c.lineWidth = 1.2;
+    for (let agent = 0; agent < n; agent++) {
+      if (!ghosts.known(agent)) continue;
+      const p = this.project(ghosts.place[agent], ghosts.place[agent + n], ghosts.place[agent + 2 * n]), q = this.project(now[agent], now[agent + n], now[agent + 2 * n]);
+      const size = radius * p[3] * 0.9;
+      c.strokeStyle = this.color(agent); c.globalAlpha = 0.9; c.setLineDash([3, 2.5]);
+      c.beginPath(); c.moveTo(q[0], q[1]); c.lineTo(p[0], p[1]); c.stroke();
+      c.beginPath(); c.arc(p[0], p[1], size, 0, 7); c.stroke(); c.setLineDash([]);
+      c.globalAlpha = 1; c.fillStyle = theme.color("soft"); c.fillText(whole(ghosts.age[agent]), p[0] + size * 0.75, p[1] + size * 0.6);
+    }
   }
 
   /* Agents whose colours come again have another shape. */

@@ -4,11 +4,7 @@ const WINDOW = 120, LEFT = 52, RIGHT = 14;
 
 class SlotLine {
   constructor(run, shared) {
-    const slots = run.slots;
-    this.run = run; this.shared = shared; this.first = slots.first; this.count = slots.count;
-    this.slot = new Uint32Array(bytes(slots.slot)); this.sender = new Uint16Array(bytes(slots.sender));
-    this.outcome = new Uint8Array(bytes(slots.outcome)); this.reason = new Uint8Array(bytes(slots.reason));
-    this.received = new Uint8Array(bytes(slots.received));
+    this.run = run; this.shared = shared; this.record = recordingOf(run);
     this.whole = el("canvas", {role: "img", "aria-label": "Who sent, over the whole run"});
     this.part = el("canvas", {role: "img", "aria-label": "Who sent, slot by slot"});
     this.node = el("div", {}, this.whole, this.part);
@@ -16,12 +12,12 @@ class SlotLine {
     onRedraw(this.node, width => { this.width = width; this.cache = null; this.draw(clock.time); });
     clock.listen(time => this.width && this.draw(time));
     shared.lines.push(this);
-    this.point(this.whole, () => [this.first, this.count]); this.point(this.part, () => [this.from, this.shown]);
+    this.point(this.whole, () => [this.record.first, this.record.count]); this.point(this.part, () => [this.from, this.shown]);
   }
 
   color(index) {
-    if (this.outcome[index] === 2) return theme.color("collision");
-    return this.shared.reasons && this.reason[index] < 255 ? reasonColor(this.run.decisions.names[this.reason[index]]) : theme.color("success");
+    if (this.record.outcome[index] === 2) return theme.color("collision");
+    return this.shared.reasons && this.record.reason[index] < 255 ? reasonColor(this.run.decisions.names[this.record.reason[index]]) : theme.color("success");
   }
 
   point(canvas, range) {
@@ -42,16 +38,16 @@ class SlotLine {
   }
 
   find(slot) { // index of the first frame in a slot or later
-    let low = 0, high = this.slot.length;
-    while (low < high) { const middle = (low + high) >> 1; if (this.slot[middle] < slot) low = middle + 1; else high = middle; }
+    let low = 0, high = this.record.sent;
+    while (low < high) { const middle = (low + high) >> 1; if (this.record.slot[middle] < slot) low = middle + 1; else high = middle; }
     return low;
   }
 
   describe(slot) {
     const rows = [`slot ${whole(slot)}, ${num(slot * this.run.slot_s, 3, "s")}`];
-    for (let i = this.find(slot); i < this.slot.length && this.slot[i] === slot; i++) {
-      const why = this.reason[i] < 255 ? this.run.decisions.names[this.reason[i]] : "";
-      rows.push(`agent ${this.sender[i]}: ${this.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.received[i] / 255, 0)}`);
+    for (let i = this.find(slot); i < this.record.sent && this.record.slot[i] === slot; i++) {
+      const why = this.record.reason[i] < 255 ? this.run.decisions.names[this.record.reason[i]] : "";
+      rows.push(`agent ${this.record.sender[i]}: ${this.record.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.record.received[i] / 255, 0)}`);
       if (why) rows.push(`  ${why}${reasonText(why) ? ": " + reasonText(why) : ""}`);
     }
     if (rows.length === 1) rows.push("nobody sent");
@@ -59,9 +55,10 @@ class SlotLine {
   }
 
   draw(time) {
-    const current = Math.min(this.first + this.count - 1, Math.floor(time / this.run.slot_s + 1e-6));
-    this.shown = Math.min(this.count, WINDOW, Math.max(30, Math.floor((this.width - LEFT - RIGHT) / 5.5))); // fewer on a phone
-    this.from = Math.max(this.first, Math.min(this.first + this.count - this.shown, current - Math.floor(this.shown / 2)));
+    if (!this.record.count) return; // nothing has come yet
+    const current = Math.min(this.record.first + this.record.count - 1, Math.floor(time / this.run.slot_s + 1e-6));
+    this.shown = Math.min(this.record.count, WINDOW, Math.max(30, Math.floor((this.width - LEFT - RIGHT) / 5.5))); // fewer on a phone
+    this.from = Math.max(this.record.first, Math.min(this.record.first + this.record.count - this.shown, current - Math.floor(this.shown / 2)));
     this.drawWhole(current); this.drawPart(current);
   }
 
@@ -70,10 +67,10 @@ class SlotLine {
     if (!this.cache) {
       this.cache = document.createElement("canvas");
       const c = prepare(this.cache, this.width, height);
-      this.frame(c, this.first, this.count, this.row, height, "whole run");
+      this.frame(c, this.record.first, this.record.count, this.row, height, "whole run");
       this.context = prepare(this.whole, this.width, height);
     }
-    const c = this.context, x = slot => LEFT + (this.width - LEFT - RIGHT) * (slot - this.first) / this.count;
+    const c = this.context, x = slot => LEFT + (this.width - LEFT - RIGHT) * (slot - this.record.first) / this.record.count;
     c.clearRect(0, 0, this.width, height);
     c.drawImage(this.cache, 0, 0, this.width, height);
     c.fillStyle = theme.color("accent"); c.globalAlpha = 0.13; c.fillRect(x(this.from), 20, x(this.from + this.shown) - x(this.from), height - 40); c.globalAlpha = 1;
@@ -100,21 +97,21 @@ class SlotLine {
     c.fillStyle = theme.color("idle"); c.fillRect(LEFT, 19, inner, 4);
     const slim = Math.max(1, wide - (wide > 4 ? 1 : 0)), tall = Math.max(1.6, row - (row > 5 ? 1.2 : 0));
     for (let pass = 0; pass < 2; pass++) { // collisions last: a single one must not vanish under its neighbours
-      for (let i = this.find(first); i < this.slot.length && this.slot[i] < first + count; i++) {
-        if ((this.outcome[i] === 2) !== (pass === 1)) continue;
-        const x = LEFT + (this.slot[i] - first) * wide;
+      for (let i = this.find(first); i < this.record.sent && this.record.slot[i] < first + count; i++) {
+        if ((this.record.outcome[i] === 2) !== (pass === 1)) continue;
+        const x = LEFT + (this.record.slot[i] - first) * wide;
         c.fillStyle = this.color(i);
-        c.globalAlpha = this.outcome[i] === 2 ? 1 : 0.3 + 0.7 * this.received[i] / 255;
-        c.fillRect(x, top + (this.sender[i] - 1) * row, slim, tall);
-        if (this.outcome[i] === 2 && slim > 6) { // a cross: not by colour alone
-          const y = top + (this.sender[i] - 1) * row;
+        c.globalAlpha = this.record.outcome[i] === 2 ? 1 : 0.3 + 0.7 * this.record.received[i] / 255;
+        c.fillRect(x, top + (this.record.sender[i] - 1) * row, slim, tall);
+        if (this.record.outcome[i] === 2 && slim > 6) { // a cross: not by colour alone
+          const y = top + (this.record.sender[i] - 1) * row;
           c.strokeStyle = theme.color("card"); c.lineWidth = 0.9;
           c.beginPath(); c.moveTo(x + 1, y + 1); c.lineTo(x + slim - 1, y + tall - 1); c.moveTo(x + slim - 1, y + 1); c.lineTo(x + 1, y + tall - 1); c.stroke();
         }
         c.globalAlpha = 1;
-        if (this.outcome[i] === 2) { c.fillStyle = theme.color("collision"); c.fillRect(x, 15, slim, 8); } // taller: not by colour alone
+        if (this.record.outcome[i] === 2) { c.fillStyle = theme.color("collision"); c.fillRect(x, 15, slim, 8); } // taller: not by colour alone
         else { c.fillStyle = theme.color("success"); c.fillRect(x, 19, slim, 4); }
-        if (this.received[i] < 255 && this.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("ink"); c.fillRect(x, top + (this.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.received[i] / 255), Math.min(3, tall / 3)); }
+        if (this.record.received[i] < 255 && this.record.outcome[i] !== 2 && axis) { c.fillStyle = theme.color("ink"); c.fillRect(x, top + (this.record.sender[i] - 1) * row + tall - Math.min(3, tall / 3), slim * (1 - this.record.received[i] / 255), Math.min(3, tall / 3)); }
       }
     }
     c.fillStyle = theme.color("soft"); c.textAlign = "right"; c.textBaseline = "middle";

@@ -1,0 +1,141 @@
+"""`dtsa view`: a swarm in the browser."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from dtsa_bench.registry import RECORDED_RUN
+
+if TYPE_CHECKING:
+    from dtsa_bench.view.orders import Order
+    from dtsa_bench.view.server import ViewServer
+    from dtsa_bench.view.track import Track
+
+DESCRIPTION = """\
+Shows a swarm on a page that this machine alone can open: a recorded run to be played, one that is being
+recorded and followed while it grows, or without a bag the swarm on the ROS graph. The address that is printed
+holds a random token; whoever does not know it gets nothing."""
+_MOST = 2  # runs side by side
+
+
+class Source(Protocol):
+    """Tells a run moment by moment, in a thread of its own."""
+
+    stopped: bool
+
+    def run(self) -> None:
+        """Tells it until it is over, or ``stopped`` is set."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    parser = subparsers.add_parser(
+        "view",
+        help="a swarm in the browser",
+        description=DESCRIPTION,
+    )
+    parser.add_argument("bags", nargs="*", metavar="BAG", help=f"{RECORDED_RUN}; two are shown side by side")
+    parser.add_argument("--domain", metavar="N", default=None, help="without a bag: ROS_DOMAIN_ID of the swarm")
+    parser.add_argument(
+        "--namespace", metavar="NAME", default=None, help="without a bag: namespace of the swarm [/swarm]"
+    )
+    parser.add_argument(
+        "--control",
+        action="store_true",
+        help="without a bag: the page may change the channel, land all Crazyflies and stop their motors",
+    )
+    parser.add_argument("--port", metavar="N", default="0", help="where the page is [a free port]")
+    parser.add_argument(
+        "--listen", metavar="ADDRESS", default=None, help="an address of this machine that others reach [127.0.0.1]"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the page until a signal comes."""
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_bench.options import whole_number
+    from dtsa_bench.view.server import ViewServer, new_token
+    from dtsa_bench.view.track import Track
+
+    port = whole_number(args.port, "port", 0, 65535)
+    if len(args.bags) > _MOST:
+        raise ConfigError("bags", len(args.bags), f"at most {_MOST} side by side")
+    for name in ("domain", "namespace", "control"):
+        if args.bags and getattr(args, name):
+            raise ConfigError(name, getattr(args, name), "only without a bag")
+    if args.listen is not None and not _plain_address(args.listen):
+        raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
+    tracks: list[Track] = []
+    sources: list[Source] = []
+    order = None
+    if not args.bags:
+        tracks, sources, order = _graph(args)
+    for bag in args.bags:
+        from dtsa_bench.view.recording import BagSource
+
+        tracks.append(Track(_name(bag)))
+        sources.append(BagSource(bag, tracks[-1]))
+    threads = [threading.Thread(target=source.run, daemon=True) for source in sources]
+    try:
+        asyncio.run(_serve(ViewServer(tracks, new_token(), order), threads, port, args.listen))
+    finally:
+        for source in sources:
+            source.stopped = True
+        for thread in threads:
+            if thread.is_alive():
+                thread.join(3.0)
+    return 0
+
+
+def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callable[[Order], str] | None]:
+    from dtsa_agent.ros.common import names
+    from dtsa_bench.options import whole_number
+    from dtsa_bench.view.graph import GraphSource
+    from dtsa_bench.view.track import Track
+
+    domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
+    space = "/" + args.namespace.strip("/") if args.namespace else names.SWARM
+    track = Track(space)
+    source = GraphSource(track, domain, space, args.control)
+    return [track], [source], source.order if args.control else None
+
+
+def _name(bag: str) -> str:
+    from dtsa_bench.bag.place import find_file
+
+    path = find_file(bag).resolve()
+    inner = path.parent
+    return inner.parent.name if inner.name == "bag" else inner.name
+
+
+def _plain_address(text: str) -> bool:
+    from ipaddress import ip_address
+
+    try:
+        return not ip_address(text).is_unspecified
+    except ValueError:
+        return False
+
+
+async def _serve(server: ViewServer, threads: Sequence[threading.Thread], port: int, address: str | None) -> None:
+    """Serves until a signal comes."""
+    import signal
+
+    from dtsa_bench.view.server import LOOPBACK
+
+    url = await server.start(port, address or LOOPBACK)
+    over = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, over.set)
+    for thread in threads:
+        thread.start()
+    print(url, flush=True)
+    if sys.stderr.isatty():
+        print("open it in a browser; Ctrl-C ends", file=sys.stderr, flush=True)
+    await over.wait()
+    await server.stop()

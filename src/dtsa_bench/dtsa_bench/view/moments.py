@@ -1,0 +1,236 @@
+"""What a page shows of one moment of a run, thinned where it arises, and how it travels."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import REASONS, AbstractSwarm, Scenario
+from dtsa_bench.report.data import flatten, pack
+from dtsa_bench.run_config import RunConfig
+
+PLACES_HZ = 20.0  # positions in a simulated second
+MOST_FRAMES = 4000  # frames told in one moment: of more than these the last
+MOST_PLACES = 400  # likewise positions
+MOST_EVENTS = 100  # likewise events
+BELIEFS = 100  # agents: of larger swarms it is not told what each believes about each
+UNKNOWN = 65535  # an age that is not known
+_AGE_STEPS = 10  # mean ages are told in tenths of slots
+_MM = 1000.0  # believed positions are told in mm
+_FARTHEST = 32767
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One moment of a run."""
+
+    slot: int  # slots flown; positions are those at the start of this one
+    text: str  # what the page takes in, a JSON object
+    heard: bytes  # (N, N) uint16, slots since each observer heard each agent; empty: not told
+    believed: bytes  # (N, 3, N) int16 mm, frame map, where each observer takes each agent to be; empty: not told
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What one observer believes at one moment."""
+
+    heard: bytes  # (N,) uint16
+    believed: bytes  # (3, N) int16
+
+
+def run_info(name: str, run: RunConfig, scenario: Scenario) -> dict[str, Any]:
+    """What a page has to know of a run before its first moment, as JSON types.
+
+    :param name: what the page calls it.
+    :param run: its settings.
+    :param scenario: its scenario.
+    """
+    both = np.concatenate([scenario.start, scenario.target], axis=1)
+    swarm = run.swarm
+    return {
+        "name": name,
+        "agents": swarm.agents,
+        "moving": scenario.moving.tolist(),
+        "slot_s": swarm.slot_ns / 1e9,
+        "mode": run.mode,
+        "policy": swarm.policy,
+        "estimator": swarm.estimator,
+        "avoider": swarm.avoider,
+        "target": np.round(scenario.target, 3).T.tolist(),
+        "box": [np.round(both.min(axis=1), 3).tolist(), np.round(both.max(axis=1), 3).tolist()],
+        "collision_m": run.limits.collision_m,
+        "reasons": list(REASONS),
+        "config": flatten(run.to_dict()),
+    }
+
+
+class Moments:
+    """Collects what happens in a run, and tells it moment by moment; all that it holds is bounded.
+
+    :param scenario: the run's scenario.
+    :param slot_ns: ns, length of a slot.
+    """
+
+    def __init__(self, scenario: Scenario, slot_ns: int) -> None:
+        self.agents = scenario.start.shape[1]
+        self.place_slots = max(1, round(1e9 / PLACES_HZ / slot_ns))  # slots from one position to the next
+        self._moving = scenario.moving
+        self._own = np.eye(self.agents, dtype=bool)
+        self._frames: deque[tuple[int, int, int, int, int]] = deque(maxlen=MOST_FRAMES)
+        self._places: deque[tuple[int, bytes]] = deque(maxlen=MOST_PLACES)
+        self._events: deque[tuple[int, str, str]] = deque(maxlen=MOST_EVENTS)
+        self._crashes: deque[tuple[int, int, int, float]] = deque(maxlen=MOST_EVENTS)
+        self._compared = self._same = 0
+
+    def frames(
+        self, slot: int, outcome: int, senders: Sequence[int], reason: Any, received: NDArray[np.bool_] | None
+    ) -> None:
+        """Takes in what became of a slot.
+
+        :param slot: its number.
+        :param outcome: the channel's verdict, as in dtsa_msgs/Reception.
+        :param senders: ids of those that sent.
+        :param reason: (N,) why each agent decided as it did, index into ``REASONS``.
+        :param received: (F, N) who received each frame; None: all others.
+        """
+        for row, sender in enumerate(senders):
+            share = 255 if received is None else round(255 * int(received[row].sum()) / max(1, self.agents - 1))
+            self._frames.append((slot, sender, outcome, int(reason[sender - 1]), min(255, share)))
+
+    def choices(self, chosen: NDArray[Any]) -> None:
+        """Takes in whom the agents take for a slot's sender.
+
+        :param chosen: ids, of those that take part.
+        """
+        if len(chosen):
+            self._compared += 1
+            self._same += bool((chosen == chosen[0]).all())
+
+    def place(self, slot: int, position: Floats) -> None:
+        """Takes in where all agents are.
+
+        :param slot: the slot that starts.
+        :param position: (3, N) m, frame map.
+        """
+        self._places.append((slot, position.astype("<f4").tobytes()))
+
+    def event(self, slot: int, kind: str, text: str) -> None:
+        """Takes in something that people should read.
+
+        :param slot: when.
+        :param kind: a word for the page's style: note, lost, back, air, bad, end.
+        :param text: one line.
+        """
+        self._events.append((slot, kind, text))
+
+    def crash(self, slot: int, pair: tuple[int, int], distance_m: float) -> None:
+        """Takes in that two agents have crashed.
+
+        :param slot: the slot that starts.
+        :param pair: their ids.
+        :param distance_m: m, how close they came.
+        """
+        self._crashes.append((slot, *pair, round(distance_m, 4)))
+
+    def make(
+        self,
+        slot: int,
+        tables: AbstractSwarm | None,
+        chosen: NDArray[Any],
+        digest: NDArray[Any],
+        absent: Iterable[int] = (),
+        **more: Any,
+    ) -> Moment:
+        """All that has come in since the last moment, and what the agents know now.
+
+        :param slot: the slot that starts.
+        :param tables: one table an agent, with the estimates for this time; None: not known.
+        :param chosen: (N,) ids that the agents take for the sender.
+        :param digest: (N,) digests of their tables.
+        :param absent: ids of agents that have fallen silent.
+        :param more: further values for the page.
+        """
+        gone = sorted(absent)
+        rows = np.array(self._frames, dtype=np.int64).reshape(-1, 5)
+        kinds = zip(("slot", "sender", "outcome", "reason", "received"), ("<u4", "<u2", "u1", "u1", "u1"), strict=True)
+        here = np.ones(len(digest), dtype=bool)
+        here[[agent - 1 for agent in gone]] = False
+        content = {
+            "slot": slot,
+            "at": pack(np.array([at for at, _ in self._places], "<u4")),
+            "place": pack(np.frombuffer(b"".join(data for _, data in self._places), "<f4")),
+            "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(kinds)},
+            "agree": [self._compared, self._same],
+            "tables": len(np.unique(digest[here])),
+            "chosen": pack(chosen.astype("<u2")),
+            "age": pack(self._mean_ages(slot, tables)),
+            "absent": gone,
+            "events": list(self._events),
+            "crashes": list(self._crashes),
+            **more,
+        }
+        heard, believed = self._beliefs(slot, tables)
+        self._frames.clear()
+        self._places.clear()
+        self._events.clear()
+        self._crashes.clear()
+        self._compared = self._same = 0
+        return Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed)
+
+    def _mean_ages(self, slot: int, tables: AbstractSwarm | None) -> NDArray[np.uint16]:
+        """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
+        told = np.full(self.agents, UNKNOWN, np.uint16)
+        if tables is None:
+            return told
+        counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & self._moving
+        if len(counted) == self.agents:
+            counted &= ~self._own
+        observers = counted.sum(axis=0)
+        some = observers > 0
+        old = np.where(counted, slot - 1 - tables.sent_slot, 0).sum(axis=0)
+        told[some] = np.minimum(UNKNOWN - 1, np.rint(_AGE_STEPS * np.maximum(0, old[some]) / observers[some]))
+        return told
+
+    def _beliefs(self, slot: int, tables: AbstractSwarm | None) -> tuple[bytes, bytes]:
+        if tables is None or self.agents > BELIEFS or len(tables.sent_slot) != self.agents:
+            return b"", b""
+        age = np.clip(slot - 1 - tables.sent_slot, 0, UNKNOWN - 1).astype("<u2")
+        age[tables.sent_slot < 0] = UNKNOWN
+        place = np.clip(np.rint(np.nan_to_num(tables.estimate_position) * _MM), -_FARTHEST, _FARTHEST)
+        return age.tobytes(), place.astype("<i2").tobytes()
+
+
+def estimate_now(tables: AbstractSwarm, oracle: bool, slot: int, position: Floats) -> None:
+    """Fills the estimates of tables for the start of a slot.
+
+    :param tables: what the agents know.
+    :param oracle: whether their estimator is the truth.
+    :param slot: the slot.
+    :param position: (3, N) m, frame map: the truth.
+    """
+    if oracle:
+        tables.estimate_position[:] = position
+    else:
+        tables.estimate(slot)
+
+
+def belief(moment: Moment, observer: int, agents: int) -> Belief:
+    """What one observer believed at a moment; empty where that was not told.
+
+    :param moment: the moment.
+    :param observer: its id.
+    :param agents: number of agents N.
+    """
+    row = observer - 1
+    return Belief(
+        moment.heard[2 * agents * row : 2 * agents * (row + 1)],
+        moment.believed[6 * agents * row : 6 * agents * (row + 1)],
+    )

@@ -1,0 +1,457 @@
+"""The live view: what its sources tell, who may see it, that a browser draws it, and that it disturbs nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flight_helpers import flight_bag
+
+pytest.importorskip("aiohttp")
+
+import aiohttp
+from browser import CHROMIUM, Browser
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.bag.errors import UnusableBag
+from dtsa_bench.bag.run import load_run
+from dtsa_bench.cli import main
+from dtsa_bench.tables.ages import follow_run, observed
+from dtsa_bench.view.link import BEGIN, ViewLink, record
+from dtsa_bench.view.moments import UNKNOWN, Moment, belief
+from dtsa_bench.view.orders import Order, read_order
+from dtsa_bench.view.recording import BagSource
+from dtsa_bench.view.server import ViewServer
+from dtsa_bench.view.track import MOST_BYTES, MOST_MOMENTS, Track
+
+SLOTS, AGENTS = 150, 6
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight on a channel that loses frames."""
+    directory = tmp_path_factory.mktemp("view") / "lossy" / "bag"
+    flight_bag(directory, slots=SLOTS, loss=0.2, agents=AGENTS, moving=5, policy="tdma", seed=2)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def track(bag: Path) -> Track:
+    """All of it, as a page gets it."""
+    found = Track("lossy")
+    BagSource(bag, found).run()
+    return found
+
+
+def numbers(text: str, kind: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+def until(condition: Callable[[], Any], what: str = "nothing happened") -> Any:
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := condition()):
+        assert time.monotonic() < deadline, what
+        time.sleep(0.02)
+    return found
+
+
+# What a bag tells.
+
+
+def test_moments_tell_what_the_bag_holds(bag: Path, track: Track) -> None:
+    run = load_run(bag)
+    _, moments = track.since(0, MOST_MOMENTS)
+    told = [json.loads(moment.text) for moment in moments]
+    assert track.state == "recorded"
+    slots, senders, outcomes, received = (
+        np.concatenate([numbers(one["frames"][name], kind) for one in told])
+        for name, kind in (("slot", "<u4"), ("sender", "<u2"), ("outcome", "u1"), ("received", "u1"))
+    )
+    assert slots.tolist() == run.frames.slot.tolist()
+    assert senders.tolist() == run.frames.sender.tolist()
+    assert outcomes.tolist() == run.outcome[run.frames.slot].tolist()
+    assert np.abs(received / 255 - run.frames.received.sum(axis=1) / (AGENTS - 1)).max() < 0.01
+    for one in told:
+        places = numbers(one["place"], "<f4").reshape(-1, 3, AGENTS)
+        for slot, place in zip(numbers(one["at"], "<u4").tolist(), places, strict=True):
+            moment_ns = run.start_ns + slot * run.slot_ns
+            known = run.motion.position[np.abs(run.motion.time_ns - moment_ns).argmin()]
+            assert slot == 0 or np.abs(place - known).max() < 1e-5
+    assert told[-1]["slot"] == SLOTS
+
+
+def test_ages_and_beliefs_are_those_of_the_report(bag: Path, track: Track) -> None:
+    run = load_run(bag)
+    ages = follow_run(run).ages
+    assert ages is not None
+    by_slot = {one.slot: one for one in observed(run)}
+    _, moments = track.since(0, MOST_MOMENTS)
+    for moment in moments[3:]:
+        told = numbers(json.loads(moment.text)["age"], "<u2")
+        known = ages.age[moment.slot - 1]
+        assert (told == UNKNOWN).tolist() == np.isnan(known).tolist()
+        assert np.nanmax(np.abs(np.where(told == UNKNOWN, np.nan, told) / 10 - known)) <= 0.051
+        one = by_slot[moment.slot - 1]
+        for observer in (1, AGENTS):
+            heard = np.frombuffer(belief(moment, observer, AGENTS).heard, "<u2")
+            for agent, age in zip(one.agent[one.observer == observer], one.age[one.observer == observer], strict=True):
+                assert heard[agent - 1] == age
+
+
+def test_a_bag_is_followed_while_it_grows(bag: Path, tmp_path: Path) -> None:
+    data = next(bag.glob("*.mcap")).read_bytes()
+    growing = tmp_path / "run" / "bag"
+    growing.mkdir(parents=True)
+    file = growing / "bag_0.mcap"
+    file.write_bytes(data[: len(data) // 2])
+    found = Track("growing")
+    source = BagSource(tmp_path / "run", found)
+    thread = threading.Thread(target=source.run, daemon=True)
+    thread.start()
+    time.sleep(0.3)
+    assert thread.is_alive()
+    assert found.state in ("", "waiting: nobody writes this bag at the moment")
+    with file.open("ab") as stream:
+        stream.write(data[len(data) // 2 :])
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    _, moments = found.since(0, MOST_MOMENTS)
+    assert moments[-1].slot == SLOTS
+
+
+def test_what_is_no_bag_is_named_and_a_damaged_one_ends_in_words(bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    with pytest.raises(UnusableBag, match="is not an MCAP file"):
+        BagSource(tmp_path / "a.mcap", Track("a"))
+    data = bytearray(next(bag.glob("*.mcap")).read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    (tmp_path / "b.mcap").write_bytes(data)
+    found = Track("b")
+    BagSource(tmp_path / "b.mcap", found).run()
+    assert found.state
+
+
+def test_a_track_keeps_a_limited_number_of_moments() -> None:
+    found = Track("long")
+    found.begin({})
+    for slot in range(MOST_MOMENTS + 10):
+        found.add(Moment(slot, "{}", b"", b""))
+    first, moments = found.since(0, 5)
+    assert (first, moments[0].slot, len(moments)) == (10, 10, 5)
+    found.begin({})
+    for slot in range(5):
+        found.add(Moment(slot, "", b"", bytes(MOST_BYTES // 4)))
+    first, moments = found.since(0, 100)
+    assert len(moments) <= 4
+    assert moments[-1].slot == 4
+
+
+# Who may see it.
+
+
+@contextmanager
+def serving(server: ViewServer) -> Iterator[str]:
+    """A server in a thread of its own; gives the address of its page."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+    url = asyncio.run_coroutine_threadsafe(server.start(), loop).result(PATIENCE_S)
+    try:
+        yield url
+    finally:
+        asyncio.run_coroutine_threadsafe(server.stop(), loop).result(PATIENCE_S)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(PATIENCE_S)
+        loop.close()
+
+
+async def _statuses(url: str) -> dict[str, int]:
+    base, token = url.rstrip("/").rsplit("/", 1)
+    found = {}
+    async with aiohttp.ClientSession() as session:
+        for name, address, headers in (
+            ("page", url, {}),
+            ("script", url + "view.js", {}),
+            ("three", url + "three.module.js", {}),
+            ("own origin", url, {"Origin": base}),
+            ("nothing", base + "/", {}),
+            ("wrong token", f"{base}/{token[:-1]}x/", {}),
+            ("no token", f"{base}/stream", {}),
+            ("other file", url + "server.py", {}),
+            ("way up", url + "..%2fserver.py", {}),
+            ("foreign origin", url, {"Origin": "http://elsewhere.example"}),
+            ("foreign host", url, {"Host": "elsewhere.example"}),
+        ):
+            async with session.get(address, headers=headers) as answer:
+                found[name] = answer.status
+                assert "no-referrer" in answer.headers.get("Referrer-Policy", "")
+        async with session.ws_connect(url + "stream", headers={"Origin": base}) as stream:
+            found["stream"] = 101
+            assert (await stream.receive_json(timeout=PATIENCE_S))["kind"] == "begin"
+            await stream.send_str(json.dumps({"order": {"kind": "jam", "value": True}}))
+            while (told := await stream.receive_json(timeout=PATIENCE_S))["kind"] != "answer":
+                pass
+            assert told["text"].startswith("refused")
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await session.ws_connect(url + "stream", headers={"Origin": "null"})
+        found["foreign stream"] = refused.value.status
+    return found
+
+
+def test_only_who_knows_the_token_and_comes_from_here_gets_anything(track: Track) -> None:
+    with serving(ViewServer([track], "some-token")) as url:
+        assert url.startswith("http://127.0.0.1:")
+        found = asyncio.run(_statuses(url))
+    allowed = {name: status for name, status in found.items() if status < 400}
+    assert allowed == {"page": 200, "script": 200, "three": 200, "own origin": 200, "stream": 101}
+    assert {status for name, status in found.items() if name not in allowed} <= {403, 404}
+
+
+def test_a_page_that_does_not_read_costs_nothing_and_garbage_is_let_go() -> None:
+    """The server's memory stays where it is while moments go on; another page gets them all."""
+    found = Track("fast")
+    found.begin({"agents": 1})
+    big = Moment(0, json.dumps({"filler": "x" * 200_000}), b"", b"")
+
+    async def session(url: str) -> int:
+        sleeping = socket.create_connection(("127.0.0.1", int(url.split(":")[2].split("/")[0])))
+        path = "/" + url.split("/", 3)[3] + "stream"
+        host = url.split("/")[2]
+        head = f"GET {path} HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        key = "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        sleeping.sendall((head + key).encode())
+        got = 0
+        async with aiohttp.ClientSession() as client, client.ws_connect(url + "stream", max_msg_size=0) as stream:
+            for _ in range(40):
+                found.add(big)
+            while got < 40:
+                message = await stream.receive_json(timeout=PATIENCE_S)
+                got += len(message.get("moments", ()))
+            await stream.send_str("[" * 4000)
+            closed = await stream.receive(timeout=PATIENCE_S)
+            while closed.type not in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED):
+                closed = await stream.receive(timeout=PATIENCE_S)
+        sleeping.close()
+        return got
+
+    with serving(ViewServer([found], "some-token")) as url:
+        assert asyncio.run(session(url)) == 40
+
+
+NO_ORDERS = [
+    *(None, [], {}, {"kind": "reboot"}, {"kind": "kill"}, {"kind": "kill", "agent": True}),
+    *({"kind": "loss", "value": value} for value in (2, "1", True, float("nan"))),
+    *(
+        {"kind": "jam", "value": 1},
+        {"kind": "emergency"},
+        {"kind": "emergency", "value": True},
+        {"kind": "partition", "value": "1" * 5000},
+    ),
+]
+
+
+@pytest.mark.parametrize("content", NO_ORDERS)
+def test_orders_are_checked(content: Any) -> None:
+    with pytest.raises(ConfigError):
+        read_order(content)
+
+
+def test_usable_orders_are_read() -> None:
+    assert read_order({"kind": "kill", "agent": 3}) == Order("kill", 3)
+    assert read_order({"kind": "loss", "value": 1}) == Order("loss", value=1.0)
+    assert read_order({"kind": "partition", "value": ""}) == Order("partition", value="")
+
+
+def test_a_link_to_a_server_that_stands_still_never_waits() -> None:
+    """What it cannot take is dropped; that a process stands still is what SIGSTOP makes of it."""
+    link = ViewLink()
+    try:
+        assert link.offer(record(BEGIN, 0, "{}"))
+        os.kill(link.process_id, signal.SIGSTOP)
+        data = record(BEGIN, 0, json.dumps("x" * 100_000))
+        begin = time.monotonic()
+        taken = sum(link.offer(data) for _ in range(100))
+        assert time.monotonic() - begin < 1.0
+        assert taken < 50
+        assert link.dropped == 100 - taken
+        os.kill(link.process_id, signal.SIGKILL)
+        until(lambda: not link.alive())
+        until(lambda: (link.offer(data), link.gone)[1])
+    finally:
+        link.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["view", "nowhere"], "there is no such file"),
+        (["view", "a", "b", "c"], "bags: got 3"),
+        (["view", "--port", "99999"], "port: got"),
+        (["view", "--listen", "0.0.0.0"], "listen: got"),
+        (["fly", "--out", "x", "--control"], "control: got True; allowed: only with --view"),
+    ],
+)
+def test_unusable_settings_are_one_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert text in said
+    assert said.count("\n") == 1
+
+
+# In a browser.
+
+FIGURES = """(() => ({
+  heads: [...document.querySelectorAll("h2")].map(node => node.textContent),
+  values: [...document.querySelectorAll(".figure .value")].map(node => node.textContent),
+  rows: document.querySelectorAll("button.agent").length, charts: document.querySelectorAll("svg.plot").length,
+  webgl: Boolean(document.querySelector("canvas.bodies")), title: document.title,
+}))()"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_chromium_plays_a_bag_and_shows_what_an_agent_believes(track: Track, tmp_path: Path) -> None:
+    with serving(ViewServer([track], "some-token")) as url, Browser(tmp_path) as browser:
+        browser.open(url)
+        browser.wait_for("dtsa.views.length === 1 && dtsa.views[0].run.record.count >= 150")
+        browser.run("dtsa.clock.set(1.0); if (dtsa.clock.playing) dtsa.clock.toggle(); dtsa.clock.set(1.0)")
+        found = browser.run(FIGURES)
+        assert found["rows"] == AGENTS
+        assert found["charts"] == 3
+        assert {"Slots", "Agents", "Events", "Distances", "Age", "Channel use"} <= set(found["heads"])
+        assert "Control" not in found["heads"]
+        assert "lossy" in found["title"]
+        assert found["values"][3].endswith("m")
+        browser.run("document.querySelectorAll('button.agent')[1].click()")
+        browser.wait_for("dtsa.views[0].run.ghosts(1.0) !== null")
+        ages = browser.run("[...dtsa.views[0].run.ghosts(1.0).age]")
+        row = next(k for k, m in enumerate(track.since(0, 1000)[1]) if m.slot == 100)
+        assert ages == np.frombuffer(belief(track.since(row, 1)[1][0], 2, AGENTS).heard, "<u2").tolist()
+        before = browser.run("dtsa.clock.time")
+        browser.run("dtsa.clock.toggle()")
+        browser.wait_for(f"dtsa.clock.time > {before} + 0.1")
+        picture = browser.picture()
+        assert colours(picture, tmp_path) > 150
+        assert browser.complaints() == []
+
+
+def colours(picture: bytes, directory: Path) -> int:
+    """How many different colours a picture has."""
+    from matplotlib.image import imread
+
+    path = directory / "picture.png"
+    path.write_bytes(picture)
+    pixels = (imread(path)[:, :, :3] * 31).astype(np.uint8).reshape(-1, 3)
+    return len(np.unique(pixels, axis=0))
+
+
+@contextmanager
+def viewed_flight(out: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A flight with a page, and the address of that."""
+    command = [sys.executable, "-m", "dtsa_bench", "fly", "--out", str(out), "--view", *words]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL, text=True
+    )
+    assert process.stderr is not None
+    try:
+        line = process.stderr.readline()
+        assert line.startswith("view: http://127.0.0.1:"), line + process.stderr.read()
+        yield process, line.split()[1]
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            process.communicate(timeout=PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+
+
+def words_of(track: Track) -> str:
+    """All events of a track."""
+    return "\n".join(
+        event[2] for moment in track.since(0, MOST_MOMENTS)[1] for event in json.loads(moment.text)["events"]
+    )
+
+
+def environment(process: int) -> dict[str, str]:
+    text = Path(f"/proc/{process}/environ").read_text()
+    return dict(entry.partition("=")[::2] for entry in text.split("\0") if entry)
+
+
+@pytest.mark.ros
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path) -> None:
+    from fly_helpers import pid_of
+
+    from dtsa_bench.view.graph import GraphSource
+
+    words = ("--mode", "realtime", "--policy", "lease", "--agents", "3", "--slot-ms", "20", "--tail-s", "90")
+    with Browser(tmp_path) as browser, viewed_flight(tmp_path / "run", *words, "--control") as (process, url):
+        browser.open(url)
+        browser.wait_for("dtsa.views.length === 1 && dtsa.views[0].run.record.count > 20")
+        domain = int(environment(pid_of(process.pid, 2))["ROS_DOMAIN_ID"])
+        listener = Track("graph")
+        source = GraphSource(listener, domain, control=True)
+        listening = threading.Thread(target=source.run, daemon=True)
+        listening.start()
+        browser.run("document.querySelector('.orders select').value = '2'")
+        browser.run("document.querySelector('[data-order=kill]').click()")
+        browser.wait_for("dtsa.views[0].run.lost.has(2)")
+        browser.wait_for("[...document.querySelectorAll('.events li')].some(node => node.textContent.includes('cf2'))")
+        browser.run("document.querySelector('[data-order=jam]').click()")
+        browser.wait_for("dtsa.views[0].run.events.some(event => event.text.includes('jam is True'))")
+        browser.run("document.querySelector('[data-order=clear]').click()")
+        browser.run("document.querySelector('[data-order=start]').click()")
+        browser.wait_for("!dtsa.views[0].run.lost.has(2)")
+        assert browser.complaints() == []
+        until(lambda: "cf2 takes part again" in words_of(listener))  # who listens on the graph sees the same
+        source.order(Order("loss", value=0.25))
+        until(lambda: "loss 0.25: done" in words_of(listener))
+        browser.wait_for("dtsa.views[0].run.events.some(event => event.text.includes('loss is 0.25'))")
+        source.stopped = True
+        listening.join(PATIENCE_S)
+        _, moments = listener.since(0, MOST_MOMENTS)
+        assert sum(len(numbers(json.loads(m.text)["frames"]["slot"], "<u4")) for m in moments) > 50
+        assert moments[-1].heard
+
+
+@pytest.mark.ros
+def test_a_lockstep_flight_tells_its_page_the_same_as_its_bag(tmp_path: Path) -> None:
+    """Read without a browser, to the end of the flight."""
+
+    async def moments(url: str) -> list[dict[str, Any]]:
+        got: list[dict[str, Any]] = []
+        async with aiohttp.ClientSession() as client, client.ws_connect(url + "stream", max_msg_size=0) as stream:
+            async for message in stream:
+                content = json.loads(message.data)
+                got += content.get("moments", ())
+                if content["kind"] == "state" and content["text"]:
+                    break
+        return got
+
+    with viewed_flight(tmp_path / "run", "--agents", "4", "--processes", "1", "--no-picture") as (process, url):
+        told = asyncio.run(moments(url))
+        process.wait(PATIENCE_S)
+    run = load_run(tmp_path / "run")
+    senders = np.concatenate([numbers(one["frames"]["sender"], "<u2") for one in told])
+    slots = np.concatenate([numbers(one["frames"]["slot"], "<u4") for one in told])
+    known = run.frames.slot <= slots[-1]
+    assert slots.tolist() == run.frames.slot[known].tolist()
+    assert senders.tolist() == run.frames.sender[known].tolist()
+    assert told[-1]["slot"] >= len(run.slots) - 1
+    assert any("the run has ended: completed" in event[2] for one in told for event in one["events"])
