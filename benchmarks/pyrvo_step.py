@@ -30,7 +30,7 @@ import numpy as np
 import pyrvo
 from numpy.typing import NDArray
 
-from dtsa_agent.core import SwarmConfig, _kernel, make_scenario
+from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.flight_models import FLIGHT_MODELS
 
 Array = NDArray[np.float64]
@@ -47,6 +47,17 @@ SETTINGS: dict[str, tuple[float, int, float]] = {
 }
 
 
+def knowing_swarm(agents: int, seed: int) -> Swarm:
+    """A swarm that knows everything; one control instant a slot.
+
+    :param agents: N.
+    :param seed: seed of the scenario.
+    """
+    config = SwarmConfig(agents=agents, avoider="orca", estimator="oracle", seed=seed)
+    assert config.slot_s / config.steps == STEP_S
+    return Swarm(config, shared_table=True)
+
+
 def flight_states(agents: int, seed: int, every: int) -> tuple[list[State], Array]:
     """States of a whole flight with perfect knowledge, every so many control instants; and the goals.
 
@@ -54,21 +65,18 @@ def flight_states(agents: int, seed: int, every: int) -> tuple[list[State], Arra
     :param seed: seed of the scenario.
     :param every: keep one state in so many.
     """
-    scenario = make_scenario(SwarmConfig(agents=agents, avoider="orca", seed=seed))
-    position, goal = scenario.start.copy(), np.ascontiguousarray(scenario.target)
-    velocity, command = np.zeros_like(position), np.zeros_like(position)
-    values, params = MODEL.avoider.to_dict(), MODEL.avoider
+    swarm, params = knowing_swarm(agents, seed), MODEL.avoider
+    position, velocity, goal = swarm.position, swarm.velocity, swarm.goal
     states: list[State] = []
     for step in range(100_000):
         if step % every == 0:
             away = params.gain * (goal - position)
             speed = np.maximum(np.linalg.norm(away, axis=0), 1e-9)
             states.append((position.copy(), velocity.copy(), away * np.minimum(1.0, params.v_max / speed)))
-        _kernel.avoid_all(MODEL.kind, values, position, velocity, goal, position, velocity, None, command)
-        MODEL.vehicle.step(STEP_S, position, velocity, command)
+        swarm.fly(0)
         if np.all(np.linalg.norm(goal - position, axis=0) < 0.3):
             break
-    return states, goal
+    return states, goal.copy()
 
 
 def time_pyrvo(states: list[State], setting: str, repeats: int) -> float:
@@ -96,15 +104,15 @@ def time_pyrvo(states: list[State], setting: str, repeats: int) -> float:
 
 def time_ours(states: list[State], goal: Array, repeats: int) -> float:
     """The same of our avoider and vehicles, s."""
-    values, command = MODEL.avoider.to_dict(), np.zeros_like(goal)
+    swarm = knowing_swarm(goal.shape[1], 1)
+    swarm.goal[:] = goal
     times = []
     for position, velocity, _ in states:
         samples = []
         for _ in range(repeats):
-            p, v = position.copy(), velocity.copy()
+            swarm.position[:], swarm.velocity[:] = position, velocity
             began = time.perf_counter()
-            _kernel.avoid_all(MODEL.kind, values, p, v, goal, p, v, None, command)
-            MODEL.vehicle.step(STEP_S, p, v, command)
+            swarm.fly(0)
             samples.append(time.perf_counter() - began)
         times.append(statistics.median(samples))
     return statistics.fmean(times)

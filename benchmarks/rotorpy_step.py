@@ -20,7 +20,7 @@ import numpy as np
 from rotorpy.vehicles.crazyflie_params import quad_params
 from rotorpy.vehicles.multirotor import Multirotor
 
-from dtsa_agent.core.flight_models import FLIGHT_MODELS
+from dtsa_agent.core import Swarm, SwarmConfig
 
 STEP_S = 0.01
 
@@ -49,13 +49,14 @@ def time_rotorpy(steps: int = 200) -> float:
 
 def time_ours(agents: int, steps: int = 2000) -> float:
     """Median time of one step of all vehicles, called from Python, s."""
-    vehicle = FLIGHT_MODELS["orca"].vehicle
-    random = np.random.default_rng(1)
-    position, velocity, command = random.normal(size=(3, 3, agents))
+    config = SwarmConfig(agents=agents, avoider="orca")
+    assert config.slot_s / config.steps == STEP_S
+    swarm, random = Swarm(config, shared_table=True), np.random.default_rng(1)
+    swarm.position[:], swarm.velocity[:], swarm.command[:] = random.normal(size=(3, 3, agents))
     samples = []
     for _ in range(steps):
         began = time.perf_counter()
-        vehicle.step(STEP_S, position, velocity, command)
+        swarm.move(0)
         samples.append(time.perf_counter() - began)
     return statistics.median(samples)
 

@@ -40,6 +40,7 @@ setup(
             depends=[*files(".h"), "setup.py"],
             include_dirs=[f"{LIBRARY}/include", LIBRARY, SIMULATOR, BINDING],
             extra_compile_args=COMPILE_FLAGS,
+            py_limited_api=True,  # module.c says so, too: one compiled file for Python 3.10 and later
             libraries=["m"],
         )
     ],
@@ -52,6 +53,7 @@ setup(
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},  # tells `colcon test` what runs the tests
+    options={"bdist_wheel": {"py_limited_api": "cp310"}},
     zip_safe=False,
     maintainer="DTSA maintainers",
     maintainer_email="maintainers@dtsa.example",

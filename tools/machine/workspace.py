@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import subprocess
-import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -147,6 +146,7 @@ def build(packages: list[str]) -> None:
                 shutil.rmtree(layout.INSTALL / package, ignore_errors=True)
                 if package == "dtsa_agent":
                     remove_kernel()
+        remove_kernel("_kernel.cpython-*.so")  # made for one Python: Python looks for these first
         (layout.INSTALL / ".dtsa-environment.json").unlink(missing_ok=True)
         arguments = ["--base-paths", str(layout.SOURCES), "--symlink-install", "--packages-select", *packages]
         arguments += ["--build-base", str(layout.BUILD), "--install-base", str(layout.INSTALL)]
@@ -160,14 +160,17 @@ def build(packages: list[str]) -> None:
 
 
 def kernel() -> Path:
-    """This Python's compiled kernel; `--symlink-install` puts it into the source tree."""
-    name = f"_kernel{sysconfig.get_config_var('EXT_SUFFIX')}"
-    return layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "core" / name
+    """The compiled kernel, the same for every Python; `--symlink-install` puts it into the source tree."""
+    return layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "core" / "_kernel.abi3.so"
 
 
-def remove_kernel() -> None:
-    """Remove this Python's compiled kernel from the source tree."""
-    kernel().unlink(missing_ok=True)
+def remove_kernel(pattern: str = "_kernel.*.so") -> None:
+    """Remove compiled kernels from the source tree.
+
+    :param pattern: of their names.
+    """
+    for made in kernel().parent.glob(pattern):
+        made.unlink(missing_ok=True)
 
 
 def environment() -> dict[str, str]:

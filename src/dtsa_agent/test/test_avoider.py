@@ -10,7 +10,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from dtsa_agent.core import _kernel
+from dtsa_agent.core import Swarm, SwarmConfig, _kernel
+from dtsa_agent.core.binding import AVOID
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, flight_model
 from dtsa_agent.core.reference import avoiders
@@ -180,7 +181,7 @@ def test_commands_are_finite_and_within_v_max(name: str, case: Case, aged: bool)
 @given(case=cases, aged=st.booleans())
 def test_same_bits_with_and_without_avx2(name: str, case: Case, aged: bool) -> None:
     model = flight_model(name, {"margin_rate": 0.1})
-    best = _kernel.vector_level()
+    best = _kernel.vector_level(-1)
     results = []
     try:
         for level in (0, best):
@@ -224,21 +225,12 @@ def test_all_agents_at_once_give_the_same_bits(name: str) -> None:
     model = FLIGHT_MODELS[name]
     case = make_case(3, 30, 2.0)
     goals = np.random.default_rng(1).uniform(-9, 9, (3, 30))
-    out = np.empty((3, 30))
-    _kernel.avoid_all(
-        model.kind,
-        model.avoider.to_dict(),
-        case.position,
-        case.velocity,
-        goals,
-        case.position,
-        case.velocity,
-        None,
-        out,
-    )
+    swarm = Swarm(SwarmConfig(agents=30, avoider=name, estimator="oracle"), shared_table=True)
+    swarm.position[:], swarm.velocity[:], swarm.goal[:] = case.position, case.velocity, goals
+    swarm.steer(0, 0)
     for i in range(30):
         one = model.command(i, case.position[:, i], case.velocity[:, i], goals[:, i], case.position, case.velocity)
-        assert one.tobytes() == np.ascontiguousarray(out[:, i]).tobytes()
+        assert one.tobytes() == swarm.command[:, i].tobytes()
 
 
 def test_margin_grows_with_age_up_to_its_limit() -> None:
@@ -265,14 +257,16 @@ def test_exchange_with_perfect_knowledge_is_safe(name: str, movers: int, shortes
     radius = max(model.min_radius, model.spacing * movers / 2 / np.pi)
     position = radius * np.stack((np.cos(angle), np.sin(angle), 0 * angle)) + random.uniform(-0.05, 0.05, (3, movers))
     goal = np.roll(position, movers // 2, axis=1).copy()
-    velocity, out = np.zeros((3, movers)), np.zeros((3, movers))
+    swarm = Swarm(SwarmConfig(agents=movers, avoider=name, estimator="oracle"), shared_table=True)
+    assert swarm.config.slot_s == 0.01
+    assert swarm.config.steps == 1
+    swarm.position[:], swarm.goal[:] = position, goal
     first, second = np.triu_indices(movers, 1)
     nearest = math.inf
     for _ in range(1200):
-        _kernel.avoid_all(model.kind, model.avoider.to_dict(), position, velocity, goal, position, velocity, None, out)
-        model.vehicle.step(0.01, position, velocity, out)
-        nearest = min(nearest, np.linalg.norm(position[:, first] - position[:, second], axis=0).min())
-        if np.all(np.linalg.norm(position - goal, axis=0) < 0.3):
+        swarm.fly(0)
+        nearest = min(nearest, np.linalg.norm(swarm.position[:, first] - swarm.position[:, second], axis=0).min())
+        if np.all(np.linalg.norm(swarm.position - goal, axis=0) < 0.3):
             break
     else:
         pytest.fail("did not arrive within 12 s")
@@ -314,27 +308,23 @@ def test_bad_settings_are_named(name: str, options: dict, field: str) -> None:
 
 
 def test_wrong_arrays_are_refused() -> None:
-    values, good, table = FLIGHT_MODELS["orca"].avoider.to_dict(), np.zeros(3), np.zeros((3, 4))
-    out = np.zeros(3)
-    for bad in (np.zeros(2), np.zeros(3, dtype=np.float32), np.zeros(3, dtype=np.int64)):
-        with pytest.raises(ValueError, match="position"):
-            _kernel.avoid_command(0, values, 0, bad, good, good, table, table, None, out)
-    with pytest.raises(ValueError, match="others_v"):
-        _kernel.avoid_command(0, values, 0, good, good, good, table, np.zeros((3, 5)), None, out)
-    with pytest.raises(ValueError, match="age_s"):
-        _kernel.avoid_command(0, values, 0, good, good, good, table, table, np.zeros(3), out)
-    with pytest.raises(ValueError, match="kind"):
-        _kernel.avoid_command(4, values, 0, good, good, good, table, table, None, out)
+    model = FLIGHT_MODELS["orca"]
+    params, good, table = AVOID.image(model.avoider.to_dict()), bytes(3 * 8), bytes(3 * 4 * 8)
+    assert _kernel.avoid_command(0, params, 0, good, good, good, table, table, None) == good
+    for bad in (bytes(2 * 8), bytes(3 * 4), bytes(4 * 8)):
+        with pytest.raises(ValueError, match="argument 4"):
+            _kernel.avoid_command(0, params, 0, bad, good, good, table, table, None)
+    for bad in (np.zeros(3), None):
+        with pytest.raises(TypeError):
+            _kernel.avoid_command(0, params, 0, bad, good, good, table, table, None)
+    with pytest.raises(ValueError, match="argument 8"):
+        _kernel.avoid_command(0, params, 0, good, good, good, table, bytes(3 * 5 * 8), None)
+    with pytest.raises(ValueError, match="argument 9"):
+        _kernel.avoid_command(0, params, 0, good, good, good, table, table, bytes(3 * 8))
+    for kind in (4, -1):
+        with pytest.raises(ValueError, match="kind"):
+            _kernel.avoid_command(kind, params, 0, good, good, good, table, table, None)
+    with pytest.raises(ValueError, match="params"):
+        _kernel.avoid_command(0, params[8:], 0, good, good, good, table, table, None)
     with pytest.raises(KeyError, match="softness"):
-        _kernel.avoid_command(
-            0,
-            {"v_max": 1.0, "gain": 1.0, "radius": 1.0, "horizon": 1.0},
-            0,
-            good,
-            good,
-            good,
-            table,
-            table,
-            None,
-            out,
-        )
+        AVOID.image({"v_max": 1.0, "gain": 1.0, "radius": 1.0, "horizon": 1.0})

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dtsa_agent.core import Swarm, SwarmConfig, _kernel, flight_models
+from dtsa_agent.core import Swarm, SwarmConfig, _kernel, binding, flight_models
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_agent.core.reference.timebase import TimeBase
@@ -174,6 +174,57 @@ def test_the_header_says_its_version() -> None:
     version = re.search(r"#define DTSA_VERSION (\d+)", HEADER.read_text())
     assert version
     assert LIB.dtsa_version() == int(version[1]) == _kernel.VERSION
+
+
+SCALARS = {"int": "i", "double": "d", "int64_t": "q", "uint64_t": "Q"}
+ITEMS = {
+    "double": "f8", "int64_t": "i8", "uint64_t": "u8", "int32_t": "i4", "uint32_t": "u4", "uint16_t": "u2",
+    "uint8_t": "u1", "metrics_sums": "i8",
+}  # fmt: skip
+
+
+def declared(structure: str, headers: str) -> list[tuple[str, str]]:
+    """Name and type of each field of a structure, those of structures in it in their place, as binding.py has them."""
+    body = re.search(rf"typedef struct (?:{structure} )?\{{((?:(?!typedef).)*?)\}} {structure};", headers, re.DOTALL)
+    assert body, structure
+    found = []
+    for line in body[1].split(";"):
+        kind, names = re.fullmatch(r"\s*(?:(?:const )?(\w+) (.*))?\s*", " ".join(line.split())).groups()
+        for name in names.split(", ") if names else ():
+            if name.startswith("*"):
+                found.append((name[1:], ITEMS.get(kind, kind)))
+            else:
+                found += [(name, SCALARS[kind])] if kind in SCALARS else declared(kind, headers)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("layout", "structure"),
+    [(binding.SWARM, "swarm"), (binding.METRICS, "metrics"), (binding.AVOID, "dtsa_avoid_params")],
+)
+def test_images_have_the_fields_of_their_headers(layout: binding.Layout, structure: str) -> None:
+    sources = (HEADER, *(HEADER.parents[2] / "libdtsa_sim" / f"{name}.h" for name in ("swarm", "metrics", "vehicle")))
+    text = re.sub(r"/\*.*?\*/", "", "".join(source.read_text() for source in sources), flags=re.DOTALL)
+    fields = declared(structure, text)
+    if structure == "swarm":
+        fields = fields[: [name for name, _ in fields].index("tables")]  # its own part is none of Python's business
+    assert [(name, kind.removesuffix("0q")) for name, kind, _ in layout.fields] == fields
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    good = {"path": np.zeros(2), "last_position": np.zeros((3, 2)), "target": np.zeros((3, 2))}
+    good |= {"moving": np.zeros(2, np.uint8), "sums": np.zeros(9, np.int64)}
+    values = {"n": 2, "news_from": 0, "collision_m": 0.1, "r_min": 0.1}
+    assert len(binding.METRICS.image(values, good, {"n": 2})) == _kernel.METRICS_IMAGE
+    frozen = np.zeros(2)
+    frozen.flags.writeable = False
+    for bad in (np.zeros(3), np.zeros(2, np.float32), np.zeros(2, np.int64), np.zeros((2, 2))[:, 0], frozen):
+        with pytest.raises(ValueError, match="path"):
+            binding.METRICS.image(values, {**good, "path": bad}, {"n": 2})
+    with pytest.raises(ValueError, match="image"):
+        _kernel.metrics(bytes(8), good)
+    with pytest.raises(ValueError, match="agents"):
+        _kernel.swarm(bytes(_kernel.SWARM_IMAGE), ())
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core.binding import METRICS
 from dtsa_agent.core.compiled import kernel as _kernel
 
 # libdtsa_sim/metrics.h
@@ -40,13 +41,12 @@ class KernelSums:
         agents = len(moving)
         self._moving, self._path, self._sums = moving.copy(), np.zeros(agents), np.zeros(1, dtype=_SUMS)
         self._sums["min_distance2"] = 1e300
-        self._handle = _kernel.metrics(
-            {"n": agents, "news_from": news_from, "collision_m": collision_m, "r_min": r_min},
-            {
-                "path": self._path, "last_position": start.copy(), "target": target.copy(), "moving": self._moving,
-                "sums": self._sums,
-            },
-        )  # fmt: skip
+        values = {"n": agents, "news_from": news_from, "collision_m": collision_m, "r_min": r_min}
+        arrays = {
+            "path": self._path, "last_position": start.copy(), "target": target.copy(), "moving": self._moving,
+            "sums": self._sums.view(np.int64),
+        }  # fmt: skip
+        self._handle = _kernel.metrics(METRICS.image(values, arrays, {"n": agents}), arrays)
 
     def update(self, slot: int, track: NDArray[np.float64], tables: AbstractSwarm | None) -> int:
         """Takes in a slot; returns METRICS_CRASHED, METRICS_ARRIVED or both.
@@ -55,7 +55,7 @@ class KernelSums:
         :param track: (S, 3, N) m, true positions at its control instants.
         :param tables: what the agents know now; None: ages are left out.
         """
-        return _kernel.update(self._handle, slot, track, None if tables is None else tables.kernel)
+        return _kernel.update(self._handle, slot, track.tobytes(), None if tables is None else tables.kernel)
 
     def drop(self, index: int) -> None:
         """A mover that is lost counts no more.

@@ -78,7 +78,10 @@ def test_a_new_or_removed_file_needs_a_build(checkout: Path) -> None:
 def test_missing_products_need_a_build(checkout: Path) -> None:
     for package in workspace.PACKAGES:
         pretend_built(package)
+    for_one_python = workspace.kernel().with_name("_kernel.cpython-311-x86_64-linux-gnu.so")
+    for_one_python.touch()
     workspace.remove_kernel()
+    assert not for_one_python.exists()
     shutil.rmtree(layout.BUILD / "dtsa_bench")
     # A plain `colcon build` copies instead of linking.
     next((layout.INSTALL / "dtsa_channel_sim").rglob("*.egg-link")).unlink()

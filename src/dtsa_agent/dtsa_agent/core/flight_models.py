@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .binding import AVOID
 from .compiled import MISSING
 from .compiled import kernel as _kernel
 from .errors import ConfigError
@@ -83,7 +84,9 @@ class VehicleParams(Settings):
         :param command: commanded velocity, same shape, m/s.
         """
         if not MISSING:
-            _kernel.vehicle_step(self.tau, self.a_max, dt, position, velocity, command)
+            states = (np.asarray(array, dtype=np.float64).tobytes() for array in (position, velocity, command))
+            both = np.frombuffer(_kernel.vehicle_step(self.tau, self.a_max, dt, *states))
+            position[...], velocity[...] = both.reshape(2, *position.shape)
             return
         from .reference import vehicle  # nodes start without it
 
@@ -140,13 +143,13 @@ class FlightModel(Settings):
         """
         if plain or MISSING:
             return self._plain_command(self_index, position, velocity, goal, others_position, others_velocity, age_s)
-        result = np.empty(3)
         given = (position, velocity, goal, others_position, others_velocity)
-        p, v, target, others_p, others_v = (np.ascontiguousarray(a, dtype=np.float64) for a in given)
-        ages = None if age_s is None else np.ascontiguousarray(age_s, dtype=np.float64)
-        params = self.avoider.to_dict()
-        _kernel.avoid_command(self.kind, params, self_index, p, v, target, others_p, others_v, ages, result)
-        return result
+        p, v, target, others_p, others_v = (np.asarray(array, dtype=np.float64).tobytes() for array in given)
+        ages = None if age_s is None else np.asarray(age_s, dtype=np.float64).tobytes()
+        params = AVOID.image(self.avoider.to_dict())
+        found = _kernel.avoid_command(self.kind, params, self_index, p, v, target, others_p, others_v, ages)
+        command: Array = np.frombuffer(found).copy()
+        return command
 
     def _plain_command(
         self,

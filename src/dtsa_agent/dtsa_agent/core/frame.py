@@ -86,18 +86,17 @@ def encode_record(record: bytes, extent_m: float) -> bytes:
     return _kernel.encode(record, position_step(extent_m))
 
 
-def decode_record(data: bytes, extent_m: float, size: int) -> bytearray:
+def decode_record(data: bytes, extent_m: float, extended: bool = False) -> bytes:
     """The kernel's structure from the bytes of a frame.
 
     :param data: the bytes heard.
     :param extent_m: largest coordinate that fits, m.
-    :param size: of the structure: that of all profiles, or that of extended frames.
+    :param extended: the structure of extended frames, not that of all profiles.
     :raises RemoteProtocolError: if they are no frame.
     """
-    record = bytearray(size)
-    fault = _kernel.decode(data, position_step(extent_m), record)
-    if fault:
-        raise RemoteProtocolError(f"{_FAULTS[fault]} ({len(data)} bytes)")
+    record = _kernel.decode(bytes(data), position_step(extent_m), extended)
+    if isinstance(record, int):
+        raise RemoteProtocolError(f"{_FAULTS[record]} ({len(data)} bytes)")
     return record
 
 
@@ -122,6 +121,6 @@ def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
     if MISSING:
         heard = plain.decode(data, position_step(extent_m))
         return dataclasses.replace(heard, intent=None) if data[0] & 15 == PROFILE_EXTENDED else heard
-    profile, sender, slot, c_r, *v = RECORD.unpack(decode_record(data, extent_m, RECORD.size))
+    profile, sender, slot, c_r, *v = RECORD.unpack(decode_record(data, extent_m))
     intent = (v[6], v[7], v[8]) if profile == PROFILE_PAPER_INTENT else None
     return Frame(sender, slot, c_r, (v[0], v[1], v[2]), (v[3], v[4], v[5]), intent)

@@ -84,7 +84,7 @@ def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
     """
     if MISSING:
         return plain.decode_extended(data, position_step(extent_m))
-    record = decode_record(data, extent_m, _kernel.EXTENDED_RECORD)
+    record = decode_record(data, extent_m, extended=True)
     _, sender, slot, c_r, *v = RECORD.unpack_from(record)
     c_s, leaving, probation, gossips, given, mask, *rest = _REST.unpack_from(record, RECORD.size)
     gossip = []

@@ -22,8 +22,8 @@ def priority(position: ArrayLike, velocity: ArrayLike, slot_s: float) -> NDArray
     :param slot_s: t_s, s.
     :returns: g, (N,), dimensionless.
     """
-    p = np.ascontiguousarray(np.asarray(position, dtype=np.float64).T)
-    v = np.ascontiguousarray(np.asarray(velocity, dtype=np.float64).T)
+    p = np.asarray(position, dtype=np.float64).T
+    v = np.asarray(velocity, dtype=np.float64).T
     if p.ndim != 2 or p.shape[0] != 3 or p.shape != v.shape:
         raise ConfigError("position, velocity", (p.T.shape, v.T.shape), "two arrays of shape (N, 3)")
     if MISSING:
@@ -31,8 +31,7 @@ def priority(position: ArrayLike, velocity: ArrayLike, slot_s: float) -> NDArray
 
         rows = [[(float(x), float(y), float(z)) for x, y, z in array.T] for array in (p, v)]
         return np.array(plain.priorities(rows[0], rows[1], float(slot_s)))
-    g = np.empty(p.shape[1])
-    _kernel.priority(p, v, float(slot_s), g, np.empty(7 * len(g)))
+    g: NDArray[np.float64] = np.frombuffer(_kernel.priority(p.tobytes(), v.tobytes(), float(slot_s))).copy()
     return g
 
 
@@ -53,9 +52,9 @@ def select(
     """
     if selection not in SELECTIONS:
         raise ConfigError("selection", selection, ", ".join(SELECTIONS))
-    values = np.ascontiguousarray(g, dtype=np.float64)
-    candidates = np.zeros(len(values), dtype=np.uint8)
+    values = np.asarray(g, dtype=np.float64)
     if MISSING:
+        candidates = np.zeros(len(values), dtype=np.bool_)
         from .reference import selection as plain_selection
 
         members = [int(k) for k in np.flatnonzero(np.asarray(in_ap))]
@@ -63,14 +62,10 @@ def select(
             values.tolist(), np.asarray(counter).tolist(), np.asarray(in_ap, bool).tolist(), epsilon, selection
         )
         if selection == "candidates" and choice.reason in ("priority", "tie"):
-            candidates[plain_selection.candidates(values.tolist(), members, epsilon)] = 1
-        return choice.index, candidates.astype(np.bool_), REASONS.index(choice.reason)
-    index, reason = _kernel.select(
-        values,
-        np.ascontiguousarray(counter, dtype=np.int64),
-        np.ascontiguousarray(in_ap, dtype=np.uint8),
-        float(epsilon),
-        SELECTIONS.index(selection),
-        candidates,
+            candidates[plain_selection.candidates(values.tolist(), members, epsilon)] = True
+        return choice.index, candidates, REASONS.index(choice.reason)
+    h, members_ = np.asarray(counter, dtype=np.int64), np.asarray(in_ap, dtype=np.uint8)
+    index, reason, close = _kernel.select(
+        values.tobytes(), h.tobytes(), members_.tobytes(), float(epsilon), SELECTIONS.index(selection)
     )
-    return index, candidates.astype(np.bool_), reason
+    return index, np.frombuffer(close, dtype=np.bool_).copy(), reason

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .abstract_swarm import PRESENT_LEAVING, AbstractSwarm, Bytes
+from .binding import SWARM
 from .compiled import COMPILED, CORES, MISSING, REFERENCE
 from .compiled import kernel as _kernel
 from .config import SwarmConfig
@@ -59,13 +60,17 @@ class Swarm(AbstractSwarm):
     ) -> None:
         self._begin(config, scenario, local, shared_table, observers)
         count = len(self.ids)
-        if config.policy_row.agent_state:
-            state = _kernel.lease_state_bytes(config.agents, config.anchor_every)
+        state = _kernel.policy_bytes(POLICIES.number(config.policy), config.agents, config.anchor_every)
+        if state:
             self.lease_state = np.zeros((count, state), dtype=np.uint8)
         self._rejects = np.zeros(2, dtype=np.uint64)  # frames heard that were malformed, foreign
         parameters = self._parameters(count)
         self._arrays = self._shared_arrays()
-        self.kernel = _kernel.swarm(parameters, self._arrays)
+        sizes = {
+            "n": config.agents, "v": len(self.observer), "l": count, "s": config.steps, "k": self._decay.shape[1],
+            "f": _kernel.FRAME_MAX, "p": state,
+        }  # fmt: skip
+        self.kernel = _kernel.swarm(SWARM.image(parameters, self._arrays, sizes), self._arrays)
 
     def _parameters(self, count: int) -> dict[str, Any]:
         config, model = self.config, flight_model(self.config.avoider, self.config.options)
@@ -129,7 +134,7 @@ class Swarm(AbstractSwarm):
         _kernel.move(self.kernel, step)
 
     def hear(self, slot: int, data: bytes, mask: Bytes | None = None) -> bool:
-        return _kernel.hear(self.kernel, slot, data, mask)
+        return _kernel.hear(self.kernel, slot, bytes(data), None if mask is None else mask.tobytes())
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
         _kernel.end(self.kernel, slot)

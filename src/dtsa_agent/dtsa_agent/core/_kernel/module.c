@@ -1,5 +1,38 @@
-/* Kernel module: what Python can call; _kernel.pyi says what each does. */
-#include "binding.h"
+/* Python's door to libdtsa: what Python can call; _kernel.pyi says what each function does.
+ *
+ * What crosses are whole numbers, doubles and bytes, and the images of structures that live on (a swarm, metrics):
+ * core/binding.py makes them, and their arrays are NumPy's, borrowed by address, so that both sides look at the same memory.
+ * All in the limited API: one compiled module serves Python 3.10 and all later versions. */
+#define Py_LIMITED_API 0x030A0000
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <string.h>
+
+#include "avoider/avoider.h"
+#include "metrics.h"
+#include "swarm.h"
+
+/* ---- arguments: a function says by letters what it takes ---- */
+
+/* q whole number, d double, y bytes, o any object; s swarm, m metrics; of the swarm: i local index, k control instant, K the
+ * same but not the last. Bytes that are arrays: 3 three doubles; of the same n: P (3, n) doubles, G n values of eight bytes,
+ * B n bytes. z, g, t: y, G, s or None, for which `at` is NULL. */
+typedef struct value {
+    int64_t whole;
+    double real;
+    void *at;
+    Py_ssize_t bytes;
+    Py_ssize_t n; /* in the first argument */
+} value;
+
+enum { ARGUMENTS_MAX = 10, THREE = 3 * sizeof(double) };
+
+typedef struct function {
+    const char *name, *takes;
+    PyObject *(*run)(const value *v);
+    PyMethodDef def; /* filled in by add_functions */
+} function;
 
 static PyObject *none(void) { Py_RETURN_NONE; }
 
@@ -8,256 +41,327 @@ static PyObject *refused(const char *what, int64_t got)
     return PyErr_Format(PyExc_ValueError, "%s: got %lld", what, (long long)got);
 }
 
-/* ---- swarms ---- */
-
-static PyObject *new_swarm(const call *c) { return make_swarm(c->at[0], c->at[1]); }
-
-static PyObject *senders(const swarm *s)
+static int within(const char *what, int64_t got, int64_t end)
 {
-    PyObject *tuple = PyTuple_New(s->sender_count);
-    for (int i = 0; tuple && i < s->sender_count; i++)
-        PyTuple_SET_ITEM(tuple, i, PyLong_FromLong(s->senders[i]));
-    return tuple;
+    return (got >= 0 && got < end) || refused(what, got);
 }
 
-static PyObject *decide(const call *c) { return swarm_decide(c->at[0], c->whole[1]), none(); }
-static PyObject *fly(const call *c) { return swarm_fly(c->at[0], c->whole[1]), none(); }
-static PyObject *end(const call *c) { return swarm_end(c->at[0], c->whole[1]), none(); }
-static PyObject *reset(const call *c) { return swarm_reset(c->at[0]), none(); }
-
-static PyObject *emit(const call *c)
+static int take_whole(value *v, int i, char kind, PyObject *object)
 {
-    swarm_emit(c->at[0], c->whole[1]);
-    return senders(c->at[0]);
+    const swarm *s = v->at;
+    const int64_t got = v[i].whole = PyLong_AsLongLong(object);
+    if (got == -1 && PyErr_Occurred()) return 0;
+    if (kind == 'i') return within("local index", got, s->local_count);
+    return kind == 'q' || within("step", got, s->config.steps + (kind == 'k'));
 }
 
-static PyObject *begin(const call *c)
+static int take_bytes(value *v, int i, char kind, PyObject *object)
 {
-    swarm_decide(c->at[0], c->whole[1]);
-    return emit(c);
+    const Py_ssize_t size = kind == 'B' ? 1 : kind == 'G' || kind == 'g' ? 8 : THREE;
+    char *at;
+    if (PyBytes_AsStringAndSize(object, &at, &v[i].bytes) < 0) return 0;
+    v[i].at = at;
+    if (kind == 'y' || kind == 'z') return 1;
+    if (kind != '3' && v->n < 0) v->n = v[i].bytes / size;
+    if (v[i].bytes == size * (kind == '3' ? 1 : v->n)) return 1;
+    PyErr_Format(PyExc_ValueError, "argument %d: %zd bytes", i + 1, v[i].bytes);
+    return 0;
 }
 
-static int within(const char *name, int64_t value, int64_t end)
+static int take(value *v, int i, char kind, PyObject *object)
 {
-    if (value < 0 || value >= end) refused(name, value);
-    return value >= 0 && value < end;
+    const int none = object == Py_None && (kind == 'z' || kind == 'g' || kind == 't');
+    v[i].at = NULL;
+    switch (none ? 'n' : kind) {
+    case 'n':
+        return 1;
+    case 'q':
+    case 'i':
+    case 'k':
+    case 'K':
+        return take_whole(v, i, kind, object);
+    case 'd':
+        v[i].real = PyFloat_AsDouble(object);
+        return v[i].real != -1.0 || !PyErr_Occurred();
+    case 'o':
+        v[i].at = object;
+        return 1;
+    case 's':
+    case 't':
+    case 'm':
+        v[i].at = PyCapsule_GetPointer(object, kind == 'm' ? "metrics" : "swarm");
+        return v[i].at != NULL;
+    default:
+        return take_bytes(v, i, kind, object);
+    }
 }
 
-static PyObject *steer(const call *c)
+static PyObject *run(PyObject *self, PyObject *const *args, Py_ssize_t count)
 {
-    swarm *s = c->at[0];
-    if (!within("step", c->whole[2], s->config.steps + 1)) return NULL;
-    return swarm_steer(s, c->whole[1], (int)c->whole[2], c->whole[3] != 0), none();
+    const function *f = PyCapsule_GetPointer(self, NULL);
+    value v[ARGUMENTS_MAX];
+    v->n = -1;
+    if (count != (Py_ssize_t)strlen(f->takes))
+        return PyErr_Format(PyExc_TypeError, "%s: %zd arguments", f->name, count);
+    for (int i = 0; i < count; i++)
+        if (!take(v, i, f->takes[i], args[i])) return NULL;
+    return f->run(v);
 }
 
-static PyObject *move(const call *c)
+/* ---- swarms and metrics: capsules that keep the arrays they borrow ---- */
+
+static void drop(PyObject *capsule)
 {
-    swarm *s = c->at[0];
-    if (!within("step", c->whole[1], s->config.steps)) return NULL;
-    return swarm_move(s, (int)c->whole[1]), none();
+    void *object = PyCapsule_GetPointer(capsule, PyCapsule_GetName(capsule));
+    if (PyCapsule_IsValid(capsule, "swarm")) swarm_close(object);
+    Py_XDECREF(PyCapsule_GetContext(capsule));
+    PyMem_Free(object);
 }
 
-static PyObject *estimate(const call *c)
+/* A structure of `size` bytes, of which Python filled in the first. */
+static PyObject *keep(const char *kind, const value *v, size_t filled, size_t size)
 {
-    swarm *s = c->at[0];
-    if (!within("step", c->whole[2], s->config.steps + 1)) return NULL;
-    for (int v = 0; v < s->table_count; v++) swarm_estimate(s, v, c->whole[1], (int)c->whole[2]);
+    if (v->bytes != (Py_ssize_t)filled) return refused("image", v->bytes);
+    void *object = PyMem_Calloc(1, size);
+    PyObject *capsule = object ? PyCapsule_New(object, kind, drop) : PyErr_NoMemory();
+    if (!capsule) return PyMem_Free(object), NULL;
+    memcpy(object, v->at, filled);
+    PyCapsule_SetContext(capsule, Py_NewRef(v[1].at));
+    return capsule;
+}
+
+static PyObject *new_swarm(const value *v)
+{
+    PyObject *capsule = keep("swarm", v, offsetof(swarm, tables), sizeof(swarm));
+    const char *fault = capsule ? swarm_open(PyCapsule_GetPointer(capsule, "swarm")) : NULL;
+    if (!fault) return capsule;
+    Py_DECREF(capsule);
+    return PyErr_Format(PyExc_ValueError, "%s: out of range", fault);
+}
+
+static PyObject *new_metrics(const value *v)
+{
+    return keep("metrics", v, sizeof(metrics), sizeof(metrics));
+}
+
+static PyObject *update(const value *v)
+{
+    metrics *m = v->at;
+    swarm *tables = v[3].at;
+    const Py_ssize_t step = m->n * (Py_ssize_t)THREE;
+    if (step < 1 || v[2].bytes < step || v[2].bytes % step) return refused("track", v[2].bytes);
+    if (tables && tables->config.agents != m->n) return refused("tables", tables->config.agents);
+    return PyLong_FromLong(
+        metrics_update(m, v[1].whole, (int)(v[2].bytes / step), v[2].at, tables));
+}
+
+/* ---- a swarm's slot ---- */
+
+static PyObject *decide(const value *v) { return swarm_decide(v->at, v[1].whole), none(); }
+static PyObject *fly(const value *v) { return swarm_fly(v->at, v[1].whole), none(); }
+static PyObject *move(const value *v) { return swarm_move(v->at, (int)v[1].whole), none(); }
+static PyObject *end(const value *v) { return swarm_end(v->at, v[1].whole), none(); }
+static PyObject *reset(const value *v) { return swarm_reset(v->at), none(); }
+
+static PyObject *emit(const value *v)
+{
+    swarm *s = v->at;
+    swarm_emit(s, v[1].whole);
+    PyObject *senders = PyTuple_New(s->sender_count);
+    for (int i = 0; senders && i < s->sender_count; i++)
+        PyTuple_SetItem(senders, i, PyLong_FromLong(s->senders[i]));
+    return senders;
+}
+
+static PyObject *begin(const value *v)
+{
+    swarm_decide(v->at, v[1].whole);
+    return emit(v);
+}
+
+static PyObject *steer(const value *v)
+{
+    return swarm_steer(v->at, v[1].whole, (int)v[2].whole, v[3].whole != 0), none();
+}
+
+static PyObject *estimate(const value *v)
+{
+    swarm *s = v->at;
+    for (int t = 0; t < s->table_count; t++) swarm_estimate(s, t, v[1].whole, (int)v[2].whole);
     return none();
 }
 
-static PyObject *hear(const call *c)
+static PyObject *hear(const value *v)
 {
-    swarm *s = c->at[0];
-    if (c->at[3] && c->items[3] != s->table_count) return refused("mask", c->items[3]);
-    return PyBool_FromLong(swarm_hear(s, c->whole[1], c->at[2], c->items[2], c->at[3]));
+    swarm *s = v->at;
+    if (v[3].at && v[3].bytes != s->table_count) return refused("mask", v[3].bytes);
+    return PyBool_FromLong(swarm_hear(s, v[1].whole, v[2].at, v[2].bytes, v[3].at));
 }
 
-static PyObject *frame(const call *c)
+static PyObject *frame(const value *v)
 {
-    const swarm *s = c->at[0];
-    const int64_t l = c->whole[1];
-    if (!within("local index", l, s->local_count)) return NULL;
+    const swarm *s = v->at;
+    const int64_t l = v[1].whole;
     return PyBytes_FromStringAndSize((const char *)s->frames + l * DTSA_FRAME_MAX, s->frame_len[l]);
 }
 
-static PyObject *restart(const call *c)
+static PyObject *restart(const value *v)
 {
-    swarm *s = c->at[0];
-    if (!within("local index", c->whole[1], s->shared ? 0 : s->local_count)) return NULL;
-    return swarm_restart(s, (int)c->whole[1]), none();
+    const swarm *s = v->at;
+    return s->shared ? refused("shared", 1) : (swarm_restart(v->at, (int)v[1].whole), none());
 }
 
-static PyObject *lease_status(const call *c)
+static PyObject *lease_status(const value *v)
 {
-    const swarm *s = c->at[0];
-    const int leases = s->config.policy == DTSA_POLICY_LEASE;
-    if (!within("local index", c->whole[1], leases ? s->local_count : 0)) return NULL;
-    const dtsa_status t = dtsa_agent_status(&s->agents[c->whole[1]]);
+    const swarm *s = v->at;
+    if (s->config.policy != DTSA_POLICY_LEASE) return refused("policy", s->config.policy);
+    const dtsa_status t = dtsa_agent_status(&s->agents[v[1].whole]);
     return Py_BuildValue("(NNLiii)", PyBool_FromLong(t.probation), PyBool_FromLong(t.deaf),
                          (long long)t.woke, t.alive, t.absent, t.silent_slots);
 }
 
-/* ---- metrics ---- */
-
-static PyObject *new_metrics(const call *c) { return make_metrics(c->at[0], c->at[1]); }
-
-static PyObject *update(const call *c)
+static PyObject *policy_bytes(const value *v)
 {
-    metrics *m = c->at[0];
-    swarm *tables = c->at[3];
-    const Py_ssize_t steps = c->items[2] / (3 * m->n);
-    if (steps < 1 || c->items[2] % (3 * m->n)) return refused("track", c->items[2]);
-    if (tables && tables->config.agents != m->n) return refused("tables", tables->config.agents);
-    return PyLong_FromLong(metrics_update(m, c->whole[1], (int)steps, c->at[2], tables));
+    const dtsa_config config = {.policy = (int)v[0].whole,
+                                .agents = (int)v[1].whole,
+                                .lease = {.anchor_every = (int)v[2].whole}};
+    return PyLong_FromSize_t(swarm_policy_bytes(&config));
 }
 
 /* ---- frames: records are the structures of frame.h as bytes ---- */
 
-static PyObject *encode(const call *c)
+static PyObject *encode(const value *v)
 {
     uint8_t out[DTSA_FRAME_MAX];
+    const double step = v[1].real;
     int length = 0;
-    if (!(c->real[1] > 0.0)) return refused("position_step", 0);
-    if (c->items[0] == sizeof(dtsa_frame))
-        length = frame_encode(c->at[0], c->real[1], out);
-    else if (c->items[0] == sizeof(extended_frame))
-        length = extended_encode(c->at[0], c->real[1], out);
+    if (!(step > 0.0)) return refused("position_step", 0);
+    if (v->bytes == sizeof(extended_frame))
+        length = extended_encode(v->at, step, out);
+    else if (v->bytes == sizeof(dtsa_frame))
+        length = frame_encode(v->at, step, out);
     else
-        return refused("record", c->items[0]);
+        return refused("record", v->bytes);
     return PyBytes_FromStringAndSize((const char *)out, length);
 }
 
-static PyObject *decode(const call *c)
+static PyObject *decode(const value *v)
 {
-    if (!(c->real[1] > 0.0)) return refused("position_step", 0);
-    if (c->items[2] == sizeof(dtsa_frame))
-        return PyLong_FromLong(frame_decode(c->at[0], c->items[0], c->real[1], c->at[2]));
-    if (c->items[2] == sizeof(extended_frame))
-        return PyLong_FromLong(extended_decode(c->at[0], c->items[0], c->real[1], c->at[2]));
-    return refused("record", c->items[2]);
+    extended_frame record = {.c_s = 0};
+    const double step = v[1].real;
+    const int extended = v[2].whole != 0;
+    if (!(step > 0.0)) return refused("position_step", 0);
+    const int fault = extended ? extended_decode(v->at, v->bytes, step, &record)
+                               : frame_decode(v->at, v->bytes, step, &record.own);
+    const size_t size = extended ? sizeof record : sizeof record.own;
+    return fault ? PyLong_FromLong(fault)
+                 : PyBytes_FromStringAndSize((const char *)&record, (Py_ssize_t)size);
 }
 
-static PyObject *length(const call *c) { return PyLong_FromLong(frame_length((int)c->whole[0])); }
+/* ---- parts that need no swarm ---- */
 
-static PyObject *lease_bytes(const call *c)
+static PyObject *priority(const value *v)
 {
-    const dtsa_config config = {.agents = (int)c->whole[0],
-                                .policy = DTSA_POLICY_LEASE,
-                                .lease = {.anchor_every = (int)c->whole[1]}};
-    return PyLong_FromSize_t(swarm_policy_bytes(&config));
-}
-
-/* ---- priorities, avoiders, vehicles ---- */
-
-static PyObject *priority(const call *c)
-{
-    priority_values((int)c->n, c->real[2], c->at[0], c->at[1], c->at[3], c->at[4]);
-    return none();
-}
-
-static PyObject *select_one(const call *c)
-{
-    int reason;
-    const int k = select_sender((int)c->n, (int)c->whole[4], c->real[3], c->at[0], c->at[1],
-                                c->at[2], c->at[5], &reason);
-    return Py_BuildValue("(ii)", k, reason);
-}
-
-/* Commands of some agents, each with its own true state (planes of `count`), from one table of beliefs. */
-static PyObject *avoid(const call *c, int first, int count, void *const *at)
-{
-    const int64_t kind = c->whole[0];
-    if (kind < 0 || kind >= DTSA_AVOID_COUNT) return refused("kind", kind);
-    double *scratch = PyMem_Malloc(sizeof(double) * (size_t)avoid_scratch_doubles((int)c->n));
-    if (!scratch) return PyErr_NoMemory();
-    for (int k = 0; k < count; k++) {
-        double own[3][3], out[3];
-        for (int i = 0; i < 9; i++) own[i / 3][i % 3] = ((double *)at[i / 3])[i % 3 * count + k];
-        avoid_command((int)kind, &c->params, (int)c->n, first + k, own[0], own[1], own[2], at[3],
-                      at[4], at[5], scratch, out);
-        for (int axis = 0; axis < 3; axis++) ((double *)at[6])[axis * count + k] = out[axis];
-    }
+    PyObject *g = PyBytes_FromStringAndSize(NULL, v->n * (Py_ssize_t)sizeof(double));
+    double *scratch = PyMem_Calloc(7 * (size_t)v->n, sizeof(double));
+    if (g && scratch)
+        priority_values((int)v->n, v[2].real, v->at, v[1].at, (void *)PyBytes_AsString(g), scratch);
     PyMem_Free(scratch);
-    return none();
+    return scratch ? g : PyErr_NoMemory();
 }
 
-static PyObject *avoid_one(const call *c) { return avoid(c, (int)c->whole[2], 1, c->at + 3); }
-static PyObject *avoid_all(const call *c) { return avoid(c, 0, (int)c->n, c->at + 2); }
-
-static PyObject *vehicle(const call *c)
+static PyObject *select_one(const value *v)
 {
-    const vehicle_params params = {c->real[0], c->real[1]};
-    vehicle_step_all(&params, c->real[2], (int)c->n, c->at[3], c->at[4], c->at[5]);
-    return none();
+    PyObject *candidates = PyBytes_FromStringAndSize(NULL, v->n);
+    int reason;
+    if (!candidates) return NULL;
+    uint8_t *at = memset(PyBytes_AsString(candidates), 0, (size_t)v->n);
+    const int k =
+        select_sender((int)v->n, (int)v[4].whole, v[3].real, v->at, v[1].at, v[2].at, at, &reason);
+    return Py_BuildValue("(iiN)", k, reason, candidates);
 }
 
-static PyObject *vector_level(const call *c)
+static PyObject *avoid(const value *v)
 {
-    return PyLong_FromLong(avoid_vector_level(c->given ? (int)c->whole[0] : -1));
+    double out[3], *scratch;
+    if (!within("kind", v->whole, DTSA_AVOID_COUNT)) return NULL;
+    if (v[1].bytes != sizeof(dtsa_avoid_params)) return refused("params", v[1].bytes);
+    scratch = PyMem_Calloc((size_t)avoid_scratch_doubles((int)v->n), sizeof(double));
+    if (!scratch) return PyErr_NoMemory();
+    avoid_command((int)v->whole, v[1].at, (int)v->n, (int)v[2].whole, v[3].at, v[4].at, v[5].at,
+                  v[6].at, v[7].at, v[8].at, scratch, out);
+    PyMem_Free(scratch);
+    return PyBytes_FromStringAndSize((const char *)out, THREE);
+}
+
+static PyObject *vehicle(const value *v)
+{
+    const vehicle_params params = {v[0].real, v[1].real};
+    const size_t bytes = (size_t)v->n * THREE;
+    PyObject *moved = PyBytes_FromStringAndSize(NULL, 2 * (Py_ssize_t)bytes);
+    if (!moved) return NULL;
+    char *at = PyBytes_AsString(moved);
+    memcpy(at, v[3].at, bytes);
+    memcpy(at + bytes, v[4].at, bytes);
+    vehicle_step_all(&params, v[2].real, (int)v->n, (void *)at, (void *)(at + bytes), v[5].at);
+    return moved;
+}
+
+static PyObject *vector_level(const value *v)
+{
+    return PyLong_FromLong(avoid_vector_level((int)v->whole));
 }
 
 /* ---- the module ---- */
 
-#define SWARM {"swarm", 'S', 0, 0, 0, 0}
-#define WHOLE(name) {name, 'q', 0, 0, 0, 0}
-#define REAL(name) {name, 'd', 0, 0, 0, 0}
-#define OBJECT(name) {name, 'O', 0, 0, 0, 0}
-#define READ(name, size, times) {name, 'r', size, times, 0, 0}
-#define WRITE(name, size, times) {name, 'w', size, times, 0, 0}
-#define THREE(name, kind) {name, kind, 8, 0, 3, 0}
-#define AGES {"age_s", 'r', 8, 1, 0, 1}
 /* clang-format off */
-static const function FUNCTIONS[] = {
-    {"swarm", new_swarm, 2, {OBJECT("parameters"), OBJECT("arrays")}},
-    {"decide", decide, 2, {SWARM, WHOLE("slot")}},
-    {"emit", emit, 2, {SWARM, WHOLE("slot")}},
-    {"begin", begin, 2, {SWARM, WHOLE("slot")}},
-    {"fly", fly, 2, {SWARM, WHOLE("slot")}},
-    {"end", end, 2, {SWARM, WHOLE("slot")}},
-    {"reset", reset, 1, {SWARM}},
-    {"steer", steer, 4, {SWARM, WHOLE("slot"), WHOLE("step"), WHOLE("estimate")}},
-    {"move", move, 2, {SWARM, WHOLE("step")}},
-    {"estimate", estimate, 3, {SWARM, WHOLE("slot"), WHOLE("step")}},
-    {"hear", hear, 4, {SWARM, WHOLE("slot"), READ("data", 1, 0), {"mask", 'r', 1, 0, 0, 1}}},
-    {"frame", frame, 2, {SWARM, WHOLE("index")}},
-    {"restart", restart, 2, {SWARM, WHOLE("index")}},
-    {"lease_status", lease_status, 2, {SWARM, WHOLE("index")}},
-    {"metrics", new_metrics, 2, {OBJECT("values"), OBJECT("arrays")}},
-    {"update", update, 4, {{"metrics", 'M', 0, 0, 0, 0}, WHOLE("slot"), READ("track", 8, 0), {"tables", 'S', 0, 0, 0, 1}}},
-    {"encode", encode, 2, {READ("record", 1, 0), REAL("position_step")}},
-    {"decode", decode, 3, {READ("data", 1, 0), REAL("position_step"), WRITE("record", 1, 0)}},
-    {"frame_length", length, 1, {WHOLE("profile")}},
-    {"lease_state_bytes", lease_bytes, 2, {WHOLE("agents"), WHOLE("anchor_every")}},
-    {"priority", priority, 5, {READ("position", 8, 3), READ("velocity", 8, 3), REAL("slot_s"), WRITE("out", 8, 1), WRITE("scratch", 8, 7)}},
-    {"select", select_one, 6, {READ("g", 8, 1), {"counter", 'h', 8, 1, 0, 0}, READ("in_ap", 1, 1), REAL("epsilon"), WHOLE("selection"), WRITE("candidates", 1, 1)}},
-    {"avoid_command", avoid_one, 10, {WHOLE("kind"), {"params", 'P', 0, 0, 0, 0}, WHOLE("self"), THREE("position", 'r'), THREE("velocity", 'r'), THREE("goal", 'r'), READ("others_p", 8, 3), READ("others_v", 8, 3), AGES, THREE("command", 'w')}},
-    {"avoid_all", avoid_all, 9, {WHOLE("kind"), {"params", 'P', 0, 0, 0, 0}, READ("position", 8, 3), READ("velocity", 8, 3), READ("goal", 8, 3), READ("others_p", 8, 3), READ("others_v", 8, 3), AGES, WRITE("command", 8, 3)}},
-    {"vehicle_step", vehicle, 6, {REAL("tau"), REAL("a_max"), REAL("dt"), WRITE("position", 8, 3), WRITE("velocity", 8, 3), READ("command", 8, 3)}},
-    {"vector_level", vector_level, 0, {WHOLE("level")}},
-    {0},
+static function FUNCTIONS[] = {
+    {"swarm", "yo", new_swarm}, {"decide", "sq", decide}, {"emit", "sq", emit},
+    {"begin", "sq", begin}, {"fly", "sq", fly}, {"steer", "sqkq", steer}, {"move", "sK", move},
+    {"estimate", "sqk", estimate}, {"hear", "sqyz", hear}, {"end", "sq", end},
+    {"frame", "si", frame}, {"restart", "si", restart}, {"reset", "s", reset},
+    {"lease_status", "si", lease_status}, {"policy_bytes", "qqq", policy_bytes},
+    {"metrics", "yo", new_metrics}, {"update", "mqyt", update},
+    {"encode", "yd", encode}, {"decode", "ydq", decode},
+    {"priority", "PPd", priority}, {"select", "GGBdq", select_one},
+    {"avoid_command", "qyq333PPg", avoid}, {"vehicle_step", "dddPPP", vehicle},
+    {"vector_level", "q", vector_level}, {0},
 };
 
 static const struct {
     const char *name;
     int value;
 } CONSTANTS[] = {
-    {"METRICS_CRASHED", METRICS_CRASHED}, {"METRICS_ARRIVED", METRICS_ARRIVED}, {"FRAME_MAX", DTSA_FRAME_MAX},
-    {"EXTENDED_LENGTH", EXTENDED_LENGTH}, {"EXTENDED_HEAD", EXTENDED_HEAD}, {"LEASE_OPEN", LEASE_OPEN},
-    {"EXTENDED_SENDER_MAX", DTSA_EXTENDED_AGENTS_MAX}, {"PRESENT_LEAVING", PRESENT_LEAVING},
-    {"FRAME_RECORD", sizeof(dtsa_frame)}, {"EXTENDED_RECORD", sizeof(extended_frame)}, {"VERSION", DTSA_VERSION},
+    {"VERSION", DTSA_VERSION}, {"FRAME_MAX", DTSA_FRAME_MAX}, {"FRAME_RECORD", sizeof(dtsa_frame)},
+    {"EXTENDED_RECORD", sizeof(extended_frame)}, {"SWARM_IMAGE", offsetof(swarm, tables)},
+    {"METRICS_IMAGE", sizeof(metrics)},
 };
 /* clang-format on */
+
+static int add_functions(PyObject *module)
+{
+    for (function *f = FUNCTIONS; f->name; f++) {
+        f->def = (PyMethodDef){f->name, (PyCFunction)(void (*)(void))run, METH_FASTCALL, NULL};
+        PyObject *row = PyCapsule_New(f, NULL, NULL);
+        PyObject *made = row ? PyCFunction_New(&f->def, row) : NULL;
+        const int status = made ? PyModule_AddObjectRef(module, f->name, made) : -1;
+        Py_XDECREF(made);
+        Py_XDECREF(row);
+        if (status < 0) return -1;
+    }
+    return 0;
+}
 
 static int add_names(PyObject *module)
 {
     PyObject *dict = PyDict_New();
     for (int i = 0; dict && dtsa_names(i); i++) {
         const dtsa_name_list *list = dtsa_names(i);
-        PyObject *tuple = PyTuple_New(list->count);
-        for (int k = 0; tuple && k < list->count; k++)
-            PyTuple_SET_ITEM(tuple, k, PyUnicode_FromString(list->names[k]));
-        if (!tuple || PyDict_SetItemString(dict, list->kind, tuple) < 0) return -1;
-        Py_DECREF(tuple);
+        PyObject *names = PyTuple_New(list->count);
+        for (int k = 0; names && k < list->count; k++)
+            PyTuple_SetItem(names, k, PyUnicode_FromString(list->names[k]));
+        if (!names || PyDict_SetItemString(dict, list->kind, names) < 0) Py_CLEAR(dict);
+        Py_XDECREF(names);
     }
     const int status = dict ? PyModule_AddObjectRef(module, "NAMES", dict) : -1;
     Py_XDECREF(dict);
@@ -268,7 +372,7 @@ static int fill_module(PyObject *module)
 {
     for (size_t i = 0; i < sizeof CONSTANTS / sizeof *CONSTANTS; i++)
         if (PyModule_AddIntConstant(module, CONSTANTS[i].name, CONSTANTS[i].value) < 0) return -1;
-    return add_names(module) < 0 || add_functions(module, FUNCTIONS) < 0 ? -1 : 0;
+    return add_names(module) < 0 || add_functions(module) < 0 ? -1 : 0;
 }
 
 PyMODINIT_FUNC PyInit__kernel(void)
