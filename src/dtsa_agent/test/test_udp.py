@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import random
 import time
 from typing import Any
 
@@ -10,14 +11,17 @@ import pytest
 
 from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
 from dtsa_agent.air.udp.clock import OwnClock
-from dtsa_agent.air.udp.datagram import LENGTH, NOT_OURS, OTHER_SETTINGS, Wrapping
+from dtsa_agent.air.udp.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
+from dtsa_agent.air.udp.delay import Delay
 from dtsa_agent.air.udp.slots import SlotTime
 from dtsa_agent.air.udp.sockets import StampClock
 from dtsa_agent.air.udp.tally import Tally
-from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core import ConfigError, Frame, SwarmConfig, encode_frame
+from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.reference.timebase import ALIGNED, FOREIGN, LISTENING, RESTARTED
 
 SLOT_NS = 10_000_000
+KEY = bytes.fromhex("8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4")
 CONFIG = SwarmConfig(agents=3, policy="lease")
 
 
@@ -58,15 +62,42 @@ def test_agents_that_cannot_fly_are_refused_by_name(
     assert error.value.field == field
 
 
+def framed(sender: int, slot: int) -> bytes:
+    """A frame of an agent with policy tdma."""
+    return encode_frame(Frame(sender, slot, 1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0)))
+
+
 def test_a_datagram_says_why_it_is_none_of_ours() -> None:
-    here = Wrapping(CONFIG)
-    frame = bytes(CONFIG.frame_length)
-    assert here.fault(here.wrap(frame)) == ""
-    assert here.fault(b"") == here.fault(b"DX" + here.wrap(frame)[2:]) == NOT_OURS
-    assert here.fault(here.wrap(frame)[:6]) == here.fault(here.wrap(frame + b"\0")) == LENGTH
+    config = SwarmConfig(agents=3, policy="tdma")
+    here, frame = Wrapping(config, None), framed(2, 7)
+    good = here.wrap(frame, 7, 1_234_567, ((1, -20_000), (3, 500_000)))
+    assert here.read(good) == ("", 2, 7, 1_230_000, ((1, -20_000), (3, 500_000)), frame)
+    assert here.read(here.wrap(frame, 7, 0)).peers == ()
+    assert here.read(here.wrap(frame, 7, 0, ((1, 10**12), (3, -(10**12))))).peers == (
+        (1, 327_670_000),
+        (3, -327_680_000),
+    )
+    assert here.read(here.wrap(frame, 7, -5)).late_ns == 0
+    assert here.read(here.wrap(frame, 7, 10**12)).late_ns == 655_350_000
+    assert here.read(b"").fault == here.read(b"DX" + good[2:]).fault == NOT_OURS
+    assert here.read(good[:6]).fault == here.read(good + b"\0").fault == LENGTH
+    assert here.read(here.wrap(bytes(len(frame)), 0)).fault == NO_FRAME
+    assert here.read(here.wrap(framed(4, 7), 7)).fault == UNKNOWN
     for changed in ({"slot_ms": 20.0}, {"agents": 4}, {"seed": 2}, {"auth_session": 1}):
-        there = Wrapping(dataclasses.replace(CONFIG, **changed))
-        assert here.fault(there.wrap(frame)) == OTHER_SETTINGS
+        there = Wrapping(dataclasses.replace(config, moving=None, **changed), None)
+        assert here.read(there.wrap(frame, 7)).fault == OTHER_SETTINGS
+
+
+def test_nothing_in_a_sealed_datagram_can_be_changed() -> None:
+    config = SwarmConfig(agents=3, policy="tdma", auth=True, auth_session=1)
+    here = Wrapping(config, Authenticator(KEY, 1))
+    good = here.wrap(framed(2, 7), 7, 50_000, ((3, 30_000),))
+    assert here.read(good) == ("", 2, 7, 50_000, ((3, 30_000),), framed(2, 7))
+    for at in range(len(good)):
+        changed = good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :]
+        assert here.read(changed).fault
+    assert Wrapping(config, Authenticator(KEY[::-1], 1)).read(good).fault == REJECTED
+    assert Wrapping(config, Authenticator(KEY, 2)).read(good).fault == REJECTED
 
 
 @pytest.mark.parametrize("drift", [0, 50_000, -1_000_000])
@@ -108,6 +139,63 @@ def test_who_took_its_time_from_a_late_frame_takes_it_anew() -> None:
     assert slots.state != LISTENING
     assert slots.hear(50, 110 * SLOT_NS) == FOREIGN
     assert slots.hear(500, 110 * SLOT_NS) == RESTARTED
+
+
+@dataclasses.dataclass
+class Ticking:
+    """The slots of one agent on a clock of its own; common time is ns of the test."""
+
+    slots: SlotTime
+    delay: Delay
+    offset_ns: int
+    drift: float
+
+    def shown(self, at_ns: float) -> int:
+        """What its clock shows."""
+        return round(self.offset_ns + at_ns * (1.0 + self.drift))
+
+    def starts(self, slot: int) -> float:
+        """When its slot starts."""
+        return (self.slots.slot_start_ns(slot) - self.offset_ns) / (1.0 + self.drift)
+
+    def hear(self, sender: int, slot: int, began_ns: int, peers: Any) -> None:
+        """A frame, as an agent takes it."""
+        before = self.slots.slot_start_ns(slot)
+        if self.slots.hear(slot, began_ns - self.delay.error_ns) == RESTARTED:
+            self.delay.reset()
+        else:
+            self.delay.hear(sender, began_ns - before, peers)
+            self.delay.moved(self.slots.slot_start_ns(slot) - before)
+
+
+@pytest.mark.parametrize(("under_way", "loss"), [(0, 0.3), (2_000_000, 0.3), (-300_000, 0.0)])
+def test_slots_stay_together_whatever_frames_are_under_way_longer_than_supposed(under_way: int, loss: float) -> None:
+    """Twelve clocks off by up to 50 ppm; frames are lost, and one of twenty is held up for milliseconds."""
+    config, draw = SwarmConfig(agents=12, policy="lease"), random.Random(7)
+    agents = {}
+    for agent in range(1, 13):
+        clock = draw.randrange(10**12), draw.uniform(-5e-5, 5e-5)
+        agents[agent] = Ticking(SlotTime(config, agent), Delay(agent, SLOT_NS // 4), *clock)
+    for one in agents.values():
+        one.slots.start(one.shown(0))
+    agents[1].slots.hear(120, agents[1].shown(120 * SLOT_NS))
+    apart, restarts = [], []
+    for slot in range(120, 2620):
+        sender = agents[slot % 12 + 1]
+        if sender.slots.state == LISTENING:
+            continue
+        peers, sent = sender.delay.tell(), sender.starts(slot)
+        for one in agents.values():
+            if one is not sender and draw.random() >= loss:
+                held_up = draw.random() * 5e6 if draw.random() < 0.05 else 0.0
+                one.hear(slot % 12 + 1, slot, one.shown(sent + under_way + held_up), peers)
+        starts = [one.starts(slot) for one in agents.values() if one.slots.state != LISTENING]
+        apart.append(max(starts) - min(starts))
+        restarts.append(sum(one.slots.restarts for one in agents.values()))
+    assert max(apart[-1000:]) < 300_000
+    assert restarts[-1000] == restarts[-1]
+    for one in agents.values():
+        assert one.delay.error_ns == pytest.approx(under_way, abs=150_000)
 
 
 def test_the_tally_knows_how_late_frames_left() -> None:

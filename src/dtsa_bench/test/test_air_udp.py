@@ -79,7 +79,7 @@ def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
 
     helpers.wait_for(repeats)
     first = stranger.hear(1)[0]
-    for data in (b"", b"noise" * 50, b"x" * 2000, first[:30], first[:4] + b"abcd" + first[8:], first[:8] + bytes(60)):
+    for data in (b"", b"noise" * 50, b"x" * 2000, first[:30], first[:4] + b"abcd" + first[8:], first[:26] + bytes(60)):
         stranger.socket.send(data)
     stranger.socket.send(first[:20] + bytes([first[20] ^ 1]) + first[21:])
     time.sleep(3 * CONFIG.slot_s)
@@ -141,8 +141,8 @@ def test_a_bag_that_lies_is_found(flight: Flight) -> None:
         (1, said.slot, "chosen")
     ]
     bags = [read(path) for path in flight.bags]
-    spoken = next(record for record in bags[1].slots[-60:] if record.sent_ns >= 0)
-    spoken.frame = spoken.frame[:-5] + bytes([spoken.frame[-5] ^ 1]) + spoken.frame[-4:]
+    spoken = next(record for record in bags[1].slots[-60:] if record.datagram)
+    spoken.datagram = spoken.datagram[:-5] + bytes([spoken.datagram[-5] ^ 1]) + spoken.datagram[-4:]
     assert merge(bags)["frames_heard_not_as_sent"] > 0
 
 

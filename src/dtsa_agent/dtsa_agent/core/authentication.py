@@ -70,30 +70,32 @@ class Authenticator:
         """Frames rejected so far, for whatever reason."""
         return self.forged + self.truncated
 
-    def seal(self, data: bytes, slot: int) -> bytes:
+    def seal(self, data: bytes, slot: int, beside: bytes = b"") -> bytes:
         """A frame with its tag.
 
         :param data: the frame, 1 to 56 bytes.
         :param slot: the slot it is sent in.
+        :param beside: what else the tag covers; it is sent beside the frame.
         :raises LocalProtocolError: if frame and tag do not fit on the air.
         """
         if not 0 < len(data) <= FRAME_MAX - TAG_LENGTH:
             raise LocalProtocolError(f"a frame of {len(data)} bytes cannot be sealed: 1 to {FRAME_MAX - TAG_LENGTH}")
-        return data + tag(self._keyed, slot, data)
+        return data + tag(self._keyed, slot, data + beside)
 
-    def open(self, data: bytes, slot: int, late: int = 0) -> bytes | None:
+    def open(self, data: bytes, slot: int, late: int = 0, beside: bytes = b"") -> bytes | None:
         """The frame without its tag, or None (and counted) if it is not authentic.
 
         :param data: the bytes heard.
         :param slot: the slot they were heard in.
         :param late: slots by which a frame may arrive after its own; 1 where agents have clocks of their own.
+        :param beside: what else the tag covers.
         """
         if len(data) <= TAG_LENGTH:
             self.truncated += 1
             return None
         frame, said = data[:-TAG_LENGTH], data[-TAG_LENGTH:]
         for sent in range(slot, max(-1, slot - late - 1), -1):
-            if hmac.compare_digest(said, tag(self._keyed, sent, frame)):
+            if hmac.compare_digest(said, tag(self._keyed, sent, frame + beside)):
                 return frame
         self.forged += 1
         return None

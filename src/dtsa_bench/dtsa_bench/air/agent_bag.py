@@ -117,8 +117,8 @@ def _message(bag: AgentBag, topic: str, said: dict[str, Any]) -> None:
     elif topic == SLOT:
         arrays = {name: np.array(said.pop(name), dtype=np.float64) for name in _ARRAYS}
         heard = {name: [_heard(one) for one in said.pop(name)] for name in ("before", "heard")}
-        frame = bytes.fromhex(said.pop("frame"))
-        record = SlotRecord(**said, **arrays, **heard, frame=frame)
+        data = {name: bytes.fromhex(said.pop(name)) for name in ("frame", "datagram")}
+        record = SlotRecord(**said, **arrays, **heard, **data)
         if bag.slots and record.slot <= bag.slots[-1].slot:
             raise UnusableBag(bag.path, f"slot {record.slot} comes after slot {bag.slots[-1].slot}")
         bag.slots.append(record)
@@ -128,4 +128,4 @@ _ARRAYS = ("track", "velocity", "command", "goal")
 
 
 def _heard(said: dict[str, Any]) -> Heard:
-    return Heard(said["sender"], said["slot"], said["arrival_ns"], bytes.fromhex(said["frame"]), said["accepted"])
+    return Heard(said["sender"], said["slot"], said["arrival_ns"], bytes.fromhex(said["datagram"]), said["accepted"])

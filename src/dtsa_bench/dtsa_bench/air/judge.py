@@ -30,16 +30,19 @@ class Judge:
         self.slots = self.frames = 0
         self.double = 0  # slots with two senders or more
 
-    def slot(self, slot: int, frames: Mapping[int, bytes]) -> None:
+    def slot(self, slot: int, frames: Mapping[int, bytes], unsent: Mapping[int, bytes] | None = None) -> None:
         """A slot in which frames were sent.
 
         :param slot: its number; slots come in ascending order.
         :param frames: the frames as they were on the air, by sender.
+        :param unsent: frames, without tags, that were too late to be sent; turns given away in them are given away.
         """
         if self._from is None:
             self._from = slot + self._window
         if self._ledger is not None:
             self._ledger.slot(slot, {agent: data[: len(data) - self._tail] for agent, data in frames.items()})
+            for agent, data in (unsent or {}).items():
+                self._ledger.read(slot, agent, data[: len(data) - self._config.own_bytes])
             found, self._ledger.broken = self._ledger.broken, []
         else:
             found = self._turns(slot, frames)

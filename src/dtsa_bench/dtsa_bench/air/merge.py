@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dtsa_agent.air.udp import SlotRecord
+from dtsa_agent.air.udp.datagram import HEADER
 from dtsa_agent.core.errors import ConfigError
 
 from .agent_bag import AgentBag
@@ -40,7 +41,7 @@ def merge(bags: Sequence[AgentBag], air_ns: int = 0) -> dict[str, Any]:
     sent: dict[tuple[int, int], Sent] = {}
     for life, bag in lives.items():
         for record in bag.slots:
-            if record.sent_ns >= 0 and record.frame:
+            if record.datagram:
                 sent[(record.slot, life[0])] = Sent(life, record)
     strange, crossings = _crossings(lives, sent)
     config, here = bags[0].swarm, {agent for agent, _ in lives}
@@ -105,7 +106,7 @@ def _crossings(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Se
         for record in bag.slots:
             for heard in (*record.before, *record.heard):
                 origin = sent.get((heard.slot, heard.sender))
-                if origin is not None and origin.record.frame == heard.frame:
+                if origin is not None and origin.record.datagram == heard.datagram:
                     found.append(Crossing(origin.life, receiver, origin.record.sent_ns, heard.arrival_ns))
                 elif origin is not None or heard.sender in whole:
                     strange += 1
@@ -117,16 +118,19 @@ def _judged(
 ) -> dict[str, Any]:
     """What the protocol says of the frames that were sent, or heard, from when on all counted alike."""
     frames: dict[int, dict[int, bytes]] = {}
-    for bag in lives.values():
+    unsent: dict[int, dict[int, bytes]] = {}
+    for (agent, _), bag in lives.items():
         for record in bag.slots:
+            if record.frame and not record.datagram:
+                unsent.setdefault(record.slot, {})[agent] = record.frame
             for heard in (*record.before, *record.heard):
-                frames.setdefault(heard.slot, {})[heard.sender] = heard.frame
+                frames.setdefault(heard.slot, {})[heard.sender] = heard.datagram[HEADER:]
     for (slot, agent), origin in sent.items():
-        frames.setdefault(slot, {})[agent] = origin.record.frame
+        frames.setdefault(slot, {})[agent] = origin.record.datagram[HEADER:]
     judge = Judge(next(iter(lives.values())).swarm)
-    for slot in sorted(frames):
+    for slot in sorted({*frames, *unsent}):
         if common_slot is not None and slot >= common_slot:
-            judge.slot(slot, frames[slot])
+            judge.slot(slot, frames.get(slot, {}), unsent.get(slot))
     return judge.summary()
 
 

@@ -25,7 +25,7 @@ _HEARD = {
         sender=("integer", "id"),
         slot=("integer", "in which it was sent"),
         arrival_ns=("integer", "when it arrived, ns, own clock"),
-        frame=("string", "as it was on the air, hexadecimal"),
+        datagram=("string", "as it was on the air, hexadecimal"),
         accepted=("boolean", "whether the table took it"),
     ),
 }
@@ -44,7 +44,8 @@ SLOT_SCHEMA = described(
     velocity=("array", "m/s, at the slot's start"),
     command=("array", "m/s, commanded velocity then"),
     goal=("array", "m, where it flies to"),
-    frame=("string", "what it was to send, as on the air, hexadecimal; empty: silent"),
+    frame=("string", "what it was to send, without a tag, hexadecimal; empty: silent"),
+    datagram=("string", "as on the air, hexadecimal; empty: nothing was sent"),
     sent_ns=("integer", "when that was handed to the network, ns, own clock; -1: not at all"),
 )
 SLOT_SCHEMA["properties"] |= {"before": _HEARD, "heard": _HEARD}
@@ -85,6 +86,7 @@ class AgentRecorder(JsonBag):
             "present": record.present, "chosen": record.chosen, "reason": record.reason, "digest": record.digest,
             "score": record.score, "track": record.track.tolist(), "velocity": record.velocity.tolist(),
             "command": record.command.tolist(), "goal": record.goal.tolist(), "frame": record.frame.hex(),
+            "datagram": record.datagram.hex(),
             "sent_ns": record.sent_ns, "before": _heard(record.before), "heard": _heard(record.heard),
         })  # fmt: skip
         if self.flush_if_due():
@@ -113,6 +115,12 @@ class AgentRecorder(JsonBag):
 
 def _heard(frames: list[Heard]) -> list[dict[str, Any]]:
     return [
-        {"sender": h.sender, "slot": h.slot, "arrival_ns": h.arrival_ns, "frame": h.frame.hex(), "accepted": h.accepted}
+        {
+            "sender": h.sender,
+            "slot": h.slot,
+            "arrival_ns": h.arrival_ns,
+            "datagram": h.datagram.hex(),
+            "accepted": h.accepted,
+        }
         for h in frames
-    ]
+    ]  # fmt: skip

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from dtsa_agent.air.udp import Heard, SlotRecord
+from dtsa_agent.air.udp.datagram import HEADER
 from dtsa_agent.core import AgentGroup, make_scenario
 from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.core.plugins import make_swarm
@@ -63,13 +64,13 @@ class Replay:
 
     def _hear(self, frames: list[Heard]) -> None:
         for heard in frames:
-            self.swarm.hear(heard.slot, heard.frame[: len(heard.frame) - self._tag])
+            self.swarm.hear(heard.slot, heard.datagram[HEADER : len(heard.datagram) - self._tag])
 
     def _compare(self, record: SlotRecord) -> None:
         swarm = self.swarm
         said = {
             "chosen": record.chosen, "reason": record.reason, "digest": record.digest,
-            "frame": record.frame[: len(record.frame) - self._tag].hex() if record.frame else "",
+            "frame": record.frame.hex(),
         }  # fmt: skip
         again = {
             "chosen": int(swarm.chosen[0]), "reason": int(swarm.reason[0]), "digest": int(swarm.digest[0]),

@@ -12,7 +12,6 @@ from typing import Any
 from dtsa_agent.air.udp import MulticastSocket, UdpSettings
 from dtsa_agent.air.udp.datagram import HEADER, Wrapping
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.frame import named_in
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 
@@ -44,9 +43,7 @@ class Sniffer:
     """
 
     def __init__(self, config: SwarmConfig, udp: UdpSettings, path: Path | None = None) -> None:
-        self._config = config
-        self._key = authenticator(config)
-        self._wrapping, self._judge = Wrapping(config), Judge(config)
+        self._wrapping, self._judge = Wrapping(config, authenticator(config)), Judge(config)
         self._slots: dict[int, dict[int, bytes]] = {}  # not judged yet
         self._judged = -1  # last slot
         self.refused: Counter[str] = Counter()
@@ -89,18 +86,13 @@ class Sniffer:
             self._judged = over
 
     def _read(self, data: bytes) -> tuple[int, int, str]:
-        fault = self._wrapping.fault(data)
+        fault, sender, slot, *_ = self._wrapping.read(data)
         if fault:
             return 0, 0, fault
-        named = named_in(data[HEADER:])
-        if named is None or not 1 <= named[0] <= self._config.agents:
-            return 0, 0, "no frame"
-        if self._key is not None and self._key.open(data[HEADER:], named[1]) is None:
-            return 0, 0, "rejected"
         # Of a group that lies behind, or the same frame once more.
-        if named[1] <= self._judged or named[0] in self._slots.get(named[1], {}):
-            return *named, "other time" if named[1] <= self._judged else "repeated"
-        return *named, ""
+        if slot <= self._judged:
+            return sender, slot, "other time"
+        return sender, slot, "repeated" if sender in self._slots.get(slot, {}) else ""
 
     def summary(self) -> dict[str, Any]:
         """What was heard, and what was found."""

@@ -60,7 +60,7 @@ class Ledger:
                 self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}")
         for sender, data in frames.items():
             self._check_sender(slot, sender, owner, given)
-            self._read(slot, sender, data)
+            self.read(slot, sender, data)
 
     def _check_sender(self, slot: int, sender: int, owner: int, given: list[tuple[int, int]]) -> None:
         lessees = {lessee for _, lessee in given}
@@ -71,7 +71,13 @@ class Ledger:
         elif any(issuer == owner for issuer, _ in given):
             self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(lessees)}")
 
-    def _read(self, slot: int, sender: int, data: bytes) -> None:
+    def read(self, slot: int, sender: int, data: bytes) -> None:
+        """Takes note of what a frame gives away, whether or not it got on the air.
+
+        :param slot: in which it was made.
+        :param sender: id.
+        :param data: the frame.
+        """
         try:
             frame = decode_extended(data)
         except RemoteProtocolError as error:

@@ -12,19 +12,19 @@ import numpy as np
 
 from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
 from dtsa_agent.core.agent import AgentGroup
-from dtsa_agent.core.authentication import TAG_LENGTH, AuthenticatedSwarm
 from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
-from dtsa_agent.core.frame import decode_frame, named_in
+from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
-from dtsa_agent.keys import with_key
+from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 
 from .clock import OwnClock
-from .datagram import HEADER, Wrapping
+from .datagram import HEADER, NO_FRAME, Wrapping
+from .delay import Delay
 from .precision import wake_precisely
 from .record import Heard, SlotRecord, Watcher
 from .settings import AgentSettings, UdpSettings
@@ -41,7 +41,6 @@ _LEAD, _LATEST_LEAD = 0.7, 0.06  # of a slot, as of agents in a ROS graph (docs/
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
 _OWN_ID = 3  # frames in the own name after which an agent that is new gives way
 _SAID = 64  # own frames that are remembered
-NO_FRAME, UNKNOWN, REJECTED = "no frame", "unknown agent", "rejected"
 OTHER_TIME, REPEATED, OWN_ID, EARLY = "other time", "repeated", "own id", "too early"
 
 
@@ -71,12 +70,12 @@ class UdpAgent:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
         check_joinable(config.policy)
         self.own, self.config, self.udp = own, config, udp
-        self.swarm: AbstractSwarm = with_key(make_swarm(config, local=[own.id]))
-        self._hears = self.swarm.inner if isinstance(self.swarm, AuthenticatedSwarm) else self.swarm
+        self._wrapping = Wrapping(config, authenticator(config))
+        self.swarm: AbstractSwarm = make_swarm(config, local=[own.id])
         self._group = AgentGroup(self.swarm)
-        self._wrapping = Wrapping(config)
         self._clock = OwnClock(own.clock_offset_ns, own.clock_drift_ppb)
         self.time = SlotTime(config, own.id)
+        self.delay = Delay(own.id, config.slot_ns // 4)
         self.watcher = watcher
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally(config.slot_ns)
@@ -88,10 +87,10 @@ class UdpAgent:
         self.slot = -1  # the slot that is open
         self._first = 0  # slot with which it began, or began anew
         self._awaits = False  # it takes another one for the slot's sender, and has not heard it yet
-        self._waiting = b""  # datagram of this slot, ready to be sent
+        self._waiting = b""  # frame of this slot, ready to be sent
         self._early: list[tuple[int, int, bytes, Datagram]] = []
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
-        self._said: deque[tuple[int, bytes]] = deque(maxlen=_SAID)  # own frames, with their slots
+        self._said: deque[bytes] = deque(maxlen=_SAID)  # own datagrams
         self._record: SlotRecord | None = None  # of the open slot
         self._before: list[Heard] = []  # heard after it began anew and before its first slot
         self._leaves_by: int | None = None  # CLOCK_MONOTONIC, ns
@@ -181,32 +180,27 @@ class UdpAgent:
 
     def _take(self, datagram: Datagram) -> str:
         """Takes in a datagram; why not, or an empty text."""
-        fault = self._wrapping.fault(datagram.data)
+        fault, sender, slot, late_ns, peers, frame = self._wrapping.read(datagram.data)
         if fault:
             return fault
-        sealed = datagram.data[HEADER:]
-        named = named_in(sealed)
-        if named is None:
-            return NO_FRAME
-        sender, slot = named
-        if not 1 <= sender <= self.config.agents:
-            return UNKNOWN
-        frame = self.swarm.unseal(sealed, slot)
-        if frame is None:
-            return REJECTED
         if not self._is_frame(frame):
             return NO_FRAME
         if sender == self.own.id:
-            return self._own_name(slot, sealed)
+            return self._own_name(slot, datagram.data)
         if self._last.get(sender, -1) == slot and self.time.state != LISTENING:
             return REPEATED
-        began = self._clock.local_ns(datagram.arrival_ns) - self._flight_ns
-        outcome = self.time.hear(slot, began)
+        began = self._clock.local_ns(datagram.arrival_ns) - self._flight_ns - late_ns
+        before = self.time.slot_start_ns(slot)
+        outcome = self.time.hear(slot, began - self.delay.error_ns)
         if outcome == FOREIGN:
             return OTHER_TIME
         self._last[sender] = slot
         if outcome == RESTARTED:
+            self.delay.reset()
             self._begin_anew()
+        else:
+            self.delay.hear(sender, began - before, peers)
+            self.delay.moved(self.time.slot_start_ns(slot) - before)
         if slot > self.slot:
             if len(self._early) >= _MOST_EARLY:
                 return EARLY
@@ -216,19 +210,21 @@ class UdpAgent:
         return ""
 
     def _is_frame(self, frame: bytes) -> bool:
-        """Whether bytes are a frame: nothing else may say what time it is."""
+        """Whether bytes are a frame: nothing else may say what time it is. What holders of the key seal is one."""
+        if self.config.auth:
+            return True
         try:
             decode_frame(frame[: len(frame) - self.config.own_bytes], self.config.extent_m)
         except RemoteProtocolError:
             return False
         return True
 
-    def _own_name(self, slot: int, sealed: bytes) -> str:
+    def _own_name(self, slot: int, data: bytes) -> str:
         """Somebody else speaks in the own name, or plays what was said there again.
 
         :raises ConfigError: while this agent is new: the other one was here before.
         """
-        if (slot, sealed) in self._said:
+        if data in self._said:
             return REPEATED
         if self.time.state == LISTENING or slot < self.slot - 1:
             return OTHER_TIME
@@ -238,11 +234,11 @@ class UdpAgent:
         return OWN_ID
 
     def _hear(self, sender: int, slot: int, frame: bytes, datagram: Datagram) -> None:
-        accepted = self._hears.hear(slot, frame)
+        accepted = self.swarm.hear(slot, frame)
         self._awaits &= slot < self.slot
         self.tally.heard += accepted
         arrival = self._clock.local_ns(datagram.arrival_ns)
-        heard = Heard(sender, slot, arrival, datagram.data[HEADER:], bool(accepted))
+        heard = Heard(sender, slot, arrival, datagram.data, bool(accepted))
         (self._before if self._record is None else self._record.heard).append(heard)
 
     # Its own slots.
@@ -282,7 +278,7 @@ class UdpAgent:
         self._awaits = int(swarm.chosen[0]) not in (0, self.own.id)
         frame = swarm.frame(0) if sends else b""
         self._record = self._recorded(slot, frame, present)
-        self._waiting = self._wrapping.wrap(frame) if sends else b""
+        self._waiting = frame
         if self._waiting and self._due_ns() - time.monotonic_ns() < 0:
             self._send()
         self._vehicle.fly(swarm, slot)
@@ -318,19 +314,20 @@ class UdpAgent:
     def _send(self) -> None:
         """Sends the frame that lies ready, unless its slot is as good as over."""
         due, now = self._due_ns(), time.monotonic_ns()
-        datagram, self._waiting = self._waiting, b""
+        frame, self._waiting = self._waiting, b""
         if now - due > self._slot_ns // 2:
             # Speaking now would disturb whoever has the next turn.
             self.swarm.frame_length[0] = 0
             self.tally.unsent += 1
             return
+        datagram = self._wrapping.wrap(frame, self.slot, now - due, self.delay.tell())
         self._socket.send(datagram)
-        self._said.append((self.slot, datagram[HEADER:]))
+        self._said.append(datagram)
         self.tally.sent(now - due)
         if self._record is not None:
             self._record.sent_ns = self._clock.local_ns(now)
+            self._record.datagram = datagram
         if self._leaves_by is not None and self.config.policy_row.says_leaving:
-            frame = datagram[HEADER : len(datagram) - (TAG_LENGTH if self.config.auth else 0)]
             self._gone = decode_extended(frame[: len(frame) - self.config.own_bytes], self.config.extent_m).leaving
 
     def _close_slot(self) -> SlotRecord | None:
@@ -352,7 +349,7 @@ class UdpAgent:
         """What came of it, as plain values."""
         swarm, away = self.swarm, self.swarm.goal[:, 0] - self.swarm.position[:, 0]
         refused: Counter[str] = Counter(self.tally.refused)
-        refused.update({"malformed": self._hears.malformed, "foreign": self._hears.foreign})
+        refused.update({"malformed": self.swarm.malformed, "foreign": self.swarm.foreign})
         return {
             "id": self.own.id,
             "agents": self.config.agents,
@@ -364,6 +361,7 @@ class UdpAgent:
             "times_taken_over": self.time.restarts,
             "times_corrected": self.time.corrected,
             "alignments": self.time.corrections,
+            "flight_time_error_us": self.delay.error_ns / 1e3,
             "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
             "not_taken_in": {name: count for name, count in sorted(refused.items()) if count},
             "unsendable": self._socket.unsendable,

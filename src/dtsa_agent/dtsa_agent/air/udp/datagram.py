@@ -6,45 +6,97 @@
 | 2 | version, 1 |
 | 3 | 0 |
 | 4-7 | of the settings that all agents share, and of the session: 32 bits of their hash, little-endian |
-| 8-.. | the frame, sealed or not |
+| 8-9 | how much later than its sender's slot the frame left, in 10 us, little-endian; the tag covers it |
+| 10-25 | four of those that its sender hears (:mod:`.delay`): id, 0: nobody; how much later than expected, in 10 us |
+| 26-.. | the frame, sealed or not |
+
+A computer that is busy sends late. Its clock is not late, and says by how much the frame is.
 """
 
 from __future__ import annotations
 
-from dtsa_agent.core.agreement import agreed_settings, settings_hash
-from dtsa_agent.core.config import SwarmConfig
+import struct
+from collections.abc import Sequence
+from typing import NamedTuple
 
-HEADER = 8  # bytes before the frame
+from dtsa_agent.core.agreement import agreed_settings, settings_hash
+from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core.config import SwarmConfig
+from dtsa_agent.core.frame import named_in
+
+from .delay import PEERS, Peer
+
+HEADER = 26  # bytes before the frame
 MODE = "udp"
-_MAGIC = b"DT\x01\x00"
 NOT_OURS, LENGTH, OTHER_SETTINGS = "not ours", "length", "other settings"
+NO_FRAME, UNKNOWN, REJECTED = "no frame", "unknown agent", "rejected"
+_TIMES = struct.Struct("<H" + PEERS * "Hh")
+_MAGIC = b"DT\x01\x00"
+_AGREED = 8  # bytes of the header that are the same in all datagrams of a swarm
+_UNIT_NS = 10_000  # of times in the header
+
+
+class Said(NamedTuple):
+    """What a datagram says; ``fault`` why it says nothing, or an empty text."""
+
+    fault: str
+    sender: int = 0
+    slot: int = 0
+    late_ns: int = 0
+    peers: tuple[Peer, ...] = ()  # whom the sender hears how late
+    frame: bytes = b""  # without its tag
 
 
 class Wrapping:
     """Puts frames into datagrams and takes them out.
 
     :param config: what all agents share.
+    :param authenticator: seals and opens frames; None: they are not sealed.
     """
 
-    def __init__(self, config: SwarmConfig) -> None:
+    def __init__(self, config: SwarmConfig, authenticator: Authenticator | None) -> None:
         agreed = settings_hash(agreed_settings(config, MODE)) & 0xFFFFFFFF
         self._header = _MAGIC + agreed.to_bytes(4, "little")
-        self._length = HEADER + config.frame_length
+        self._length, self._agents = HEADER + config.frame_length, config.agents
+        self._authenticator = authenticator
 
-    def wrap(self, frame: bytes) -> bytes:
+    def wrap(self, frame: bytes, slot: int, late_ns: int = 0, peers: Sequence[Peer] = ()) -> bytes:
         """The datagram of a frame.
 
-        :param frame: the frame, sealed if the settings say so.
+        :param frame: the frame, not sealed yet.
+        :param slot: in which it is sent.
+        :param late_ns: ns, how much later than its slot it leaves.
+        :param peers: whom its sender hears how late, :data:`PEERS` at most.
         """
-        return self._header + frame
+        told = [number for peer, late in peers for number in (peer, min(max(late // _UNIT_NS, -0x8000), 0x7FFF))]
+        told += [0] * (2 * PEERS - len(told))
+        times = _TIMES.pack(min(max(late_ns, 0) // _UNIT_NS, 0xFFFF), *told)
+        sealed = frame if self._authenticator is None else self._authenticator.seal(frame, slot, times)
+        return self._header + times + sealed
 
-    def fault(self, data: bytes) -> str:
-        """Why a datagram holds no frame for us; empty: it holds one.
+    def read(self, data: bytes) -> Said:
+        """What a datagram says.
 
         :param data: the datagram.
         """
         if data[:3] != _MAGIC[:3]:
-            return NOT_OURS
-        if data[:HEADER] != self._header:
-            return OTHER_SETTINGS if len(data) >= HEADER else LENGTH
-        return "" if len(data) == self._length else LENGTH
+            return Said(NOT_OURS)
+        if data[:_AGREED] != self._header:
+            return Said(OTHER_SETTINGS if len(data) >= _AGREED else LENGTH)
+        if len(data) != self._length:
+            return Said(LENGTH)
+        times, frame = data[_AGREED:HEADER], data[HEADER:]
+        named = named_in(frame)
+        if named is None:
+            return Said(NO_FRAME)
+        sender, slot = named
+        if not 1 <= sender <= self._agents:
+            return Said(UNKNOWN)
+        if self._authenticator is not None:
+            opened = self._authenticator.open(frame, slot, beside=times)
+            if opened is None:
+                return Said(REJECTED)
+            frame = opened
+        late, *told = _TIMES.unpack(times)
+        peers = tuple((peer, by * _UNIT_NS) for peer, by in zip(told[::2], told[1::2], strict=True) if peer)
+        return Said("", sender, slot, late * _UNIT_NS, peers, frame)

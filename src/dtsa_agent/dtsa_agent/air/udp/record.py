@@ -15,7 +15,7 @@ class Heard:
     sender: int  # id
     slot: int  # in which it was sent
     arrival_ns: int  # own clock
-    frame: bytes  # as it was on the air
+    datagram: bytes  # as it was on the air
     accepted: bool  # whether the tables took it
 
 
@@ -36,8 +36,9 @@ class SlotRecord:
     velocity: Floats  # (3,) m/s, at the start
     command: Floats  # (3,) m/s, at the start
     goal: Floats  # (3,) m
-    frame: bytes = b""  # what it was to send, as on the air; empty: silent
+    frame: bytes = b""  # what it was to send, without a tag; empty: silent
     sent_ns: int = -1  # when that was handed to the network; -1: not at all
+    datagram: bytes = b""  # as on the air; empty: nothing was sent
     before: list[Heard] = field(default_factory=list)  # heard since it began anew, before this first slot
     heard: list[Heard] = field(default_factory=list)  # while this slot was open, in this order
 

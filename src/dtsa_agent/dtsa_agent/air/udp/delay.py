@@ -1,0 +1,83 @@
+"""How much longer frames are under way than an agent supposes: nobody can tell alone, two together can.
+
+What agent i hears of j comes later than i expects by d + o_j - o_i, and what j hears of i by d + o_i - o_j: d is the
+part of the way that nobody has thought of, o the offsets of their slots. So d is half the sum. Every agent says in its
+datagrams how late it hears some of the others, in turn, and takes the median over all pairs that it is part of for d.
+Without it everybody would move towards frames that seem late, and the slots of those that hear much would run away
+from the slots of those that hear little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+_SHARE = 64  # of which the estimate moves by a part with a frame: slowly, so that it does not follow the slots
+_STEP_NS = 1_000_000
+PEERS = 4  # of which a datagram tells
+
+Peer = tuple[int, int]  # id, and how much later than expected it is heard, ns
+
+
+class Delay:
+    """What one agent knows of it.
+
+    :param agent: own id.
+    :param limit_ns: ns; what is off by more, either way, counts as this.
+    """
+
+    __slots__ = ("_agent", "_hears", "_limit_ns", "_said", "_turn", "error_ns")
+
+    def __init__(self, agent: int, limit_ns: int) -> None:
+        self._agent, self._limit_ns = agent, limit_ns
+        self._hears: dict[int, int] = {}  # how much later than expected each other one is heard, ns
+        self._said: dict[int, int] = {}  # how much later than expected each other one says to hear this one, ns
+        self._turn = 0
+        #: How much longer frames are under way than supposed, ns.
+        self.error_ns = 0
+
+    def _median(self) -> int:
+        """Half the sum over the pairs that are known, their median, ns."""
+        sums = sorted(self._hears[peer] + said for peer, said in self._said.items() if peer in self._hears)
+        if not sums:
+            return self.error_ns
+        middle = len(sums) // 2
+        return (sums[middle] + sums[~middle]) // 4
+
+    def hear(self, sender: int, offset_ns: int, peers: Sequence[Peer]) -> None:
+        """A frame was heard.
+
+        :param sender: id.
+        :param offset_ns: ns, how much later than expected.
+        :param peers: whom its sender hears how late.
+        """
+        self._hears[sender] = self._limited(offset_ns)
+        for peer, late_ns in peers:
+            if peer == self._agent:
+                self._said[sender] = self._limited(late_ns)
+        step = self._median() - self.error_ns
+        self.error_ns += min(max(step, -_STEP_NS), _STEP_NS) // _SHARE
+
+    def tell(self) -> tuple[Peer, ...]:
+        """What the next datagram says: the others in turn."""
+        heard = sorted(self._hears)
+        count = min(PEERS, len(heard))
+        told = [heard[(self._turn + k) % len(heard)] for k in range(count)]
+        self._turn += count
+        return tuple((peer, self._hears[peer]) for peer in told)
+
+    def moved(self, by_ns: int) -> None:
+        """The own slots have moved.
+
+        :param by_ns: ns, later.
+        """
+        for values, by in ((self._hears, -by_ns), (self._said, by_ns)):
+            for peer in values:
+                values[peer] += by
+
+    def reset(self) -> None:
+        """Another time was taken over."""
+        self._hears.clear()
+        self._said.clear()
+
+    def _limited(self, offset_ns: int) -> int:
+        return min(max(offset_ns, -self._limit_ns), self._limit_ns)
