@@ -18,6 +18,7 @@ from metronome import flown_again_when_overloaded
 
 from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.state_machine import State
+from dtsa_agent.crazyflie.trajectories import Piece, Trajectory
 
 pytestmark = pytest.mark.slow
 
@@ -51,12 +52,21 @@ def radio_flight(
 @flown_again_when_overloaded
 def test_a_link_that_cflib_closes_is_opened_again_in_flight(tmp_path: Path) -> None:
     with radio_flight(tmp_path, 2, {"safety": {"emergency_watchdog": False}}) as (fleet, pilot):
+        one = pilot.bridge.vehicles["cf1"]
+        still = (0.0,) * 8
+        aside = Piece((0.0, -0.2, *still[2:]), still, still, still, 1.0)
+        assert one.upload_trajectory(Trajectory(0, 0, (aside,))) == ""
         pilot.take_off()
-        link = pilot.bridge.vehicles["cf1"].link
+        link = one.link
         link._cf.link.link_error_callback("Too many packets lost")  # as cflib does it after 100 of them
         assert pilot.logged("cf1: flying -> lost .*Too many packets lost")
         wait_for(lambda: link.reopened == 1 and pilot.state(1) != State.LOST, 5.0)
         wait_for(lambda: pilot.state(1) == State.FLYING)
+        # Parameters can be set again once cflib has read them; nothing waits for that.
+        wait_for(lambda: one.onboard.settable)
+        one.onboard.set_parameter("ring.effect", 9)
+        wait_for(lambda: one.onboard.parameters()["ring.effect"].value == 9)
+        assert one.onboard.trajectories[0].pieces == (aside,)
         pilot.bridge.land_all("test over")
         assert pilot.bridge.wait_landed(lambda: False) == []
         assert [e for e in fleet.flown(1) if e in ("level out", "locked")] in ([], ["level out"])
