@@ -32,6 +32,7 @@ from std_srvs.srv import Empty  # noqa: E402
 from dtsa_agent.crazyflie import bridge_node  # noqa: E402
 from dtsa_agent.crazyflie.bridge_inputs import Inputs  # noqa: E402
 from dtsa_agent.crazyflie.crazyswarm2.inputs import Answer, Crazyswarm2Inputs  # noqa: E402
+from dtsa_bench.cli import main  # noqa: E402
 from dtsa_bench.fly.domain import ros_domain  # noqa: E402
 
 pytestmark = pytest.mark.ros
@@ -62,6 +63,16 @@ def test_units_and_frames_are_those_of_its_server() -> None:
     assert place == (1.0, 0.0, 0.5)
     assert rates == [0.1, 0.2, 0.3]  # rad/s
     assert ours._full_state(state, 0.0).arguments[0] == (1.0, 0.0, 1.45)  # frame map, unless the header says world
+
+
+def test_the_command_says_it_to_the_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[list[str]] = []
+    monkeypatch.setattr(bridge_node, "main", lambda arguments: said.append(arguments) or 0)
+    config = tmp_path / "swarm.yaml"
+    config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9001"}}}))
+    assert main(["bridge", "--config", str(config)]) == 0
+    assert main(["bridge", "--config", str(config), "--interfaces", "crazyswarm2"]) == 0
+    assert ["interfaces:=crazyswarm2" in arguments for arguments in said] == [False, True]
 
 
 def test_all_are_not_sent_to_one_place() -> None:
@@ -126,11 +137,22 @@ class Program:
         self.context.try_shutdown()
 
 
+def heard(messages: list[Any], number: int = 3) -> Any:
+    """The latest of some messages."""
+    wait_for(lambda: len(messages) >= number)
+    return messages[-1]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not MESSAGES, reason="crazyflie_interfaces is not in the workspace")
 @flown_again_when_overloaded
 def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
-    from crazyflie_interfaces.msg import LogDataGeneric, Status, TrajectoryPolynomialPiece
+    from crazyflie_interfaces.msg import (
+        ConnectionStatisticsArray,
+        LogDataGeneric,
+        Status,
+        TrajectoryPolynomialPiece,
+    )
     from crazyflie_interfaces.srv import AddLogging, GoTo, Land, StartTrajectory, Takeoff, UploadTrajectory
 
     with ros_domain() as domain, fake_fleet(tmp_path, 2) as fleet:
@@ -142,7 +164,9 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
         data["all"]["firmware_logging"] = {"enabled": True, "custom_topics": {"volts": volts}}
         config.write_text(yaml.safe_dump(data))
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), "--interfaces", "crazyswarm2"]
+        parameters = {"config": config, "interfaces": "crazyswarm2", "warnings.communication.publish_stats": "true"}
+        command = [sys.executable, "-m", "dtsa_agent.crazyflie.bridge_node", "--ros-args"]
+        command += [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
         process = subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -169,6 +193,8 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
             volts_of_two = program.listen(LogDataGeneric, "/cf2/volts")
             wait_for(lambda: len(logged) > 2 and len(volts_of_two) > 2)
             assert 3.0 < logged[-1].values[0] < 4.3
+            (counted,) = heard(program.listen(ConnectionStatisticsArray, "/cf1/connection_statistics")).stats
+            assert (counted.uri, counted.receive_count > 10) == (fleet.uri(1), True)
             # Nobody is armed: they arm themselves. Groups by the firmware's parameter.
             smooth = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]
             piece = TrajectoryPolynomialPiece(
