@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -16,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.positions import PositionNumbers
+from dtsa_agent.crazyflie.reports import snapshot
 from dtsa_agent.crazyflie.snapshot import Snapshot
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.crazyflie.units import VehicleState, to_map
@@ -47,6 +49,7 @@ class Outputs:
         self._clock = node.get_clock()
         self._name = node.get_name()
         self._origin = settings.station.room_origin_in_world
+        self._told: dict[str, State] = {}  # the last state that was not left to the regular status
         self._odom: dict[str, Any] = {}
         self._pose: dict[str, Any] = {}
         self._status: dict[str, Any] = {}
@@ -67,8 +70,15 @@ class Outputs:
         return to_map(state.position, self._origin)
 
     def publish_state(self, vehicle: Vehicle, state: VehicleState) -> None:
-        """Odometry and pose of one log packet, in the link's thread; only what somebody listens to."""
+        """Odometry and pose of one log packet, in the link's thread; only what somebody listens to.
+
+        Whoever has entered another state says so at once: others may fly towards it.
+        """
         name = vehicle.name
+        if vehicle.state != self._told.get(name):
+            self._told[name] = vehicle.state
+            message = self._status_message(snapshot(vehicle, time.monotonic()), self._clock.now().to_msg())
+            self._status[name].publish(message)
         odom, pose = self._wanted.get(name, (False, False))
         if not (odom or pose):
             return

@@ -11,6 +11,9 @@ from dtsa_agent.core.abstract_swarm import AbstractSwarm, SwarmWrapper
 
 HOLD_GAIN = 1.0  # 1/s, for agents that hover: real air does not leave them where they are
 HOLD_MPS = 0.3
+SPREAD_M = 0.45  # horizontally: closer than this nobody comes to rest, since all land straight down
+NOWHERE_M = 1e-3
+PUSH_M = 0.3  # farther than this at once nobody makes way
 
 
 class ExternalVehicles(SwarmWrapper):
@@ -36,7 +39,10 @@ class ExternalVehicles(SwarmWrapper):
         self.track[:] = position
 
     def stop_here(self) -> None:
-        """From now on nobody flies to its goal: all come to rest, and keep out of each other's way as before."""
+        """From now on nobody flies to its goal: all come to rest, and nobody above another one.
+
+        They keep out of each other's way as before.
+        """
         self._stopping = True
 
     def fly(self, slot: int) -> None:
@@ -52,6 +58,18 @@ class ExternalVehicles(SwarmWrapper):
     def _steer(self, slot: int) -> None:
         goal = self.goal.copy()  # the protocol still counts with it
         if self._stopping:
-            self.goal[:] = self.position  # nothing else to wish for than to be at rest
+            self.goal[:] = self.position + self._way()
         self.steer(slot, 0)
         self.goal[:] = goal
+
+    def _way(self) -> NDArray[np.float64]:
+        """Where each goes to make way for those that are near horizontally, at whatever height, (3, L) m."""
+        apart = self.position[:2, :, None] - self.position[:2, None, :]
+        distance = np.linalg.norm(apart, axis=0)
+        index = np.arange(distance.shape[0])
+        above = (distance < NOWHERE_M) & (index[:, None] != index)  # one right above the other: by their numbers
+        apart[0] += np.where(above, np.sign(index[:, None] - index) * NOWHERE_M, 0.0)
+        distance = np.maximum(np.linalg.norm(apart, axis=0), NOWHERE_M)
+        way = np.zeros_like(self.position)
+        way[:2] = (apart / distance * np.maximum(SPREAD_M - distance, 0.0)).sum(axis=2)
+        return way * np.minimum(1.0, PUSH_M / np.maximum(np.linalg.norm(way, axis=0), NOWHERE_M))

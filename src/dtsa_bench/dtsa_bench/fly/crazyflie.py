@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 import yaml
 from rclpy.context import Context
@@ -38,7 +39,7 @@ from .domain import LAST_DOMAIN, ros_domain
 from .flight import END_S, QUIET, Flight, run_environment
 from .mission import Ended, Mission
 from .options import FlightOptions
-from .places import MissionError, check_places
+from .places import APART_M, MissionError, check_places
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import RealtimeSupervisor
@@ -68,13 +69,19 @@ class _Rest:
 
     :param ended: why it has to end.
     :param mission: tells them.
+    :param channel: knows where they are.
     """
 
-    def __init__(self, ended: Ended, mission: Mission) -> None:
-        self._ended, self._mission = ended, mission
+    def __init__(self, ended: Ended, mission: Mission, channel: RealtimeChannel) -> None:
+        self._ended, self._mission, self._channel = ended, mission, channel
 
     def __bool__(self) -> bool:
-        return bool(self._ended) and (self._ended.stop.count > 1 or self._mission.at_rest())
+        return bool(self._ended) and (self._ended.stop.count > 1 or self._mission.at_rest(self._apart))
+
+    def _apart(self) -> bool:
+        places = np.array([self._channel.last_place(agent)[:2] for agent in range(1, self._channel.agents + 1)])
+        gaps = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(len(places), np.inf))
+        return bool(gaps.min() >= APART_M)
 
 
 class _BridgeWatch(ChannelObserver):
@@ -207,7 +214,7 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         shown = FlightProgress(progress, measurement, channel)
         channel.observe(_BridgeWatch(mission), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
         try:
-            channel.run(_Rest(ended, mission))
+            channel.run(_Rest(ended, mission, channel))
             ended.reason = ended.reason or channel.fell_behind
             shown.show()
         except (NodeError, MissionError) as error:  # the bridge has died: what was flown is there all the same

@@ -40,7 +40,7 @@ SHIFT_MPS = 0.3
 BRING_MPS = 0.8  # of one that is brought to its place, at most
 KEEP_M = 0.3  # nobody comes closer to one that is brought to its place
 BRIDGE_SILENT_S = 3.0
-STOPPING_S = 1.2  # all come to rest within that time, and keep out of each other's way
+STOPPING_S = (1.2, 6.0)  # all come to rest within the first time; at the second they land wherever they are
 IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
 BRIDGE_S = 60.0  # s, for the connections
 
@@ -294,13 +294,17 @@ class Mission:
         """Who was in the air, or may have been, when it was last heard of."""
         return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
 
-    def at_rest(self) -> bool:
-        """Tell all that fly to come to rest where they are; True once they have had the time for that."""
+    def at_rest(self, apart: Callable[[], bool]) -> bool:
+        """Tell all that fly to come to rest, nobody above another one; True once they have, or time is up.
+
+        :param apart: whether all are where they can land straight down.
+        """
         now = time.monotonic()
         if self._stopping is None:
             self._stopping = now
             self._stop_here.publish(EmptyMessage())
-        return now - self._stopping > STOPPING_S
+        least, most = STOPPING_S
+        return now - self._stopping > most or (now - self._stopping > least and apart())
 
     def order_landing(self) -> None:
         """Have all land that are in the air; does not wait. They brake at once, all at the same time."""

@@ -9,24 +9,24 @@ from typing import Any
 from dtsa_bench.batch.task import Row
 
 from ..item import Item, Soak
-from . import gaps, missions, streams
+from . import cuts, gaps, missions, streams
 
-_PARTS = {"mission": missions.run, "gap": gaps.run, "stream": streams.run}
+_PARTS = {"mission": missions, "gap": gaps, "stream": streams, "cut": cuts}
 
 
 def _items() -> Iterator[Item]:
     """All items, some of each kind first: a soak that is cut short has seen everything."""
-    yield from sorted((item for part in (streams, gaps, missions) for item in part.items()), key=lambda i: i.seed)
+    yield from sorted((item for part in _PARTS.values() for item in part.items()), key=lambda i: i.seed)
 
 
 def _run(item: Item, directory: Path) -> dict[str, Any]:
-    return _PARTS[str(item.settings["part"])](item, directory)
+    return _PARTS[str(item.settings["part"])].run(item, directory)
 
 
 def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     found = [row["summary"] for row in rows]
-    for name, part in (("mission", missions), ("gap", gaps), ("stream", streams)):
+    for name, part in _PARTS.items():
         figures.update(part.figures([summary for summary in found if summary["part"] == name]))
     return figures
 
@@ -34,7 +34,8 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
 SOAK = Soak(
     "crazyflie",
     "missions of twelve complete with code 0, nobody nearer than 0.25 m, over UDP and over radios that lose packets; "
-    "nobody falls after a gap of the air below 0.75 s; commands reach twelve over three dongles at 50 Hz",
+    "nobody falls after a gap of the air below 0.75 s; commands reach twelve over three dongles at 50 Hz; missions cut "
+    "short land as far apart",
     tuple(_items()),
     _run,
     _figures,
