@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -78,7 +79,10 @@ class Graph:
         return status.state_name if status else ""
 
     def place(self, k: int) -> tuple[float, float, float]:
-        p = self.last[f"/cf{k}/odom"].pose.pose.position
+        odometry = self.last.get(f"/cf{k}/odom")
+        if odometry is None:  # sent only once the bridge knows that somebody listens
+            return math.inf, math.inf, math.inf
+        p = odometry.pose.pose.position
         return p.x, p.y, p.z
 
     def close(self) -> None:
