@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
             found = explore(program, world)
             failed += bool(found.broken)
             end = found.broken or ("all states" if found.closed else "holds so far, not all states")
-            print(f"{world.name:36} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
+            print(f"{world.name:62} {found.states:9} states, depth {found.depth:3}: {end}", flush=True)
         for mutant in MUTANTS:
             found = explore(build(Path(directory), mutant), mutant.world)
             failed += not found.broken

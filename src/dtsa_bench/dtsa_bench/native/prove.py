@@ -64,7 +64,11 @@ WORLDS = (
     World("three agents, M = 3", 3, anchor_every=3),
     World("three agents, adoption", 3, adoption=True),
     World("three agents, OPEN turns", 3, open_every=4),
-)
+    World(
+        "three agents, OPEN turns, adoption; one restart, death, claim", 3, open_every=4, adoption=True, restarts=1,
+        deaths=1, returns=0, claims=1,
+    ),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
