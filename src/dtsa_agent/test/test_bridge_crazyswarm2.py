@@ -87,8 +87,16 @@ def test_without_its_messages_the_bridge_says_so_and_ends(
     monkeypatch.setitem(sys.modules, "crazyflie_interfaces", None)
     config = tmp_path / "swarm.yaml"
     config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9001"}}}))
-    for value, words in (("crazyswarm2", "crazyflie_interfaces"), ("other", "one of dtsa, crazyswarm2"), ("1", "dtsa")):
-        arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config}", "-p", f"interfaces:={value}"]
+    parameters = tmp_path / "parameters.yaml"  # as a launch file hands them over, with the node's name
+    asked = {"config": str(config), "interfaces": "crazyswarm2"}
+    parameters.write_text(yaml.safe_dump({"/crazyflie_server": {"ros__parameters": asked}}))
+    for given, words in (
+        (["-p", "interfaces:=crazyswarm2"], "crazyflie_interfaces"),
+        (["-r", "__node:=crazyflie_server", "--params-file", str(parameters)], "crazyflie_interfaces"),
+        (["-p", "interfaces:=other"], "one of dtsa, crazyswarm2"),
+        (["-p", "interfaces:=[1, 2]"], "one of dtsa, crazyswarm2"),
+    ):
+        arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config}", *given]
         assert bridge_node.main(arguments) == 2
         errors = capsys.readouterr().err.strip().splitlines()
         assert len(errors) == 1

@@ -1,6 +1,7 @@
 """Crazyflies: the bridge alone, for other nodes to fly them; or a whole recorded mission. With simulated ones, too.
 
 ``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm.yaml``
+``ros2 launch dtsa_bench crazyflie_launch.py config:=crazyflies.yaml interfaces:=crazyswarm2``
 ``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm.yaml mission:=true out:=mission_1``
 ``ros2 launch dtsa_bench crazyflie_launch.py config:=swarm_simulated.yaml mission:=true simulated:=true``
 
@@ -21,6 +22,7 @@ from launch_ros.actions import Node
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.config import load_swarm
 
+CRAZYSWARM2 = "crazyswarm2"
 LAND_S = "60.0"  # from Ctrl-C until SIGTERM: all land first
 
 
@@ -45,11 +47,12 @@ def _processes(context: LaunchContext) -> list:
         fly = [_bench("dtsa"), "fly", "--backend", "cflib", "--config", config, "--domain", domain, "--out", out, *more]
         actions.append(ExecuteProcess(cmd=fly, output="screen", name="mission", sigterm_timeout=LAND_S, on_exit=over))
         return actions
+    interfaces = LaunchConfiguration("interfaces").perform(context)
     bridge = Node(
         package="dtsa_agent",
         executable="crazyflie_bridge",
-        name="crazyflie_bridge",
-        parameters=[{"config": os.path.abspath(config)}],
+        name="crazyflie_server" if interfaces == CRAZYSWARM2 else "crazyflie_bridge",
+        parameters=[{"config": os.path.abspath(config), "interfaces": interfaces}],
         output="screen",
         sigterm_timeout=LAND_S,
         on_exit=over,
@@ -60,19 +63,21 @@ def _processes(context: LaunchContext) -> list:
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for."""
     yes_no = ["true", "false"]
+    choices = {"mission": yes_no, "simulated": yes_no, "interfaces": ["dtsa", CRAZYSWARM2]}
     described = {
         "config": "the swarm's YAML file",
         "mission": "fly a recorded mission",
         "simulated": "the Crazyflies are simulated ones",
+        "interfaces": "of the bridge: dtsa, or crazyswarm2 for its programs",
         "out": "directory for a mission's bag and results",
         "options": "further options of a mission, as `fly` has them",
     }
-    defaults = {"mission": "false", "simulated": "false", "out": "mission"}
+    defaults = {"mission": "false", "simulated": "false", "interfaces": "dtsa", "out": "mission"}
     arguments = [
         DeclareLaunchArgument(
             name,
             default_value=defaults.get(name, ""),
-            choices=yes_no if defaults.get(name) in yes_no else None,
+            choices=choices.get(name),
             description=text,
         )
         for name, text in described.items()
