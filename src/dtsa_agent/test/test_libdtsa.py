@@ -176,6 +176,10 @@ def test_the_header_says_its_version() -> None:
     assert LIB.dtsa_version() == int(version[1]) == _kernel.VERSION
 
 
+def test_one_compiled_file_serves_every_python() -> None:
+    assert Path(str(_kernel.__file__)).name == "_kernel.abi3.so"
+
+
 SCALARS = {"int": "i", "double": "d", "int64_t": "q", "uint64_t": "Q"}
 ITEMS = {
     "double": "f8", "int64_t": "i8", "uint64_t": "u8", "int32_t": "i4", "uint32_t": "u4", "uint16_t": "u2",
