@@ -17,6 +17,7 @@ from dtsa_agent.core.frame_extended import (
     decode_extended,
     encode_extended,
 )
+from dtsa_agent.core.reference.lease.issue import open_block
 from dtsa_agent.core.reference.lease.memory import Memory
 from dtsa_agent.core.reference.rules import Rules
 
@@ -120,7 +121,7 @@ def test_deaf_agents_give_nothing_away() -> None:
     air = Air(make(12, 6)).run(600)
     air.run(300, jam=True)
     # What is still said at first was given away before the jam.
-    later = [slot for slot in range(600 + 6 * 12, 900) if slot in air.frames and any(air.frames[slot].leases)]
+    later = [slot for slot in range(600 + 16 * 12, 900) if slot in air.frames and any(air.frames[slot].leases)]
     assert later == []
     before = len(air.sent)
     air.run(600)
@@ -215,6 +216,7 @@ def test_waking_takes_the_next_open_turn() -> None:
 
 def test_many_that_wake_together_get_out_of_each_others_way() -> None:
     swarm = make(40, 10)
+    swarm.final[:] = 0
     air = Air(swarm).run(2000)
     swarm.goal[0, 20:] = FAR
     air.run(5 * 40)
@@ -325,9 +327,47 @@ def test_every_agent_needs_a_table_of_its_own() -> None:
 def test_open_turns_visit_all_owners() -> None:
     for agents in range(2, 255):
         period = SwarmConfig(agents=agents, moving=0, policy="lease").open_period
-        assert period >= 11
-        assert np.gcd(period, agents) == 1
+        assert period == max(11, agents // 5)
+        for resting in {1, agents // 3, agents} - {0}:
+            kinds = ((0.0, 0), (0.0, resting), (1.0, 0), (1.0, resting))
+            blocks = [open_block(agents, period, wakers, resting, settled) for wakers, settled in kinds]
+            assert all(np.gcd(block, agents) == 1 for block in blocks)
+            assert blocks[0] >= period * agents / resting
+            assert blocks[2] <= blocks[0] <= blocks[1]
     assert SwarmConfig(policy="lease", open_every=0).open_period == 0
+    assert open_block(12, 0, 0.0, 6, 6) == open_block(12, 11, 0.0, 0, 0) == 0
+
+
+def test_open_turns_are_spaced_evenly() -> None:
+    """So who wakes waits for one block at most, the odd one that is nobody's apart."""
+    air = Air(make(40, 10, open_every=20)).run(3000)
+    block = open_block(40, 20, 0.0, 30, 30)
+    opened = [slot for slot in range(3000, 3600) if air.run(1).swarm.reason_name(0) == "open"]
+    assert len(opened) >= 0.9 * 600 / block
+    assert max(np.diff(opened)) < 2 * block
+
+
+def test_who_knows_that_it_will_rest_speaks_at_main_anchors_only() -> None:
+    """Agent 12 does not know: it goes on speaking every M rounds."""
+    swarm = make(12, 6)
+    swarm.final[11] = 0
+    air = Air(swarm).run(3000)
+    main = Memory(Rules(agents=12, slot_s=0.01, main_every=15)).is_main
+    for agent in range(7, 12):
+        assert [slot for slot in range(1000, 3000) if (agent,) == air.sent[slot]] == [
+            slot for slot in range(1000, 3000) if slot % 12 == agent - 1 and main(slot)
+        ]
+    assert all(air.sent[slot] == (12,) for slot in range(1000, 3000) if slot % 12 == 11 and is_anchor(slot, 12))
+    assert all(len(senders) <= 1 for senders in air.sent)
+
+
+def test_turns_are_spread_evenly_over_those_that_move() -> None:
+    """Half move: each has about every sixth slot, and never waits for longer than a round."""
+    air = Air(make(12, 6)).run(3000)
+    gaps = [np.diff([slot for slot in range(1500, 3000) if air.sent[slot] == (agent,)]) for agent in range(1, 7)]
+    assert max(each.max() for each in gaps) <= 12
+    ages = [((each**2).sum() / each.sum() - 1.0) / 2.0 for each in gaps]
+    assert 2.5 <= np.mean(ages) < 3.1  # (6 - 1) / 2 is the bound
 
 
 @pytest.mark.parametrize(("agents", "every"), [(3, 5), (5, 2), (2, 8)])

@@ -29,7 +29,7 @@ class Avoid(ctypes.Structure):
 class Lease(ctypes.Structure):
     _fields_ = [
         ("anchor_every", c_int), ("open_every", c_int), ("adoption", c_int), ("depth_rate", c_double),
-        ("share", c_double), ("patience", c_int64),
+        ("share", c_double), ("patience", c_int64), ("main_every", c_int),
     ]  # fmt: skip
 
 

@@ -73,6 +73,17 @@ def test_every_state_of_three_agents_keeps_the_rules(adoption: bool, tmp_path: P
     assert whole.states > 1_000
 
 
+def test_anchors_that_are_given_away_keep_the_rules(tmp_path: Path) -> None:
+    """OPEN turns, adoption, a restart, a wrong claim; one anchor in two is a main one."""
+    world = World(
+        "two agents", 2, anchor_rest=2, open_every=3, adoption=True, restarts=1, deaths=0, returns=0, claims=1
+    )
+    whole = explore(build_prover(tmp_path), world)
+    assert whole.closed
+    assert not whole.broken
+    assert whole.states > 1_000
+
+
 def test_every_broken_rule_is_found(tmp_path: Path) -> None:
     found = {mutant.rule: explore(build_prover(tmp_path, mutant), mutant.world).broken for mutant in MUTANTS}
     assert all(found.values()), [rule for rule, broken in found.items() if not broken]

@@ -85,7 +85,8 @@ SWARM = Layout(
         ("boot_round", "i", ""), ("return_every", "i", ""), ("r_min", "d", ""), ("c_r", "i", ""),
         ("targets_known", "i", ""), ("gossip", "i", ""), ("position_step", "d", ""), ("key", "Q", ""), *_AVOID_FIELDS,
         ("anchor_every", "i", ""), ("open_every", "i", ""), ("adoption", "i", ""), ("depth_rate", "d", ""),
-        ("share", "d", ""), ("patience", "q", ""), ("start", "f8", "3n"), ("target", "f8", "3n"), ("decay", "f8", "2k"),
+        ("share", "d", ""), ("patience", "q", ""), ("main_every", "i0q", ""),
+        ("start", "f8", "3n"), ("target", "f8", "3n"), ("decay", "f8", "2k"),
         ("decay_len", "i0q", ""),  # a structure in a structure ends at a multiple of eight bytes
         ("local_count", "i", ""), ("table_count", "i", ""), ("shared", "i", ""), ("tau", "d", ""), ("a_max", "d", ""),
         ("local", "i4", "l"), ("observer", "i4", "v"), ("sent_p", "f8", "v3n"), ("sent_v", "f8", "v3n"),

@@ -17,6 +17,7 @@ FRAMES = ("auto", "paper", "extended")
 SHAPES = ("circle", "ellipse", "ellipsoid")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
 MAX_AGENTS = 1024
+MOST_ROUNDS = 15  # from one anchor that nobody gives away to the next: so far lease bytes reach
 MAX_EXTENDED_AGENTS = EXTENDED_SENDER_MAX  # ids have 8 bits in extended frames
 
 
@@ -85,11 +86,21 @@ class SwarmConfig(Settings):
     )
     gossip: bool = setting(True, "extended frames carry what their sender last heard of others")
     anchor_every: int = setting(
-        5, "lease: every so many rounds an agent's turn is its own whatever happens, M", minimum=1, maximum=15
+        5,
+        "lease: every so many rounds an agent's turn is an anchor: nobody else gives it away, M",
+        minimum=1,
+        maximum=MOST_ROUNDS,
+    )
+    anchor_rest: int = setting(
+        3,
+        "lease: who knows that it will rest gives all but one of so many anchors away, K; K M is at most 15, and M "
+        "without open turns or adoption",
+        minimum=1,
+        maximum=MOST_ROUNDS,
     )
     open_every: int = setting(
         11,
-        "lease: one of so many leased turns is open to all who wake, S (or the next coprime to N); 0: none",
+        "lease: one of so many turns of those that rest is open to all who wake, S (at least N / 5); 0: none",
         minimum=0,
         maximum=1000,
     )
@@ -215,14 +226,18 @@ class SwarmConfig(Settings):
 
     @property
     def open_period(self) -> int:
-        """S: the smallest number from ``open_every`` on that has no factor in common with N; 0: no open turns.
+        """S: one of so many turns of those that rest is open to all who wake, at least N / 5; 0: none is."""
+        return max(self.open_every, self.agents // 5) if self.open_every else 0
 
-        With a common factor the turns of the same few owners would always be the open ones.
+    @property
+    def main_every(self) -> int:
+        """Rounds from one main anchor of an agent, which nobody gives away, to the next: K M.
+
+        Where there are no open turns, or nobody speaks for the absent, every anchor is a main one: who wakes or comes
+        back would have nothing else.
         """
-        period = self.open_every
-        while period > 1 and math.gcd(period, self.agents) > 1:
-            period += 1
-        return period
+        rest = min(self.anchor_rest, MOST_ROUNDS // self.anchor_every)
+        return self.anchor_every * (rest if self.open_every and self.adoption else 1)
 
     @property
     def slot_s(self) -> float:

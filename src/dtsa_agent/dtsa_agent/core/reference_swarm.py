@@ -44,8 +44,8 @@ def rules_of(config: SwarmConfig, scenario: Scenario) -> Rules:
         position_step=position_step(config.extent_m), r_min=config.r_min, c_r=config.c_r,
         targets_known=config.targets_known and scenario.goals_known, gossip=config.gossip,
         key=int(generator(config.seed, STREAM_POLICY).integers(0, 2**63)), anchor_every=config.anchor_every,
-        open_every=config.open_period, adoption=config.adoption, depth_rate=config.depth_rate,
-        lease_share=config.lease_share,
+        main_every=config.main_every, open_every=config.open_period, adoption=config.adoption,
+        depth_rate=config.depth_rate, lease_share=config.lease_share,
     )  # fmt: skip
 
 

@@ -268,7 +268,7 @@ REASON_TEXTS: Mapping[str, str] = MappingProxyType(
         "random": "a draw decides whether the agent sends",
         "plugin": "a policy from another package decided",
         "own": "the owner uses its own turn",
-        "anchor": "the owner's turn that is never given away, so that all hear of it now and then",
+        "anchor": "the owner's turn that nobody else gives away, so that all hear of it now and then",
         "leased": "the owner gave this turn to an agent that has more to say",
         "adopted": "the owner is thought dead; the next one alive gave its turn away",
         "open": "turn for whoever has just woken or joined; nobody in particular is expected",

@@ -60,7 +60,7 @@ class Swarm(AbstractSwarm):
     ) -> None:
         self._begin(config, scenario, local, shared_table, observers)
         count = len(self.ids)
-        state = _kernel.policy_bytes(POLICIES.number(config.policy), config.agents, config.anchor_every)
+        state = _kernel.policy_bytes(POLICIES.number(config.policy), config.agents, config.main_every)
         if state:
             self.lease_state = np.zeros((count, state), dtype=np.uint8)
         self._rejects = np.zeros(2, dtype=np.uint64)  # frames heard that were malformed, foreign
@@ -89,8 +89,8 @@ class Swarm(AbstractSwarm):
             "decay_len": self._decay.shape[1], "tau": model.vehicle.tau, "a_max": model.vehicle.a_max,
             "gossip": int(config.gossip), **model.avoider.to_dict(),
             "position_step": position_step(config.extent_m), "anchor_every": config.anchor_every,
-            "open_every": config.open_period, "adoption": int(config.adoption), "depth_rate": float(config.depth_rate),
-            "share": float(config.lease_share), "patience": 0,
+            "main_every": config.main_every, "open_every": config.open_period, "adoption": int(config.adoption),
+            "depth_rate": float(config.depth_rate), "share": float(config.lease_share), "patience": 0,
         }  # fmt: skip
 
     def _shared_arrays(self) -> dict[str, Any]:

@@ -29,6 +29,9 @@ const char *dtsa_config_fault(const dtsa_config *c)
     if (c->estimator == DTSA_ESTIMATE_INTENT && (!c->decay || c->decay_len < 1)) return "decay";
     if (policy->bytes && (c->lease.anchor_every < 1 || c->lease.anchor_every > 15))
         return "anchor_every";
+    if (policy->bytes && (c->lease.main_every < 0 || c->lease.main_every > 15 ||
+                          c->lease.main_every % c->lease.anchor_every))
+        return "main_every";
     return c->lease.open_every < 0 ? "open_every" : NULL;
 }
 

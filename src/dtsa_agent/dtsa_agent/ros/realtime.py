@@ -200,7 +200,7 @@ class RealtimeNode(SwarmNode):
             if not self.config.policy_row.says_leaving or self.slot < self._first:
                 return True
             self._signals = stop.count
-            self._leaves_by = self.slot + (self.config.anchor_every + 1) * self.config.agents
+            self._leaves_by = self.slot + (self.config.main_every + 1) * self.config.agents
             for index in range(len(swarm.ids)):
                 swarm.leave(index)
         if stop.count == self._signals and self.slot <= self._leaves_by and (swarm.present == PRESENT_LEAVING).any():

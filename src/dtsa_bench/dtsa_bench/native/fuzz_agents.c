@@ -57,9 +57,15 @@ static void configure(input *in, dtsa_config *c, double *places)
     c->avoid = (dtsa_avoid_params){1.5,  2.0, 0.336, 1.0, 30.0, 0.2,  0.2, 1.31,
                                    0.33, 0.1, 0.3,   0.0, 0.3,  0.25, 1.0};
     c->avoid.margin_rate = (next(in) & 1) * 0.2;
-    c->lease = (dtsa_lease_config){
-        1 + (int)(next(in) % 15), (int)(next(in) % 12), (int)(next(in) & 1), 2.0, 1.0,
-        (int64_t)next(in)};
+    c->lease = (dtsa_lease_config){1 + (int)(next(in) % 15),
+                                   (int)(next(in) % 12),
+                                   (int)(next(in) & 1),
+                                   2.0,
+                                   1.0,
+                                   (int64_t)next(in),
+                                   0};
+    c->lease.main_every =
+        c->lease.anchor_every * (1 + (int)next(in) % (15 / c->lease.anchor_every));
     for (int i = 0; i < 6 * c->agents; i++) places[i] = i * 0.7;
     c->start = places;
     c->target = places + 3 * c->agents;

@@ -7,6 +7,7 @@
  *
  *   who has something to say, and who knows that it will rest          (goals)
  *   whether a turn is given away, and to whom of those not thought dead (contents; choose_lessee is prove_lessee)
+ *   which turns are OPEN                                               (contents; is_open is prove_open)
  *   whom a speaker thinks dead, and whether a hearer thought it dead   (all that absence, silence and gossip can lead to)
  *   whether the wait that ends probation with adoption is over         (ages)
  *   whether an OPEN turn is taken, whether gossip names a waker        (draws, gossip)
@@ -15,7 +16,7 @@
  *
  * Breadth first, states compared byte by byte, until there are no new ones.
  *
- *     prove AGENTS M S ADOPTION RESTARTS DEATHS RETURNS CLAIMS MOST_STATES
+ *     prove AGENTS M KM S ADOPTION RESTARTS DEATHS RETURNS CLAIMS MOST_STATES
  *
  * prints one line of words and numbers, or the rule that is broken; exit code 1 then. A budget below 0: any number.
  */
@@ -58,6 +59,8 @@ int prove_lessee(const uint8_t *able, int count)
         if (able[k]) who[found++] = k;
     return who[choose(found)];
 }
+
+int prove_open(void); /* in the place of is_open */
 
 uint64_t mix64(uint64_t x) { return x; } /* digests of tables do not count */
 
@@ -114,6 +117,13 @@ static void start(void)
 
 static int anchor(int64_t turn) { return (turn / n + turn % n) % config.lease.anchor_every == 0; }
 
+static int main_anchor(int64_t turn)
+{
+    return (turn / n + turn % n) % config.lease.main_every == 0;
+}
+
+int prove_open(void) { return config.lease.open_every ? choose(2) : 0; }
+
 /* ---- states as bytes ---- */
 
 static uint8_t *at;
@@ -126,7 +136,7 @@ static int pack(uint8_t *out)
     put(slot < n ? slot : n + slot % period);
     for (int i = 0; i < 4; i++) put(left[i]);
     for (int64_t t = slot; t < slot + reach; t++) {
-        if (anchor(t)) continue;
+        if (main_anchor(t)) continue;
         put(book[t % MOST_WINDOW].owner);
         if (config.lease.adoption) put(book[t % MOST_WINDOW].others);
     }
@@ -151,7 +161,7 @@ static void unpack(const uint8_t *in)
     for (int i = 0; i < 4; i++) left[i] = (int8_t)take();
     memset(book, 0, sizeof book);
     for (int64_t t = slot; t < slot + reach; t++) {
-        if (anchor(t)) continue;
+        if (main_anchor(t)) continue;
         book[t % MOST_WINDOW].owner = (uint8_t)take();
         if (config.lease.adoption) book[t % MOST_WINDOW].others = (uint8_t)take();
     }
@@ -189,12 +199,12 @@ static void write_down(int sender, const uint8_t *data)
     rule(slot % n == sender, "2: gives away in an own turn only");
     rule(config.lease.adoption || !e.c_s, "2: adopts where there is no adoption");
     int place = 0, own = 1;
-    for (int j = 1; j <= config.lease.anchor_every; j++)
+    for (int j = 1; j <= config.lease.main_every; j++)
         for (int i = e.c_s; i >= 0; i--) {
             const int64_t turn = slot + (int64_t)j * n - i;
             ledger *entry = &book[turn % MOST_WINDOW];
-            if (anchor(turn) && !i) own = 0;
-            if (anchor(turn) || (!i && !own)) continue;
+            if (main_anchor(turn) && !i) own = 0;
+            if (i ? anchor(turn) : !own) continue;
             const int given = place < e.lease_count ? e.leases[place++] : 0;
             if (!given) continue;
             if (i)
@@ -203,17 +213,26 @@ static void write_down(int sender, const uint8_t *data)
                 rule(!entry->owner || entry->owner == given, "3: gives a turn away once");
             if (!i) entry->owner = (uint8_t)given;
         }
-    rule(place >= e.lease_count || !e.leases[place], "4: gives no anchor away, nothing beyond it");
+    rule(place >= e.lease_count || !e.leases[place],
+         "4: gives no main anchor away, nothing beyond it");
+}
+
+/* Whether its owner sends in an anchor of which it does not know that it has given it away, in an earlier life. */
+static int taken_back(int sender, int probation)
+{
+    return probation && slot % n == sender && anchor(slot) && !main_anchor(slot);
 }
 
 static void judge(int sender, int probation, int64_t woke)
 {
     const ledger *entry = &book[slot % MOST_WINDOW];
     const int owner = slot % n == sender, lent = entry->others >> sender & 1;
-    if (entry->owner == LEASE_OPEN && !lent) rule(woke >= 0, "2: only who wakes takes OPEN turns");
+    if (entry->owner == LEASE_OPEN && !lent)
+        rule(woke >= 0 || taken_back(sender, probation), "2: only who wakes takes OPEN turns");
     rule(entry->owner != LEASE_OPEN || config.lease.open_every, "2: OPEN where there is none");
     if (owner)
-        rule(!entry->owner || entry->owner == sender + 1 || lent || entry->owner == LEASE_OPEN,
+        rule(!entry->owner || entry->owner == sender + 1 || lent || entry->owner == LEASE_OPEN ||
+                 taken_back(sender, probation),
              "3: does not send in a turn that it gave away");
     else
         rule(entry->owner == sender + 1 || entry->owner == LEASE_OPEN || lent,
@@ -269,7 +288,6 @@ static void speak(int k, uint8_t *frame)
     v.a->moving = mood == 0;
     v.a->idle_since = mood ? slot : -1;
     a->final = mood == 1;
-    v.a->wakers = own && config.lease.open_every > 1 ? choose(2) : 0.0;
     v.a->deaf = 0;
     a->frame_length = (uint8_t)agent_speak(a, slot, frame);
     memcpy(a->frame, frame, DTSA_FRAME_MAX);
@@ -297,9 +315,9 @@ static void hear(int k, const int *senders, int count, uint8_t frames[][DTSA_FRA
 static void finish(int k)
 {
     const lease_scope v = lease_of(agents[k]);
-    const int past = v.a->anchored || (slot % n == k && anchor(slot));
+    const int past = v.a->anchored || (slot % n == k && main_anchor(slot));
     if (config.lease.adoption && agents[k]->present && v.a->probation && past)
-        v.a->claimed = choose(2) ? slot - 2 * n * config.lease.anchor_every : slot;
+        v.a->claimed = choose(2) ? slot - 2 * n * config.lease.main_every : slot;
     v.a->deaf = 0;
     dtsa_agent_end(agents[k], slot);
 }
@@ -307,7 +325,7 @@ static void finish(int k)
 static void step(void)
 {
     uint8_t frames[MOST_AGENTS][DTSA_FRAME_MAX];
-    int senders[MOST_AGENTS], count = 0;
+    int senders[MOST_AGENTS], count = 0, returned = 0;
     for (int k = 0; k < n; k++) happen(k);
     for (int k = 0; k < n; k++) {
         dtsa_agent *a = agents[k];
@@ -319,11 +337,13 @@ static void step(void)
         v.a->attempts = 0;
         if (!a->decision.sends) continue;
         judge(k, v.a->probation, v.a->woke);
+        returned |= taken_back(k, v.a->probation);
         speak(k, frames[k]);
         senders[count++] = k;
     }
     const ledger *entry = &book[slot % MOST_WINDOW];
-    rule(count < 2 || entry->owner == LEASE_OPEN || entry->others, "1: at most one sends");
+    rule(count < 2 || entry->owner == LEASE_OPEN || entry->others || returned,
+         "1: at most one sends");
     for (int k = 0; k < n && count; k++)
         if (agents[k]->present && !agents[k]->decision.sends) hear(k, senders, count, frames);
     for (int k = 0; k < n; k++) finish(k);
@@ -399,18 +419,18 @@ static long search(int *closed)
 
 int main(int argc, char **argv)
 {
-    long numbers[9];
-    if (argc != 10) return 2;
-    for (int i = 0; i < 9; i++) numbers[i] = strtol(argv[i + 1], NULL, 10);
+    long numbers[10];
+    if (argc != 11) return 2;
+    for (int i = 0; i < 10; i++) numbers[i] = strtol(argv[i + 1], NULL, 10);
     n = (int)numbers[0];
     if (n < 2 || n > MOST_AGENTS) return 2;
     config.lease = (dtsa_lease_config){.anchor_every = (int)numbers[1],
-                                       .open_every = (int)numbers[2],
-                                       .adoption = (int)numbers[3]};
-    for (int i = 0; i < 4; i++) left[i] = (int)numbers[4 + i];
-    most = numbers[8];
-    reach = config.lease.anchor_every * n;
-    period = reach * (config.lease.open_every ? config.lease.open_every : 1);
+                                       .main_every = (int)numbers[2],
+                                       .open_every = (int)numbers[3],
+                                       .adoption = (int)numbers[4]};
+    for (int i = 0; i < 4; i++) left[i] = (int)numbers[5 + i];
+    most = numbers[9];
+    period = reach = config.lease.main_every * n;
     base = (1000 / period + 1) * (int64_t)period;
     if (reach > MOST_WINDOW / 2 || period + n > 250) return 2;
     start();

@@ -17,10 +17,12 @@ _SPEED = "-O2"
 
 
 ANY = -1  # any number of times
-# Not explored as it flies: whom a turn is worth most to. Any of those able may get it, or nobody.
-_CHOICE = "choose_lessee(agent->table->sent_slot, v, &who, slot, turn)"
+# Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody), and which are OPEN.
+_CHOICE = "choose_lessee(v, &who, turn)"
 _FREE_CHOICE = "prove_lessee(who.able, v->n)"
+_OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, &who, turn)", "mine && prove_open()"
 _HEADER = '#include "lease.h"\n'
+_DECLARED = "int prove_lessee(const uint8_t *able, int count);\nint prove_open(void);\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +32,8 @@ class World:
     name: str
     agents: int
     anchor_every: int = 2  # M
-    open_every: int = 0  # S
+    anchor_rest: int = 1  # K
+    open_every: int = 0  # S; which turns are OPEN is free where it is not 0
     adoption: bool = False
     restarts: int = ANY
     deaths: int = ANY  # or leaving
@@ -41,7 +44,8 @@ class World:
     def words(self) -> list[str]:
         """Arguments of ``prove.c``."""
         budgets = (self.restarts, self.deaths, self.returns, self.claims, self.most_states)
-        return [str(int(value)) for value in (self.agents, self.anchor_every, self.open_every, self.adoption, *budgets)]
+        rounds = (self.anchor_every, self.anchor_every * self.anchor_rest)
+        return [str(int(value)) for value in (self.agents, *rounds, self.open_every, self.adoption, *budgets)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,17 @@ WORLDS = (
     World("two agents, OPEN turns", 2, open_every=3),
     World("two agents, adoption", 2, adoption=True),
     World("two agents, OPEN turns, adoption", 2, open_every=3, adoption=True),
+    World(
+        "two agents, OPEN turns, adoption, K = 2",
+        2,
+        anchor_rest=2,
+        open_every=3,
+        adoption=True,
+        restarts=1,
+        deaths=1,
+        returns=1,
+        claims=2,
+    ),
     World("three agents", 3),
     World("three agents, M = 3", 3, anchor_every=3),
     World("three agents, adoption", 3, adoption=True),
@@ -87,6 +102,7 @@ class Mutant:
 
 
 _PLAIN, _RESTART = World("plain", 2, restarts=0, deaths=0), World("restart", 2, restarts=1, deaths=0)
+_RESTS = World("rests", 2, anchor_rest=2, open_every=1, adoption=True, restarts=1, deaths=0)
 _OPEN, _ADOPTS = World("open", 2, open_every=3, deaths=0), World("adopts", 2, adoption=True)
 MUTANTS = (
     Mutant(
@@ -102,8 +118,18 @@ MUTANTS = (
         "an owner is silent in a turn that it gave away", "lease.c",
         "if (given == LEASE_NONE) return", "if (given == LEASE_NONE || slot % v.n == self) return", _PLAIN,
     ),
-    Mutant("anchors are never given away", "lease.c", "if (anchor || (!i && !own))", "if (!i && !own)", _ADOPTS),
-    Mutant("leases end at the next own anchor", "lease.c", "if (!i && anchor)", "if (0)", _RESTART),
+    Mutant(
+        "others' anchors are not given away", "lease.c",
+        "if (i ? lease_is_anchor(v, turn) : !own)", "if (!i && !own)", _ADOPTS,
+    ),
+    Mutant(
+        "leases end at the next own main anchor", "lease.c", "if (!i && lease_is_main(v, turn))", "if (0)", _RESTART,
+    ),
+    Mutant(
+        "probation lasts until an own main anchor is over", "lease.c",
+        "== agent->self && lease_is_main(", "== agent->self && lease_is_anchor(",
+        _RESTS,
+    ),
     Mutant("OPEN turns are for who wakes", "lease.c", "if (v->a->woke < 0 || own_right", "if (own_right", _OPEN),
     Mutant(
         "who hears itself claimed goes into probation", "lease.c", "distance <= e->c_s || ", "", _ADOPTS,
@@ -133,7 +159,8 @@ def build(directory: Path, mutant: Mutant | None = None) -> Path:
     shutil.copy(LEASE.parent / "policy.h", copy.parent)
     shutil.copytree(LEASE, copy, dirs_exist_ok=True)
     _replace(copy / "issue.c", _CHOICE, _FREE_CHOICE)
-    _replace(copy / "issue.c", _HEADER, f"{_HEADER}int prove_lessee(const uint8_t *able, int count);\n")
+    _replace(copy / "issue.c", _OPEN_TURN, _FREE_OPEN_TURN)
+    _replace(copy / "issue.c", _HEADER, f"{_HEADER}{_DECLARED}")
     if mutant is not None:
         _replace(copy / mutant.file, mutant.right, mutant.wrong)
     files = [*sorted(copy.glob("*.c")), *sorted(parts.glob("*.o"))]

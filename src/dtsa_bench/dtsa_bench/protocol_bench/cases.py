@@ -19,12 +19,16 @@ PROTOCOLS: dict[str, dict[str, Any]] = {
     "tdma": {"policy": "tdma"},
     "tdma+gossip": {"policy": "tdma", "frame": "extended"},
     "dtsa": {"policy": "dtsa"},
+    "genie (age)": {"policy": "genie-age", "frame": "extended"},
+    "genie (error)": {"policy": "genie-error", "frame": "extended"},
     "lease S=0": {"policy": "lease", "open_every": 0, "adoption": False},
     "lease": {"policy": "lease"},
 }
 LEASE = ("lease S=0", "lease")
+GENIES = ("genie (age)", "genie (error)")
 # Plain DTSA computes N^2 priorities for every agent in every slot: with many agents and loss so much must do.
 DTSA_SLOTS, DTSA_MANY = 2000, 20
+GENIE_SLOTS = 4000  # the bounds are written in Python
 MOVE = 1000  # slots, mean time of flight between two pauses
 
 
@@ -55,7 +59,7 @@ class Case:
         """
         if protocol == "dtsa" and self.agents > DTSA_MANY and not self.shared(protocol):
             return min(slots, self.warmup + DTSA_SLOTS)
-        return slots
+        return min(slots, self.warmup + GENIE_SLOTS) if protocol in GENIES else slots
 
     def shared(self, protocol: str) -> bool:
         """Whether one table may serve all agents: nothing is lost, and with plain DTSA all compute the same from it.
@@ -79,7 +83,8 @@ def _steady_cases() -> Iterator[Case]:
     for agents, movers, factor in sizes:
         for name, loss in channels:
             burst = 10.0 if "bursts" in name else 0.0
-            protocols = tuple(p for p in PROTOCOLS if agents < 200 or not loss or p != "dtsa")
+            too_long = ("genie (error)", *(("dtsa",) if loss else ()))
+            protocols = tuple(p for p in PROTOCOLS if agents < 200 or p not in too_long)
             asked = 1.0 if burst else factor  # who hears nothing for ten slots knows old states whatever the protocol
             warmup = 10 * agents if agents > 12 else 600
             yield Case(
@@ -227,6 +232,7 @@ def _wake(case: Case, ids: list[int], random: np.random.Generator, slots: int) -
     return {
         "movers": ids[: case.movers],
         "events": [Event(when, "go", agent) for agent in woken],
+        "final": False,
         "slots": when + 8 * case.agents,
     }
 

@@ -131,7 +131,7 @@ class Experiment:
         for event in events:
             self._events.setdefault(event.slot, []).append(event)
         if config.policy_row.agent_state:
-            self.outcome.ledger = Ledger(config.agents, config.anchor_every)
+            self.outcome.ledger = Ledger(config.agents, config.anchor_every, config.main_every)
         self.swarm.active[:] = 0
         self.swarm.final[:] = final
         for agent in movers:

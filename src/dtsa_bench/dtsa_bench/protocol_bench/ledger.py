@@ -22,13 +22,16 @@ class Ledger:
 
     :param agents: number of agents N.
     :param anchor_every: M.
+    :param main_every: K M; 0: M.
     """
 
     agents: int
     anchor_every: int
+    main_every: int = 0
     issued: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # turn -> (issuer, lessee)
     open_collisions: int = 0  # slots with two senders that had been given to all who wake
     adopted_collisions: int = 0  # slots with two senders, given away by somebody other than their owner
+    anchor_collisions: int = 0  # ... in an anchor that its owner gave away before it restarted
     plain_collisions: int = 0  # any other slot with two senders
     open_slots: int = 0
     adopted_slots: int = 0
@@ -37,7 +40,8 @@ class Ledger:
     _rules: Memory = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._rules = Memory(Rules(agents=self.agents, slot_s=1.0, anchor_every=self.anchor_every))
+        main = self.main_every or self.anchor_every
+        self._rules = Memory(Rules(agents=self.agents, slot_s=1.0, anchor_every=self.anchor_every, main_every=main))
 
     def slot(self, slot: int, frames: dict[int, bytes]) -> None:
         """Takes in one slot.
@@ -55,20 +59,28 @@ class Ledger:
         if len(frames) > 1:
             self.open_collisions += is_open
             self.adopted_collisions += adopted and not is_open
-            self.plain_collisions += not is_open and not adopted
-            if not is_open and not adopted:
+            taken_back = not is_open and not adopted and self._taken_back(slot, frames.get(owner))
+            self.anchor_collisions += taken_back
+            self.plain_collisions += not is_open and not adopted and not taken_back
+            if not is_open and not adopted and not taken_back:
                 self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}")
         for sender, data in frames.items():
-            self._check_sender(slot, sender, owner, given)
+            self._check_sender(slot, sender, owner, given, data)
             self.read(slot, sender, data)
 
-    def _check_sender(self, slot: int, sender: int, owner: int, given: list[tuple[int, int]]) -> None:
+    def _taken_back(self, slot: int, data: bytes | None) -> bool:
+        """Whether the owner sends in an anchor, no main one, in probation: it may have given it away before."""
+        if data is None or not self._rules.is_anchor(slot) or self._rules.is_main(slot):
+            return False
+        return decode_extended(data).probation
+
+    def _check_sender(self, slot: int, sender: int, owner: int, given: list[tuple[int, int]], data: bytes) -> None:
         lessees = {lessee for _, lessee in given}
         if sender in lessees or OPEN in lessees:
             return
         if sender != owner:
             self.broken.append(f"slot {slot}: agent {sender} sends in a turn of {owner} given to {sorted(lessees)}")
-        elif any(issuer == owner for issuer, _ in given):
+        elif any(issuer == owner for issuer, _ in given) and not self._taken_back(slot, data):
             self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(lessees)}")
 
     def read(self, slot: int, sender: int, data: bytes) -> None:
@@ -90,7 +102,7 @@ class Ledger:
             if not lessee:
                 continue
             owner = turn % self.agents + 1
-            if self._rules.is_anchor(turn) or turn <= slot:
+            if self._rules.is_main(turn) or turn <= slot:
                 self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
             entries = self.issued.setdefault(turn, [])
             if sender == owner and any(i == owner and other != lessee for i, other in entries):

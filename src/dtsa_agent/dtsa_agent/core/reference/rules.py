@@ -34,7 +34,8 @@ class Rules:
     key: int = 0  # of the draws
     # lease
     anchor_every: int = 5  # M
-    open_every: int = 11  # S, has no factor in common with N; 0: none
+    main_every: int = 5  # K M
+    open_every: int = 11  # S; 0: none
     adoption: bool = True
     depth_rate: float = 0.1  # c
     lease_share: float = 1.0

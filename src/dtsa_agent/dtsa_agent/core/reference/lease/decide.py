@@ -64,7 +64,7 @@ def own_right_is_near(memory: Memory, self_index: int, slot: int) -> bool:
         lease = memory.leases.get(turn)
         if lease is not None and lease.lessee == self_index + 1:
             return True
-        if memory.owner(turn) == self_index and (memory.is_anchor(turn) or (lease is None and not memory.probation)):
+        if memory.owner(turn) == self_index and lease is None and (memory.is_anchor(turn) or not memory.probation):
             return True
     return False
 

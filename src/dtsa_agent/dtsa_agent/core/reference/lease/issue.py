@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..frame_extended import LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH
 from ..table import Row
@@ -22,12 +23,17 @@ class Said:
     relay: tuple[tuple[int, int], ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Electorate:
-    """Who may be given a turn."""
+    """Who may be given a turn, who rests, and what is known and foreseen of when each sends."""
 
     alive: int  # N_alive: me and those heard of lately
     able: list[bool]  # members of A_p that live, are not in probation and do not miss their turns
+    rests: list[bool]  # live, are not in A_p and not in probation: they give turns away, as far as is known
+    settled: list[bool]  # of these, who knows that it will rest
+    block: int  # one turn in so many is OPEN; 0: none
+    last: list[int]  # slot in which each sent last, or is foreseen to send
+    rights: list[list[int]] = field(default_factory=list)  # slots to come in which each is known to send
 
     @property
     def members(self) -> int:
@@ -63,36 +69,67 @@ def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
     return count
 
 
-def electorate(memory: Memory, self_index: int, rows: Sequence[Row]) -> Electorate:
-    """Who may be given a turn, and how many live."""
-    others = [k for k in range(memory.rules.agents) if k != self_index]
-    able = [
-        memory.alive(k) and rows[k].in_ap and not memory.quiet[k] and memory.missed[k] < MISSED
-        for k in range(memory.rules.agents)
-    ]
+def electorate(memory: Memory, self_index: int, rows: Sequence[Row], slot: int, final: bool) -> Electorate:
+    """Who may be given a turn, and who else there is.
+
+    :param final: the agent itself knows that no further goal is scheduled for it.
+    """
+    agents = range(memory.rules.agents)
+    alive = [k == self_index or memory.alive(k) for k in agents]
+    able = [alive[k] and rows[k].in_ap and not memory.quiet[k] and memory.missed[k] < MISSED for k in agents]
     able[self_index] = memory.moving
-    return Electorate(1 + sum(memory.alive(k) for k in others), able)
+    rests = [alive[k] and not rows[k].in_ap and not memory.quiet[k] for k in agents]
+    rests[self_index] = not memory.moving and not memory.probation
+    settled = [rests[k] and memory.settled[k] for k in agents]
+    settled[self_index] = rests[self_index] and final
+    last = [row.sent_slot if row.sent_slot >= 0 else slot - memory.rules.agents for row in rows]
+    block = open_block(memory.rules.agents, memory.rules.open_every, memory.wakers, sum(rests), sum(settled))
+    return Electorate(sum(alive), able, rests, settled, block, last)
+
+
+def open_block(agents: int, every: int, wakers: float, resting: int, settled: int) -> int:
+    """Slots of which one turn goes to those who wake; 0: none.
+
+    S turns of those that rest lie in so many. Half as many more where all of them are settled; half of it while many
+    wake. It has no factor in common with N, or the same few owners would always pay.
+
+    :param agents: N.
+    :param every: S.
+    :param wakers: w.
+    :param resting: number of those that rest.
+    :param settled: number of those of them that know that they will rest.
+    """
+    if not every or not resting:
+        return 0
+    block = -(-every * agents // resting)  # rounded up
+    if settled == resting:
+        block += block // 2
+    if wakers > BUSY:
+        block = (block + 1) // 2
+    while math.gcd(block, agents) > 1:
+        block += 1
+    return block
 
 
 def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
     """How many of its next turns an idle agent gives away: all if it is final, else floor(c x idle rounds)."""
     rules = memory.rules
-    if memory.idle_since < 0 or not who.members or memory.deaf or slot < rules.agents:
+    if memory.idle_since < 0 or not who.members or memory.deaf:
         return 0
     if who.members > rules.lease_share * who.alive:
         return 0
     if final:
-        return rules.anchor_every
+        return 1 if slot < rules.agents else rules.main_every  # in the first round not all have spoken
     turns = rules.depth_rate * (slot - memory.idle_since) / rules.agents
     return int(min(turns, rules.anchor_every))
 
 
-def is_open(memory: Memory, turn: int) -> bool:
-    """Whether a turn goes to those who wake: one of S; two, while many wake."""
-    every = memory.rules.open_every
-    if not every:
+def is_open(memory: Memory, who: Electorate, turn: int) -> bool:
+    """Whether a turn goes to those who wake: the first one in its block of somebody that rests."""
+    if not who.block:
         return False
-    return turn % every == 0 or (memory.wakers > BUSY and turn % every == every // 2)
+    first = max(turn - turn % who.block, turn - 2 * memory.rules.agents)
+    return not any(who.rests[memory.owner(t)] and not memory.is_main(t) for t in range(first, turn))
 
 
 def issue(
@@ -104,48 +141,72 @@ def issue(
     :param own_depth: how many own turns at most; None: as :func:`depth` says.
     :returns: a byte a turn, up to the last that is given away.
     """
-    who = electorate(memory, self_index, rows)
+    who = electorate(memory, self_index, rows, slot, final)
+    foreseen = slot + 1  # up to here, excluded
     rounds_mine = depth(memory, who, slot, final) if own_depth is None else own_depth
     rounds_adopted = memory.rules.anchor_every if memory.idle_since >= 0 else 1
     said = []
     for turn in memory.turns_of_leases(slot, c_s, LEASE_ROOM):
         mine = memory.owner(turn) == self_index
         rounds_ahead = -(-(turn - slot) // memory.rules.agents)  # rounded up
+        if mine and not final and memory.is_anchor(turn):
+            rounds_mine = 0
         reach = rounds_mine if mine else rounds_adopted
         if turn not in memory.leases and rounds_ahead <= reach and not memory.probation:
             lessee = 0
-            if mine and is_open(memory, turn):
+            if mine and is_open(memory, who, turn):
                 lessee = OPEN
             elif who.members and (mine or not memory.deaf):
-                lessee = choose_lessee(memory, rows, who, slot, turn) + 1
+                if foreseen == slot + 1:
+                    who.rights = look_ahead(memory, slot)
+                foresee(memory, self_index, who, range(foreseen, turn))
+                foreseen = turn
+                lessee = choose_lessee(memory, who, turn) + 1
             if lessee:
                 memory.leases[turn] = Lease(lessee, self_index + 1)
         said.append(memory.leases[turn].lessee if turn in memory.leases else 0)
     return bytes(said).rstrip(b"\0")
 
 
-def choose_lessee(memory: Memory, rows: Sequence[Row], who: Electorate, slot: int, turn: int) -> int:
-    """To whom a turn is worth most: the able agent with the largest p min(n, N_p + 1), then the lowest id.
+def look_ahead(memory: Memory, slot: int) -> list[list[int]]:
+    """For each agent the slots to come in which it is known to send."""
+    rights: list[list[int]] = [[] for _ in range(memory.rules.agents)]
+    for turn in range(slot + 1, slot + memory.window):
+        sender = memory.scheduled(turn)
+        if sender >= 0:
+            rights[sender].append(turn)
+    return rights
 
-    p and n are the distances from the turn to that agent's previous and next scheduled slot, N + 1 if there is none
-    within N. p n is what the turn takes off the sum of its ages; n is cut off, because more leases will come in
-    between.
 
-    :param slot: the present slot; what was sent up to now is in the table.
+def foresee(memory: Memory, self_index: int, who: Electorate, turns: range) -> None:
+    """Who will send in the turns to come: as far as is known; else, where the owner is settled, whom it will choose."""
+    for turn in turns:
+        sender, owner = memory.scheduled(turn), memory.owner(turn)
+        unsaid = turn not in memory.leases and who.settled[owner] and owner != self_index
+        if unsaid and not memory.is_main(turn) and not is_open(memory, who, turn):
+            sender = choose_lessee(memory, who, turn)
+        if sender >= 0:
+            who.last[sender] = turn
+
+
+def choose_lessee(memory: Memory, who: Electorate, turn: int) -> int:
+    """To whom a turn is worth most: the able agent with the largest p min(n, N_p + 1), then the lowest id; -1: nobody.
+
+    p and n are the distances from the turn to that agent's previous and next slot, as far as they are known or
+    foreseen; p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases
+    will come in between.
+
     :param turn: the turn to be given away.
     """
-    n = memory.rules.agents
-    before = [turn - row.sent_slot if row.sent_slot >= 0 and turn - row.sent_slot <= n else n + 1 for row in rows]
-    after = [n + 1] * n
-    for distance in range(n, 0, -1):
-        earlier = memory.scheduled(turn - distance) if turn - distance > slot else -1
-        later = memory.scheduled(turn + distance)
-        if earlier >= 0:
-            before[earlier] = min(before[earlier], distance)
-        if later >= 0:
-            after[later] = distance
-    able = [k for k in range(n) if who.able[k]]
-    return max(able, key=lambda k: before[k] * min(after[k], who.members + 1), default=-1)  # the first of several
+    most = memory.rules.agents + 1
+
+    def worth(k: int) -> int:
+        before = min(turn - who.last[k], most)
+        after = next((right - turn for right in who.rights[k] if right > turn), most)
+        return before * min(after, who.members + 1)
+
+    able = [k for k in range(memory.rules.agents) if who.able[k]]
+    return max(able, key=worth, default=-1)  # the first of several
 
 
 def relay(memory: Memory, self_index: int, slot: int, own_is_said: bool) -> tuple[tuple[int, int], ...]:

@@ -29,9 +29,11 @@ def listen(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, wak
     for entry in frame.gossip:
         hear_gossip(memory, self_index, entry.agent - 1, slot - entry.age)
     turns = memory.turns_of_leases(slot, frame.c_s, len(frame.leases))
-    for turn, lessee in zip(turns, frame.leases, strict=False):
-        if lessee:
-            memory.note(turn, lessee, frame.own.sender)
+    given = [(turn, lessee) for turn, lessee in zip(turns, frame.leases, strict=False) if lessee]
+    if memory.owner(slot) == sender:
+        memory.settled[sender] = any(memory.owner(turn) == sender and memory.is_anchor(turn) for turn, _ in given)
+    for turn, lessee in given:
+        memory.note(turn, lessee, frame.own.sender)
     for ahead, lessee in frame.relay:
         memory.note(slot + ahead, lessee, 0)
 
@@ -90,15 +92,15 @@ def note_silence(memory: Memory, slot: int) -> None:
 
 
 def end_probation(memory: Memory, self_index: int, slot: int) -> None:
-    """Probation ends after an own anchor: leases of an earlier life reach no farther.
+    """Probation ends after an own main anchor: leases of an earlier life reach no farther.
 
-    With adoption others may have given turns away, too; everybody who might has spoken twice after 2 M N slots.
+    With adoption others may have given turns away, too; everybody who might has spoken twice after 2 K M N slots.
     """
-    if memory.owner(slot) == self_index and memory.is_anchor(slot):
+    if memory.owner(slot) == self_index and memory.is_main(slot):
         memory.anchored = True
     if not memory.probation or not memory.anchored:
         return
     quiet = slot - memory.claimed
-    enough = 2 * memory.rules.anchor_every * memory.rules.agents
+    enough = 2 * memory.rules.main_every * memory.rules.agents
     if not memory.rules.adoption or (quiet >= enough and not memory.deaf):
         memory.probation = False

@@ -36,6 +36,7 @@ class Memory:
     heard: list[int] = field(default_factory=list)  # last slot of which it is known that each lived; NEVER, GONE
     missed: list[int] = field(default_factory=list)  # expected turns that each missed in a row
     quiet: list[bool] = field(default_factory=list)  # in probation: sends in anchors only
+    settled: list[bool] = field(default_factory=list)  # gives anchors away, for it knows that it will rest
     moving: bool = False
     idle_since: int = NEVER
     woke: int = NEVER  # slot in which it woke or joined, and since when nobody is known to have heard it
@@ -57,7 +58,7 @@ class Memory:
     @property
     def window(self) -> int:
         """Turns ahead, the present one included, that can be remembered: more than any lease reaches."""
-        return (self.rules.anchor_every + 2) * self.rules.agents
+        return (self.rules.main_every + 2) * self.rules.agents
 
     @property
     def deaf(self) -> bool:
@@ -69,9 +70,14 @@ class Memory:
         return slot % self.rules.agents
 
     def is_anchor(self, slot: int) -> bool:
-        """Whether a slot is its owner's whatever happens: (R + T mod N) mod M = 0."""
+        """Whether nobody but its owner may give a slot away: (R + T mod N) mod M = 0."""
         n = self.rules.agents
         return (slot // n + slot % n) % self.rules.anchor_every == 0
+
+    def is_main(self, slot: int) -> bool:
+        """Whether a slot is its owner's whatever happens, a main anchor: (R + T mod N) mod (K M) = 0."""
+        n = self.rules.agents
+        return (slot // n + slot % n) % self.rules.main_every == 0
 
     def alive(self, k: int) -> bool:
         """Whether an agent was heard of lately."""
@@ -101,7 +107,7 @@ class Memory:
         :param lessee: id or OPEN.
         :param issuer: id of who gave it away, 0: known by a relay only.
         """
-        if not self.now < turn < self.now + self.window or self.is_anchor(turn):
+        if not self.now < turn < self.now + self.window or self.is_main(turn):
             return
         there = self.leases.get(turn)
         if there is None or lessee < there.lessee:
@@ -112,20 +118,20 @@ class Memory:
     def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
         """The turns that the lease bytes of a frame speak of, in order; the same for sender and receiver.
 
-        T + j N - i for j = 1 .. M, and within each j for i = c_s .. 0; anchors are left out, and of the sender's own
-        turns (i = 0) those from its next anchor on.
+        T + j N - i for j = 1 .. K M, and within each j for i = c_s .. 0; anchors of others (i > 0) are left out, and of
+        the sender's own turns (i = 0) those from its next main anchor on.
 
         :param slot: T, the slot of the frame, the sender's own turn.
         :param c_s: number of agents before the sender that it gives turns away for.
         :param room: at most so many.
         """
         turns, own = [], True
-        for j in range(1, self.rules.anchor_every + 1):
+        for j in range(1, self.rules.main_every + 1):
             for i in range(c_s, -1, -1):
                 turn = slot + j * self.rules.agents - i
-                if i == 0 and self.is_anchor(turn):
+                if i == 0 and self.is_main(turn):
                     own = False
-                if not self.is_anchor(turn) and (i > 0 or own):
+                if not self.is_anchor(turn) if i > 0 else own:
                     turns.append(turn)
         return turns[:room]
 
@@ -137,7 +143,8 @@ class Memory:
         n = self.rules.agents
         self.started = True
         self.born = self.now = self.claimed = slot
-        self.heard, self.missed, self.quiet = [NEVER] * n, [0] * n, [False] * n
+        self.heard, self.missed = [NEVER] * n, [0] * n
+        self.quiet, self.settled = [False] * n, [False] * n
         if slot > 0:
             self.probation = True
             self.woke = slot

@@ -6,29 +6,65 @@
 static const double BUSY = 0.5;
 
 typedef struct {
-    int alive;               /* N_alive: me and those heard of lately */
-    int members;             /* N_p: those in A_p that do not miss their turns */
-    uint8_t *able;           /* (n) may be given a turn */
-    uint8_t *before, *after; /* (n) for choose_lessee */
+    int alive;       /* N_alive: me and those heard of lately */
+    int members;     /* N_p: those in A_p that do not miss their turns */
+    int block;       /* one turn in so many is OPEN, 0: none */
+    int64_t *last;   /* (n) last slot in which each sent, or is foreseen to send */
+    int64_t *next;   /* (n) next slot in which each is known to send */
+    uint16_t *again; /* (w) slots from each turn to the next one of the same agent */
+    uint8_t *able;   /* (n) may be given a turn */
+    uint8_t *rests;  /* (n) gives its turns away, as far as is known */
+    uint8_t *list;   /* (members) those able */
 } electorate;
+
+static int common_factor(int a, int b)
+{
+    while (b) {
+        const int rest = a % b;
+        a = b;
+        b = rest;
+    }
+    return a;
+}
+
+/* Slots of which one turn goes to those who wake: S turns of those that rest lie in so many; half as many more where all of
+ * them are settled, half of it while many wake. No factor in common with n, or the same few owners would always pay. */
+static int open_block(int every, const lease_scope *v, int resting, int settled)
+{
+    if (!every || !resting) return 0;
+    int block = (every * v->n + resting - 1) / resting;
+    if (settled == resting) block += block / 2;
+    if (v->a->wakers > BUSY) block = (block + 1) / 2;
+    while (common_factor(block, v->n) > 1) block++;
+    return block;
+}
 
 static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int64_t slot,
                              electorate *who)
 {
-    const uint8_t *in_ap = agent->table->in_ap;
+    const dtsa_table *table = agent->table;
     const int self = agent->self;
-    who->able = (uint8_t *)agent->table->scratch;
-    who->before = who->able + v->n;
-    who->after = who->before + v->n;
-    who->alive = 1;
-    who->members = who->able[self] = v->a->moving;
+    int resting = 0, settled = 0;
+    who->last = (int64_t *)(void *)table->scratch;
+    who->next = who->last + v->n;
+    who->again = (uint16_t *)(who->next + v->n);
+    who->able = (uint8_t *)(who->again + v->window);
+    who->rests = who->able + v->n;
+    who->list = who->rests + v->n;
+    who->alive = who->members = 0;
     for (int k = 0; k < v->n; k++) {
-        if (k == self) continue;
-        const int alive = lease_alive(v, k, slot);
-        who->able[k] = alive && in_ap[k] && !v->quiet[k] && v->miss[k] < LEASE_MISSED;
+        const int alive = k == self || lease_alive(v, k, slot);
+        const int quiet = k == self ? v->a->probation : v->quiet[k];
+        const int moving = k == self ? v->a->moving : table->in_ap[k];
+        who->able[k] = k == self ? moving : alive && moving && !quiet && v->miss[k] < LEASE_MISSED;
+        who->rests[k] = alive && !moving && !quiet;
+        if (who->able[k]) who->list[who->members++] = (uint8_t)k;
         who->alive += alive;
-        who->members += who->able[k];
+        resting += who->rests[k];
+        settled += who->rests[k] && (k == self ? agent->final : v->settled[k]);
+        who->last[k] = table->sent_slot[k] < 0 ? slot - v->n : table->sent_slot[k];
     }
+    who->block = open_block(table->config->lease.open_every, v, resting, settled);
 }
 
 /* Number of consecutive ids before me that nobody has heard of for long. */
@@ -39,34 +75,61 @@ static int count_absent_before(const lease_scope *v, int self, int64_t slot)
     return count;
 }
 
-/* To whom a turn is worth most: the longest wait before it, times the wait that follows. */
-static int choose_lessee(const int64_t *sent, const lease_scope *v, const electorate *who,
-                         int64_t slot, int64_t turn)
+/* To whom a turn is worth most: the longest wait before it, times the wait that follows. -1: nobody is able. */
+static int choose_lessee(const lease_scope *v, const electorate *who, int64_t turn)
 {
-    const int n = v->n;
-    uint8_t *before = who->before, *after = who->after; /* n + 1 fits: n is 254 at most */
-    for (int k = 0; k < n; k++) {
-        before[k] = (uint8_t)(turn - sent[k] <= n && sent[k] >= 0 ? turn - sent[k] : n + 1);
-        after[k] = (uint8_t)(n + 1);
-    }
-    for (int d = n; d >= 1; d--) {
-        const int k = turn - d > slot ? lease_scheduled(v, turn - d) : -1,
-                  m = lease_scheduled(v, turn + d);
-        if (k >= 0 && d < before[k]) before[k] = (uint8_t)d;
-        if (m >= 0) after[m] = (uint8_t)d;
-    }
     int best = -1;
     long worth = 0;
-    for (int k = 0; k < n; k++) {
-        if (!who->able[k]) continue;
-        const long w =
-            (long)before[k] * (after[k] < who->members + 1 ? after[k] : who->members + 1);
-        if (best < 0 || w > worth) {
+    for (int i = 0; i < who->members; i++) {
+        const int k = who->list[i];
+        const int64_t wait = turn - who->last[k], rest = who->next[k] - turn;
+        const long before = wait <= v->n ? (long)wait : v->n + 1;
+        const long after = rest <= who->members ? (long)rest : who->members + 1;
+        if (best < 0 || before * after > worth) {
             best = k;
-            worth = w;
+            worth = before * after;
         }
     }
     return best;
+}
+
+/* One turn in each block is for those who wake: the first one of somebody that rests. */
+static int is_open(const lease_scope *v, const electorate *who, int64_t turn)
+{
+    if (!who->block) return 0;
+    for (int64_t t = turn - 1; t >= turn - turn % who->block && t >= turn - 2 * v->n; t--)
+        if (who->rests[t % v->n] && !lease_is_main(v, t)) return 0;
+    return 1;
+}
+
+/* Notes when each will send next, and after each turn again, as far as is known. */
+static void look_ahead(const lease_scope *v, electorate *who, int64_t slot)
+{
+    for (int k = 0; k < v->n; k++) who->next[k] = INT64_MAX;
+    for (int64_t t = slot + v->window - 1; t > slot; t--) {
+        const int k = lease_scheduled(v, t);
+        if (k < 0) continue;
+        const int64_t rest = who->next[k] - t;
+        who->again[t % v->window] = (uint16_t)(rest < UINT16_MAX ? rest : UINT16_MAX);
+        who->next[k] = t;
+    }
+}
+
+/* Who will send in the slots before a turn: as far as is known, and where a settled owner has not said it yet, the one to whom
+ * it will be worth most.
+ *
+ * from: the first of these slots. */
+static void foresee(const lease_scope *v, electorate *who, int self, int64_t from, int64_t turn)
+{
+    for (int64_t t = from; t < turn; t++) {
+        const int owner = (int)(t % v->n), given = v->lessee[t % v->window];
+        int k = lease_scheduled(v, t);
+        if (k >= 0 && who->next[k] == t) who->next[k] = t + who->again[t % v->window];
+        if (given == LEASE_NONE && who->rests[owner] && v->settled[owner] && owner != self &&
+            !lease_is_main(v, t) && !is_open(v, who, t))
+            k = choose_lessee(v, who, t);
+        if (k >= 0) who->last[k] = t;
+    }
 }
 
 /* How many of its next turns an idle agent gives away. */
@@ -74,18 +137,11 @@ static int depth(const dtsa_agent *agent, const lease_scope *v, const electorate
 {
     const dtsa_lease_config *c = &agent->table->config->lease;
     const lease_agent *a = v->a;
-    if (a->idle_since < 0 || !who->members || a->deaf > LEASE_DEAF || slot < v->n) return 0;
+    if (a->idle_since < 0 || !who->members || a->deaf > LEASE_DEAF) return 0;
     if (who->members > c->share * who->alive) return 0;
-    if (agent->final) return v->every;
+    if (agent->final) return slot < v->n ? 1 : v->main; /* in the first round not all have spoken */
     const double turns = c->depth_rate * (double)(slot - a->idle_since) / v->n;
     return turns < v->every ? (int)turns : v->every;
-}
-
-/* One of S turns is for those who wake; two, while many do. */
-static int is_open(int every, const lease_scope *v, int64_t turn)
-{
-    if (!every) return 0;
-    return turn % every == 0 || (v->a->wakers > BUSY && turn % every == every / 2);
 }
 
 static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extended_frame *e)
@@ -93,19 +149,25 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
     int64_t turns[LEASE_ROOM];
     electorate who;
     const int self = agent->self, count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
+    int64_t from = slot + 1;
     count_electorate(agent, v, slot, &who);
-    const int own = e->leaving ? 0 : depth(agent, v, &who, slot),
-              adopted = v->a->idle_since >= 0 ? v->every : 1;
+    const int adopted = v->a->idle_since >= 0 ? v->every : 1;
+    int own = e->leaving ? 0 : depth(agent, v, &who, slot);
     for (int i = 0; i < count; i++) {
         const int64_t turn = turns[i];
         const int mine = turn % v->n == self;
         uint8_t *given = &v->lessee[turn % v->window];
+        if (mine && !agent->final && lease_is_anchor(v, turn)) own = 0;
         if (*given == LEASE_NONE && (turn - slot + v->n - 1) / v->n <= (mine ? own : adopted) &&
             !v->a->probation) {
-            if (mine && is_open(agent->table->config->lease.open_every, v, turn))
+            if (mine && is_open(v, &who, turn)) {
                 *given = LEASE_OPEN;
-            else if (who.members && (mine || v->a->deaf <= LEASE_DEAF))
-                *given = (uint8_t)(choose_lessee(agent->table->sent_slot, v, &who, slot, turn) + 1);
+            } else if (who.members && (mine || v->a->deaf <= LEASE_DEAF)) {
+                if (from == slot + 1) look_ahead(v, &who, slot);
+                foresee(v, &who, self, from, turn);
+                from = turn;
+                *given = (uint8_t)(choose_lessee(v, &who, turn) + 1);
+            }
             if (*given != LEASE_NONE) v->issuer[turn % v->window] = (uint8_t)(self + 1);
         }
         e->leases[i] = *given;

@@ -1,6 +1,6 @@
 /* Policy lease: an agent's decisions. Who may send in a slot, and what silence means.
  *
- * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its next anchor: so whoever
+ * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its next main anchor: so whoever
  * sends in a turn is its owner or the one agent that its owner named. docs/protocol.md has states, events and proof.
  */
 #include <string.h>
@@ -10,12 +10,17 @@
 static const double CROWD = 8.0;
 static const int64_t GONE = INT64_MIN / 4; /* heard: said that it leaves */
 
-static int ring_length(const dtsa_config *c) { return (c->lease.anchor_every + 2) * c->agents; }
+static int main_every(const dtsa_config *c)
+{
+    return c->lease.main_every ? c->lease.main_every : c->lease.anchor_every;
+}
+
+static int ring_length(const dtsa_config *c) { return (main_every(c) + 2) * c->agents; }
 
 static size_t state_bytes(const dtsa_config *c)
 {
     const size_t n = (size_t)c->agents;
-    return (sizeof(lease_agent) + 8 * n + 2 * (size_t)ring_length(c) + 2 * n + 7) / 8 * 8;
+    return (sizeof(lease_agent) + 8 * n + 2 * (size_t)ring_length(c) + 3 * n + 7) / 8 * 8;
 }
 
 static int64_t patience(const dtsa_config *c)
@@ -31,6 +36,7 @@ lease_scope lease_of(const dtsa_agent *agent)
     lease_scope v;
     v.n = c->agents;
     v.every = c->lease.anchor_every;
+    v.main = main_every(c);
     v.window = ring_length(c);
     v.patience = patience(c);
     v.a = agent->state;
@@ -39,12 +45,18 @@ lease_scope lease_of(const dtsa_agent *agent)
     v.issuer = v.lessee + v.window;
     v.miss = v.issuer + v.window;
     v.quiet = v.miss + v.n;
+    v.settled = v.quiet + v.n;
     return v;
 }
 
 int lease_is_anchor(const lease_scope *v, int64_t slot)
 {
     return (slot / v->n + slot % v->n) % v->every == 0;
+}
+
+int lease_is_main(const lease_scope *v, int64_t slot)
+{
+    return (slot / v->n + slot % v->n) % v->main == 0;
 }
 
 int lease_alive(const lease_scope *v, int k, int64_t slot)
@@ -70,7 +82,7 @@ int lease_scheduled(const lease_scope *v, int64_t slot)
 void lease_note(lease_scope *v, int64_t turn, int lessee, int issuer)
 {
     if (lessee == LEASE_NONE || turn <= v->a->now || turn >= v->a->now + v->window ||
-        lease_is_anchor(v, turn))
+        lease_is_main(v, turn))
         return;
     uint8_t *there = &v->lessee[turn % v->window], *by = &v->issuer[turn % v->window];
     /* Two leases of one turn: only adoption can do that. The smaller id, so that all who know both agree. */
@@ -85,14 +97,12 @@ void lease_note(lease_scope *v, int64_t turn, int lessee, int issuer)
 int lease_turns(const lease_scope *v, int64_t slot, int c_s, int64_t *turns, int room)
 {
     int count = 0, own = 1;
-    for (int j = 1; j <= v->every; j++)
+    for (int j = 1; j <= v->main; j++)
         for (int i = c_s; i >= 0; i--) {
             const int64_t turn = slot + (int64_t)j * v->n - i;
-            const int anchor = lease_is_anchor(v, turn);
-            if (!i && anchor)
-                own =
-                    0; /* its own turns up to its next anchor, those of the dead as far as it goes */
-            if (anchor || (!i && !own)) continue;
+            /* Its own turns up to its next main anchor; those of the dead as far as it goes, but for anchors. */
+            if (!i && lease_is_main(v, turn)) own = 0;
+            if (i ? lease_is_anchor(v, turn) : !own) continue;
             if (count == room) return count;
             turns[count++] = turn;
         }
@@ -150,8 +160,7 @@ static int own_right_is_near(const lease_scope *v, int self, int64_t slot)
     for (int64_t t = slot + 1; t <= slot + v->n / 2; t++) {
         const int given = v->lessee[t % v->window];
         if (given == self + 1) return 1;
-        if (t % v->n == self &&
-            (lease_is_anchor(v, t) || (given == LEASE_NONE && !v->a->probation)))
+        if (t % v->n == self && given == LEASE_NONE && (lease_is_anchor(v, t) || !v->a->probation))
             return 1;
     }
     return 0;
@@ -261,10 +270,15 @@ static void lease_listen(dtsa_agent *agent, int64_t slot, const extended_frame *
     v.heard[sender] = e->leaving ? GONE : slot;
     judge_claim(agent, &v, slot, e, was_absent);
     hear_gossip(agent, &v, slot, e);
+    if (slot % v.n == sender) v.settled[sender] = 0;
     if (e->lease_count) {
         int64_t turns[SECTIONS * SECTION_BYTES];
         const int count = lease_turns(&v, slot, e->c_s, turns, e->lease_count);
-        for (int i = 0; i < count; i++) lease_note(&v, turns[i], e->leases[i], e->own.sender);
+        for (int i = 0; i < count; i++) {
+            lease_note(&v, turns[i], e->leases[i], e->own.sender);
+            if (e->leases[i] && turns[i] % v.n == sender && lease_is_anchor(&v, turns[i]))
+                v.settled[sender] = 1;
+        }
     }
     for (int d = 0, i = 0; d < RELAY_REACH && e->relay_mask >> d; d++)
         if (e->relay_mask >> d & 1) lease_note(&v, slot + 1 + d, e->relay_ids[i++], 0);
@@ -275,13 +289,13 @@ static void lease_listen(dtsa_agent *agent, int64_t slot, const extended_frame *
 static void end_probation(const dtsa_agent *agent, lease_scope *v, int64_t slot)
 {
     lease_agent *a = v->a;
-    if (slot % v->n == agent->self && lease_is_anchor(v, slot)) a->anchored = 1;
+    if (slot % v->n == agent->self && lease_is_main(v, slot)) a->anchored = 1;
     if (!a->probation || !a->anchored) return;
-    /* Leases of an earlier life reach up to my first anchor at most. Without adoption nobody else gives my turns away;
+    /* Leases of an earlier life reach up to my first main anchor at most. Without adoption nobody else gives my turns away;
      * with it, everybody who might has spoken twice by then. */
     const int64_t quiet = slot - a->claimed;
     if (!agent->table->config->lease.adoption ||
-        (quiet >= 2 * (int64_t)v->every * v->n && a->deaf <= LEASE_DEAF))
+        (quiet >= 2 * (int64_t)v->main * v->n && a->deaf <= LEASE_DEAF))
         a->probation = 0;
 }
 

@@ -9,7 +9,8 @@ enum {
     LEASE_MISSED = 4 /* who missed so many expected turns gets no leases */
 };
 
-/* State of one agent; followed in memory by heard (n), lessee (w), issuer (w), miss (n), quiet (n). */
+/* State of one agent; followed in memory by heard (n), lessee (w), issuer (w), miss (n), quiet (n),
+ * settled (n). */
 typedef struct lease_agent {
     int64_t born;       /* slot of the first decision since the (re)start */
     int64_t now;        /* the ring holds the turns now .. now + w - 1 */
@@ -25,17 +26,20 @@ typedef struct lease_agent {
 
 typedef struct lease_scope {
     lease_agent *a;
-    int64_t *heard;       /* (n) last slot of which it is known that the agent lived, -1: never */
-    uint8_t *lessee;      /* (w) LEASE_NONE, id of the lessee, LEASE_OPEN */
-    uint8_t *issuer;      /* (w) id of who gave the turn away, 0: known by relay only */
-    uint8_t *miss;        /* (n) expected turns missed in a row */
-    uint8_t *quiet;       /* (n) in probation: sends in anchors only */
-    int n, window, every; /* every: M */
-    int64_t patience;     /* slots without a sign of life after which an agent is thought absent */
+    int64_t *heard;   /* (n) last slot of which it is known that the agent lived, -1: never */
+    uint8_t *lessee;  /* (w) LEASE_NONE, id of the lessee, LEASE_OPEN */
+    uint8_t *issuer;  /* (w) id of who gave the turn away, 0: known by relay only */
+    uint8_t *miss;    /* (n) expected turns missed in a row */
+    uint8_t *quiet;   /* (n) in probation: sends in anchors only */
+    uint8_t *settled; /* (n) gives anchors away, for it knows that it will rest */
+    int n, window;
+    int every, main;  /* rounds from one anchor to the next, M; from one main anchor to the next */
+    int64_t patience; /* slots without a sign of life after which an agent is thought absent */
 } lease_scope;
 
 lease_scope lease_of(const dtsa_agent *agent);
 int lease_is_anchor(const lease_scope *v, int64_t slot);
+int lease_is_main(const lease_scope *v, int64_t slot); /* an anchor that nobody gives away */
 int lease_absent(const lease_scope *v, int k, int64_t slot);
 int lease_alive(const lease_scope *v, int k, int64_t slot);
 int lease_scheduled(const lease_scope *v,
