@@ -23,8 +23,9 @@ class Judge:
     def __init__(self, config: SwarmConfig) -> None:
         self._config = config
         self._tail = config.own_bytes + (TAG_LENGTH if config.auth else 0)
-        self._ledger = Ledger(config.agents, config.anchor_every) if config.policy == "lease" else None
-        self._window = (config.anchor_every + 2) * config.agents if self._ledger else 0
+        rounds = config.anchor_every, config.main_every
+        self._ledger = Ledger(config.agents, *rounds) if config.policy == "lease" else None
+        self._window = (config.main_every + 2) * config.agents if self._ledger else 0
         self._from: int | None = None  # slot
         self.broken: list[str] = []
         self.slots = self.frames = 0
@@ -66,6 +67,7 @@ class Judge:
         shared = {} if ledger is None else {
             "two_senders_in_open_turns": ledger.open_collisions,
             "two_senders_in_adopted_turns": ledger.adopted_collisions,
+            "two_senders_in_anchors_given_away": ledger.anchor_collisions,
         }  # fmt: skip
         return {
             "slots_judged": self.slots,

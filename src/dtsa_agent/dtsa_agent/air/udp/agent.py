@@ -162,7 +162,7 @@ class UdpAgent:
         if self._leaves_by is None:
             if not self.config.policy_row.says_leaving or self.time.state == LISTENING or self.slot < self._first:
                 return True
-            turns = (self.config.anchor_every + 1) * self.config.agents * self._slot_ns
+            turns = (self.config.main_every + 1) * self.config.agents * self._slot_ns
             self._leaves_by, self._signals = now + min(_LEAVING_NS, turns), stop.count
             self.swarm.leave(0)
         return self._gone or now >= self._leaves_by or stop.count > self._signals
