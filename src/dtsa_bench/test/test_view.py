@@ -400,7 +400,7 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
 
     from dtsa_bench.view.graph import GraphSource
 
-    words = ("--mode", "realtime", "--policy", "lease", "--agents", "3", "--slot-ms", "20", "--tail-s", "90")
+    words = ("--mode", "realtime", "--policy", "lease", "--agents", "3", "--slot-ms", "40", "--tail-s", "90")
     with Browser(tmp_path) as browser, viewed_flight(tmp_path / "run", *words, "--control") as (process, url):
         browser.open(url)
         browser.wait_for("dtsa.views.length === 1 && dtsa.views[0].run.record.count > 20")
@@ -409,6 +409,7 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
         source = GraphSource(listener, domain, control=True)
         listening = threading.Thread(target=source.run, daemon=True)
         listening.start()
+        until(lambda: listener.since(0, 1)[1], "nothing is heard on the graph")
         browser.run("document.querySelector('.orders select').value = '2'")
         browser.run("document.querySelector('[data-order=kill]').click()")
         browser.wait_for("dtsa.views[0].run.lost.has(2)")

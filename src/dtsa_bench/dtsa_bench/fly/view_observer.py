@@ -25,7 +25,7 @@ from .measurement import FlightMeasurement
 from .recorded_channel import RecordedFlight
 from .supervisor import RealtimeSupervisor
 
-_PERIOD_S = 1 / 40  # wall time from one moment to the next, at least
+_PERIOD_S = 1 / 20  # wall time from one moment to the next, at least
 _MOST_ORDERS = 10  # carried out at a time
 
 

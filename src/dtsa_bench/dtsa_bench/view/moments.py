@@ -83,6 +83,8 @@ class Moments:
         self.agents = scenario.start.shape[1]
         self.place_slots = max(1, round(1e9 / PLACES_HZ / slot_ns))  # slots from one position to the next
         self._moving = scenario.moving
+        most = max(1, self.agents - 1)
+        self._shares = [min(255, round(255 * count / most)) for count in range(self.agents + 1)]  # by receivers
         self._own = np.eye(self.agents, dtype=bool)
         self._frames: deque[tuple[int, int, int, int, int]] = deque(maxlen=MOST_FRAMES)
         self._places: deque[tuple[int, bytes]] = deque(maxlen=MOST_PLACES)
@@ -102,17 +104,18 @@ class Moments:
         :param received: (F, N) who received each frame; None: all others.
         """
         for row, sender in enumerate(senders):
-            share = 255 if received is None else round(255 * int(received[row].sum()) / max(1, self.agents - 1))
-            self._frames.append((slot, sender, outcome, int(reason[sender - 1]), min(255, share)))
+            share = 255 if received is None else self._shares[np.count_nonzero(received[row])]
+            self._frames.append((slot, sender, outcome, reason.item(sender - 1), share))
 
     def choices(self, chosen: NDArray[Any]) -> None:
         """Takes in whom the agents take for a slot's sender.
 
         :param chosen: ids, of those that take part.
         """
-        if len(chosen):
+        data, size = chosen.tobytes(), chosen.itemsize
+        if data:  # compared as bytes, which is faster: this is asked in every slot
             self._compared += 1
-            self._same += bool((chosen == chosen[0]).all())
+            self._same += data == data[:size] * len(chosen)
 
     def place(self, slot: int, position: Floats) -> None:
         """Takes in where all agents are.
@@ -169,7 +172,7 @@ class Moments:
             "place": pack(np.frombuffer(b"".join(data for _, data in self._places), "<f4")),
             "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(kinds)},
             "agree": [self._compared, self._same],
-            "tables": len(np.unique(digest[here])),
+            "tables": len(set(digest[here].tolist())),
             "chosen": pack(chosen.astype("<u2")),
             "age": pack(self._mean_ages(slot, tables)),
             "absent": gone,
@@ -204,8 +207,10 @@ class Moments:
             return b"", b""
         age = np.clip(slot - 1 - tables.sent_slot, 0, UNKNOWN - 1).astype("<u2")
         age[tables.sent_slot < 0] = UNKNOWN
-        place = np.clip(np.rint(np.nan_to_num(tables.estimate_position) * _MM), -_FARTHEST, _FARTHEST)
-        return age.tobytes(), place.astype("<i2").tobytes()
+        place = tables.estimate_position * _MM
+        np.clip(place, -_FARTHEST, _FARTHEST, out=place)
+        place[place != place] = 0.0  # not a number: of somebody never heard
+        return age.tobytes(), np.rint(place, out=place).astype("<i2").tobytes()
 
 
 def estimate_now(tables: AbstractSwarm, oracle: bool, slot: int, position: Floats) -> None:

@@ -27,16 +27,29 @@ function quadcopter() {
   return merged([...arms, ...rotors, new THREE.BoxGeometry(0.55, 0.4, 0.26)]);
 }
 
+const SOFTWARE_AGENTS = 30; // where the processor draws in place of a graphics card, discs are faster for more
+
+/* Whether the processor has to draw what a graphics card should. */
+function drawnBySoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return true;
+  const known = gl.getExtension("WEBGL_debug_renderer_info"), name = known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "";
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
+}
+
 export class Bodies {
-  /* A layer of a scene; null where the browser cannot draw by WebGL: then the scene draws discs. */
+  /* A layer of a scene; null where WebGL is missing or too slow for so many agents: then the scene draws discs. */
   static make(scene) {
-    try { return new Bodies(scene); } catch { return null; }
+    const software = drawnBySoftware();
+    if (software && scene.count > SOFTWARE_AGENTS) return null;
+    try { return new Bodies(scene, software); } catch { return null; }
   }
 
-  constructor(scene) {
+  constructor(scene, software) {
     this.scene = scene;
     this.canvas = el("canvas", {"aria-hidden": "true", class: "bodies"});
-    this.renderer = new THREE.WebGLRenderer({canvas: this.canvas, alpha: true, antialias: true, powerPreference: "low-power"});
+    this.renderer = new THREE.WebGLRenderer({canvas: this.canvas, alpha: true, antialias: !software, powerPreference: "low-power"});
     this.world = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(50, 1, 0.05, 1000);
     const sun = new THREE.DirectionalLight(0xffffff, 1.9);
@@ -80,6 +93,7 @@ export class Bodies {
       place(this.spheres, agent, now, safe);
       if (ghosts && ghosts.known(agent)) place(this.ghosts, agent, ghosts.place, radius * 0.9); else place(this.ghosts, agent, now, 0);
     }
+    this.ghosts.visible = Boolean(ghosts);
     for (const mesh of [this.craft, this.spheres, this.ghosts]) mesh.instanceMatrix.needsUpdate = true;
     this.renderer.render(this.world, camera);
   }

@@ -4,7 +4,7 @@ import {Bodies} from "./bodies.js";
 import {LiveRun} from "./run.js";
 import {Panels} from "./panels.js";
 
-const FRAME_MS = 30, LAG_S = 0.12, CHARTS_MS = 1000;
+const FRAME_MS = 30, SLOW_MS = 90, LAG_S = 0.12, CHARTS_MS = 1000;
 sharpness.ratio = Math.min(2, devicePixelRatio || 1);
 Scene.bodies = Bodies.make;
 const root = document.getElementById("report"), main = el("main");
@@ -59,18 +59,30 @@ requestAnimationFrame(tick);
 function makeView(run) {
   const panels = new Panels(run, DATA.control && run.control ? content => send({order: content}) : null, agent => send({ghosts: agent, run: run.index}));
   const chart = (name, what, ...rest) => el("section", {class: "half"}, el("h2", {}, name), el("p", {class: "what"}, what), ...rest);
-  const lines = {reasons: true, lines: []}, strip = new SlotLine(run, lines);
+  const lines = {reasons: true, lines: []}, strip = new SlotLine(run, lines), drawn = new Scene(run, scene);
   const color = ["success", "collision", "idle"].map(name => () => theme.color(name));
   const series = (data, colors, most, unit, label, digits, suffix, limits = []) => lineChart({time: data.time, unit, label, digits, suffix, limits, height: 180, high: most,
     series: data.names.map((name, k) => ({name, values: data.values[k], color: colors[k], width: 1.6}))});
   const node = el("div", {class: "run"}, el("h3", {class: "runname"}, el("span", {class: "dot", style: `background:${runColor(run.index)}`}), run.name), panels.figures,
-    el("div", {class: "stagebox"}, el("section", {class: "flight"}, new Scene(run, scene).node), el("div", {class: "side"}, panels.crazyflies, panels.control, panels.agents, panels.events)),
+    el("div", {class: "stagebox"}, el("section", {class: "flight"}, drawn.node), el("div", {class: "side"}, panels.crazyflies, panels.control, panels.agents, panels.events)),
     el("section", {}, el("h2", {}, "Slots"), el("p", {class: "what"}, "Who sends in which slot, and why. The strip on top says what becomes of each slot. Click to go there."), strip.node, reasonLegend(run)),
     el("div", {class: "charts"},
       chart("Distances", "Between the two that are closest.", series(run.distance, [() => theme.color("ink")], () => Math.max(1, Math.min(3, run.distance.most)), "distance (m)", "Distance of the closest pair over time", 3, "m", [{name: `crash (${num(run.collision_m, 2, "m")})`, value: run.collision_m, color: "collision"}])),
       chart("Age", "Slots since the others last heard each moving agent.", series(run.ages, [LINES[0], LINES[1]], () => run.ages.most, "age (slots)", "Age over time", 1, "slots")),
       chart("Channel use", "Shares of the slots of the last second, and of the slots in which all take the same agent for the sender.", series(run.shares, [...color, LINES[2]], () => 1, "share", "Channel use over time", 2, ""))));
-  return {run, panels, strip, node};
+  // While time passes, strip and figures are drawn less often than the scene: nobody could read them faster.
+  strip.draw = slower((time) => SlotLine.prototype.draw.call(strip, time));
+  return {run, panels, strip, scene: drawn, node, show: slower(time => panels.show(time))};
+}
+
+function slower(draw) {
+  let last = 0;
+  return time => {
+    const now = performance.now();
+    if ((clock.playing || live.on) && now - last < SLOW_MS) return;
+    last = now;
+    draw(time);
+  };
 }
 
 function reasonLegend(run) {
@@ -97,7 +109,7 @@ function begin(message) {
   live.play = !run.live; // as soon as there is something
   document.documentElement.dataset.ready = "";
 }
-clock.listen(time => { for (const view of views) if (view) view.panels.show(time); });
+clock.listen(time => { for (const view of views) if (view) view.show(time); });
 
 /* ---- the connection ---- */
 function send(content) { if (live.socket && live.socket.readyState === WebSocket.OPEN) live.socket.send(JSON.stringify(content)); }
