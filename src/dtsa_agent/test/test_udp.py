@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import random
 import time
 from typing import Any
 
 import pytest
 
-from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+from dtsa_agent.air.udp import AgentSettings, MulticastSocket, UdpAgent, UdpSettings
 from dtsa_agent.air.udp.clock import OwnClock
 from dtsa_agent.air.udp.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
 from dtsa_agent.air.udp.delay import Delay
 from dtsa_agent.air.udp.slots import SlotTime
-from dtsa_agent.air.udp.sockets import StampClock
+from dtsa_agent.air.udp.sockets import Datagram, StampClock
 from dtsa_agent.air.udp.tally import Tally
 from dtsa_agent.core import ConfigError, Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
@@ -125,6 +126,32 @@ def test_stamps_of_a_clock_that_has_been_set_are_not_believed(monkeypatch: pytes
     assert abs(stamps.arrival_ns(arrived + ahead[0]) - arrived) < 500_000
     assert abs(stamps.arrival_ns(0) - time.monotonic_ns()) < 50_000_000
     assert abs(stamps.arrival_ns(None) - time.monotonic_ns()) < 50_000_000
+
+
+def test_arrivals_are_exact_however_long_a_process_was_kept_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stands still between two datagrams of one pass: the second one has arrived long after the first was read."""
+    with MulticastSocket(UdpSettings(interface="lo", group=f"239.255.77.77:{20_000 + os.getpid() % 10_000}")) as end:
+        sent = []
+        look = StampClock.look
+
+        def send() -> None:
+            sent.append(time.monotonic_ns())
+            end.send(b"x")
+
+        def stand_still(stamps: StampClock) -> None:
+            look(stamps)
+            if len(sent) == 1:
+                time.sleep(0.05)
+                send()
+
+        monkeypatch.setattr(StampClock, "look", stand_still)
+        send()
+        found: list[Datagram] = []
+        while len(found) < 2:
+            assert time.monotonic_ns() - sent[0] < 10 * 10**9
+            found += end.receive(16)
+    for datagram, at in zip(found, sent, strict=True):
+        assert 0 <= datagram.arrival_ns - at < 20_000_000
 
 
 def test_who_took_its_time_from_a_late_frame_takes_it_anew() -> None:

@@ -57,7 +57,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         helpers.wait_for(lambda: all(len(one.heard) == 2 and min(one.heard.values()) > 10 for one in flying))
         _disturb(stranger, flying)
         seen = [len(one.slots) for one in flying]
-        helpers.wait_for(lambda: all(len(one.slots) > before + 25 for one, before in zip(flying, seen, strict=True)))
+        helpers.wait_for(lambda: all(len(one.slots) > before + 60 for one, before in zip(flying, seen, strict=True)))
     finally:
         for one in flying:
             one.end()

@@ -62,6 +62,7 @@ def merge(bags: Sequence[AgentBag], air_ns: int = 0) -> dict[str, Any]:
         "time_line": line.summary(),
         **turns.summary(),
         **_air(sent, line, air_ns, turns.common_slot),
+        "frames_unsent": sum(bool(r.frame and not r.datagram) for bag in lives.values() for r in bag.slots),
         "frames_heard": len(crossings),
         "frames_heard_not_as_sent": strange,
         "turns": _judged(lives, sent, turns.common_slot),

@@ -38,9 +38,11 @@ def fly(
     :param replays: of each of them.
     :param senders: how many have sent, by slot.
     :param common_slot: from which all counted alike; None: never.
-    :returns: the results of the flight from that slot on, until the first of them ends in order; None: there is none.
+    :returns: the results of the flight from when all can have become known, (M + 2) N slots after that, until
+        the first of them ends in order; None: there are none.
     """
     config = next(iter(lives.values())).swarm
+    begins = None if common_slot is None else common_slot + (config.anchor_every + 2) * config.agents
     by_slot: dict[int, dict[Life, SlotRecord]] = {}
     records: dict[int, dict[int, SlotRecord]] = {agent: {} for agent, _ in lives}
     for life, bag in lives.items():
@@ -61,7 +63,7 @@ def fly(
         for life, record in by_slot[slot].items():
             replays[life].fly(record)
             replays[life].lay(tables, watch.index(life[0]))
-        if common_slot is None or not common_slot <= slot < last:
+        if begins is None or not begins <= slot < last:
             continue
         first = slot if first is None else first
         here = _follow(metrics, records, slot, track)

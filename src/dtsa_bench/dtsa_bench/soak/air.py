@@ -88,6 +88,7 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
         "common_after_last_start_s": found["common_after_last_start_s"],
         "clock_spread_ms": found["clock_spread_ms"],
         "residual_us": found["time_line"]["residual_us"],
+        "frames": [found["frames_sent"], found["frames_unsent"]],
         "overlap_slots": air["overlap_slots"],
         "slots": air["slots"],
         "decisions_again": found["decisions_again"]["equal"],

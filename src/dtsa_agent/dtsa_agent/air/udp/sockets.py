@@ -34,8 +34,8 @@ class Datagram(NamedTuple):
 class StampClock:
     """Turns the kernel's stamps of arrival, which are CLOCK_REALTIME, into CLOCK_MONOTONIC.
 
-    Both clocks are looked at once in each pass. When the first one has been set since the last pass, stamps of before
-    are worth nothing, and the time of the pass stands for them.
+    Both clocks are looked at after each datagram. When the first one has been set since the last look, stamps of before
+    are worth nothing, and the time of the look stands for them.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class StampClock:
         self.steps = 0  # how often the clock of the stamps has been set
 
     def look(self) -> None:
-        """A pass begins."""
+        """A datagram has been read: looks at both clocks."""
         ahead, self._now_ns = _look()
         self._usable = abs(ahead - self._ahead_ns) <= _STEP_NS
         self.steps += not self._usable
@@ -58,8 +58,7 @@ class StampClock:
         if stamp_ns is None or not self._usable:
             return self._now_ns
         arrival = stamp_ns - self._ahead_ns
-        # What has come since the look is newer than that, by a little.
-        return arrival if -_OLDEST_NS < arrival - self._now_ns < _STEP_NS else self._now_ns
+        return arrival if -_OLDEST_NS < arrival - self._now_ns <= 0 else self._now_ns
 
 
 def _look() -> tuple[int, int]:
@@ -142,8 +141,7 @@ class MulticastSocket:
             except OSError:  # an interface that has gone, for example: it may come back
                 self.unreadable += 1
                 break
-            if not found:
-                self._stamps.look()
+            self._stamps.look()  # for each: this process may have been kept waiting since the last one
             stamp = next((_stamp(value) for level, kind, value in ancillary
                           if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS)), None)  # fmt: skip
             found.append(Datagram(data, self._stamps.arrival_ns(stamp), source == self._self))
