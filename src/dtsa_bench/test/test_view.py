@@ -325,15 +325,36 @@ FIGURES = """(() => ({
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_chromium_plays_a_bag_and_shows_what_an_agent_believes(track: Track, tmp_path: Path) -> None:
-    with serving(ViewServer([track], "some-token")) as url, Browser(tmp_path) as browser:
+    info = track.info[1]
+    assert info is not None
+    mission, ordered = Track("mission"), []
+    mission.begin({**info, "name": "mission", "live": True, "control": True})
+    content = json.loads(track.since(0, 1)[1][0].text)
+    content["vehicles"] = [[1, "flying", 3.91, 0.98, ""], [2, "<b>landing</b>", 3.2, 0.5, "low battery"]]
+    mission.add(Moment(0, json.dumps(content), b"", b""))
+
+    def order(given: Order) -> str:
+        ordered.append(given)
+        return f"ordered: {given.kind}"
+
+    with serving(ViewServer([track, mission], "some-token", order)) as url, Browser(tmp_path) as browser:
         browser.open(url)
-        browser.wait_for("dtsa.views.length === 1 && dtsa.views[0].run.record.count >= 150")
+        browser.wait_for("dtsa.views.length === 2 && dtsa.views[0].run.record.count >= 150")
         browser.run("dtsa.clock.set(1.0); if (dtsa.clock.playing) dtsa.clock.toggle(); dtsa.clock.set(1.0)")
         found = browser.run(FIGURES)
-        assert found["rows"] == AGENTS
-        assert found["charts"] == 3
+        assert found["rows"] == 2 * AGENTS  # side by side
+        assert found["charts"] == 2 * 3
         assert {"Slots", "Agents", "Events", "Distances", "Age", "Channel use"} <= set(found["heads"])
-        assert "Control" not in found["heads"]
+        assert found["heads"].count("Control") == 1  # of the mission alone
+        browser.wait_for("document.querySelector('.vehicles tbody').textContent.includes('<b>landing</b>')")
+        browser.run("document.querySelector('[data-order=emergency]').click()")  # one click is none
+        browser.run("document.querySelector('[data-order=land]').click()")
+        until(lambda: ordered)
+        browser.run(
+            "(b => { delete b.dataset.sure; b.click(); b.click(); })(document.querySelector('[data-order=emergency]'))"
+        )
+        until(lambda: len(ordered) > 1)
+        assert ordered == [Order("land"), Order("emergency", value="stop all motors")]
         assert "lossy" in found["title"]
         assert found["values"][3].endswith("m")
         browser.run("document.querySelectorAll('button.agent')[1].click()")
