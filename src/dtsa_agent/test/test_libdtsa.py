@@ -213,6 +213,8 @@ def test_images_have_the_fields_of_their_headers(layout: binding.Layout, structu
     if structure == "swarm":
         fields = fields[: [name for name, _ in fields].index("tables")]  # its own part is none of Python's business
     assert [(name, kind.removesuffix("0q")) for name, kind, _ in layout.fields] == fields
+    with pytest.raises(ImportError, match="build dtsa_agent again"):
+        binding.Layout(layout.fields, 0)
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:

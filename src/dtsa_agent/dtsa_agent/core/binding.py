@@ -25,7 +25,7 @@ class Layout:
     """What a structure consists of.
 
     :param fields: in the order of the header. A shape is read letter by letter: a figure, or a size of the image's.
-    :param size: bytes of the structure in the compiled kernel.
+    :param size: bytes of the structure in the compiled kernel; of a kernel made before there were images 0.
     :raises ImportError: if it has another size there.
     """
 
@@ -98,7 +98,7 @@ SWARM = Layout(
         ("score", "f8", "l"), ("sends", "u1", "l"), ("frame_len", "u1", "l"), ("frames", "u1", "lf"),
         ("lease_state", "u1", "lp"), ("rejects", "u8", "2"),
     ),
-    0 if MISSING else _kernel.SWARM_IMAGE,
+    getattr(_kernel, "SWARM_IMAGE", 0),
 )  # fmt: skip
 
 # metrics of libdtsa_sim/metrics.h.
@@ -107,5 +107,5 @@ METRICS = Layout(
         ("n", "i", ""), ("news_from", "q", ""), ("collision_m", "d", ""), ("r_min", "d", ""), ("path", "f8", "n"),
         ("last_position", "f8", "3n"), ("target", "f8", "3n"), ("moving", "u1", "n"), ("sums", "i8", "9"),
     ),
-    0 if MISSING else _kernel.METRICS_IMAGE,
+    getattr(_kernel, "METRICS_IMAGE", 0),
 )  # fmt: skip
