@@ -125,11 +125,18 @@ def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
 
 
 def is_open(memory: Memory, who: Electorate, turn: int) -> bool:
-    """Whether a turn goes to those who wake: the first one in its block of somebody that rests."""
+    """Whether a turn goes to those who wake: the first one in its block that its owner gives away."""
     if not who.block:
         return False
     first = max(turn - turn % who.block, turn - 2 * memory.rules.agents)
-    return not any(who.rests[memory.owner(t)] and not memory.is_main(t) for t in range(first, turn))
+    return not any(is_spare(memory, who, t) for t in range(first, turn))
+
+
+def is_spare(memory: Memory, who: Electorate, turn: int) -> bool:
+    """Whether a turn is one that its owner gives away, as far as is known."""
+    owner = memory.owner(turn)
+    kept = memory.is_main(turn) if who.settled[owner] else memory.is_anchor(turn)
+    return who.rests[owner] and not kept
 
 
 def issue(
@@ -183,7 +190,7 @@ def foresee(memory: Memory, self_index: int, who: Electorate, turns: range) -> N
     for turn in turns:
         sender, owner = memory.scheduled(turn), memory.owner(turn)
         unsaid = turn not in memory.leases and who.settled[owner] and owner != self_index
-        if unsaid and not memory.is_main(turn) and not is_open(memory, who, turn):
+        if unsaid and is_spare(memory, who, turn) and not is_open(memory, who, turn):
             sender = choose_lessee(memory, who, turn)
         if sender >= 0:
             who.last[sender] = turn

@@ -14,6 +14,7 @@ typedef struct {
     uint16_t *again; /* (w) slots from each turn to the next one of the same agent */
     uint8_t *able;   /* (n) may be given a turn */
     uint8_t *rests;  /* (n) gives its turns away, as far as is known */
+    uint8_t *sure;   /* (n) rests and is settled: gives anchors away, but for main ones */
     uint8_t *list;   /* (members) those able */
 } electorate;
 
@@ -50,7 +51,8 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
     who->again = (uint16_t *)(who->next + v->n);
     who->able = (uint8_t *)(who->again + v->window);
     who->rests = who->able + v->n;
-    who->list = who->rests + v->n;
+    who->sure = who->rests + v->n;
+    who->list = who->sure + v->n;
     who->alive = who->members = 0;
     for (int k = 0; k < v->n; k++) {
         const int alive = k == self || lease_alive(v, k, slot);
@@ -61,7 +63,8 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
         if (who->able[k]) who->list[who->members++] = (uint8_t)k;
         who->alive += alive;
         resting += who->rests[k];
-        settled += who->rests[k] && (k == self ? agent->final : v->settled[k]);
+        who->sure[k] = who->rests[k] && (k == self ? agent->final : v->settled[k]);
+        settled += who->sure[k];
         who->last[k] = table->sent_slot[k] < 0 ? slot - v->n : table->sent_slot[k];
     }
     who->block = open_block(table->config->lease.open_every, v, resting, settled);
@@ -93,12 +96,20 @@ static int choose_lessee(const lease_scope *v, const electorate *who, int64_t tu
     return best;
 }
 
-/* One turn in each block is for those who wake: the first one of somebody that rests. */
+/* Whether a turn is one that its owner gives away, as far as is known. */
+static int is_spare(const lease_scope *v, const electorate *who, int64_t turn)
+{
+    const int owner = (int)(turn % v->n);
+    if (!who->rests[owner]) return 0;
+    return who->sure[owner] ? !lease_is_main(v, turn) : !lease_is_anchor(v, turn);
+}
+
+/* One turn in each block is for those who wake: the first one that its owner gives away. */
 static int is_open(const lease_scope *v, const electorate *who, int64_t turn)
 {
     if (!who->block) return 0;
     for (int64_t t = turn - 1; t >= turn - turn % who->block && t >= turn - 2 * v->n; t--)
-        if (who->rests[t % v->n] && !lease_is_main(v, t)) return 0;
+        if (is_spare(v, who, t)) return 0;
     return 1;
 }
 
@@ -125,8 +136,8 @@ static void foresee(const lease_scope *v, electorate *who, int self, int64_t fro
         const int owner = (int)(t % v->n), given = v->lessee[t % v->window];
         int k = lease_scheduled(v, t);
         if (k >= 0 && who->next[k] == t) who->next[k] = t + who->again[t % v->window];
-        if (given == LEASE_NONE && who->rests[owner] && v->settled[owner] && owner != self &&
-            !lease_is_main(v, t) && !is_open(v, who, t))
+        if (given == LEASE_NONE && who->sure[owner] && owner != self && is_spare(v, who, t) &&
+            !is_open(v, who, t))
             k = choose_lessee(v, who, t);
         if (k >= 0) who->last[k] = t;
     }
