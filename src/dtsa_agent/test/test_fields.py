@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_msgs.msg import Slot, Transmission
+from dtsa_msgs.msg import Report, Slot, Transmission
 from rclpy.serialization import deserialize_message, serialize_message
 
+from dtsa_agent.ros.common import report_fields
+from dtsa_agent.ros.common.report_fields import ReportFields, pack_report, read_report
 from dtsa_agent.ros.common.slot_fields import SlotFields, _fields, _read_usual, read_slot
 from dtsa_agent.ros.common.stamps import header_of, ns_of
 from dtsa_agent.ros.common.transmission_fields import TransmissionFields, read_transmission, transmission_layout
@@ -70,6 +72,25 @@ def slots(draw: Any) -> Slot:
     )
 
 
+@st.composite
+def reports(draw: Any) -> Report:
+    """Reports of any lengths of their fields, fitting or not."""
+    counts = st.integers(0, 4)
+    words_of = {"H": st.integers(0, 2**16 - 1), "I": words, "q": st.integers(-(2**63), 2**63 - 1), "d": numbers,
+                "B": st.integers(0, 255)}  # fmt: skip
+    kinds = {"agent": "H", "slot": "I", "offset_ns": "q", "length": "B", "chosen": "H", "reason": "B", "digest": "I",
+             "score": "d", "track": "d", "velocity": "d", "command": "d", "goal": "d", "heard_sender": "H",
+             "heard_slot": "I", "heard_in": "I", "heard_ns": "q", "heard_by": "B"}  # fmt: skip
+    fields = {name: draw(sequence(kind, words_of[kind], draw(counts))) for name, kind in kinds.items()}
+    stamp = draw(st.integers(-(2**60), 2**60))
+    return Report(header=header_of(stamp), run=draw(words), steps=draw(st.integers(0, 255)), **fields)
+
+
+def told_by(fields: ReportFields) -> list[Any]:
+    """All values of a report, as what can be compared: arrays may hold values that are no numbers."""
+    return [value if isinstance(value, int) else value.tobytes() for value in fields]
+
+
 def fields_of(message: Transmission) -> TransmissionFields:
     """What a message says, by rclpy."""
     values = {name: getattr(message, name) for name in TransmissionFields._fields[4:]}
@@ -93,6 +114,16 @@ def test_transmissions(message: Transmission) -> None:
     assert read_transmission(packed, MOST, STEPS) == told
 
 
+@given(reports())
+def test_reports(message: Report) -> None:
+    found, by_rclpy = read_report(bytes(serialize_message(message))), report_fields._fields(message)
+    assert told_by(found) == told_by(by_rclpy)
+    rows = {name: value.tobytes() for name, value in found._asdict().items() if not isinstance(value, int)}
+    packed = pack_report(found.time_ns, found.run, found.steps, rows)
+    assert report_fields._read_usual(packed) is not None
+    assert deserialize_message(packed, Report) == message
+
+
 @given(slots())
 def test_slots(message: Slot) -> None:
     data = bytes(serialize_message(message))
@@ -102,13 +133,17 @@ def test_slots(message: Slot) -> None:
 places, bits = st.integers(0, 10_000), st.integers(0, 255)
 
 
-@given(transmissions() | slots(), st.integers(0, 40) | st.just(0), places, bits)
+@given(transmissions() | slots() | reports(), st.integers(0, 40) | st.just(0), places, bits)
 def test_what_is_damaged_says_what_it_says_by_rclpy_or_is_left_to_it(
-    message: Transmission | Slot, cut: int, at: int, value: int
+    message: Transmission | Slot | Report, cut: int, at: int, value: int
 ) -> None:
     data = damaged(bytes(serialize_message(message)), cut, at, value)
     found: TransmissionFields | SlotFields | None
-    if isinstance(message, Slot):
+    if isinstance(message, Report):
+        report = report_fields._read_usual(data)
+        if report is not None:
+            assert told_by(report) == told_by(report_fields._fields(deserialize_message(data, Report)))
+    elif isinstance(message, Slot):
         found = _read_usual(data)
         assert found is None or found == _fields(deserialize_message(data, Slot))
     else:

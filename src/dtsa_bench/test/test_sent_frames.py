@@ -98,9 +98,9 @@ def test_two_frames_at_one_time_are_never_both_heard() -> None:
 
 def test_spread_and_lateness_come_from_the_right_agents() -> None:
     statistics = ClockStatistics(3)
-    statistics.add(0, [1, 2], [0, 400_000], [0, 0])
-    statistics.add(0, [3], [3_200_000], [24])  # late by 3 ms: not a clock that is off
-    statistics.add(1, [1, 2, 3], [100_000, 0, 100_000], [0, 24, 0])
+    statistics.add([0, 1], [1, 2], np.array([0, 400_000, 100_000, 0]), np.array([0, 0, 0, 24]))
+    statistics.add([0], [3], np.array([3_200_000]), np.array([24]))  # late by 3 ms: not a clock that is off
+    statistics.add([1], [3], np.array([100_000]), np.array([0]))
     summary = statistics.summary()
     assert summary["clock_spread_max_ms"] == pytest.approx(0.4)
     assert summary["clock_spread_mean_ms"] == pytest.approx(0.2)

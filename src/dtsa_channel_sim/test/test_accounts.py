@@ -14,15 +14,17 @@ from hypothesis import strategies as st
 pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_msgs.msg import Report
+from rclpy.serialization import serialize_message
 
 from dtsa_agent.ros.common.checks import Unusable
+from dtsa_agent.ros.common.report_fields import ReportFields, read_report
 from dtsa_channel_sim.ros.accounts import Accounts, Delivered
 
 AGENTS, STEPS, LATEST = 5, 1, 50
 IDS, SLOTS = (2, 3), (7, 8)
 
 
-def report(**changed: Any) -> Report:
+def report(**changed: Any) -> ReportFields:
     """A report of agents 2 and 3 on slots 7 and 8, in which each has taken in the frame of agent 1."""
     entries = len(IDS) * len(SLOTS)
     fields: dict[str, Any] = {
@@ -34,7 +36,7 @@ def report(**changed: Any) -> Report:
         "heard_sender": array("H", [1]), "heard_slot": array("I", [6]), "heard_in": array("I", [7]),
         "heard_ns": array("q", [70_000_000]), "heard_by": array("B", [3]),
     }  # fmt: skip
-    return Report(**{**fields, **changed})
+    return read_report(bytes(serialize_message(Report(**{**fields, **changed}))))
 
 
 def accounts() -> Accounts:

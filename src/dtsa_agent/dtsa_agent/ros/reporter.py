@@ -6,20 +6,17 @@ from array import array
 from typing import Any
 
 import numpy as np
-from dtsa_msgs.msg import Report
 from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm
 
 from .common import names
-from .common.stamps import header_of
+from .common.report_fields import pack_report
 
 _PERIOD_NS = 100_000_000
 _MOST_HEARD = 1000  # frames taken in that wait to be told: far more than a swarm sends in one period
 
-# Fields of a report with one entry a slot and agent, and their types in it.
-_FIELDS = {"chosen": "H", "reason": "B", "digest": "I", "score": "d",
-           "track": "d", "velocity": "d", "command": "d", "goal": "d"}  # fmt: skip
+_FIELDS = ("chosen", "reason", "digest", "score", "track", "velocity", "command", "goal")  # of the swarm, as they are
 
 
 class Reporter:
@@ -39,7 +36,7 @@ class Reporter:
         self._rows: dict[str, list[bytes]] = {name: [] for name in ("offset_ns", "length", *_FIELDS)}
         self._heard: list[tuple[int, int, int, int]] = []  # sender, slot, slot here, ns
         self._heard_by: list[bytes] = []
-        self._message = Report(agent=array("H", swarm.ids), steps=swarm.config.steps)
+        self._ids = array("H", swarm.ids).tobytes()
 
     def add_slot(self, slot: int, offset_ns: NDArray[np.int64]) -> None:
         """Takes note of what all agents have decided for a slot, and of where they are; before they fly on.
@@ -76,22 +73,20 @@ class Reporter:
 
         :param run_id: the run's id.
         """
-        message, rows = self._message, self._rows
-        message.header = header_of(names.slot_time_ns(self._slots[-1] if self._slots else 0, self._slot_ns))
-        message.run = run_id
-        message.slot = array("I", self._slots)
-        message.offset_ns = array("q", b"".join(rows["offset_ns"]))
-        message.length = array("B", b"".join(rows["length"]))
-        for name, kind in _FIELDS.items():
-            setattr(message, name, array(kind, b"".join(rows[name])))
+        rows = {name: b"".join(values) for name, values in self._rows.items()}
         sender, slot, here, at_ns = zip(*self._heard, strict=True) if self._heard else ((), (), (), ())
-        message.heard_sender = array("H", sender)
-        message.heard_slot = array("I", slot)
-        message.heard_in = array("I", here)
-        message.heard_ns = array("q", at_ns)
-        message.heard_by = array("B", b"".join(self._heard_by))
-        self._publisher.publish(message)
+        rows |= {
+            "agent": self._ids,
+            "slot": array("I", self._slots).tobytes(),
+            "heard_sender": array("H", sender).tobytes(),
+            "heard_slot": array("I", slot).tobytes(),
+            "heard_in": array("I", here).tobytes(),
+            "heard_ns": array("q", at_ns).tobytes(),
+            "heard_by": b"".join(self._heard_by),
+        }
+        time_ns = names.slot_time_ns(self._slots[-1] if self._slots else 0, self._slot_ns)
+        self._publisher.publish(pack_report(time_ns, run_id, self._swarm.config.steps, rows))
         self._slots = []
-        for values in rows.values():
+        for values in self._rows.values():
             values.clear()
         self._heard, self._heard_by = [], []

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from dtsa_agent.ros.common.report_fields import ReportFields
 from dtsa_channel_sim.ros.observer import ChannelObserver
 
 ON_TIME_NS = 1_000_000  # a frame this far from the swarm's common time is not on time any more
 _END = 50  # slots
-_OPEN = 2000  # slots that are not summed up yet
+_OPEN = 1000  # slots that are not summed up yet
 
 
 class ClockStatistics(ChannelObserver):
@@ -23,45 +24,47 @@ class ClockStatistics(ChannelObserver):
     """
 
     def __init__(self, agents: int) -> None:
-        self._agents = agents
-        self._starts: dict[int, NDArray[np.float64]] = {}  # (N,) ns by slot: own slot's start where silent
-        self._sends: dict[int, list[tuple[int, int]]] = {}  # by slot: agent's id, ns
+        self._slot = np.full(_OPEN, -1, dtype=np.int64)  # each in row slot % _OPEN, -1: none yet
+        self._starts = np.full((_OPEN, agents), np.nan)  # ns, own slot's start, nan: sent, or not known
+        self._sends = np.full((_OPEN, agents), np.nan)  # ns, of the transmission
         self._spread = array("f")  # ns, of slots that are summed up
         self._away: dict[int, array[float]] = {}  # ns, by agent, likewise
 
-    def report(self, message: Any, data: bytes) -> None:
-        count = len(message.agent)
-        for row, slot in enumerate(message.slot):
-            part = slice(row * count, (row + 1) * count)
-            self.add(slot, message.agent, message.offset_ns[part], message.length[part])
+    def report(self, message: ReportFields, data: bytes) -> None:
+        self.add(message.slot, message.agent, message.offset_ns, message.length)
 
-    def add(self, slot: int, ids: Sequence[int], offsets_ns: Sequence[int], lengths: Sequence[int]) -> None:
-        """Takes in what one process says of one slot.
+    def add(
+        self, slot: ArrayLike, ids: Sequence[int], offsets_ns: NDArray[np.int64], lengths: NDArray[np.uint8]
+    ) -> None:
+        """Takes in what one process says of some slots; nothing of slots that have been summed up.
 
-        :param slot: as its agents count.
-        :param ids: of the agents.
-        :param offsets_ns: ns, of each agent's slot from the channel's; of its transmission, if it sends.
-        :param lengths: bytes of each frame, 0: silent.
+        :param slot: (m,) as its agents count, ascending.
+        :param ids: (n,) of the agents.
+        :param offsets_ns: (m n) ns, of each agent's slot from the channel's; of its transmission, if it sends.
+        :param lengths: (m n) bytes of each frame, 0: silent.
         """
-        starts = self._starts.get(slot)
-        if starts is None:
-            starts = self._starts[slot] = np.full(self._agents, np.nan)
-            if len(self._starts) > _OPEN:
-                self._sum_up(min(self._starts))
-        silent = np.array(lengths) == 0
-        starts[np.array(ids)[silent] - 1] = np.array(offsets_ns)[silent]
-        for index in np.flatnonzero(~silent):
-            self._sends.setdefault(slot, []).append((ids[index], offsets_ns[index]))
+        slots = np.asarray(slot, dtype=np.int64)
+        rows = slots % _OPEN
+        for new in slots[self._slot[rows] < slots].tolist():
+            self._sum_up(new % _OPEN)
+            self._slot[new % _OPEN] = new
+        at = np.ix_(rows, np.asarray(ids, dtype=np.intp) - 1)
+        open_ = (self._slot[rows] == slots)[:, None]
+        silent, offsets = lengths.reshape(len(slots), -1) == 0, offsets_ns.reshape(len(slots), -1)
+        self._starts[at] = np.where(open_ & silent, offsets, self._starts[at])
+        self._sends[at] = np.where(open_ & ~silent, offsets, self._sends[at])
 
-    def _sum_up(self, slot: int) -> None:
+    def _sum_up(self, row: int) -> None:
         """Nothing more will be told of a slot."""
-        row = self._starts.pop(slot)
-        usable = row[~np.isnan(row)]
-        if len(usable) > 1:
-            self._spread.append(usable.max() - usable.min())
-        for agent, offset in self._sends.pop(slot, []):
-            if len(usable):
-                self._away.setdefault(agent, array("f")).append(offset - float(np.median(usable)))
+        starts, sends = self._starts[row], self._sends[row]
+        usable = np.sort(starts[~np.isnan(starts)])
+        count = len(usable)
+        if count > 1:
+            self._spread.append(usable[-1] - usable[0])
+        for index in np.flatnonzero(~np.isnan(sends)).tolist() if count else ():
+            median = (usable[(count - 1) // 2] + usable[count // 2]) / 2
+            self._away.setdefault(index + 1, array("f")).append(sends[index] - median)
+        starts[:] = sends[:] = np.nan
 
     def summary(self) -> dict[str, Any]:
         """The results; None where nothing was reported.
@@ -70,8 +73,8 @@ class ClockStatistics(ChannelObserver):
         largest of the last 50; ``send_offset_ms``: by agent, how far its frames left from the swarm's common time (the
         median of the slot's starts); ``sends_on_time_share``: frames within 1 ms of it.
         """
-        for slot in sorted(self._starts):
-            self._sum_up(slot)
+        for row in np.argsort(self._slot).tolist():
+            self._sum_up(row)
         spread = np.array(self._spread, dtype=np.float64) / 1e6
         away = {agent: np.array(values, dtype=np.float64) for agent, values in sorted(self._away.items())}
         every = np.concatenate(list(away.values())) if away else np.zeros(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from dtsa_msgs.msg import RunStatus
 from rcl_interfaces.msg import ParameterType
@@ -11,6 +10,7 @@ from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.report_fields import ReportFields
 from dtsa_bench.bag.cdr import HEADER, SECOND, CdrBuilder, OdometryPacker
 from dtsa_bench.bag.metadata import RUN_ID
 from dtsa_bench.bag.writer import BagWriter
@@ -86,9 +86,9 @@ class FlightRecorder(ChannelObserver):
     def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
         self._frames.setdefault(slot, []).append((data, time_ns))
 
-    def report(self, message: Any, data: bytes) -> None:
+    def report(self, message: ReportFields, data: bytes) -> None:
         if len(message.slot):
-            at = self._time_ns(message.slot[-1])
+            at = self._time_ns(int(message.slot[-1]))
             self.bag.write(self._report, data, at, at)
 
     def all_answered(self, slot: int, answers: Answers) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_ids
+from dtsa_agent.ros.common.report_fields import ReportFields
 
 from .answers import Answers, TakenIn, named
 
@@ -15,7 +16,8 @@ _LONGEST = 2000  # slots in one report
 _MOST_HEARD = 20_000  # frames taken in, in one report
 _FARTHEST_OFF_NS = 60_000_000_000  # no agent's slot is farther from the channel's
 _FLOATS = ("score", "track", "velocity", "command", "goal")
-_DECIDED = {"chosen": np.uint16, "reason": np.uint8, "digest": np.uint32, "score": np.float64}
+_DECIDED = ("chosen", "reason", "digest", "score")
+_MOTION = ("track", "velocity", "command", "goal")
 
 
 class Delivered(NamedTuple):
@@ -72,24 +74,22 @@ class Accounts:
         """
         self._delivered[slot, sender] = delivered
 
-    def add(self, message: Any, latest: int) -> int:
+    def add(self, message: ReportFields, latest: int) -> int:
         """Takes in a report.
 
-        :param message: a dtsa_msgs/Report.
+        :param message: its fields.
         :param latest: no slot after this one can have begun.
         :returns: its last slot that is still open; -1: none.
         :raises Unusable: if its fields do not fit together.
         """
         at, count = self._where(message.agent), len(message.agent)
         _check(message, count, self._steps)
-        slots = np.frombuffer(message.slot, dtype=np.uint32).tolist()
-        heard_in = np.frombuffer(message.heard_in, dtype=np.uint32)
-        last = max(slots[-1] if slots else 0, int(heard_in.max()) if len(heard_in) else 0)
+        slots = message.slot.tolist()
+        last = max(slots[-1] if slots else 0, max(message.heard_in.tolist(), default=0))
         if last > latest:
             raise Unusable(SLOT, f"{named(message.agent)} reported slot {last}, which has not begun")
-        fields = {name: np.frombuffer(getattr(message, name), dtype=kind) for name, kind in _DECIDED.items()}
-        offsets = np.frombuffer(message.offset_ns, dtype=np.int64)
-        motion = [np.frombuffer(getattr(message, name)) for name in ("track", "velocity", "command", "goal")]
+        fields = {name: getattr(message, name) for name in _DECIDED}
+        motion = [getattr(message, name).reshape(len(slots), -1) for name in _MOTION] if slots else []
         newest = -1
         for row, slot in enumerate(slots):
             if slot <= self._closed:
@@ -99,22 +99,21 @@ class Accounts:
             if book.answered[at].any():
                 continue  # told twice
             part = slice(row * count, (row + 1) * count)
-            track, velocity, command, goal = (plane.reshape(len(slots), -1)[row] for plane in motion)
             decided = {name: values[part] for name, values in fields.items()}
-            book.put(at, count, offsets[part], (track, velocity, command, goal), **decided)
+            book.put(at, count, message.offset_ns[part], [planes[row] for planes in motion], **decided)
             newest = slot
         self._take_in(message, at, count)
         return newest
 
-    def _take_in(self, message: Any, at: slice | NDArray[np.intp], count: int) -> None:
+    def _take_in(self, message: ReportFields, at: slice | NDArray[np.intp], count: int) -> None:
         """What some agents have taken in, by the slot in which they did; what was not delivered to them is left out."""
         if not len(message.heard_sender):
             return
         width = -(-count // 8)
-        rows = np.frombuffer(message.heard_by, dtype=np.uint8).reshape(-1, width)
+        rows = message.heard_by.reshape(-1, width)
         masks = np.unpackbits(rows, axis=1, count=count, bitorder="little").astype(np.bool_)
-        heard = zip(message.heard_slot, message.heard_sender, message.heard_in, message.heard_ns, masks, strict=True)
-        for slot, sender, here, at_ns, mask in heard:
+        told = (message.heard_slot, message.heard_sender, message.heard_in, message.heard_ns)
+        for slot, sender, here, at_ns, mask in zip(*(column.tolist() for column in told), masks, strict=True):
             found = self._delivered.get((slot, sender))
             if found is None:
                 continue
@@ -153,7 +152,7 @@ class Accounts:
         return known
 
 
-def _check(message: Any, count: int, steps: int) -> None:
+def _check(message: ReportFields, count: int, steps: int) -> None:
     """Whether the fields of a report fit together.
 
     :raises Unusable: if they do not.
@@ -169,17 +168,17 @@ def _check(message: Any, count: int, steps: int) -> None:
         raise Unusable(RANGE, f"{who} reported {message.steps} control instants a slot instead of {steps}")
     if wrong or not count:
         raise Unusable(SIZES, f"{who} sent a report in which {', '.join(wrong)} do not fit")
-    if len(message.slot) > _LONGEST or list(message.slot) != sorted(set(message.slot)):
+    if len(message.slot) > _LONGEST or (message.slot[1:] <= message.slot[:-1]).any():
         raise Unusable(SLOT, f"{who} reported slots that do not ascend, or too many")
     if heard > _MOST_HEARD:
         raise Unusable(SIZES, f"{who} reported {heard} frames at once")
-    offsets = np.frombuffer(message.offset_ns, dtype=np.int64)
+    offsets = message.offset_ns
     if entries and not -_FARTHEST_OFF_NS <= offsets.min() <= offsets.max() <= _FARTHEST_OFF_NS:
         farthest = np.abs(offsets.astype(np.float64)).max() / 1e9
         raise Unusable(RANGE, f"{who} reported slots {farthest:.3g} s from the channel's")
     # A sum of squares is finite only if all its terms are, and small only if they are.
     for name in _FLOATS:
-        values = np.frombuffer(getattr(message, name))
+        values = getattr(message, name)
         with np.errstate(over="ignore"):
             size = values @ values
         if not size <= FARTHEST_M**2:

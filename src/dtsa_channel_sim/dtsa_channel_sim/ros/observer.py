@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.ros.common.report_fields import ReportFields
 from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 
@@ -67,10 +68,10 @@ class ChannelObserver:
         :param time_ns: ns, simulated time at which its transmission starts.
         """
 
-    def report(self, message: Any, data: bytes) -> None:
+    def report(self, message: ReportFields, data: bytes) -> None:
         """A usable report has come in, in real time only.
 
-        :param message: the dtsa_msgs/Report; it may tell of slots that are over.
+        :param message: its fields; it may tell of slots that are over.
         :param data: the message as CDR.
         """
 
@@ -212,7 +213,7 @@ class Observers(ChannelObserver):
     def frame_sent(self, slot: int, data: bytes, time_ns: int) -> None:
         self._tell("frame_sent", slot, data, time_ns)
 
-    def report(self, message: Any, data: bytes) -> None:
+    def report(self, message: ReportFields, data: bytes) -> None:
         self._tell("report", message, data)
 
     def begun(self, at_s: float) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 from heapq import heappop, heappush
 from typing import Any
 
@@ -17,6 +19,7 @@ from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import OTHER_RUN, RANGE, SIZES, UNREADABLE, Unusable, check_start
 from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.report_fields import ReportFields, read_report
 from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of, ns_of, time_of
 from dtsa_channel_sim.model.air import Air, FrameVerdict
@@ -49,6 +52,8 @@ _FRAMES, _REPORTS = 64, 2
 _TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
 
 _Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
+
+_read_frame = partial(deserialize_message, message_type=Frame)
 
 
 class RealtimeChannel(RosChannel):
@@ -275,13 +280,13 @@ class RealtimeChannel(RosChannel):
         )
         return True
 
-    def _decoded(self, data: bytes, kind: type) -> Any:
+    def _decoded(self, data: bytes, kind: type, read: Callable[[bytes], Any]) -> Any:
         """A message of this run.
 
         :raises Unusable: if it is none.
         """
         try:
-            message: Any = deserialize_message(data, kind)
+            message = read(data)
         except Exception:  # rclpy has no common base for what a message can do to it
             raise Unusable(UNREADABLE, f"a message of {len(data)} bytes that is no {kind.__name__}") from None
         if message.run != self.run_id:
@@ -293,7 +298,7 @@ class RealtimeChannel(RosChannel):
 
         :raises Unusable: if it cannot be one.
         """
-        message = self._decoded(data, Frame)
+        message = self._decoded(data, Frame, _read_frame)
         slot, agent, length = message.slot, message.agent, len(message.data)
         if agent in self.lost:
             self._meet_processes()  # a new process tells about itself before it sends anything else
@@ -355,10 +360,10 @@ class RealtimeChannel(RosChannel):
             if data is None:
                 return False
             with self.intake.guard():
-                self._take_report(self._decoded(data, Report), data)
+                self._take_report(self._decoded(data, Report, read_report), data)
         return True
 
-    def _take_report(self, message: Any, data: bytes) -> None:
+    def _take_report(self, message: ReportFields, data: bytes) -> None:
         """Takes in one process's report.
 
         :raises Unusable: if it cannot be one.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from array import array
-from typing import Any
 
 import numpy as np
-from dtsa_msgs.msg import Report, Slot
+from dtsa_msgs.msg import Slot
 from rclpy.publisher import Publisher
-from rclpy.serialization import deserialize_message
 
 from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.report_fields import read_report
 
 _ROUNDS, _LONGEST_S = 20, 0.5
 _PAUSE_S = 0.0001
@@ -44,10 +43,10 @@ class RollCall:
         found: set[int] = set()
         while (data := self._reports.take()) is not None:
             try:
-                message: Any = deserialize_message(data, Report)
+                message = read_report(data)
             except Exception:  # rclpy has no common base for what a message can do to it
                 continue
-            if message.run == self._run_id and list(message.slot) == [number]:
+            if message.run == self._run_id and message.slot.tolist() == [number]:
                 found.update(message.agent)
         return found
 

@@ -30,6 +30,7 @@ from .taking import Taker
 
 _POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
 HOUSEKEEPING_S = 0.1
+_SPIN_S = 5.0  # at the latest after so long an executor looks, too
 _MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
 
 
@@ -134,7 +135,7 @@ class Loop(Feed):
         context = node.context.handle
         self._stack.enter_context(context)
         self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, context)
-        self._next_housekeeping = 0.0
+        self._next_housekeeping = self._next_spin = 0.0
         gc.freeze()  # nothing made so far is garbage: do not look at it again and again
 
     def wait(self, timeout_ns: int = _POLL_NS) -> Any:
@@ -148,17 +149,44 @@ class Loop(Feed):
         wait_set.wait(timeout_ns)
         return self.take()
 
+    def _something_waits(self) -> bool:
+        """Whether anything of the node but this subscription has to be served.
+
+        An executor takes milliseconds to find out that there is nothing to do.
+        """
+        node = self._node
+        waiting = {
+            "subscription": [one for one in node.subscriptions if not isinstance(one.callback_group, _OwnHands)],
+            "timer": list(node.timers),
+            "client": list(node.clients),
+            "service": list(node.services),
+        }
+        if not any(waiting.values()):
+            return False
+        if time.monotonic() > self._next_spin:  # an executor serves rarer things as well
+            self._next_spin = time.monotonic() + _SPIN_S
+            return True
+        subscriptions, timers, clients, services = (len(entities) for entities in waiting.values())
+        with ExitStack() as stack:
+            wait_set = _rclpy.WaitSet(subscriptions, 0, timers, clients, services, 0, node.context.handle)
+            for kind, entities in waiting.items():
+                add = getattr(wait_set, f"add_{kind}")
+                for entity in entities:
+                    stack.enter_context(entity.handle)
+                    add(entity.handle)
+            wait_set.wait(0)
+            return any(wait_set.get_ready_entities(kind) for kind in waiting)
+
     def housekeeping(self) -> bool:
         """Serves parameters and timers if it is time; whether it did."""
         now = time.monotonic()
         if now < self._next_housekeeping:
             return False
         self._next_housekeeping = now + HOUSEKEEPING_S
-        node = self._node
-        if any(True for _ in node.services) or any(True for _ in node.timers):
+        if self._something_waits():
             if self._executor is None:
-                self._executor = SingleThreadedExecutor(context=node.context)
-                self._executor.add_node(node)
+                self._executor = SingleThreadedExecutor(context=self._node.context)
+                self._executor.add_node(self._node)
             for _ in range(2):
                 self._executor.spin_once(timeout_sec=0.0)
         return True
