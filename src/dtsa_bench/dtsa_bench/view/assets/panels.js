@@ -129,6 +129,6 @@ export class Panels {
     const events = this.run.events, last = events.length ? events[events.length - 1] : null;
     if (last === this.listed) return;
     this.listed = last;
-    this.list.replaceChildren(...events.slice(-60).reverse().map(event => el("li", {class: event.kind}, el("button", {type: "button", onclick: () => clock.set(event.time)}, num(event.time, 2, "s")), " ", event.text)));
+    this.list.replaceChildren(...events.slice(-60).reverse().map(event => el("li", {class: `is-${event.kind}`}, el("button", {type: "button", onclick: () => clock.set(event.time)}, num(event.time, 2, "s")), " ", event.text)));
   }
 }
