@@ -80,12 +80,8 @@ WORLDS = (
     World("three agents, adoption", 3, adoption=True),
     World("three agents, OPEN turns", 3, open_every=4),
     World(
-        "three agents, OPEN turns, adoption; one restart, death, claim", 3, open_every=4, adoption=True, restarts=1,
-        deaths=1, returns=0, claims=1,
-    ),
-    World(
-        "three agents, OPEN turns, adoption; one death, return, claim", 3, open_every=4, adoption=True, restarts=0,
-        deaths=1, returns=1, claims=1,
+        "three agents, OPEN turns, adoption; each befalls once", 3, open_every=4, adoption=True, restarts=1, deaths=1,
+        returns=1, claims=1,
     ),
 )  # fmt: skip
 
