@@ -238,7 +238,7 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: Fli
         try:
             channel.close()
         finally:
-            if first:
+            if first and not ended.stop:  # who has been told to end does so before all else
                 give_way_by(0)
 
 
