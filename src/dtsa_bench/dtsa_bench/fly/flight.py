@@ -212,6 +212,9 @@ def _fly(
         except DtsaError as error:
             failure = error
         progress.end()
+        if stop:
+            # Before the others are killed: the middleware may wait for seconds for locks of those that died with them.
+            node.destroy_node()
         children.stop(hurry=bool(stop))
         try:
             pictures = options.pictures and not ended and failure is None
