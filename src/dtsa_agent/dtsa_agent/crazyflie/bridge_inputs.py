@@ -43,6 +43,22 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def helper_node(node: Node, name: str) -> Node:
+    """A node beside another one, whose topics or services are taken by a thread of their own.
+
+    :param node: the node.
+    :param name: what is appended to its name.
+    """
+    return Node(
+        f"{node.get_name()}_{name}",
+        namespace=node.get_namespace(),
+        context=node.context,
+        enable_rosout=False,
+        start_parameter_services=False,
+        use_global_arguments=False,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Types:
     """Messages of the streamed commands and services: ours, or others with the same fields."""

@@ -25,7 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import named
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.bridge_inputs import Inputs
+from dtsa_agent.crazyflie.bridge_inputs import Inputs, helper_node
 from dtsa_agent.crazyflie.bridge_outputs import Outputs
 from dtsa_agent.crazyflie.bridge_positions import subscribe_positions
 from dtsa_agent.crazyflie.config import SwarmSettings, load_swarm
@@ -117,25 +117,14 @@ class BridgeNode(Node):
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
         self.settings = SwarmSettings(settings.robots, station)
         self.outputs = Outputs(self, self.settings) if foreign is None else foreign.outputs(self, self.settings)
-        self._commands = self._listener("commands")
+        self._commands = helper_node(self, "commands")
         self.pump = CommandPump(self._commands)
         self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
         self._inputs = (Inputs if foreign is None else foreign.inputs)(self, self.bridge, self.pump, self.say)
-        self._cameras = self._listener("positions") if positions.on else None
+        self._cameras = helper_node(self, "positions") if positions.on else None
         self.positions = CommandPump(self._cameras) if self._cameras is not None else None
         if self.positions is not None:
             subscribe_positions(self.positions, positions, self.bridge.vehicles)
-
-    def _listener(self, name: str) -> Node:
-        """A node whose topics are taken by a thread of their own."""
-        return Node(
-            f"{self.get_name()}_{name}",
-            namespace=self.get_namespace(),
-            context=self.context,
-            enable_rosout=False,
-            start_parameter_services=False,
-            use_global_arguments=False,
-        )
 
     def close(self) -> None:
         """End of what this node added to itself."""

@@ -19,6 +19,7 @@ from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import Listeners, check_joinable
+from dtsa_agent.core.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
 from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 
@@ -36,14 +37,9 @@ _LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
 _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
-# Of a slot: an agent that has heard all it waits for decides this long before its slot starts, mostly as soon as it has
-# heard: one wake-up of its process less, and its frame leaves on time.
-_LEAD = 0.7
-_LATEST_LEAD = 0.06  # while it misses the frame of the slot before, only this long;
-# with a policy that needs all tables equal it waits beyond the start, as long as its frame still counts as on time.
+# With a policy that needs all tables equal it waits beyond the start, as long as its frame still counts as on time.
 _LATEST, _LATEST_NS = 0.09, 900_000
 _BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
-_MOST_EARLY = 64  # frames of slots that are still to come here
 
 
 def slot_starts(local_ns: int, offset_ns: NDArray[np.int64], drift_ppb: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -98,7 +94,7 @@ class RealtimeNode(SwarmNode):
         super().__init__(*args, waiting=names.REALTIME_WAITING, **kwargs)
         count = len(self.swarm.ids)
         self.slot_ns = self.config.slot_ns
-        self._lead_ns, self._latest_lead_ns = round(_LEAD * self.slot_ns), round(_LATEST_LEAD * self.slot_ns)
+        self._lead_ns, self._latest_lead_ns = round(LEAD * self.slot_ns), round(LATEST_LEAD * self.slot_ns)
         if not self.config.policy_row.may_join:
             self._latest_lead_ns = -min(_LATEST_NS, round(_LATEST * self.slot_ns))
         self._own_or_nobody = {0, *self.swarm.ids}
@@ -120,8 +116,7 @@ class RealtimeNode(SwarmNode):
             count, dtype=np.bool_
         )  # came late, and takes its time from the next frame
         self._first = 0  # slot with which this process began, or began anew
-        # Whoever stood still for so long does not wait until the others think it dead, and knows too little.
-        self._too_long_ns = max(500, 3 * self.config.anchor_every * self.config.agents) * self.slot_ns
+        self._too_long_ns = too_long_ns(self.config)
         self._leaves_by: int | None = None  # slot: leaving; ends then at the latest
         self._gone: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)  # who has said on the air that it leaves
         self._signals = 0
@@ -302,7 +297,7 @@ class RealtimeNode(SwarmNode):
             return False
         if message.phase == Slot.RUN:
             if message.heard_slot > self.slot:
-                if len(self._early) < _MOST_EARLY:
+                if len(self._early) < MOST_EARLY:
                     self._early.append(message)
             else:
                 self._take_frames(message)

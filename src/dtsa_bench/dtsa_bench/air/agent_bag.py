@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
 from dtsa_agent.air.udp import Heard, SlotRecord
-from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.air.udp.datagram import flight_ns
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.bag.errors import UnusableBag
 
@@ -43,8 +43,7 @@ class AgentBag:
     @property
     def flight_ns(self) -> int:
         """From the order to send a frame to its arrival as the agents take it to be, ns."""
-        length = HEADER + self.swarm.frame_length
-        return int(self.udp["flight_time_ns"]) + int(self.udp["byte_time_ns"]) * length
+        return flight_ns(self.swarm, int(self.udp["flight_time_ns"]), int(self.udp["byte_time_ns"]))
 
 
 def find(path: str | Path) -> Path:

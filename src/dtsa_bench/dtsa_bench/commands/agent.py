@@ -25,12 +25,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     parser = subparsers.add_parser("agent", help="one agent on a real network", description=DESCRIPTION)
     parser.usage = "%(prog)s --id N --interface NAME [OPTIONS]"
-    parser.add_argument("--air", choices=("udp",), default="udp", help="what carries the frames [udp]")
-    parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
-    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    add_air(parser)
     add_options(parser.add_argument_group("this agent"), AgentSettings, "own")
     add_network(parser)
     add_swarm(parser)
+
+
+def add_air(parser: argparse.ArgumentParser) -> None:
+    """Adds what carries the frames, and where the results go."""
+    parser.add_argument("--air", choices=("udp",), default="udp", help="what carries the frames [udp]")
+    parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
+    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
 
 
 def add_network(parser: argparse.ArgumentParser) -> None:

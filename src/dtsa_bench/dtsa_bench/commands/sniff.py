@@ -13,13 +13,11 @@ lease that it does not know looks like a broken rule."""
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
-    from dtsa_bench.commands.agent import add_network, add_swarm
+    from dtsa_bench.commands.agent import add_air, add_network, add_swarm
 
     parser = subparsers.add_parser("sniff", help="listen to agents on a real network", description=DESCRIPTION)
     parser.usage = "%(prog)s --interface NAME [OPTIONS]"
-    parser.add_argument("--air", choices=("udp",), default="udp", help="what carries the frames [udp]")
-    parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
-    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    add_air(parser)
     parser.add_argument("--duration-s", metavar="X", default="0", help="for so long; 0: until Ctrl-C [0]")
     add_network(parser)
     add_swarm(parser)

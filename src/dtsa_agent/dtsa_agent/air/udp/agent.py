@@ -17,13 +17,14 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtoc
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import check_joinable
+from dtsa_agent.core.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 
 from .clock import OwnClock
-from .datagram import HEADER, NO_FRAME, Wrapping
+from .datagram import NO_FRAME, Wrapping, flight_ns
 from .delay import Delay
 from .precision import wake_precisely
 from .record import Heard, SlotRecord, Watcher
@@ -36,8 +37,6 @@ from .vehicle import SimulatedVehicle, Vehicle
 _SECOND = 1_000_000_000
 _PATIENCE_S = 0.05  # a signal is noticed after this time at the latest
 _BURST = 16  # datagrams taken in at a time: whatever comes, the own slots go on
-_MOST_EARLY = 64  # frames of slots that are still to come here
-_LEAD, _LATEST_LEAD = 0.7, 0.06  # of a slot, as of agents in a ROS graph (docs/realtime.md)
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
 _OWN_ID = 3  # frames in the own name after which an agent that is new gives way
 _SAID = 64  # own frames that are remembered
@@ -80,10 +79,9 @@ class UdpAgent:
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally(config.slot_ns)
         self._slot_ns = config.slot_ns
-        self._lead_ns, self._latest_lead_ns = round(_LEAD * self._slot_ns), round(_LATEST_LEAD * self._slot_ns)
-        self._flight_ns = udp.flight_time_ns + udp.byte_time_ns * (HEADER + config.frame_length)
-        # Who has stood still for so long may have been taken for dead, and knows too little.
-        self._too_long_ns = max(500, 3 * config.anchor_every * config.agents) * self._slot_ns
+        self._lead_ns, self._latest_lead_ns = round(LEAD * self._slot_ns), round(LATEST_LEAD * self._slot_ns)
+        self._flight_ns = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
+        self._too_long_ns = too_long_ns(config)
         self.slot = -1  # the slot that is open
         self._first = 0  # slot with which it began, or began anew
         self._awaits = False  # it takes another one for the slot's sender, and has not heard it yet
@@ -202,7 +200,7 @@ class UdpAgent:
             self.delay.hear(sender, began - before, peers)
             self.delay.moved(self.time.slot_start_ns(slot) - before)
         if slot > self.slot:
-            if len(self._early) >= _MOST_EARLY:
+            if len(self._early) >= MOST_EARLY:
                 return EARLY
             self._early.append((sender, slot, frame, datagram))
         elif slot >= self._first - 1:

@@ -36,6 +36,16 @@ _AGREED = 8  # bytes of the header that are the same in all datagrams of a swarm
 _UNIT_NS = 10_000  # of times in the header
 
 
+def flight_ns(config: SwarmConfig, flight_time_ns: int, byte_time_ns: int) -> int:
+    """From the order to send a frame to its arrival, as agents take it to be, ns.
+
+    :param config: what all agents share.
+    :param flight_time_ns: of :class:`.settings.UdpSettings`.
+    :param byte_time_ns: likewise.
+    """
+    return flight_time_ns + byte_time_ns * (HEADER + config.frame_length)
+
+
 class Said(NamedTuple):
     """What a datagram says; ``fault`` why it says nothing, or an empty text."""
 

@@ -19,7 +19,7 @@ from rclpy.node import Node
 
 from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.bridge_inputs import Inputs, seconds
+from dtsa_agent.crazyflie.bridge_inputs import Inputs, helper_node, seconds
 from dtsa_agent.crazyflie.crazyswarm2.interfaces import Interfaces
 from dtsa_agent.crazyflie.crazyswarm2.logs import Logs
 from dtsa_agent.crazyflie.crazyswarm2.parameters import FirmwareParameters
@@ -60,14 +60,7 @@ class Crazyswarm2Inputs(Inputs):
         self._interfaces = interfaces
         self._masks = {name: vehicle.robot.group_mask for name, vehicle in bridge.vehicles.items()}
         # An upload takes up to seconds: it must not keep an emergency stop waiting.
-        self._uploads = Node(
-            f"{node.get_name()}_uploads",
-            namespace=node.get_namespace(),
-            context=node.context,
-            enable_rosout=False,
-            start_parameter_services=False,
-            use_global_arguments=False,
-        )
+        self._uploads = helper_node(node, "uploads")
         self._executor = SingleThreadedExecutor(context=node.context)
         self._thread = threading.Thread(target=self._executor.spin, name="uploads", daemon=True)
 
