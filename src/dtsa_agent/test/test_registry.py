@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, _kernel, registry
+from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, registry
+from dtsa_agent.core.compiled import NAMES
 from dtsa_agent.core.flight_models import AVOIDERS, AvoiderParams, flight_model
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, PORT, PolicyRow, check_kernel
@@ -32,9 +33,9 @@ def flown(policy: str, shared: bool, slots: int = 60) -> Swarm:
 
 
 def test_lists_of_names_are_the_kernels_and_a_difference_is_said() -> None:
-    assert _kernel.NAMES["policies"] == POLICIES.names
-    assert _kernel.NAMES["reasons"] == registry.REASONS
-    for kind, names in _kernel.NAMES.items():
+    assert NAMES["policies"] == POLICIES.names
+    assert NAMES["reasons"] == registry.REASONS
+    for kind, names in NAMES.items():
         check_kernel(kind, names)
         for other in (names[::-1], names[:-1], (*names, "more")):
             with pytest.raises(ImportError, match=f"{kind}.*build dtsa_agent again"):
@@ -43,7 +44,7 @@ def test_lists_of_names_are_the_kernels_and_a_difference_is_said() -> None:
 
 def test_every_list_of_the_kernel_is_compared() -> None:
     text = (CORE / "registry.py").read_text() + (CORE / "flight_models.py").read_text()
-    assert all(f'"{kind}"' in text for kind in _kernel.NAMES)
+    assert all(f'"{kind}"' in text for kind in NAMES)
 
 
 def test_settings_and_rows_have_the_same_names() -> None:
@@ -144,7 +145,7 @@ def test_what_a_policy_declares_is_checked(monkeypatch: pytest.MonkeyPatch, what
 def test_flight_models_take_the_kernels_parameters() -> None:
     for name in AVOIDERS.names:
         model = flight_model(name)
-        assert model.kind == _kernel.NAMES["avoiders"].index(model.avoider_kind)
+        assert model.kind == NAMES["avoiders"].index(model.avoider_kind)
         assert set(model.avoider.to_dict()) == {spec.name for spec in settings_of(AvoiderParams)}
 
 

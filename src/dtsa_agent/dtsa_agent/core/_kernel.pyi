@@ -2,7 +2,6 @@
 
 from typing import Any
 
-NAMES: dict[str, tuple[str, ...]]
 VERSION: int  # of libdtsa
 FRAME_MAX: int
 FRAME_RECORD: int  # bytes of a frame's structure
@@ -70,3 +69,6 @@ def vehicle_step(tau: float, a_max: float, dt: float, position: bytes, velocity:
 
 # Instructions in use: 0 baseline, 1 AVX2; same bits either way. A level sets it, bounded by the machine; -1: leaves it.
 def vector_level(level: int, /) -> int: ...
+
+# Of what has numbers: the list's name, then the names in it; empty after the last list.
+def names(index: int, /) -> tuple[str, ...]: ...

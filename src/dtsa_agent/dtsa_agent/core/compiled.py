@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import count, takewhile
+
 try:
     from . import _kernel as kernel
 
@@ -10,7 +12,12 @@ except ImportError as error:  # no compiler, or the package is used from its sou
     kernel = None  # type: ignore[assignment]
     MISSING = f"{error}"  # why there is none; empty: there is one
 
-__all__ = ["COMPILED", "CORES", "MISSING", "REFERENCE", "kernel"]
+__all__ = ["COMPILED", "CORES", "MISSING", "NAMES", "REFERENCE", "kernel"]
 
 COMPILED, REFERENCE = "compiled", "reference"
 CORES = (COMPILED, REFERENCE)  # what moves a swarm
+
+_names = getattr(kernel, "names", lambda index: ())  # a kernel made before has none
+
+# What the compiled kernel calls what has a number, by kind, in the order of the numbers.
+NAMES: dict[str, tuple[str, ...]] = {kind: tuple(names) for kind, *names in takewhile(bool, map(_names, count()))}

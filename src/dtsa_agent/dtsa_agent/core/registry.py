@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-from .compiled import MISSING
-from .compiled import kernel as _kernel
+from .compiled import MISSING, NAMES
 from .errors import ConfigError
 
 if TYPE_CHECKING:
@@ -286,7 +285,7 @@ def check_kernel(kind: str, names: tuple[str, ...]) -> None:
     :param names: the list as Python has it.
     :raises ImportError: if they differ: kernel and Python are not of the same version.
     """
-    compiled = names if MISSING else _kernel.NAMES[kind]
+    compiled = names if MISSING else NAMES.get(kind)
     if compiled != names:
         raise ImportError(f"{kind}: Python has {names}, the compiled kernel has {compiled}; build dtsa_agent again")
 

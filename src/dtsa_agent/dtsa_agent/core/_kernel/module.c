@@ -312,6 +312,15 @@ static PyObject *vector_level(const value *v)
     return PyLong_FromLong(avoid_vector_level((int)v->whole));
 }
 
+static PyObject *names(const value *v)
+{
+    const dtsa_name_list *list = dtsa_names((int)v->whole);
+    PyObject *all = PyTuple_New(list ? list->count + 1 : 0);
+    for (int k = 0; list && all && k <= list->count; k++)
+        PyTuple_SetItem(all, k, PyUnicode_FromString(k ? list->names[k - 1] : list->kind));
+    return all;
+}
+
 /* ---- the module ---- */
 
 /* clang-format off */
@@ -325,7 +334,7 @@ static function FUNCTIONS[] = {
     {"encode", "yd", encode}, {"decode", "ydq", decode},
     {"priority", "PPd", priority}, {"select", "GGBdq", select_one},
     {"avoid_command", "qyq333PPg", avoid}, {"vehicle_step", "dddPPP", vehicle},
-    {"vector_level", "q", vector_level}, {0},
+    {"vector_level", "q", vector_level}, {"names", "q", names}, {0},
 };
 
 static const struct {
@@ -338,8 +347,10 @@ static const struct {
 };
 /* clang-format on */
 
-static int add_functions(PyObject *module)
+static int fill_module(PyObject *module)
 {
+    for (size_t i = 0; i < sizeof CONSTANTS / sizeof *CONSTANTS; i++)
+        if (PyModule_AddIntConstant(module, CONSTANTS[i].name, CONSTANTS[i].value) < 0) return -1;
     for (function *f = FUNCTIONS; f->name; f++) {
         f->def = (PyMethodDef){f->name, (PyCFunction)(void (*)(void))run, METH_FASTCALL, NULL};
         PyObject *row = PyCapsule_New(f, NULL, NULL);
@@ -350,29 +361,6 @@ static int add_functions(PyObject *module)
         if (status < 0) return -1;
     }
     return 0;
-}
-
-static int add_names(PyObject *module)
-{
-    PyObject *dict = PyDict_New();
-    for (int i = 0; dict && dtsa_names(i); i++) {
-        const dtsa_name_list *list = dtsa_names(i);
-        PyObject *names = PyTuple_New(list->count);
-        for (int k = 0; names && k < list->count; k++)
-            PyTuple_SetItem(names, k, PyUnicode_FromString(list->names[k]));
-        if (!names || PyDict_SetItemString(dict, list->kind, names) < 0) Py_CLEAR(dict);
-        Py_XDECREF(names);
-    }
-    const int status = dict ? PyModule_AddObjectRef(module, "NAMES", dict) : -1;
-    Py_XDECREF(dict);
-    return status;
-}
-
-static int fill_module(PyObject *module)
-{
-    for (size_t i = 0; i < sizeof CONSTANTS / sizeof *CONSTANTS; i++)
-        if (PyModule_AddIntConstant(module, CONSTANTS[i].name, CONSTANTS[i].value) < 0) return -1;
-    return add_names(module) < 0 || add_functions(module) < 0 ? -1 : 0;
 }
 
 PyMODINIT_FUNC PyInit__kernel(void)
