@@ -226,10 +226,10 @@ def test_slots_stay_together_whatever_frames_are_under_way_longer_than_supposed(
 
 
 def test_the_tally_knows_how_late_frames_left() -> None:
-    tally = Tally(SLOT_NS)
+    tally = Tally()
     assert tally.summary()["sends_on_time_share"] is None
     for late in (0, 50_000, 60_000, 3_000_000):
         tally.sent(late)
     found = tally.summary()
     assert (found["sent"], found["sends_on_time_share"]) == (4, 0.75)
-    assert found["send_late_ms"] == {"p50": 0.06, "p99": 3.01, "max": 3.0}
+    assert found["send_late_ms"] == {"p50": pytest.approx(0.05, rel=0.05), "p99": 3.0, "max": 3.0}

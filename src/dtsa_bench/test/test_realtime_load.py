@@ -17,11 +17,11 @@ import pytest
 from fly_helpers import command, until
 from metronome import flown_again_when_overloaded
 
+from dtsa_agent.core.delays import Delays
 from dtsa_bench.commands.fly import describe
 from dtsa_bench.fly.ending import EarlyEnd, wall_limit_s
 from dtsa_bench.soak.flights import children, end_all
 from dtsa_bench.verify import verify_bag
-from dtsa_channel_sim.model.delays import Delays
 from dtsa_channel_sim.ros.pace import Pace
 
 MS = 1_000_000

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_channel_sim.model.delays import Delays
+from dtsa_agent.core.delays import Delays
 from dtsa_channel_sim.model.verdict import Verdict
 from dtsa_channel_sim.ros.answers import Answers
 from dtsa_channel_sim.ros.observer import ChannelObserver

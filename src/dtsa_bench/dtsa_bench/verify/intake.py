@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_channel_sim.model.delays import Delays
+from dtsa_agent.core.delays import Delays
 
 from .frames import SentFrames
 from .result import Difference, Mismatch

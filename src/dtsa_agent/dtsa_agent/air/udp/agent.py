@@ -77,7 +77,7 @@ class UdpAgent:
         self.delay = Delay(own.id, config.slot_ns // 4)
         self.watcher = watcher
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
-        self.tally = Tally(config.slot_ns)
+        self.tally = Tally()
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = round(LEAD * self._slot_ns), round(LATEST_LEAD * self._slot_ns)
         self._flight_ns = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)

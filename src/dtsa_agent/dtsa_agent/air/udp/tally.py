@@ -7,18 +7,15 @@ import time
 from collections import Counter
 from typing import Any
 
+from dtsa_agent.core.delays import Delays
+
 _ON_TIME_NS = 1_000_000
-_BINS_NS = 10_000  # of the histogram of lateness: as fine as it is told
-_MS = 1e6
 
 
 class Tally:
-    """Counts of one agent; of bounded size, however long it flies.
+    """Counts of one agent; of bounded size, however long it flies."""
 
-    :param slot_ns: ns, length of a slot: a frame is never later than half of it.
-    """
-
-    def __init__(self, slot_ns: int) -> None:
+    def __init__(self) -> None:
         self.refused: Counter[str] = Counter()  # datagrams not taken in, by reason
         self.slots = 0  # slots that are over
         self.heard = 0  # frames of others taken in
@@ -26,8 +23,8 @@ class Tally:
         self.began_ns = self.ended_ns = 0  # CLOCK_MONOTONIC
         self.first_slot = -1  # with which it began for the first time
         self.joined_ns = -1  # CLOCK_MONOTONIC, when
-        self._late = [0] * (slot_ns // 2 // _BINS_NS + 2)  # frames sent, by how late they left
-        self._latest_ns = self._on_time = 0
+        self._late = Delays()  # frames sent, by how late they left
+        self._on_time = 0
 
     def begun(self, slot: int, now_ns: int) -> None:
         """It begins, or begins anew.
@@ -43,22 +40,12 @@ class Tally:
 
         :param late_ns: ns, how much later than its slot started.
         """
-        self._late[min(max(late_ns, 0) // _BINS_NS, len(self._late) - 1)] += 1
-        self._latest_ns = max(self._latest_ns, late_ns)
+        self._late.add(late_ns)
         self._on_time += late_ns <= _ON_TIME_NS
-
-    def _quantile_ms(self, share: float) -> float | None:
-        count, wanted = sum(self._late), share * sum(self._late)
-        reached = 0
-        for index, number in enumerate(self._late):
-            reached += number
-            if count and reached >= wanted:
-                return (index + 1) * _BINS_NS / _MS
-        return None
 
     def summary(self) -> dict[str, Any]:
         """The counts as plain values."""
-        sent = sum(self._late)
+        sent = self._late.count()
         used = resource.getrusage(resource.RUSAGE_SELF)
         ended = self.ended_ns or time.monotonic_ns()
         return {
@@ -70,9 +57,9 @@ class Tally:
             "unsent": self.unsent,
             "sends_on_time_share": self._on_time / sent if sent else None,
             "send_late_ms": {
-                "p50": self._quantile_ms(0.5),
-                "p99": self._quantile_ms(0.99),
-                "max": self._latest_ns / _MS if sent else None,
+                "p50": self._late.quantile_ms(0.5),
+                "p99": self._late.quantile_ms(0.99),
+                "max": self._late.largest_ms(),
             },
             "heard": self.heard,
             "processor_s": used.ru_utime + used.ru_stime,
