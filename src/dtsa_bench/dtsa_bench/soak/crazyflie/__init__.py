@@ -9,9 +9,9 @@ from typing import Any
 from dtsa_bench.batch.task import Row
 
 from ..item import Item, Soak
-from . import cuts, gaps, missions, streams
+from . import cuts, faults, gaps, missions, streams
 
-_PARTS = {"mission": missions, "gap": gaps, "stream": streams, "cut": cuts}
+_PARTS = {"mission": missions, "gap": gaps, "stream": streams, "cut": cuts, "fault": faults}
 
 
 def _items() -> Iterator[Item]:
@@ -35,7 +35,7 @@ SOAK = Soak(
     "crazyflie",
     "missions of twelve complete with code 0, nobody nearer than 0.25 m, over UDP and over radios that lose packets; "
     "nobody falls after a gap of the air below 0.75 s; commands reach twelve over three dongles at 50 Hz; missions cut "
-    "short land as far apart",
+    "short land as far apart; with random faults nobody whose motors run comes nearer than 0.2 m to another",
     tuple(_items()),
     _run,
     _figures,

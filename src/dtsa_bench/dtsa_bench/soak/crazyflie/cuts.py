@@ -46,7 +46,7 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     with running(directory, COUNT, None, options, station) as fleet:
         words = ("--backend", "cflib", "--config", str(fleet.config), "--slot-ms", "20", "--no-picture")
         with flying(directory / "mission", *words, "--seed", str(item.seed), begun=False) as flight:
-            _exchange_begins(fleet.truth)
+            wait_for_events(fleet.truth, '"streaming"', COUNT)  # the exchange begins
             time.sleep(chance.uniform(BEGIN_S, END_S))
             if way == CTRL_C:
                 when = fleet.fault("heal")
@@ -63,16 +63,22 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     return {**item.settings, "closest_before_m": round(before, 3), "closest_after_m": round(after, 3)}
 
 
-def _exchange_begins(truth: Path) -> None:
-    """Wait until all follow streamed commands."""
-    streaming, end = 0, time.monotonic() + _PATIENCE_S
+def wait_for_events(truth: Path, name: str, count: int) -> None:
+    """Wait until something has happened often enough.
+
+    :param truth: the record of what really happens.
+    :param name: the event's name, as JSON.
+    :param count: so often.
+    :raises NotMet: it does not happen.
+    """
+    found, end = 0, time.monotonic() + _PATIENCE_S
     with truth.open(encoding="utf-8") as lines:
-        while streaming < COUNT:
+        while found < count:
             line = lines.readline()
-            streaming += '"streaming"' in line
+            found += name in line
             if not line:
                 if time.monotonic() > end:
-                    raise NotMet(f"the exchange did not begin within {_PATIENCE_S:g} s")
+                    raise NotMet(f"only {found} of {count} {name} within {_PATIENCE_S:g} s")
                 time.sleep(0.01)
 
 
