@@ -45,10 +45,10 @@ class JsonBag:
         self.path = path
         try:
             self._stream = path.open("xb")
+            self._mcap = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
+            keep_small(self._mcap, path.parent)
         except OSError as error:
             raise BagError(f"cannot record to {path}: {error.strerror or error}") from error
-        self._mcap = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
-        keep_small(self._mcap)
         self._mcap.start(profile="", library=f"dtsa {__version__}")
         self._mcap.add_metadata(name, {"version": __version__, **about})
         self._channels = {

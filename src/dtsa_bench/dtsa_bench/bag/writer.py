@@ -104,9 +104,9 @@ class BagWriter:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         size = _UNLIMITED if marked else chunk_size
         self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
-        keep_small(self._mcap)
         write_quickly(self._mcap)
         try:
+            keep_small(self._mcap, self.directory)
             self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
             self._add_metadata_record()
             self._stream.flush()
