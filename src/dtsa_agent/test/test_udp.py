@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import random
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -14,11 +16,13 @@ from dtsa_agent.air.udp import AgentSettings, MulticastSocket, UdpAgent, UdpSett
 from dtsa_agent.air.udp.clock import OwnClock
 from dtsa_agent.air.udp.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
 from dtsa_agent.air.udp.delay import Delay
+from dtsa_agent.air.udp.precision import going_first
 from dtsa_agent.air.udp.slots import SlotTime
 from dtsa_agent.air.udp.sockets import Datagram, StampClock
 from dtsa_agent.air.udp.tally import Tally
 from dtsa_agent.core import ConfigError, Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core.pacing import latest_send_ns
 from dtsa_agent.core.reference.timebase import ALIGNED, FOREIGN, LISTENING, RESTARTED
 
 SLOT_NS = 10_000_000
@@ -233,3 +237,39 @@ def test_the_tally_knows_how_late_frames_left() -> None:
     found = tally.summary()
     assert (found["sent"], found["sends_on_time_share"]) == (4, 0.75)
     assert found["send_late_ms"] == {"p50": pytest.approx(0.05, rel=0.05), "p99": 3.0, "max": 3.0}
+
+
+@pytest.mark.parametrize("flight_ns", [30_000, 600_000, 5_000_000])
+def test_who_wakes_late_sends_as_long_as_the_next_turn_is_not_disturbed(
+    monkeypatch: pytest.MonkeyPatch, flight_ns: int
+) -> None:
+    latest = latest_send_ns(SLOT_NS, flight_ns)
+    assert latest + flight_ns < SLOT_NS
+    config = SwarmConfig(agents=2, policy="tdma", auth=False)
+    udp = UdpSettings(interface="lo", group=f"239.255.78.78:{20_000 + os.getpid() % 10_000}", flight_time_ns=flight_ns)
+    with UdpAgent(AgentSettings(id=1), config, udp) as agent:
+        now = [time.monotonic_ns()]
+        monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
+        agent.time.hear(101, now[0])
+        agent._begin_anew()
+        own = agent.slot + 2 - agent.slot % 2  # a turn of agent 1
+        counts = []
+        for slot, late in ((own, latest), (own + 2, latest + 1), (own + 4, 1_000)):
+            now[0] = agent.time.slot_start_ns(slot) + late
+            agent._open(slot)
+            counts.append((agent.tally.summary()["sent"], agent.tally.unsent))
+        assert counts == [(1, 0), (1, 1), (2, 1)]
+
+
+def test_an_agent_goes_first_and_what_it_starts_does_not() -> None:
+    before = os.sched_getscheduler(0)
+    with going_first(3) as problem:
+        if problem:
+            pytest.skip(problem)
+        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR
+        assert os.sched_getparam(0).sched_priority == 3
+        says = [sys.executable, "-c", "import os; print(os.sched_getscheduler(0))"]
+        assert int(subprocess.check_output(says)) == os.SCHED_OTHER
+    assert os.sched_getscheduler(0) == before
+    with going_first(0) as problem:
+        assert (problem, os.sched_getscheduler(0)) == ("", before)

@@ -111,6 +111,7 @@ class Newcomers:
                 course = swarm.course
                 flies = swarm.scenario.moving[swarm.local] if course is None else course.active
                 swarm.active[index] = flies[index]
+        self._some = bool((self._since >= 0).any())
 
     def _known(self, swarm: AbstractSwarm, index: Any, slot: int) -> bool:
         config = swarm.config

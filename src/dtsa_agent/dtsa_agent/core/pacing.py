@@ -7,8 +7,19 @@ from .config import SwarmConfig
 # Of a slot: an agent that has heard all it waits for decides this long before its slot starts, mostly as soon as it has
 # heard: one wake-up of its process less, and its frame leaves on time.
 LEAD = 0.7
+LONGEST_LEAD = 0.95  # where every wake-up counts: when it has heard, as soon as it has
 LATEST_LEAD = 0.06  # while it misses the frame of the slot before, only this long
 MOST_EARLY = 64  # frames of slots that are still to come, kept until they do
+_BETWEEN = 0.2  # of a slot, from the end of a frame that left late to the start of the next one: clocks differ
+
+
+def latest_send_ns(slot_ns: int, flight_ns: int) -> int:
+    """How late a frame may still leave, ns after its slot has started: it is over before the next one starts.
+
+    :param slot_ns: ns, length of a slot.
+    :param flight_ns: ns, from the order to send a frame until its arrival.
+    """
+    return max(slot_ns - flight_ns - round(_BETWEEN * slot_ns), slot_ns // 10)
 
 
 def too_long_ns(config: SwarmConfig) -> int:

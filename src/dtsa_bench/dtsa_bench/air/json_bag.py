@@ -16,6 +16,7 @@ from dtsa_bench.bag.errors import BagError
 
 _FLUSH_S = 0.5
 _CHUNK = 1 << 18  # bytes
+_encode = json.JSONEncoder(separators=(",", ":")).encode
 AnyBag = TypeVar("AnyBag", bound="JsonBag")
 
 
@@ -69,7 +70,7 @@ class JsonBag:
         :param values: the message.
         """
         self._counts[topic] += 1
-        data = json.dumps(values, separators=(",", ":")).encode()
+        data = _encode(values).encode()
         at = max(0, time_ns)
         self._try(self._mcap.add_message, self._channels[topic], at, data, at, self._counts[topic])
 

@@ -29,6 +29,7 @@ from .switch import Links, Switch
 GROUP = ("239.68.84.83", 7583)
 _START_S = 60.0  # until all have begun, on a busy machine
 _END_S = 30.0
+_PRIORITY = 40  # of the switch: above that of the agents
 _AFTER_S = 2.0  # of the flight, from when on overlaps count
 
 
@@ -200,7 +201,7 @@ def _as_medium() -> Iterator[None]:
     """The air waits for no process: the switch runs before all others where it may; what it starts does not."""
     before = os.sched_getscheduler(0)
     with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
     try:
         yield
     finally:

@@ -17,7 +17,7 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtoc
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import check_joinable
-from dtsa_agent.core.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
+from dtsa_agent.core.pacing import LATEST_LEAD, LEAD, LONGEST_LEAD, MOST_EARLY, latest_send_ns, too_long_ns
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
 from dtsa_agent.keys import authenticator
@@ -26,7 +26,7 @@ from dtsa_agent.stop import Stop
 from .clock import OwnClock
 from .datagram import NO_FRAME, Wrapping, flight_ns
 from .delay import Delay
-from .precision import wake_precisely
+from .precision import going_first, wake_precisely
 from .record import Heard, SlotRecord, Watcher
 from .settings import AgentSettings, UdpSettings
 from .slots import SlotTime
@@ -79,12 +79,15 @@ class UdpAgent:
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally()
         self._slot_ns = config.slot_ns
-        self._lead_ns, self._latest_lead_ns = round(LEAD * self._slot_ns), round(LATEST_LEAD * self._slot_ns)
+        longest, self._lead_ns, latest = (round(lead * self._slot_ns) for lead in (LONGEST_LEAD, LEAD, LATEST_LEAD))
+        self._leads_ns = {None: self._lead_ns, True: latest, False: longest}
         self._flight_ns = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
+        self._latest_send_ns = latest_send_ns(self._slot_ns, self._flight_ns)
         self._too_long_ns = too_long_ns(config)
+        self._ordinary = ""  # why it has no real-time priority
         self.slot = -1  # the slot that is open
         self._first = 0  # slot with which it began, or began anew
-        self._awaits = False  # it takes another one for the slot's sender, and has not heard it yet
+        self._awaits: bool | None = None  # the slot's sender has not been heard yet; None: there is none to hear
         self._waiting = b""  # frame of this slot, ready to be sent
         self._early: list[tuple[int, int, bytes, Datagram]] = []
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
@@ -110,6 +113,10 @@ class UdpAgent:
         """
         wake_precisely()
         gc.freeze()  # nothing made so far is garbage: do not look at it again and again
+        with going_first(self.own.priority) as self._ordinary:
+            self._run(stop)
+
+    def _run(self, stop: Stop) -> None:
         began = time.monotonic_ns()
         end = began + round(self.own.duration_s * _SECOND) if self.own.duration_s else None
         self.tally.began_ns = began
@@ -123,7 +130,7 @@ class UdpAgent:
         deadline = self._clock.monotonic_ns(self.time.start(self._clock.local_ns(began)))
         while not self._ended(stop, end):
             due = deadline if self.time.state == LISTENING else self._due_ns()
-            self._wait(due)
+            heard = self._wait(due)
             if self.time.state == LISTENING:
                 self._take_in()
                 if self.time.wake(self._clock.local_ns(time.monotonic_ns())):
@@ -134,23 +141,25 @@ class UdpAgent:
                 else:
                     self._take_in()
             else:
-                self._take_in()
+                if heard:
+                    self._take_in()
                 if time.monotonic_ns() >= self._due_ns() and not self._waiting:
                     self._step()
         self._tell(self._close_slot())
         self.tally.ended_ns = time.monotonic_ns()
 
-    def _wait(self, due: int) -> None:
+    def _wait(self, due: int) -> bool:
+        """Waits for a frame, or until a time; whether there may be a frame."""
         remaining = due - time.monotonic_ns()
-        if remaining > 0:
-            select.select([self._socket], [], [], min(remaining / _SECOND, _PATIENCE_S))
+        if remaining <= 0:
+            return True
+        return bool(select.select([self._socket], [], [], min(remaining / _SECOND, _PATIENCE_S))[0])
 
     def _due_ns(self) -> int:
         """When to do something of one's own accord: to send, or to decide the next slot; ns, CLOCK_MONOTONIC."""
         if self._waiting:
             return self._clock.monotonic_ns(self.time.slot_start_ns(self.slot))
-        lead = self._latest_lead_ns if self._awaits else self._lead_ns
-        return self._clock.monotonic_ns(self.time.slot_start_ns(self.slot + 1) - lead)
+        return self._clock.monotonic_ns(self.time.slot_start_ns(self.slot + 1) - self._leads_ns[self._awaits])
 
     def _ended(self, stop: Stop, end: int | None) -> bool:
         """Whether to end now: after a second signal, when it has said that it leaves, or has no time left to."""
@@ -233,8 +242,11 @@ class UdpAgent:
 
     def _hear(self, sender: int, slot: int, frame: bytes, datagram: Datagram) -> None:
         accepted = self.swarm.hear(slot, frame)
-        self._awaits &= slot < self.slot
+        if self._awaits and slot >= self.slot:
+            self._awaits = False
         self.tally.heard += accepted
+        if self.watcher is None:
+            return
         arrival = self._clock.local_ns(datagram.arrival_ns)
         heard = Heard(sender, slot, arrival, datagram.data, bool(accepted))
         (self._before if self._record is None else self._record.heard).append(heard)
@@ -250,7 +262,7 @@ class UdpAgent:
         if following is None:
             raise LocalProtocolError("an agent that listens has no slots")
         self._first, self.slot = following + 1, following
-        self._waiting, self._awaits = b"", False
+        self._waiting, self._awaits = b"", None
         self._early.clear()
         self._group.restart(0, self._first)
         self.tally.begun(self._first, time.monotonic_ns())
@@ -273,9 +285,9 @@ class UdpAgent:
         self._vehicle.sense(swarm)
         sends = bool(self._group.on_slot(slot))
         self.slot = slot
-        self._awaits = int(swarm.chosen[0]) not in (0, self.own.id)
+        self._awaits = True if int(swarm.chosen[0]) not in (0, self.own.id) else None
         frame = swarm.frame(0) if sends else b""
-        self._record = self._recorded(slot, frame, present)
+        self._record = None if self.watcher is None else self._recorded(slot, frame, present)
         self._waiting = frame
         if self._waiting and self._due_ns() - time.monotonic_ns() < 0:
             self._send()
@@ -313,8 +325,7 @@ class UdpAgent:
         """Sends the frame that lies ready, unless its slot is as good as over."""
         due, now = self._due_ns(), time.monotonic_ns()
         frame, self._waiting = self._waiting, b""
-        if now - due > self._slot_ns // 2:
-            # Speaking now would disturb whoever has the next turn.
+        if now - due > self._latest_send_ns:  # it would disturb whoever has the next turn
             self.swarm.frame_length[0] = 0
             self.tally.unsent += 1
             return
@@ -354,6 +365,7 @@ class UdpAgent:
             "policy": self.config.policy,
             "slot_ms": self.config.slot_ms,
             "sealed": self.config.auth,
+            "no_priority": self._ordinary,
             **self.tally.summary(),
             "state": self.time.state,
             "times_taken_over": self.time.restarts,

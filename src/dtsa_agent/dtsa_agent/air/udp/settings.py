@@ -78,6 +78,7 @@ class AgentSettings(Settings):
     duration_s: float = setting(
         0.0, "it ends by itself after this time; 0: with a signal only", unit="s", minimum=0, maximum=1e6
     )
+    priority: int = setting(20, "real-time priority, where allowed; 0: none", minimum=0, maximum=90)
     clock_offset_ns: int = setting(
         0, "for trials: its clock shows this much more at the start", unit="ns", minimum=-(10**15), maximum=10**15
     )

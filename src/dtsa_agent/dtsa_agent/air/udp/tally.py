@@ -19,10 +19,11 @@ class Tally:
         self.refused: Counter[str] = Counter()  # datagrams not taken in, by reason
         self.slots = 0  # slots that are over
         self.heard = 0  # frames of others taken in
-        self.unsent = 0  # own frames that would have left half a slot late or more
+        self.unsent = 0  # own frames that would have left so late that they disturb the next turn
         self.began_ns = self.ended_ns = 0  # CLOCK_MONOTONIC
         self.first_slot = -1  # with which it began for the first time
         self.joined_ns = -1  # CLOCK_MONOTONIC, when
+        self._joined_s = 0.0  # processor time until then
         self._late = Delays()  # frames sent, by how late they left
         self._on_time = 0
 
@@ -33,7 +34,7 @@ class Tally:
         :param now_ns: ns, CLOCK_MONOTONIC.
         """
         if self.first_slot < 0:
-            self.first_slot, self.joined_ns = slot, now_ns
+            self.first_slot, self.joined_ns, self._joined_s = slot, now_ns, _processor_s()
 
     def sent(self, late_ns: int) -> None:
         """A frame was sent.
@@ -46,7 +47,7 @@ class Tally:
     def summary(self) -> dict[str, Any]:
         """The counts as plain values."""
         sent = self._late.count()
-        used = resource.getrusage(resource.RUSAGE_SELF)
+        used = _processor_s()
         ended = self.ended_ns or time.monotonic_ns()
         return {
             "wall_time_s": (ended - self.began_ns) / 1e9,
@@ -62,6 +63,13 @@ class Tally:
                 "max": self._late.largest_ms(),
             },
             "heard": self.heard,
-            "processor_s": used.ru_utime + used.ru_stime,
-            "memory_mb": used.ru_maxrss / 1024,
+            "processor_s": used,
+            "processor_us_per_slot": (used - self._joined_s) / self.slots * 1e6 if self.slots else None,
+            "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
+
+
+def _processor_s() -> float:
+    """Processor time of this process so far, s."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
