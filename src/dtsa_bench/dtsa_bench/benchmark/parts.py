@@ -113,12 +113,13 @@ def slots(avoided: list[Row]) -> Iterator[Row]:
 
 
 def _slot(agents: int, policy: str) -> Row:
+    mean, count = slot_us(agents, policy)
+    row: Row = {"core_us": mean, "slots": count}
     try:
-        row: Row = baseline("numpy_swarm").measure(agents, policy)
+        row["numpy_us"] = baseline("numpy_swarm").measure(agents, policy)["numpy_us"]
     except NotHere as missing:
-        return {"core_us": slot_us(agents, policy)[0], "left_out": str(missing)}
-    row["numpy_ratio"] = row.pop("ratio")
-    return row
+        return {**row, "left_out": str(missing)}
+    return {**row, "numpy_ratio": row["numpy_us"] / mean}
 
 
 def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0.2) -> tuple[float, int]:

@@ -40,10 +40,11 @@ def run(args: argparse.Namespace) -> int:
         if name not in PARTS:
             raise ConfigError("parts", name, ", ".join(PARTS))
     directory = None if args.out is None else new_directory(args.out)
+    from dtsa_bench.batch.made_with import made_with
     from dtsa_bench.benchmark import parts
     from dtsa_bench.benchmark.tables import machine, table_text
 
-    result: dict[str, Any] = {"machine": machine()}
+    result: dict[str, Any] = {**made_with(), "machine": machine()}
     load, cores = result["machine"]["load"], result["machine"]["cores"]
     if load > 0.5 * cores:
         print(

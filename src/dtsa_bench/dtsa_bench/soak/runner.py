@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -13,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_bench.batch.journal import Journal
+from dtsa_bench.batch.made_with import made_with
 from dtsa_bench.batch.progress import Progress, ending_on_signals
 from dtsa_bench.batch.table import write_whole
 from dtsa_bench.batch.task import FAILED, Row, Task, attempt
@@ -45,7 +44,7 @@ def run_soak(soak: Soak, directory: Path, minutes: float, sample: bool = False) 
     """
     plan, end = SoakPlan(soak, sample), time.monotonic() + 60.0 * minutes
     journal = Journal(directory, plan, code_digest())
-    state = _machine()
+    state = made_with()
     before = _load()
     with ending_on_signals(journal), Progress(journal) as progress:
         rows = journal.rows()
@@ -107,28 +106,6 @@ def write_record(path: Path, record: dict[str, Any]) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(record, indent=1) + "\n")
-
-
-def _machine() -> dict[str, Any]:
-    """The commit, and whether the tree differs from it; cores and Python."""
-    commit = _git("rev-parse", "HEAD")
-    return {
-        "commit": commit or "unknown",
-        "tree_changed": bool(_git("status", "--porcelain", "--untracked-files=no")) if commit else None,
-        "date": time.strftime("%Y-%m-%dT%H:%MZ", time.gmtime()),
-        "cores": len(os.sched_getaffinity(0)),
-        "python": ".".join(map(str, sys.version_info[:3])),
-    }
-
-
-def _git(*words: str) -> str:
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(_PACKAGES), *words], capture_output=True, text=True, timeout=30, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def _load() -> list[float]:
