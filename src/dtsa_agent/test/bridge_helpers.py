@@ -9,10 +9,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from waiting import wait_for
 
 from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.bridge import Bridge
@@ -138,11 +140,3 @@ def flight(data: dict[str, Any]) -> Iterator[Flight]:
     finally:
         result.stop.set()
         bridge.close()
-
-
-def wait_for(condition: Callable[[], bool], limit: float = 20.0) -> None:
-    """Wait until something is so; fails after `limit` seconds."""
-    end = time.monotonic() + limit
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)

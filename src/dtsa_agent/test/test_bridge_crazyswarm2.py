@@ -20,7 +20,7 @@ pytest.importorskip("cflib")
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from bridge_helpers import end_process, fake_fleet, settings, wait_for  # noqa: E402
+from bridge_helpers import end_process, fake_fleet, settings  # noqa: E402
 from builtin_interfaces.msg import Duration  # noqa: E402
 from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
 from metronome import flown_again_when_overloaded  # noqa: E402
@@ -28,6 +28,7 @@ from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Empty  # noqa: E402
+from waiting import wait_for  # noqa: E402
 
 from dtsa_agent.crazyflie import bridge_node  # noqa: E402
 from dtsa_agent.crazyflie.bridge_inputs import Inputs  # noqa: E402

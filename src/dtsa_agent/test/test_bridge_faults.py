@@ -15,8 +15,9 @@ import pytest
 
 pytest.importorskip("cflib")
 
-from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings, wait_for
+from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings
 from metronome import ATTEMPTS, Metronome, flown_again_when_overloaded
+from waiting import wait_for
 
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_bench.fake_crazyflie.truth import read_truth

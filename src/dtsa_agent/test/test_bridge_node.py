@@ -21,7 +21,7 @@ pytest.importorskip("cflib")
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from bridge_helpers import FakeFleet, end_process, fake_fleet, settings, wait_for  # noqa: E402
+from bridge_helpers import FakeFleet, end_process, fake_fleet, settings  # noqa: E402
 from builtin_interfaces.msg import Duration  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from dtsa_msgs.msg import Position, Status, VelocityWorld  # noqa: E402
@@ -31,6 +31,7 @@ from metronome import flown_again_when_overloaded  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Empty, Trigger  # noqa: E402
+from waiting import wait_for  # noqa: E402
 
 from dtsa_bench.fly.domain import ros_domain  # noqa: E402
 

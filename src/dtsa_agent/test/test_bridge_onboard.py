@@ -10,8 +10,9 @@ import pytest
 
 pytest.importorskip("cflib")
 
-from bridge_helpers import fake_fleet, flight, settings, wait_for
+from bridge_helpers import fake_fleet, flight, settings
 from metronome import flown_again_when_overloaded
+from waiting import wait_for
 
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.crazyflie.trajectories import Piece, Trajectory

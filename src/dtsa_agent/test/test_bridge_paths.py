@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from metronome import flown_again_when_overloaded
+from waiting import wait_for
 
 from dtsa_agent.crazyflie.paths import PEAK, shortest_s, too_short
 
@@ -39,7 +40,7 @@ def test_why_a_duration_is_too_short() -> None:
 @flown_again_when_overloaded
 def test_in_flight(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
-    from bridge_helpers import fake_fleet, flight, settings, wait_for
+    from bridge_helpers import fake_fleet, flight, settings
 
     from dtsa_agent.crazyflie.state_machine import State
 
@@ -80,7 +81,7 @@ def test_in_flight(tmp_path: Path) -> None:
 @flown_again_when_overloaded
 def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
-    from bridge_helpers import fake_fleet, flight, settings, wait_for
+    from bridge_helpers import fake_fleet, flight, settings
 
     from dtsa_agent.crazyflie.state_machine import State
     from dtsa_agent.crazyflie.units import velocity_world

@@ -13,8 +13,9 @@ import yaml
 
 pytest.importorskip("cflib")
 
-from bridge_helpers import FakeFleet, Flight, fake_fleet, flight, wait_for
+from bridge_helpers import FakeFleet, Flight, fake_fleet, flight
 from metronome import flown_again_when_overloaded
+from waiting import wait_for
 
 from dtsa_agent.crazyflie.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.state_machine import State

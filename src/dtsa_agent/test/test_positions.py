@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from metronome import flown_again_when_overloaded
+from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.config import parse_swarm
@@ -218,7 +219,7 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
     """A publisher at 100 Hz; then an estimate jumps, one freezes, one vehicle is not seen any more; one flies on."""
     pytest.importorskip("cflib")
     pytest.importorskip("dtsa_msgs.srv")
-    from bridge_helpers import end_process, fake_fleet, settings, wait_for
+    from bridge_helpers import end_process, fake_fleet, settings
     from builtin_interfaces.msg import Duration
     from dtsa_msgs.srv import Arm, Takeoff
     from test_bridge_node import Graph

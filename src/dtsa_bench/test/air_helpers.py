@@ -8,11 +8,11 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from waiting import wait_for
 
 from dtsa_agent.air.udp import AgentSettings, MulticastSocket, SlotRecord, UdpAgent, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
@@ -77,14 +77,6 @@ class Flying:
         self.stop.signal = self.stop.count = 1
         self._thread.join(_PATIENCE_S)
         assert not self._thread.is_alive()
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Waits until something is so."""
-    end = time.monotonic() + _PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
 
 
 class Stranger:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from waiting import wait_for
 
 from dtsa_agent.ros.common.wire import split_frames
 from dtsa_bench.bag.reader import Bag
@@ -42,13 +43,6 @@ def frames(out: Path) -> list[tuple[int, int, bytes]]:
     return sorted(sent)
 
 
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, "nothing happened"
-        time.sleep(0.02)
-
-
 @contextmanager
 def flying(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
     """A flight that has begun, in the state in which the test leaves it."""
@@ -57,7 +51,7 @@ def flying(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
     )
     bag = out / "bag" / "bag_0.mcap"
     try:
-        until(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 20_000))
+        wait_for(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 20_000))
         yield process
     finally:
         end_all(process)

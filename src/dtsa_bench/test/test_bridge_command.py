@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +27,7 @@ from dtsa_msgs.msg import Status
 from dtsa_msgs.srv import Arm, Land, Takeoff
 from node_helpers import Graph, ros_graph
 from std_srvs.srv import Empty
+from waiting import wait_for
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 NAMES = ("cf1", "cf2")
@@ -90,13 +90,6 @@ def gone(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except (FileNotFoundError, ProcessLookupError):
         return True
-
-
-def wait_for(condition: Callable[[], object], limit: float = 60.0) -> None:
-    end = time.monotonic() + limit
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 class Station:

@@ -21,10 +21,11 @@ pytest.importorskip("cflib")
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from bridge_helpers import FakeFleet, fake_fleet, settings, wait_for
+from bridge_helpers import FakeFleet, fake_fleet, settings
 from metronome import flown_again_when_overloaded
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from waiting import wait_for
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import PATIENCE_S, command, fly, frames, until
+from fly_helpers import PATIENCE_S, command, fly, frames
 from node_helpers import Graph, end_of, graph_in, ros_graph
+from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -136,7 +137,7 @@ def disturbed(tmp_path: Path, disturb: Any, *words: str) -> dict[str, Any]:
         command("--out", str(out), *words), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
     )
     try:
-        until(lambda: process.poll() is not None or children(process.pid))
+        wait_for(lambda: process.poll() is not None or children(process.pid))
         environment = Path(f"/proc/{children(process.pid)[0]}/environ").read_bytes().split(b"\0")
         domain = next(int(entry.partition(b"=")[2]) for entry in environment if entry.startswith(b"ROS_DOMAIN_ID="))
         with graph_in(domain, tmp_path / "log") as graph:

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import command, until
+from fly_helpers import command
 from metronome import flown_again_when_overloaded
+from waiting import wait_for
 
 from dtsa_agent.core.delays import Delays
 from dtsa_bench.commands.fly import describe
@@ -35,7 +36,7 @@ def flight(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
     process = subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     bag = out / "bag" / "bag_0.mcap"
     try:
-        until(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 10_000))
+        wait_for(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 10_000))
         yield process
     finally:
         end_all(process)

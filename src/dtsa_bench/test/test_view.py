@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ pytest.importorskip("aiohttp")
 
 import aiohttp
 from browser import CHROMIUM, Browser
+from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.bag.errors import UnusableBag
@@ -60,14 +61,6 @@ def track(bag: Path) -> Track:
 
 def numbers(text: str, kind: str) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), kind)
-
-
-def until(condition: Callable[[], Any], what: str = "nothing happened") -> Any:
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := condition()):
-        assert time.monotonic() < deadline, what
-        time.sleep(0.02)
-    return found
 
 
 # What a bag tells.
@@ -290,8 +283,8 @@ def test_a_link_to_a_server_that_stands_still_never_waits() -> None:
         assert taken < 50
         assert link.dropped == 100 - taken
         os.kill(link.process_id, signal.SIGKILL)
-        until(lambda: not link.alive())
-        until(lambda: (link.offer(data), link.gone)[1])
+        wait_for(lambda: not link.alive())
+        wait_for(lambda: (link.offer(data), link.gone)[1])
     finally:
         link.close()
 
@@ -349,11 +342,11 @@ def test_chromium_plays_a_bag_and_shows_what_an_agent_believes(track: Track, tmp
         browser.wait_for("document.querySelector('.vehicles tbody').textContent.includes('<b>landing</b>')")
         browser.run("document.querySelector('[data-order=emergency]').click()")  # one click is none
         browser.run("document.querySelector('[data-order=land]').click()")
-        until(lambda: ordered)
+        wait_for(lambda: ordered)
         browser.run(
             "(b => { delete b.dataset.sure; b.click(); b.click(); })(document.querySelector('[data-order=emergency]'))"
         )
-        until(lambda: len(ordered) > 1)
+        wait_for(lambda: len(ordered) > 1)
         assert ordered == [Order("land"), Order("emergency", value="stop all motors")]
         assert "lossy" in found["title"]
         assert found["values"][3].endswith("m")
@@ -435,7 +428,7 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
         source = GraphSource(listener, domain, control=True)
         listening = threading.Thread(target=source.run, daemon=True)
         listening.start()
-        until(lambda: listener.since(0, 1)[1], "nothing is heard on the graph")
+        wait_for(lambda: listener.since(0, 1)[1], what="nothing is heard on the graph")
         browser.run("document.querySelector('.orders select').value = '2'")
         browser.run("document.querySelector('[data-order=kill]').click()")
         browser.wait_for("dtsa.views[0].run.lost.has(2)")
@@ -446,11 +439,11 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
         browser.run("document.querySelector('[data-order=start]').click()")
         browser.wait_for("!dtsa.views[0].run.lost.has(2)")
         assert browser.complaints() == []
-        until(lambda: "cf2 takes part again" in words_of(listener))  # who listens on the graph sees the same
+        wait_for(lambda: "cf2 takes part again" in words_of(listener))  # who listens on the graph sees the same
         source.order(Order("loss", value=0.25))
-        until(lambda: "loss 0.25: done" in words_of(listener))
+        wait_for(lambda: "loss 0.25: done" in words_of(listener))
         browser.wait_for("dtsa.views[0].run.events.some(event => event.text.includes('loss is 0.25'))")
-        until(lambda: slots_of(listener) > 50)
+        wait_for(lambda: slots_of(listener) > 50)
         source.stopped = True
         listening.join(PATIENCE_S)
         assert listener.since(0, MOST_MOMENTS)[1][-1].heard
