@@ -42,6 +42,13 @@ class FaultFlight:
         return self.flight.logged(pattern, self.monotonic) - self.monotonic
 
 
+def seen(pilot: Flight, cf: int) -> tuple[float, float, float]:
+    """Where one believes to be, m, world."""
+    last = pilot.bridge.vehicles[f"cf{cf}"].last
+    assert last is not None
+    return last.position
+
+
 def fly_with_faults(folder: Path) -> tuple[FaultFlight, bool]:
     """The flight, and whether the machine was overloaded."""
     with (
@@ -61,6 +68,9 @@ def fly_with_faults(folder: Path) -> tuple[FaultFlight, bool]:
         pilot.velocity["cf6"] = (-1.0, 0.0, 0.0)
         time.sleep(7)
         states = {k: pilot.state(k) for k in range(1, 9)}
+        x, y, _ = seen(pilot, 8)
+        assert pilot.bridge.vehicles["cf7"].go_to((x + 0.05, y, 1.6), 0.0, 2.8, False) == ""
+        time.sleep(3.0)
         pilot.bridge.land_all("test over")
         pilot.bridge.wait_landed(lambda: False)
         others = [fleet.flown(cf) for cf in (7, 8)]
@@ -145,6 +155,17 @@ def test_nobody_else_is_harmed(fault_flight: FaultFlight) -> None:
     assert fault_flight.others[1][3:] == ["pre-flight checks not passed", "pre-flight checks passed"]
 
 
+def test_one_above_another_moves_aside_before_it_lands(fault_flight: FaultFlight) -> None:
+    over = fault_flight.flight.logged("cf7: flying -> landing")
+    fault_flight.flight.logged("cf7: cf8 is below it: moves aside to", over)
+    _, track, events = read_truth(fault_flight.fleet.truth)
+    up, low = track[:, :, 6], track[:, :, 7]
+    assert np.linalg.norm(up - low, axis=1).min() > 0.4
+    assert np.linalg.norm(up[-1, :2] - low[-1, :2]) > 0.4
+    assert up[-1, 2] < 0.05
+    assert len([e for e in events if e["cf"] == 7 and e["event"] == "land"]) == 1
+
+
 TESTS_OF_THE_FLIGHT = (
     test_frozen_link_is_lost_within_half_a_second,
     test_closed_socket_is_lost,
@@ -153,6 +174,7 @@ TESTS_OF_THE_FLIGHT = (
     test_commands_that_cease_hold_then_land,
     test_geofence_lands_at_once,
     test_nobody_else_is_harmed,
+    test_one_above_another_moves_aside_before_it_lands,
 )
 
 

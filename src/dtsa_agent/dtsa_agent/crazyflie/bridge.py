@@ -12,11 +12,13 @@ from dtsa_agent.crazyflie.budget import WATCHDOG_HZ, check_budget, radio_loads
 from dtsa_agent.crazyflie.claims import Claims
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.emergency_radio import EmergencyRadio
+from dtsa_agent.crazyflie.landing_places import SINK, Descent, LandingPlaces, Other
+from dtsa_agent.crazyflie.limits import room_of
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.reports import snapshot, watched
 from dtsa_agent.crazyflie.safety import Action, SafetyMonitor, Verdict
 from dtsa_agent.crazyflie.snapshot import Snapshot
-from dtsa_agent.crazyflie.state_machine import State
+from dtsa_agent.crazyflie.state_machine import IN_AIR, State
 from dtsa_agent.crazyflie.units import VehicleState
 from dtsa_agent.crazyflie.vehicle import Vehicle
 
@@ -61,7 +63,8 @@ class Bridge:
         )
         cache = cache.expanduser()
         cache.mkdir(parents=True, exist_ok=True)
-        self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
+        self._landing_places = LandingPlaces(*room_of(station))
+        self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state, self._descent) for r in settings.robots}
         self.emergency = EmergencyRadio([r.uri for r in settings.robots], log)
         self.monitor = SafetyMonitor(station.safety)
         self._heartbeat: float | None = None
@@ -143,6 +146,17 @@ class Bridge:
         for vehicle in self.vehicles.values():
             if vehicle.state in (State.ARMED, State.FLYING):
                 vehicle.land(reason)
+
+    def _descent(self, vehicle: Vehicle, down_to: float, since: float) -> Descent:
+        now, places = time.monotonic(), self._landing_places
+        others = []
+        for v in self.vehicles.values():
+            place, state = v.senses.whereabouts(now), v.state
+            if v is not vehicle and place is not None:
+                flies = state in IN_AIR or state == State.LOST
+                others.append(Other(v.name, place, flies, state == State.LANDING, places.goal(v.name)))
+        here = vehicle.senses.whereabouts(now)
+        return SINK if here is None else places.descent(vehicle.name, here, others, since, now, down_to)
 
     def stop_all(self, reason: str) -> None:
         """Emergency stop of all."""

@@ -15,6 +15,7 @@ from dtsa_agent.crazyflie.units import (
     outside_by,
     place_text,
     to_map,
+    to_world,
 )  # fmt: skip
 
 
@@ -32,6 +33,17 @@ def outside_fence(place: Vector, station: StationSettings) -> str:
         if away > fence.geofence_tolerance_m:
             return f"{place_text(here)} is {away:.2f} m outside the geofence in {axis}"
     return ""
+
+
+def room_of(station: StationSettings) -> tuple[Vector, Vector]:
+    """Lower and upper corner of the room, m, world; infinite without a geofence.
+
+    :param station: fence, and where the room is.
+    """
+    fence, origin = station.safety, station.room_origin_in_world
+    if not fence.geofence:
+        return (-math.inf, -math.inf, -math.inf), (math.inf, math.inf, math.inf)
+    return to_world(fence.geofence_min, origin), to_world(fence.geofence_max, origin)
 
 
 def check_stream(setpoint: Setpoint, station: StationSettings) -> None:

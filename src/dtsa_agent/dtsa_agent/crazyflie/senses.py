@@ -70,6 +70,11 @@ class Senses:
         """Last known height above the floor, m."""
         return self.last.position[2] if self.last is not None else 1.0
 
+    def whereabouts(self, now: float) -> Vector | None:
+        """Where it is, as far as anybody knows, m, world; None: nobody does."""
+        seen = self.seen_at(now) if self.wrong else None
+        return seen or (None if self.last is None else self.last.position)
+
     def log_age(self, now: float) -> float:
         """Seconds since the last log packet; infinite before the first one."""
         return now - self._log_times[-1] if self._log_times else math.inf

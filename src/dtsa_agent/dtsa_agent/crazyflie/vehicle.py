@@ -12,19 +12,22 @@ from typing import Any
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.controls import SLOW_MPS, Controls, end_of_stream
 from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, TRAJECTORY
+from dtsa_agent.crazyflie.landing_places import MOVE_MPS, SINK, Descent
 from dtsa_agent.crazyflie.limits import outside_fence
 from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.onboard import Onboard
-from dtsa_agent.crazyflie.paths import landing_s, too_short
+from dtsa_agent.crazyflie.paths import landing_s, shortest_s, too_short
 from dtsa_agent.crazyflie.senses import Senses
 from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 from dtsa_agent.crazyflie.trajectories import Planned, Trajectory, why_not
-from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, yaw_of
+from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, place_text, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
 BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
 BLIND_REPEATS = 3
 BLIND_LAND_S = 2.0
+ASK_AGAIN_S = 0.1  # one that waits to land asks as often whether it may
+ARRIVES_S = 0.3  # after the end of its path aside
 SINK_MPS = 0.3  # of a vehicle that does not know where it is
 SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
@@ -41,6 +44,8 @@ class Vehicle:
     :param cache: folder for cflib's tables.
     :param log: called with a level (info, warn, error) and a line.
     :param on_state: called with this vehicle and each new state of it, in a thread of cflib's.
+    :param descent: what it does once it is at rest to land: called with the vehicle, the height (m) at which it stops,
+        and since when it lands (s, monotonic); does not take the locks of others.
     """
 
     def __init__(
@@ -50,6 +55,7 @@ class Vehicle:
         cache: Path,
         log: Callable[[str, str], None],
         on_state: Callable[[Vehicle, VehicleState], None] | None = None,
+        descent: Callable[[Vehicle, float, float], Descent] = lambda vehicle, down_to, since: SINK,
     ) -> None:
         self.robot = robot
         self.station = station
@@ -61,9 +67,13 @@ class Vehicle:
         self.guarded = False  # the firmware's emergency watchdog is running
         self._log = log
         self._publish = on_state
+        self._descent = descent
         self._moved = False  # something that makes it fly was sent since it was armed
         self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
         self._blind: list[float] = []  # when to repeat a landing that may not have been heard
+        self._landing_since = 0.0  # s, monotonic, when the landing was ordered
+        self._obstacle = ""  # what keeps it from sinking
+        self._next: tuple[float, Callable[[], None]] | None = None  # when (s) its landing goes on, and how
         self._paused = False  # held because it is not seen: streamed commands do not count until it is
         self.senses = Senses(robot, station, log)
         self.link = Link(
@@ -115,7 +125,7 @@ class Vehicle:
         elif drifts or not self.controls.delivery.landing:
             self._log("info", f"{self.name}: heard again: brakes and lands")
             self.controls.streaming = True
-            self._brake_then(self._sink)
+            self._brake_then(self._come_down)
 
     def _answered(self, code: int, result: int) -> None:
         self.onboard.answered(code, result)
@@ -199,6 +209,7 @@ class Vehicle:
             return True
 
     def _high_level(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
+        self._next = None
         self.controls.fly(kind, action, duration, time.monotonic(), again=again)
 
     def arm(self, arm: bool) -> str:
@@ -360,7 +371,7 @@ class Vehicle:
             self._brake_then(stay)
 
     def _steer_blindly(self, velocity: Vector, until: float) -> None:
-        self._deaf = True
+        self._deaf, self._next = True, None
         self.controls.steer_blindly(velocity, until, time.monotonic())
 
     def _sink_blindly(self) -> None:
@@ -410,8 +421,30 @@ class Vehicle:
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)
-            self._brake_then(lambda: self._sink(height, duration))
+            self._landing_since, self._obstacle = time.monotonic(), ""
+            self._brake_then(lambda: self._come_down(height, duration))
             return ""
+
+    def _come_down(self, height: float = 0.0, duration: float = 0.0) -> None:
+        """Sink, but onto nobody: who has somebody below it first moves aside, or waits."""
+        descent = self._descent(self, height, self._landing_since) if self.state == State.LANDING else SINK
+        if self.last is None or not (descent.wait or descent.aside):
+            if descent.why:
+                self._log("error", f"{self.name}: lands straight down: {descent.why}")
+            self._sink(height, duration)
+            return
+        x, y, z = descent.aside or self.last.position
+        way = math.dist((x, y, z), self.last.position)
+        seconds = max(HOLD_S, way / MOVE_MPS, shortest_s(way, self.station.max_speed_mps))
+        if descent.aside or descent.why != self._obstacle:
+            goes = f"moves aside to {place_text((x, y, z))} (world) first" if descent.aside else "waits"
+            self._log("warn", f"{self.name}: {descent.why}: {goes}")
+        if descent.aside or not self._obstacle:
+            yaw = yaw_of(self.last.orientation)
+            self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, seconds), math.inf)
+        self._obstacle = descent.why
+        again = seconds + ARRIVES_S if descent.aside else ASK_AGAIN_S
+        self._next = time.monotonic() + again, lambda: self._come_down(height, duration)
 
     def _sink(self, height: float = 0.0, duration: float = 0.0) -> None:
         seconds = landing_s(self.senses.height - height, duration, self.station)
@@ -423,7 +456,7 @@ class Vehicle:
             if self.state in (State.DISCONNECTED, State.CONNECTING):
                 return
             self.action = f"emergency stop: {reason}"
-            self._deaf = True
+            self._deaf, self._next = True, None
             self.controls.stop()
 
             def run(cf: Any) -> None:
@@ -466,6 +499,10 @@ class Vehicle:
                 self.controls.go_on_blindly(self.state in IN_AIR, self.senses.seen_at(now), now)
             elif self.last is not None:
                 self.controls.slow_down(self.senses.speed, now)
+            if self._next is not None and now >= self._next[0]:
+                (_, go_on), self._next = self._next, None
+                if self.state == State.LANDING:
+                    go_on()
             if self.state not in (State.DISCONNECTED, State.CONNECTING):
                 self.link.order_log(now)
             if self.state in WATCHED_OVER and (order := self.controls.delivery.due(now)) is not None:
