@@ -76,7 +76,7 @@ def speed(record: Row) -> str:
     return (
         f"On {machine['cores']} cores of a server processor, load {machine['load']:.1f} before it began, Python "
         f"{machine['python']} ([its record](evidence/speed.json), {record['date'][:10]}):\n\n"
-        f"{markdown(heads, lines)}\n\n{_nodes(record['nodes'])}"
+        f"{markdown(heads, lines)}\n\n{_nodes(record['nodes'])}\n{_targets(record['targets'])}"
     )
 
 
@@ -121,6 +121,12 @@ def _nodes(rows: Iterable[Row]) -> str:
         lines.append([str(row["agents"]), str(row["processes"]), f"{row['slots_per_s']:.0f}", limit, bare])
     heads = ("agents", "processes", "slots/s", "target", "rounds/s of bare messages")
     return f"Nodes in lockstep, recorded:\n\n{markdown(heads, lines)}\n"
+
+
+def _targets(rows: Sequence[Row]) -> str:
+    missed = [f"{row['target']}: {row['value']:.3g}, not {row['limit']:.3g}" for row in rows if not row["met"]]
+    said = f"{len(rows) - len(missed)} of {len(rows)} targets are met"
+    return f"{said}; not: {'; '.join(missed)}.\n" if missed else f"{said}.\n"
 
 
 QUOTED: dict[str, Callable[[Row], str]] = {"speed": speed, "fuzz": fuzz}
