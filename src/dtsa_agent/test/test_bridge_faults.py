@@ -69,7 +69,7 @@ def fly_with_faults(folder: Path) -> tuple[FaultFlight, bool]:
         time.sleep(7)
         states = {k: pilot.state(k) for k in range(1, 9)}
         x, y, _ = seen(pilot, 8)
-        assert pilot.bridge.vehicles["cf7"].go_to((x + 0.05, y, 1.6), 0.0, 2.8, False) == ""
+        pilot.bridge.vehicles["cf7"].go_to((x + 0.05, y, 1.6), 0.0, 2.8, False)
         time.sleep(3.0)
         pilot.bridge.land_all("test over")
         pilot.bridge.wait_landed(lambda: False)

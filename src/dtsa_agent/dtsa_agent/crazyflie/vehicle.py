@@ -11,25 +11,19 @@ from typing import Any
 
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.controls import SLOW_MPS, Controls, end_of_stream
-from dtsa_agent.crazyflie.delivery import GO_TO, LAND, TAKEOFF, TRAJECTORY
-from dtsa_agent.crazyflie.landing_places import MOVE_MPS, SINK, Descent
+from dtsa_agent.crazyflie.delivery import GO_TO, TAKEOFF, TRAJECTORY
+from dtsa_agent.crazyflie.landing import Landing
+from dtsa_agent.crazyflie.landing_places import SINK, Descent
 from dtsa_agent.crazyflie.limits import outside_fence
 from dtsa_agent.crazyflie.link import Link
 from dtsa_agent.crazyflie.onboard import Onboard
-from dtsa_agent.crazyflie.paths import landing_s, shortest_s, too_short
+from dtsa_agent.crazyflie.paths import too_short
 from dtsa_agent.crazyflie.senses import Senses
 from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 from dtsa_agent.crazyflie.trajectories import Planned, Trajectory, why_not
-from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, place_text, yaw_of
+from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
-BLIND_REPEAT_S = 0.5  # s, a landing that is ordered blindly is ordered this often
-BLIND_REPEATS = 3
-BLIND_LAND_S = 2.0
-ASK_AGAIN_S = 0.1  # one that waits to land asks as often whether it may
-ARRIVES_S = 0.3  # after the end of its path aside
-SINK_MPS = 0.3  # of a vehicle that does not know where it is
-SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
 LOW_M = 0.1  # this close to the floor there is nothing left to land from
 WATCHED_OVER = frozenset({State.ARMED, State.FLYING, State.LANDING})
@@ -67,13 +61,8 @@ class Vehicle:
         self.guarded = False  # the firmware's emergency watchdog is running
         self._log = log
         self._publish = on_state
-        self._descent = descent
         self._moved = False  # something that makes it fly was sent since it was armed
         self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
-        self._blind: list[float] = []  # when to repeat a landing that may not have been heard
-        self._landing_since = 0.0  # s, monotonic, when the landing was ordered
-        self._obstacle = ""  # what keeps it from sinking
-        self._next: tuple[float, Callable[[], None]] | None = None  # when (s) its landing goes on, and how
         self._paused = False  # held because it is not seen: streamed commands do not count until it is
         self.senses = Senses(robot, station, log)
         self.link = Link(
@@ -87,6 +76,11 @@ class Vehicle:
         )
         self.controls = Controls(self.link)
         self.onboard = Onboard(self.link)
+
+        def next_step(down_to: float, since: float) -> Descent:
+            return descent(self, down_to, since) if self.state == State.LANDING else SINK
+
+        self.landing = Landing(self.name, station, self.senses, self.controls, log, next_step)
 
     # -- what comes in ----------------------------------------------------------------------------------------------
     def _changed(self, before: State, state: State, reason: str) -> None:
@@ -112,7 +106,7 @@ class Vehicle:
 
     def _heard_again(self, state: VehicleState) -> None:
         """The end of a gap: the orders that were given in it may have been lost."""
-        self._blind.clear()
+        self.landing.heard()
         if self.guarded:  # its watchdog has not much time left
             self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
         if self.state != State.LANDING:
@@ -125,7 +119,7 @@ class Vehicle:
         elif drifts or not self.controls.delivery.landing:
             self._log("info", f"{self.name}: heard again: brakes and lands")
             self.controls.streaming = True
-            self._brake_then(self._come_down)
+            self._brake_then(self.landing.come_down)
 
     def _answered(self, code: int, result: int) -> None:
         self.onboard.answered(code, result)
@@ -154,7 +148,7 @@ class Vehicle:
         with self.lock:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
             self._deaf = self._paused = self.guarded = False
-            self._blind.clear()
+            self.landing.heard()
             self.controls.reset()
             self.onboard.forget()
 
@@ -209,7 +203,7 @@ class Vehicle:
             return True
 
     def _high_level(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
-        self._next = None
+        self.landing.cancel()
         self.controls.fly(kind, action, duration, time.monotonic(), again=again)
 
     def arm(self, arm: bool) -> str:
@@ -355,7 +349,8 @@ class Vehicle:
                 return
             self.action = f"hold: {reason}"
             if self.senses.wrong:
-                self._steer_blindly((0.0, 0.0, 0.0), math.inf)
+                self._deaf = True
+                self.landing.stand_blindly()
                 return
             self._paused = until_seen
 
@@ -369,14 +364,6 @@ class Vehicle:
 
             self.controls.held = stale
             self._brake_then(stay)
-
-    def _steer_blindly(self, velocity: Vector, until: float) -> None:
-        self._deaf, self._next = True, None
-        self.controls.steer_blindly(velocity, until, time.monotonic())
-
-    def _sink_blindly(self) -> None:
-        now = time.monotonic()
-        self._steer_blindly((0.0, 0.0, -SINK_MPS), now + self.senses.sinking_height(now) / SINK_MPS + SINK_MORE_S)
 
     def _brake_then(self, action: Callable[[], None]) -> None:
         """Slow down, then do something."""
@@ -408,47 +395,18 @@ class Vehicle:
             self.action = f"land: {reason}"
             if self.senses.wrong:
                 self.machine.land(self.action)
-                self._sink_blindly()
+                self.landing.sink_blindly()
                 return ""
             # A blind landing must end a stream that the firmware may still follow.
             self.controls.streaming |= self.state == State.LOST
             self.machine.land(f"land: {reason}")
-            way = self.senses.height - height
-            seconds = landing_s(way, duration, self.station)
-            if 0.0 < duration < seconds:
-                why = too_short(duration, way, self.station.max_speed_mps)
-                longer = f"{self.name}: landing takes {seconds:.2f} s: {why}"
+            if longer := self.landing.takes_longer(height, duration):
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)
-            self._landing_since, self._obstacle = time.monotonic(), ""
-            self._brake_then(lambda: self._come_down(height, duration))
+            self.landing.begin()
+            self._brake_then(lambda: self.landing.come_down(height, duration))
             return ""
-
-    def _come_down(self, height: float = 0.0, duration: float = 0.0) -> None:
-        """Sink, but onto nobody: who has somebody below it first moves aside, or waits."""
-        descent = self._descent(self, height, self._landing_since) if self.state == State.LANDING else SINK
-        if self.last is None or not (descent.wait or descent.aside):
-            if descent.why:
-                self._log("error", f"{self.name}: lands straight down: {descent.why}")
-            self._sink(height, duration)
-            return
-        x, y, z = descent.aside or self.last.position
-        way = math.dist((x, y, z), self.last.position)
-        seconds = max(HOLD_S, way / MOVE_MPS, shortest_s(way, self.station.max_speed_mps))
-        if descent.aside or descent.why != self._obstacle:
-            goes = f"moves aside to {place_text((x, y, z))} (world) first" if descent.aside else "waits"
-            self._log("warn", f"{self.name}: {descent.why}: {goes}")
-        if descent.aside or not self._obstacle:
-            yaw = yaw_of(self.last.orientation)
-            self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, seconds), math.inf)
-        self._obstacle = descent.why
-        again = seconds + ARRIVES_S if descent.aside else ASK_AGAIN_S
-        self._next = time.monotonic() + again, lambda: self._come_down(height, duration)
-
-    def _sink(self, height: float = 0.0, duration: float = 0.0) -> None:
-        seconds = landing_s(self.senses.height - height, duration, self.station)
-        self._high_level(LAND, lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf)
 
     def stop(self, reason: str) -> None:
         """Emergency stop: motors off for good."""
@@ -456,7 +414,8 @@ class Vehicle:
             if self.state in (State.DISCONNECTED, State.CONNECTING):
                 return
             self.action = f"emergency stop: {reason}"
-            self._deaf, self._next = True, None
+            self._deaf = True
+            self.landing.cancel()
             self.controls.stop()
 
             def run(cf: Any) -> None:
@@ -488,7 +447,7 @@ class Vehicle:
                 self.controls.delivery.cancel()  # a take-off that comes late takes nobody by surprise
             elif self.link.connected and not self.controls.delivery.landing:
                 self.land(reason)
-                self._blind = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
+                self.landing.repeat_blindly(now)
 
     def tick(self, now: float) -> None:
         """Called 50 times a second: goes on braking, and sends again what has not been answered."""
@@ -499,10 +458,7 @@ class Vehicle:
                 self.controls.go_on_blindly(self.state in IN_AIR, self.senses.seen_at(now), now)
             elif self.last is not None:
                 self.controls.slow_down(self.senses.speed, now)
-            if self._next is not None and now >= self._next[0]:
-                (_, go_on), self._next = self._next, None
-                if self.state == State.LANDING:
-                    go_on()
+            self.landing.go_on(now, landing=self.state == State.LANDING)
             if self.state not in (State.DISCONNECTED, State.CONNECTING):
                 self.link.order_log(now)
             if self.state in WATCHED_OVER and (order := self.controls.delivery.due(now)) is not None:
@@ -511,11 +467,7 @@ class Vehicle:
     def keep_alive(self, now: float, watchdog: bool) -> None:
         """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
         with self.lock:
-            if self._blind and now >= self._blind[0]:
-                self._blind.pop(0)
-                self.controls.streaming = True
-                seconds = landing_s(self.senses.height, BLIND_LAND_S, self.station)
-                self._high_level(LAND, lambda cf: cf.high_level_commander.land(0.0, seconds, yaw=None), math.inf)
+            self.landing.repeat(now)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
             self.guarded |= watchdog and self.state in WATCHED_OVER
             self.link.guarded = self.guarded
