@@ -15,8 +15,10 @@ _PARTS = {"mission": missions, "gap": gaps, "stream": streams, "cut": cuts, "fau
 
 
 def _items() -> Iterator[Item]:
-    """All items, some of each kind first: a soak that is cut short has seen everything."""
-    yield from sorted((item for part in _PARTS.values() for item in part.items()), key=lambda i: i.seed)
+    """All items, a fifth of each kind after the other: a soak that is cut short has seen everything."""
+    parts = [list(part.items()) for part in _PARTS.values()]
+    placed = [((item.seed - 1) / max(i.seed for i in part), item) for part in parts for item in part]
+    yield from (item for _, item in sorted(placed, key=lambda pair: pair[0]))
 
 
 def _run(item: Item, directory: Path) -> dict[str, Any]:

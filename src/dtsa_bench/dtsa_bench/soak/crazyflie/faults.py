@@ -1,4 +1,4 @@
-"""Missions of twelve with two random faults each: who flies keeps apart, and motors stop only where they may."""
+"""Missions of twelve with four random faults each: who flies keeps apart, and motors stop only where they may."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from .fleets import RunningFleet, running
 from .gaps import LOW_M, SURVIVED_S
 from .missions import COUNT, FLYING_M
 
-MISSIONS = 30
-EACH = 2  # faults, of two vehicles
+MISSIONS = 15
+EACH = 4  # faults, of so many vehicles
 CLOSEST_M = 0.2
-LAST_S = 11.0  # after the take-off's begin: a mission takes about 12 s to its landing
+FIRST_S = 11.0  # the first one, after the take-off's begin: a mission takes about 12 s to its landing
+MORE_S = 5.0  # the others, after it: it ends the exchange, and all come to rest and land
 KINDS = ("silence", "loss", "bounce", "battery", "estimate jumps", "estimate freezes", "tumbles")
 _PATIENCE_S = 180.0
 _OFF = ("locked", "crashed")
@@ -53,16 +54,17 @@ class Fault:
 
 
 def faults_of(seed: int) -> list[Fault]:
-    """Two faults at random, in the order of time."""
+    """Faults at random, in the order of time."""
     chance = random.Random(f"faults {seed}")
+    first = chance.uniform(0.2, FIRST_S)
     found = [
-        _fault(chance, cf, KINDS[(EACH * (seed - 1) + k) % len(KINDS)])
+        _fault(chance, cf, KINDS[(EACH * (seed - 1) + k) % len(KINDS)], first + k * chance.uniform(0.0, MORE_S / EACH))
         for k, cf in enumerate(chance.sample(range(1, COUNT + 1), EACH))
     ]
     return sorted(found, key=lambda fault: fault.after_s)
 
 
-def _fault(chance: random.Random, cf: int, kind: str) -> Fault:
+def _fault(chance: random.Random, cf: int, kind: str, after_s: float) -> Fault:
     seconds = round(chance.uniform(0.1, 3.0), 2)
     sign = chance.choice((-1.0, 1.0))
     rate = round(chance.uniform(0.3, 0.95), 2)
@@ -76,11 +78,11 @@ def _fault(chance: random.Random, cf: int, kind: str) -> Fault:
         "estimate freezes": {"name": "estimate_freeze"},
         "tumbles": {"name": "tumble"},
     }[kind]
-    return Fault(cf, round(chance.uniform(0.2, LAST_S), 2), kind, request)
+    return Fault(cf, round(after_s, 2), kind, request)
 
 
 def items() -> Iterator[Item]:
-    """Thirty missions."""
+    """Fifteen missions: sixty faults."""
     for seed in range(1, MISSIONS + 1):
         yield Item(f"a mission with {EACH} random faults, {seed}", {"part": "fault"}, seed, 32.0)
 

@@ -13,14 +13,14 @@ from ..checks import met
 from ..item import Item
 from .fleets import station_priority
 
-EACH = 3
+EACH = 2
 LEAST_HZ = 48.0
 _LOSSES: dict[str, float | None] = {"udp": None, "radio": 0.0, "radio 1 %": 0.01, "radio 5 %": 0.05}
 _KEPT = ("commands_hz", "logs_hz", "latency_median_ms", "latency_p99_ms", "bridge_cpu_percent", "fleet_cpu_percent")
 
 
 def items() -> Iterator[Item]:
-    """Three flights of each kind."""
+    """Two flights of each kind."""
     for over in _LOSSES:
         for seed in range(1, EACH + 1):
             yield Item(f"commands over {over}, {seed}", {"part": "stream", "over": over}, seed, 30.0)
