@@ -14,7 +14,7 @@ import socket
 import struct
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from dtsa_agent.core.errors import DtsaError
 
 CABLE = "air0"  # the interface of each host
 _NET = "10.68"
-_CLONE_NEWNET = 0x40000000
+_CLONE_NEWNET, _CLONE_NEWTIME = 0x40000000, 0x80
 _TUNSETIFF, _IFF_TAP, _IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
 _SIOCSIFADDR, _SIOCSIFNETMASK, _SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8916, 0x891C, 0x8913, 0x8914
 _IFF_UP = 1
@@ -42,10 +42,12 @@ class Host:
     cable: int  # file descriptor of the switch's end
     namespace: int  # file descriptor
 
-    def start(self, command: Sequence[str], **more: Any) -> subprocess.Popen[str]:
+    def start(self, command: Sequence[str], clock_ahead_s: int = 0, **more: Any) -> subprocess.Popen[str]:
         """Starts a process on it.
 
         :param command: its command line.
+        :param clock_ahead_s: s, by how much its CLOCK_MONOTONIC is ahead of everybody else's, where Linux has time
+            namespaces; CLOCK_REALTIME is one for all.
         :param more: as for ``subprocess.Popen``.
         """
         libc, namespace = _libc(), self.namespace
@@ -53,6 +55,9 @@ class Host:
         def enter() -> None:
             if libc.setns(namespace, _CLONE_NEWNET):
                 os._exit(126)
+            if clock_ahead_s and not libc.unshare(_CLONE_NEWTIME):
+                with suppress(OSError), open("/proc/self/timens_offsets", "w") as offsets:
+                    offsets.write(f"monotonic {clock_ahead_s} 0\nboottime {clock_ahead_s} 0\n")
 
         return subprocess.Popen(command, preexec_fn=enter, text=True, **more)
 

@@ -39,7 +39,8 @@ def fly(
     :param senders: how many have sent, by slot.
     :param common_slot: from which all counted alike; None: never.
     :returns: the results of the flight from when all can have become known, (M + 2) N slots after that, until
-        the first of them ends in order; None: there are none.
+        and from when nobody is new any more (until then they hover), until the first of them ends in order; None:
+        there are none.
     """
     config = next(iter(lives.values())).swarm
     begins = None if common_slot is None else common_slot + (config.anchor_every + 2) * config.agents
@@ -65,6 +66,8 @@ def fly(
             replays[life].lay(tables, watch.index(life[0]))
         if begins is None or not begins <= slot < last:
             continue
+        if first is None and any(_new(replays[life]) for life in by_slot[slot]):
+            continue
         first = slot if first is None else first
         here = _follow(metrics, records, slot, track)
         if len(here) > 1:
@@ -73,6 +76,12 @@ def fly(
         outcome = COLLISION if count > 1 else SUCCESS if count else IDLE
         metrics.update(slot, track, tables, outcome, [config.frame_length] * count)
     return None if first is None else _results(metrics, first)
+
+
+def _new(replay: Replay) -> bool:
+    """Whether an agent is on probation: it speaks at its anchors only, and hovers."""
+    swarm = replay.swarm
+    return swarm.config.policy_row.probation and bool(swarm.lease_status(0)["probation"])
 
 
 def _follow(metrics: FlightMetrics, records: Records, slot: int, track: Any) -> list[int]:

@@ -79,6 +79,8 @@ class Switch:
         self._count = 0
         self._zero = time.monotonic_ns()
         self.log: list[OnAir] = []
+        #: Is told each Ethernet frame that has left the air.
+        self.listener: Callable[[bytes], None] | None = None
         self.left_out = 0  # Ethernet frames that were nothing for the air
         self.undelivered = 0  # frames that a host did not take
         wake_precisely()
@@ -163,6 +165,8 @@ class Switch:
                     verdict.collided,
                 )
             )  # fmt: skip
+            if self.listener is not None:
+                self.listener(frame)
         while self._ends and self._ends[0] <= until_ns:
             heapq.heappop(self._ends)
 
@@ -174,6 +178,15 @@ class Switch:
                 os.write(cable, frame)
             except OSError:
                 self.undelivered += 1
+
+    def tell_all(self, frame: bytes) -> None:
+        """Brings all hosts a frame that was never on the air.
+
+        :param frame: an Ethernet frame.
+        """
+        for cable in self._hosts:
+            with suppress(OSError):
+                os.write(cable, frame)
 
     def drain(self) -> None:
         """Throws away what the hosts have sent and nobody has read."""

@@ -27,7 +27,8 @@ from .merge import merge
 from .switch import Links, Switch
 
 GROUP = ("239.68.84.83", 7583)
-_START_S = 60.0  # until all have begun, on a busy machine
+_CLOCKS_S = 10**6  # CLOCK_MONOTONIC of the hosts differ by up to this
+_START_S = 120.0  # until all have begun, on a busy machine
 _END_S = 30.0
 _PRIORITY = 40  # of the switch: above that of the agents
 _AFTER_S = 2.0  # of the flight, from when on overlaps count
@@ -97,8 +98,9 @@ class Flight:
         command += [f"--{name}={value}" for name, value in words.items()] + swarm_words(self.trial.swarm)
         with (self.directory / f"cf{agent}-{life}.err").open("w") as errors:
             self._processes[agent] = self._joined[agent].start(
-                command, stdout=subprocess.DEVNULL, stderr=errors, env={**os.environ, VARIABLE: self.key}
-            )
+                command, self._random.randrange(1, _CLOCKS_S), stdout=subprocess.DEVNULL, stderr=errors,
+                env={**os.environ, VARIABLE: self.key},
+            )  # fmt: skip
 
     def signal(self, agent: int, number: int) -> None:
         """Sends a signal to an agent's process.
@@ -142,6 +144,17 @@ class Flight:
             ended = [agent for agent in sorted(silent) if self._processes[agent].poll() is not None]
             first = (ended or sorted(silent))[0]
             raise NotFlown(f"cf{first} has not sent: {self._said(first)}")
+
+    def carry_until_heard(self, agent: int) -> None:
+        """Time goes on until an agent has sent a frame.
+
+        :param agent: its id.
+        :raises NotFlown: if it does not.
+        """
+        seen = len(self.switch.log)
+        self.switch.run(lambda: any(one.agent == agent for one in self.switch.log[seen:]) or self._broken(), _START_S)
+        if all(one.agent != agent for one in self.switch.log[seen:]):
+            raise NotFlown(f"cf{agent} has not sent: {self._said(agent)}")
 
     def end(self) -> None:
         """Ends all in order.
@@ -239,6 +252,8 @@ def seen(flight: Flight, from_ns: int, to_ns: int) -> dict[str, Any]:
     """
     slot_ns = flight.trial.swarm.slot_ns
     log = [one for one in flight.switch.log if from_ns <= one.start_ns < to_ns]
+    # Who has arrived speaks at its main anchors only; one of them may be lost.
+    reach_ns = 2 * (flight.trial.swarm.main_every + 1) * flight.trial.swarm.agents * slot_ns
     slots = max(1, (to_ns - from_ns) // slot_ns)
     torn = {one.start_ns // slot_ns for one in log if one.collided}
     return {
@@ -247,6 +262,7 @@ def seen(flight: Flight, from_ns: int, to_ns: int) -> dict[str, Any]:
         "overlap_slots": len(torn),
         "overlap_share": len(torn) / slots,
         "frames_lost": sum(bool(one.lost) for one in log),
+        "heard_at_the_end": sorted({one.agent for one in log if one.start_ns >= to_ns - reach_ns}),
         "undelivered": flight.switch.undelivered,
     }
 
