@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from waiting import wait_for
@@ -18,6 +19,7 @@ from dtsa_agent.air.udp import AgentSettings, MulticastSocket, SlotRecord, UdpAg
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.air.recorder import AgentRecorder
+from dtsa_bench.air.sniffer import Sniffer
 
 _PATIENCE_S = 60.0
 
@@ -77,6 +79,28 @@ class Flying:
         self.stop.signal = self.stop.count = 1
         self._thread.join(_PATIENCE_S)
         assert not self._thread.is_alive()
+
+
+class Sniffing:
+    """Somebody who listens, in a thread."""
+
+    def __init__(self, config: SwarmConfig, udp: UdpSettings) -> None:
+        self.sniffer = Sniffer(config, udp)
+        self._stop = Stop()
+        self._thread = threading.Thread(target=self.sniffer.run, args=(self._stop,))
+
+    def start(self) -> None:
+        """Begins."""
+        self._thread.start()
+
+    def end(self) -> dict[str, Any]:
+        """Ends, if it has begun; what it has found."""
+        self._stop.signal = self._stop.count = 1
+        if self._thread.ident is not None:
+            self._thread.join(_PATIENCE_S)
+            assert not self._thread.is_alive()
+        self.sniffer.close()
+        return self.sniffer.summary()
 
 
 class Stranger:

@@ -7,6 +7,9 @@ import os
 import signal
 import socket
 import struct
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +19,8 @@ import pytest
 
 from dtsa_agent.air.udp.datagram import Wrapping
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
-from dtsa_bench.air.hosts import Host, why_not
+from dtsa_bench.air.hosts import Host, hosts, why_not
+from dtsa_bench.air.intruder import Intruder
 from dtsa_bench.air.merge import merge, verified
 from dtsa_bench.air.switch import Links, Switch
 from dtsa_bench.air.trial import NotFlown, Trial, flight_time, under_way
@@ -55,9 +59,13 @@ class Cables:
         """A host sends."""
         self.pairs[host - 1][1].send(data)
 
+    def carry_on(self, frames: int) -> None:
+        """Carries until so many frames have left the air."""
+        assert self.switch.run(lambda: len(self.switch.log) >= frames, 30.0)
+
     def carry(self, frames: int) -> None:
         """Carries until so many frames have left the air, and a little longer."""
-        assert self.switch.run(lambda: len(self.switch.log) >= frames, 30.0)
+        self.carry_on(frames)
         self.switch.run(lambda: False, 0.02)
 
     def heard(self, host: int) -> list[bytes]:
@@ -133,6 +141,22 @@ def test_links_delay_and_double() -> None:
         cables.close()
 
 
+def test_a_stranger_brings_all_what_was_never_on_the_air(cables: Cables) -> None:
+    good = [frame(1 + slot % 3, slot) for slot in range(100)]
+    intruder = Intruder(cables.switch, 1)
+    found: list[bytes] = []
+    for number, data in enumerate(good, 1):
+        cables.send(1, data)
+        cables.carry_on(number)
+        found += cables.heard(2)
+    said = len(found) - len(good)
+    assert said == intruder.said >= len(good)
+    assert all(data in found for data in good)
+    kinds = {Wrapping(CONFIG, None).read(data[42:]).fault for data in found}
+    assert {"", "not ours", "other settings", "no frame"} <= kinds
+    assert len(cables.switch.log) == len(good)
+
+
 def test_a_datagram_takes_as_long_as_agents_are_told() -> None:
     config = ChannelConfig(agents=3)
     fixed, byte = flight_time(config.airtime)
@@ -164,6 +188,8 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
             return len([seen for seen in flight.switch.log if seen.sender == 2]) > frames + 3
 
         assert flight.switch.run(back, 60.0)
+        stranger = Intruder(flight.switch, 1)
+        flight.carry(0.5)
         flight.end()
         found = merge(flight.bags())
     assert os.readlink("/proc/self/ns/net") == home
@@ -172,6 +198,21 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
     assert verified(found), found["decisions_again"]
     assert found["slots_with_two_senders"] == 0
     assert found["flight"] is not None
+    assert stranger.said > 10
+    refused = {reason for counts in found["not_taken_in"].values() for reason in counts}
+    assert {"other time", "repeated", "rejected"} <= refused
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+def test_hosts_have_clocks_of_their_own() -> None:
+    with hosts(1) as joined:
+        says = [sys.executable, "-c", "import time; print(time.monotonic(), time.time())"]
+        process = joined[0].start(says, 1_000_000, stdout=subprocess.PIPE)
+        monotonic, real = map(float, process.communicate(timeout=60.0)[0].split())
+    if monotonic < time.monotonic() + 900_000:
+        pytest.skip("no time namespaces here")
+    assert abs(monotonic - time.monotonic() - 1_000_000) < 60.0
+    assert abs(real - time.time()) < 60.0
 
 
 @pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")

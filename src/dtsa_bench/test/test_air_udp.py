@@ -38,6 +38,7 @@ class Flight:
     bags: list[Path]
     summaries: dict[int, dict[str, Any]]
     merged: dict[str, Any]
+    sniffed: dict[str, Any]  # by who has listened since they count alike
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +52,13 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     paths = [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
     flying: list[helpers.Flying] = []
     stranger = helpers.Stranger(group)
+    sniffing = helpers.Sniffing(CONFIG, udp)
     try:
         for agent, path in enumerate(paths, 1):
             own = AgentSettings(id=agent, clock_offset_ns=OFFSET_NS * agent, clock_drift_ppb=40_000 * (agent - 2))
             flying.append(helpers.Flying(own, CONFIG, udp, path))
         wait_for(lambda: all(len(one.heard) == 2 and min(one.heard.values()) > 10 for one in flying))
+        sniffing.start()
         _disturb(stranger, flying)
         seen = [len(one.slots) for one in flying]
         wait_for(lambda: all(len(one.slots) > before + 60 for one, before in zip(flying, seen, strict=True)))
@@ -63,12 +66,13 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         for one in flying:
             one.end()
         stranger.close()
+        sniffed = sniffing.end()
         if old is None:
             del os.environ["DTSA_AUTH_KEY"]
         else:
             os.environ["DTSA_AUTH_KEY"] = old
     merged = merge([read(path) for path in reversed(paths)])
-    return Flight(paths, {one.agent.own.id: one.agent.summary() for one in flying}, merged)
+    return Flight(paths, {one.agent.own.id: one.agent.summary() for one in flying}, merged, sniffed)
 
 
 def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
@@ -87,6 +91,14 @@ def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
     time.sleep(3 * CONFIG.slot_s)
     for data in kept:
         stranger.socket.send(data)
+
+
+def test_who_only_listens_finds_that_all_keep_the_rules(flight: Flight) -> None:
+    found = flight.sniffed
+    assert found["heard"].keys() == {"cf1", "cf2", "cf3"}
+    assert found["frames_judged"] > 10
+    assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]
+    assert {"not ours", "other settings", "rejected", "repeated"} <= found["not_taken_in"].keys()
 
 
 def test_groups_become_one(flight: Flight) -> None:

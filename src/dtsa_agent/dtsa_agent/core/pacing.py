@@ -10,7 +10,7 @@ LEAD = 0.7
 LONGEST_LEAD = 0.95  # where every wake-up counts: when it has heard, as soon as it has
 LATEST_LEAD = 0.06  # while it misses the frame of the slot before, only this long
 MOST_EARLY = 64  # frames of slots that are still to come, kept until they do
-_BETWEEN = 0.2  # of a slot, from the end of a frame that left late to the start of the next one: clocks differ
+BETWEEN = 0.2  # on a network, between a frame that left late and the next slot: clocks differ, nobody waits any longer
 
 
 def latest_send_ns(slot_ns: int, flight_ns: int) -> int:
@@ -19,7 +19,7 @@ def latest_send_ns(slot_ns: int, flight_ns: int) -> int:
     :param slot_ns: ns, length of a slot.
     :param flight_ns: ns, from the order to send a frame until its arrival.
     """
-    return max(slot_ns - flight_ns - round(_BETWEEN * slot_ns), slot_ns // 10)
+    return max(slot_ns - flight_ns - round(BETWEEN * slot_ns), slot_ns // 10)
 
 
 def too_long_ns(config: SwarmConfig) -> int:

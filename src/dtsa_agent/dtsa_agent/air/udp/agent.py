@@ -17,7 +17,7 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtoc
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import check_joinable
-from dtsa_agent.core.pacing import LATEST_LEAD, LEAD, LONGEST_LEAD, MOST_EARLY, latest_send_ns, too_long_ns
+from dtsa_agent.core.pacing import BETWEEN, LEAD, LONGEST_LEAD, MOST_EARLY, latest_send_ns, too_long_ns
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
 from dtsa_agent.keys import authenticator
@@ -79,7 +79,7 @@ class UdpAgent:
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally()
         self._slot_ns = config.slot_ns
-        longest, self._lead_ns, latest = (round(lead * self._slot_ns) for lead in (LONGEST_LEAD, LEAD, LATEST_LEAD))
+        longest, self._lead_ns, latest = (round(lead * self._slot_ns) for lead in (LONGEST_LEAD, LEAD, BETWEEN))
         self._leads_ns = {None: self._lead_ns, True: latest, False: longest}
         self._flight_ns = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
         self._latest_send_ns = latest_send_ns(self._slot_ns, self._flight_ns)
