@@ -45,6 +45,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("runs/a", "a recorded run, played; one that is being recorded is followed"),
         ("runs/a runs/b", "two side by side"),
         ("--domain 7", "the swarm on a ROS domain"),
+        ("--air udp --interface eth0", "agents on a network, as one who listens; the key is in DTSA_AUTH_KEY"),
     ),
     "report": (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side")),
     "export": (

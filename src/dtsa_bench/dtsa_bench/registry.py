@@ -21,7 +21,7 @@ COMMANDS = {
     "sniff": "listen to agents on a real network, record and judge what they send",
     "merge": "the bags of agents on a real network as one flight: one time line, results, decisions made again",
     "recover": "make a readable bag of what a killed recorder left behind",
-    "view": "a swarm in the browser: a recorded run, one that is being recorded, or one on the ROS graph",
+    "view": "a swarm in the browser: a recorded run, one that is being recorded, one on the ROS graph or a network",
     "report": "one web page about one or several recorded runs",
     "export": "a bag's contents as CSV or Parquet",
     "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",

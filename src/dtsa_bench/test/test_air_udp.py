@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from dtsa_agent.stop import Stop
 from dtsa_bench.air.agent_bag import read
 from dtsa_bench.air.merge import merge, verified
 from dtsa_bench.air.timeline import Crossing, fit
+from dtsa_bench.view.air import AirSource
+from dtsa_bench.view.track import MOST_MOMENTS, Track
 
 KEY = "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4"
 # Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
@@ -39,6 +42,7 @@ class Flight:
     summaries: dict[int, dict[str, Any]]
     merged: dict[str, Any]
     sniffed: dict[str, Any]  # by who has listened since they count alike
+    told: list[dict[str, Any]]  # what a page gets of one who listens
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +55,15 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     udp = UdpSettings(interface="lo", group=group)
     paths = [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
     flying: list[helpers.Flying] = []
-    stranger = helpers.Stranger(group)
     sniffing = helpers.Sniffing(CONFIG, udp)
+    stranger, track = helpers.Stranger(group), Track("listener")
+    source = AirSource(track, CONFIG, udp)
+    listening = threading.Thread(target=source.run)
+    listening.start()
+
+    def told() -> list[dict[str, Any]]:
+        return [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+
     try:
         for agent, path in enumerate(paths, 1):
             own = AgentSettings(id=agent, clock_offset_ns=OFFSET_NS * agent, clock_drift_ppb=40_000 * (agent - 2))
@@ -62,9 +73,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         _disturb(stranger, flying)
         seen = [len(one.slots) for one in flying]
         wait_for(lambda: all(len(one.slots) > before + 60 for one, before in zip(flying, seen, strict=True)))
+        for one in flying:
+            one.end()
+        wait_for(lambda: told()[-1]["absent"] == [1, 2, 3, 4])
     finally:
         for one in flying:
             one.end()
+        source.stopped = True
+        listening.join()
         stranger.close()
         sniffed = sniffing.end()
         if old is None:
@@ -72,7 +88,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         else:
             os.environ["DTSA_AUTH_KEY"] = old
     merged = merge([read(path) for path in reversed(paths)])
-    return Flight(paths, {one.agent.own.id: one.agent.summary() for one in flying}, merged, sniffed)
+    return Flight(paths, {one.agent.own.id: one.agent.summary() for one in flying}, merged, sniffed, told())
 
 
 def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
@@ -119,6 +135,41 @@ def test_what_is_not_ours_is_counted_by_reason(flight: Flight) -> None:
         found = summary["not_taken_in"]
         assert found["not ours"] >= 2
         assert {"length", "other settings", "no frame", "rejected", "repeated", "other time"} <= found.keys()
+
+
+def test_a_page_is_told_what_a_listener_heard(flight: Flight) -> None:
+    """Who sends in which slot, where the frames say that all are, who comes and who leaves; and nothing more."""
+
+    def numbers(text: str, kind: str) -> Any:
+        return np.frombuffer(base64.b64decode(text), kind)
+
+    records = {agent: {r.slot: r for r in read(path).slots} for agent, path in enumerate(flight.bags, 1)}
+    heard = [
+        pair
+        for moment in flight.told
+        for pair in zip(
+            numbers(moment["frames"]["slot"], "<u4").tolist(),
+            numbers(moment["frames"]["sender"], "<u2").tolist(),
+            strict=True,
+        )
+    ]
+    assert len(heard) > 60
+    sent = {(slot, agent) for agent, found in records.items() for slot, r in found.items() if r.sent_ns >= 0}
+    assert set(heard) <= sent
+    assert len(set(heard)) == len(heard)
+    first = heard[0][0]
+    assert len(heard) > 0.9 * len([slot for slot, _ in sent if slot >= first])
+    middle = flight.told[len(flight.told) // 2]
+    slot = numbers(middle["at"], "<u4")[-1]
+    place = numbers(middle["place"], "<f4").reshape(-1, 3, CONFIG.agents)[-1]
+    for agent in (1, 2, 3):
+        assert np.linalg.norm(place[:, agent - 1] - records[agent][slot].track[-1]) < 0.1
+    words = "\n".join(event[2] for moment in flight.told for event in moment["events"])
+    assert all(f"cf{agent} is heard" in words and f"cf{agent} leaves" in words for agent in (1, 2, 3))
+    assert "cf4" not in words
+    last = flight.told[-1]
+    assert last["refused"] >= 8  # what the stranger said
+    assert (last["tables"], last["agree"]) == (0, [0, 0])
 
 
 def test_bags_lie_on_one_time_line(flight: Flight) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import json
 import math
@@ -21,6 +22,7 @@ pytest.importorskip("cflib")
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
+import aiohttp
 from bridge_helpers import FakeFleet, fake_fleet, settings
 from metronome import flown_again_when_overloaded
 from rosbags.highlevel import AnyReader
@@ -111,13 +113,27 @@ def check_records(out: Path) -> None:
     assert any("order /all/takeoff" in text for _, _, text in data["mission"]["events"])
 
 
+async def told_in_flight(url: str) -> set[str]:
+    """Waits until a mission's page is told of an exchange under way; who it says is flying then."""
+    flying: set[str] = set()
+    moments = 0
+    async with aiohttp.ClientSession() as client, client.ws_connect(url + "stream", max_msg_size=0) as stream:
+        while len(flying) < COUNT or moments < 10:
+            content = await stream.receive_json(timeout=60)
+            moments += len(content.get("moments", ()))
+            flying |= {told[0] for told in content.get("told", ()) if told[1] == "flying"}
+    return flying
+
+
 @flown_again_when_overloaded
 def test_a_bridge_that_dies_leaves_records_and_a_summary(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         out = tmp_path / "out"
-        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(out), "--tail-s", "60"]
+        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(out), "--tail-s", "60", "--view"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
+            assert process.stderr is not None
+            page = asyncio.run(told_in_flight(process.stderr.readline().split()[1]))
             wait_for(lambda: len(fleet.events(name="streaming")) == COUNT, 60)
             (bridge,) = (
                 int(child)
@@ -125,13 +141,13 @@ def test_a_bridge_that_dies_leaves_records_and_a_summary(tmp_path: Path) -> None
                 for child in (task / "children").read_text().split()
                 if b"bridge_node" in Path(f"/proc/{child}/cmdline").read_bytes()
             )
-            time.sleep(1.0)
             os.kill(bridge, signal.SIGKILL)
             _, errors = process.communicate(timeout=60)
         finally:
             process.kill()
             process.wait()
         assert process.returncode == 1
+        assert page == {"cf1", "cf2", "cf3", "cf4"}
         assert "bridge" in errors
         assert "not known to have landed: cf1, cf2, cf3, cf4" in errors
         summary = json.loads((out / "summary.json").read_text())

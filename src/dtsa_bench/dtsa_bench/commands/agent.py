@@ -15,7 +15,7 @@ DESCRIPTION = """\
 Flies one agent, with a simulated vehicle, whose frames go to a multicast group: one process a computer, no channel
 node, no start signal, no ROS. Who is first begins; groups that meet become one. Frames are sealed: the key is in the
 environment, DTSA_AUTH_KEY. See docs/several-computers.md."""
-_DEFAULT_POLICY = "lease"
+DEFAULT_POLICY = "lease"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -60,7 +60,7 @@ def add_swarm(parser: argparse.ArgumentParser) -> None:
     from dtsa_bench.options import add_options
 
     swarm = parser.add_argument_group("the swarm: what all agents share")
-    swarm.add_argument("--policy", metavar="NAME", default=_DEFAULT_POLICY, help=f"who sends next [{_DEFAULT_POLICY}]")
+    swarm.add_argument("--policy", metavar="NAME", default=DEFAULT_POLICY, help=f"who sends next [{DEFAULT_POLICY}]")
     skip = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
     add_options(swarm, SwarmConfig, "swarm", skip=skip)
 

@@ -51,7 +51,9 @@ def add_parser(subparsers: Any) -> None:
     )
     group.add_argument("--view-port", metavar="N", default=None, help="port of the page [a free one]")
     group.add_argument(
-        "--control", action="store_true", help="the page may kill and start agents and change the channel"
+        "--control",
+        action="store_true",
+        help="the page may kill and start agents and change the channel; land and stop Crazyflies",
     )
     add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
     crazyflies = parser.add_argument_group("Crazyflies")
@@ -148,15 +150,10 @@ def viewed(args: argparse.Namespace, stop: Stop) -> Iterator[ViewLink | None]:
     :param args: the command line.
     :param stop: set by signals.
     """
-    from dtsa_agent.core.errors import ConfigError
-
-    if not args.view:
-        for name in ("view_port", "control"):
-            if getattr(args, name):
-                raise ConfigError(name, getattr(args, name), "only with --view")
+    port = page_port(args)
+    if port is None:
         yield None
         return
-    port = 0 if args.view_port is None else whole_number(args.view_port, "view_port", 0, 65535)
     from dtsa_bench.view.link import ViewLink
 
     view = ViewLink(port, args.control)
@@ -169,6 +166,22 @@ def viewed(args: argparse.Namespace, stop: Stop) -> Iterator[ViewLink | None]:
                 time.sleep(0.1)
     finally:
         view.close()
+
+
+def page_port(args: argparse.Namespace) -> int | None:
+    """The port of the page that is wanted, 0: any that is free; None: no page is wanted.
+
+    :param args: the command line.
+    :raises ConfigError: for options of a page that is not wanted.
+    """
+    from dtsa_agent.core.errors import ConfigError
+
+    if args.view:
+        return 0 if args.view_port is None else whole_number(args.view_port, "view_port", 0, 65535)
+    for name in ("view_port", "control"):
+        if getattr(args, name):
+            raise ConfigError(name, getattr(args, name), "only with --view")
+    return None
 
 
 def late_agents(text: str | None) -> dict[int, float]:
@@ -198,9 +211,6 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     for name, value in {"late": args.late, **given(args, FlightOptions, "flight")}.items():
         if value is not None and name != "answer_s":
             raise ConfigError(name, value, "only with --backend sim")
-    for name in ("view", "view_port", "control"):
-        if getattr(args, name):
-            raise ConfigError(name, getattr(args, name), "only with --backend sim; `dtsa view` shows a mission")
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     use_simulated_radio(args)
@@ -208,6 +218,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     settings = load_swarm(path)
     from dtsa_agent.ros.common.loop import Stop
     from dtsa_bench.fly.crazyflie import fly_crazyflies, mission_defaults
+    from dtsa_bench.view.mission import PageOptions
 
     if getattr(args, "run.mode") is None:
         setattr(args, "run.mode", "realtime")
@@ -217,13 +228,17 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     options = FlightOptions(domain=domain, pictures=args.picture)
     if args.dry_run and args.attach:
         raise ConfigError("dry_run", True, "either --dry-run or --attach: it connects by itself")
+    port = page_port(args)
+    page = None if port is None else PageOptions(port, args.control)
     with Stop() as stop:
         if args.dry_run:
             from dtsa_bench.fly.rehearsal import rehearse
 
-            flight, cut_short = rehearse(config, settings, path, args.out, options, stop)
+            flight, cut_short = rehearse(config, settings, path, args.out, options, stop, page=page)
         else:
-            flight, cut_short = fly_crazyflies(config, settings, path, args.out, options, stop, attach=args.attach)
+            flight, cut_short = fly_crazyflies(
+                config, settings, path, args.out, options, stop, attach=args.attach, page=page
+            )
     _tell(args, flight)
     if cut_short:
         left = ", ".join(flight.summary["not_landed"])

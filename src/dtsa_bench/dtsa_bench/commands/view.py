@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Shows a swarm on a page that this machine alone can open: a recorded run to be played, one that is being
-recorded and followed while it grows, or without a bag the swarm on the ROS graph. The address that is printed
-holds a random token; whoever does not know it gets nothing."""
+recorded and followed while it grows, or without a bag the swarm on the ROS graph, or (--air udp) agents on a network,
+with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not know it gets
+nothing."""
 _MOST = 2  # runs side by side
+_ROS, _UDP = "ros", "udp"
 
 
 class Source(Protocol):
@@ -39,7 +41,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="a swarm in the browser",
         description=DESCRIPTION,
     )
+    parser.usage = "%(prog)s [BAG ...] [OPTIONS]"
     parser.add_argument("bags", nargs="*", metavar="BAG", help=f"{RECORDED_RUN}; two are shown side by side")
+    parser.add_argument(
+        "--air", choices=(_ROS, _UDP), default=_ROS, help="without a bag: what carries the swarm's frames [ros]"
+    )
     parser.add_argument("--domain", metavar="N", default=None, help="without a bag: ROS_DOMAIN_ID of the swarm")
     parser.add_argument(
         "--namespace", metavar="NAME", default=None, help="without a bag: namespace of the swarm [/swarm]"
@@ -53,28 +59,33 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--listen", metavar="ADDRESS", default=None, help="an address of this machine that others reach [127.0.0.1]"
     )
+    from dtsa_bench.commands.agent import add_network, add_swarm
+
+    add_network(parser)
+    add_swarm(parser)
+    parser.set_defaults(policy=None, seal=None)  # so that it is known whether they were given
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until a signal comes."""
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.options import whole_number
+    from dtsa_bench.view.link import give_way
     from dtsa_bench.view.server import ViewServer, new_token
     from dtsa_bench.view.track import Track
 
     port = whole_number(args.port, "port", 0, 65535)
     if len(args.bags) > _MOST:
         raise ConfigError("bags", len(args.bags), f"at most {_MOST} side by side")
-    for name in ("domain", "namespace", "control"):
-        if args.bags and getattr(args, name):
-            raise ConfigError(name, getattr(args, name), "only without a bag")
+    _check_source(args)
     if args.listen is not None and not _plain_address(args.listen):
         raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
     tracks: list[Track] = []
     sources: list[Source] = []
     order = None
     if not args.bags:
-        tracks, sources, order = _graph(args)
+        give_way()
+        tracks, sources, order = _air(args) if args.air == _UDP else _graph(args)
     for bag in args.bags:
         from dtsa_bench.view.recording import BagSource
 
@@ -90,6 +101,42 @@ def run(args: argparse.Namespace) -> int:
             if thread.is_alive():
                 thread.join(3.0)
     return 0
+
+
+def _check_source(args: argparse.Namespace) -> None:
+    """Refuses options of another source than the one that is shown."""
+    from dtsa_agent.air.udp.settings import UdpSettings
+    from dtsa_agent.core import SwarmConfig
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_bench.options import given
+
+    for name in ("domain", "namespace", "control"):
+        if getattr(args, name) and (args.bags or args.air == _UDP):
+            raise ConfigError(name, getattr(args, name), "only without a bag" if args.bags else "only with --air ros")
+    if args.air == _UDP:
+        if args.bags:
+            raise ConfigError("air", args.air, "only without a bag")
+        return
+    own = {"policy": args.policy, "seal": args.seal}
+    for name, value in {**given(args, UdpSettings, "udp"), **given(args, SwarmConfig, "swarm"), **own}.items():
+        if value is not None:
+            raise ConfigError(name, value, "only with --air udp")
+
+
+def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
+    from dtsa_agent.air.udp.settings import UdpSettings
+    from dtsa_agent.keys import check_key
+    from dtsa_bench.commands.agent import DEFAULT_POLICY, swarm_of
+    from dtsa_bench.options import given
+    from dtsa_bench.view.air import AirSource
+    from dtsa_bench.view.track import Track
+
+    udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
+    args.policy, args.seal = args.policy or DEFAULT_POLICY, args.seal is not False
+    config = swarm_of(args)
+    check_key(config)
+    track = Track(f"{udp.group} on {udp.interface}")
+    return [track], [AirSource(track, config, udp)], None
 
 
 def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callable[[Order], str] | None]:

@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from dtsa_agent.ros.common.priority import give_way, take_priority
 from dtsa_bench.options import new_directory, whole_number
 from dtsa_bench.processes import end_process
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
+from dtsa_bench.view.mission import PageOptions, mission_page
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
@@ -103,6 +104,7 @@ def fly_crazyflies(
     stop: Stop,
     *,
     attach: bool = False,
+    page: PageOptions | None = None,
 ) -> tuple[Flight, str]:
     """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
 
@@ -113,6 +115,7 @@ def fly_crazyflies(
     :param options: domain, pictures.
     :param stop: a flag that ends the mission early.
     :param attach: by the bridge that runs already on this ROS domain, and goes on running.
+    :param page: shows the mission in a browser; None: nothing does.
     :returns: the results, and why the exchange was cut short (empty: it was not).
     :raises ConfigError: before anything has been started.
     :raises DtsaError: something failed before the exchange began, or a node died.
@@ -126,11 +129,12 @@ def fly_crazyflies(
     wanted = options.domain
     if wanted is None and shared:  # that of the bridge, or of motion capture
         wanted = whole_number(os.environ.get("ROS_DOMAIN_ID") or "0", "ROS_DOMAIN_ID", 0, LAST_DOMAIN)
-    with ros_domain(wanted, shared=shared) as domain:
+    with ros_domain(wanted, shared=shared) as domain, ExitStack() as shown:
         directory = new_directory(out)
         logs = directory / "log"
         logs.mkdir()
         environment = run_environment(domain, logs)
+        shown.enter_context(mission_page(domain, environment, page))
         context = Context()
         progress = ProgressLine("fly")
         bridge, agents, recorder = (Children(logs, environment) for _ in range(3))

@@ -20,6 +20,7 @@ from dtsa_agent.ros.common.loop import Stop
 from dtsa_bench.fake_crazyflie.ports import free_base_port
 from dtsa_bench.fake_crazyflie.process import FleetError, running_fleet
 from dtsa_bench.run_config import RunConfig
+from dtsa_bench.view.mission import PageOptions
 
 from .crazyflie import fly_crazyflies
 from .flight import Flight
@@ -30,7 +31,14 @@ WHERE_S = 120.0  # s, to connect to all and ask where they stand
 
 
 def rehearse(
-    run: RunConfig, settings: SwarmSettings, swarm_yaml: Path, out: str | Path, options: FlightOptions, stop: Stop
+    run: RunConfig,
+    settings: SwarmSettings,
+    swarm_yaml: Path,
+    out: str | Path,
+    options: FlightOptions,
+    stop: Stop,
+    *,
+    page: PageOptions | None = None,
 ) -> tuple[Flight, str]:
     """Ask where everybody stands, then fly the mission with simulated Crazyflies that stand there.
 
@@ -47,7 +55,7 @@ def rehearse(
         data["station"]["positions"] = {}  # decks: what is rehearsed are the ways
         path = Path(folder) / "swarm.yaml"
         path.write_text(yaml.safe_dump(data), encoding="utf-8")
-        return fly_crazyflies(run, parse_swarm(data), path, out, replace(options, domain=None), stop)
+        return fly_crazyflies(run, parse_swarm(data), path, out, replace(options, domain=None), stop, page=page)
 
 
 def measured_places(settings: SwarmSettings, swarm_yaml: Path) -> list[list[float]]:

@@ -14,6 +14,7 @@ SOAKS = {
     "fuzz": "an hour of coverage-guided fuzzing of decoders and event streams of libdtsa (needs clang)",
     "crazyflie": "missions of twelve, gaps of the air, streams of commands: over UDP and simulated radios with losses",
     "air": "agents on hosts of their own over a switch that is the medium: cold starts, losses, drifts, faults",
+    "view": "what a live page costs a flight, 70 agents drawn, a page left open (needs Chromium)",
     "load": "12 and 18 agents at 10 ms beside six busy loops: flights end by themselves and by Ctrl-C",
 }
 

@@ -38,7 +38,6 @@ class Follower:
         self._wanted = 0  # slots from one moment to the next; 0: 20 moments a simulated second
         self._run: RunConfig | None = None
         self.unusable = 0
-        self.vehicles: dict[int, list[Any]] = {}  # by id: state, battery in V, link quality, reason
 
     @property
     def begun(self) -> bool:
@@ -189,8 +188,6 @@ class Follower:
         if self._tables is not None:
             estimate_now(self._tables, self._oracle, slot, self._way[-1])
         more: dict[str, Any] = {"lag_ms": round(self._lag_ms, 2)}
-        if self.vehicles:
-            more["vehicles"] = [[agent, *told] for agent, told in sorted(self.vehicles.items())]
         self._track.add(self._moments.make(slot, self._tables, self._chosen, self._digest, self._absent, **more))
 
     def _find_crashes(self, slot: int) -> None:

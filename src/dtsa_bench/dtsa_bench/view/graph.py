@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections import deque
@@ -10,7 +9,7 @@ from typing import Any
 
 import rclpy
 from builtin_interfaces.msg import Duration
-from dtsa_msgs.msg import Configuration, Decision, Reception, RunStatus, Slot, Status
+from dtsa_msgs.msg import Configuration, Decision, Reception, RunStatus, Slot
 from dtsa_msgs.srv import Land
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
@@ -18,7 +17,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_srvs.srv import Empty
@@ -32,6 +31,7 @@ from dtsa_agent.ros.common.loop import Feed
 from .follower import Follower
 from .orders import Order
 from .track import Track
+from .vehicles import VehicleWatch, listening
 
 _POLL_S = 0.02
 _PLACES_S = 0.05  # wall time from one look at all positions to the next
@@ -40,11 +40,6 @@ _ENDED = 2  # RunStatus.ENDED
 _MOST_ORDERS = 20  # that wait
 _ANSWER_S = 5.0
 _LAND_S = 3
-
-
-def _listening(depth: int) -> QoSProfile:
-    """Nobody waits for a listener: what it does not take in time is lost to it alone."""
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def _latched() -> QoSProfile:
@@ -74,11 +69,11 @@ class GraphSource:
         self._settings = self._feed(Configuration, names.CONFIGURATION, _latched())
         self._status = self._feed(RunStatus, names.STATUS, _latched())
         self._slots = [
-            (kind.__name__, self._feed(kind, topic, _listening(_WAITING)))
+            (kind.__name__, self._feed(kind, topic, listening(_WAITING)))
             for kind, topic in ((Slot, names.SLOT), (Decision, names.DECISION), (Reception, names.RECEPTION))
         ]
         self._places: list[Feed] = []
-        self._vehicles: list[Feed] = []
+        self._vehicles = VehicleWatch(self._node, self._intake, track, names.swarm_prefix(space))
         self._orders = _Orders(self._node, self._context, space) if control else None
         self._run = 0
         self._follower: Follower | None = None
@@ -94,17 +89,22 @@ class GraphSource:
         try:
             while not self.stopped and self._context.ok():
                 self._settle()
-                if self._follower is not None:
-                    if (now := time.monotonic()) >= look:
-                        look = now + _PLACES_S
+                if (now := time.monotonic()) >= look:
+                    look = now + _PLACES_S
+                    self._vehicles.look(now)
+                    if self._follower is not None:
                         self._look(self._follower)
+                if self._follower is not None:
                     self._hear(self._follower)
-                    for text in self._orders.carry_out() if self._orders else ():
+                for text in self._orders.carry_out() if self._orders else ():
+                    self._vehicles.answer = text
+                    if self._follower is not None:
                         self._follower.note(text)
                 time.sleep(_POLL_S)
         finally:
+            self._vehicles.close()
             slots = (feed for _, feed in self._slots)
-            for feed in (self._settings, self._status, *slots, *self._places, *self._vehicles):
+            for feed in (self._settings, self._status, *slots, *self._places):
                 feed.close()
             if self._orders:
                 self._orders.close()
@@ -130,12 +130,11 @@ class GraphSource:
             if not self._follower.begun:
                 self._follower = None
                 return
-            for feed in (*self._places, *self._vehicles):
+            for feed in self._places:
                 feed.close()
                 self._node.destroy_subscription(feed.subscription)
             spaces = [names.agent_namespace(agent, self._space) for agent in range(1, self._follower.agents + 1)]
-            self._places = [self._feed(Odometry, names.ODOMETRY, _listening(1), space) for space in spaces]
-            self._vehicles = [self._feed(Status, names.STATUS, _listening(1), space) for space in spaces]
+            self._places = [self._feed(Odometry, names.ODOMETRY, listening(1), space) for space in spaces]
         status = self._status.take()
         if status is not None and self._follower is not None and status.run == self._run:
             self._follower.take("RunStatus", status)
@@ -150,11 +149,6 @@ class GraphSource:
             if message is not None:
                 place = message.pose.pose.position
                 follower.place(agent, (place.x, place.y, place.z))
-        for agent, feed in enumerate(self._vehicles, 1):
-            told = feed.take()
-            if told is not None and math.isfinite(told.battery_voltage) and math.isfinite(told.link_quality):
-                numbers = round(told.battery_voltage, 2), round(told.link_quality, 2)
-                follower.vehicles[agent] = [told.state_name[:20], *numbers, told.reason[:80]]
 
     def _hear(self, follower: Follower) -> None:
         """Takes in what has been said since the last look: decisions and frames before the verdicts on them."""

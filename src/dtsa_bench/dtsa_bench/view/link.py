@@ -22,7 +22,7 @@ LONGEST = 64 << 20  # bytes of a part of a record
 _START_S = 30.0
 _ORDERS_BYTES = 1 << 16  # of orders that wait; what sends more is not our page
 _NICE = 10
-_OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
+OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
 
 
 def record(kind: int, slot: int, text: str, heard: bytes = b"", believed: bytes = b"") -> bytes:
@@ -62,7 +62,7 @@ class ViewLink:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[other.fileno()],
-                **_OWN_GROUP,
+                **OWN_GROUP,
             )
         try:
             self.url = self._hello()

@@ -148,7 +148,7 @@ class Moments:
         slot: int,
         tables: AbstractSwarm | None,
         chosen: NDArray[Any],
-        digest: NDArray[Any],
+        digest: NDArray[Any] | None,
         absent: Iterable[int] = (),
         **more: Any,
     ) -> Moment:
@@ -157,14 +157,14 @@ class Moments:
         :param slot: the slot that starts.
         :param tables: one table an agent, with the estimates for this time; None: not known.
         :param chosen: (N,) ids that the agents take for the sender.
-        :param digest: (N,) digests of their tables.
+        :param digest: (N,) digests of their tables; None: not known.
         :param absent: ids of agents that have fallen silent.
         :param more: further values for the page.
         """
         gone = sorted(absent)
         rows = np.array(self._frames, dtype=np.int64).reshape(-1, 5)
         kinds = zip(("slot", "sender", "outcome", "reason", "received"), ("<u4", "<u2", "u1", "u1", "u1"), strict=True)
-        here = np.ones(len(digest), dtype=bool)
+        here = np.ones(self.agents, dtype=bool)
         here[[agent - 1 for agent in gone]] = False
         content = {
             "slot": slot,
@@ -172,7 +172,7 @@ class Moments:
             "place": pack(np.frombuffer(b"".join(data for _, data in self._places), "<f4")),
             "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(kinds)},
             "agree": [self._compared, self._same],
-            "tables": len(set(digest[here].tolist())),
+            "tables": 0 if digest is None else len(set(digest[here].tolist())),
             "chosen": pack(chosen.astype("<u2")),
             "age": pack(self._mean_ages(slot, tables)),
             "absent": gone,

@@ -25,7 +25,7 @@ class Asset:
 
 
 _SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js", "player.js")  # as in the report
-_MODULES = ("three.module.js", "three.core.js", "bodies.js", "run.js", "panels.js", "view.js")
+_MODULES = ("three.module.js", "three.core.js", "bodies.js", "run.js", "panels.js", "crazyflies.js", "view.js")
 ASSETS = {
     **{name: Asset(_REPORT, _JS) for name in _SCRIPTS},
     **{name: Asset(_VIEW, _JS) for name in _MODULES},

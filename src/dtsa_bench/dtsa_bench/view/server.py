@@ -20,7 +20,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from .moments import BELIEFS, belief
 from .orders import Order, read_order
 from .page import ASSETS, asset_of, page_html
-from .track import Track
+from .track import Track, Vehicles
 
 LOOPBACK = "127.0.0.1"
 RATE_HZ = 20.0  # messages a second to one page, at most
@@ -178,6 +178,7 @@ class _Reader:
         self._run = [0] * len(tracks)  # number of the run that the page knows
         self._next = [0] * len(tracks)  # first moment that it does not have
         self._state = ["-"] * len(tracks)
+        self._vehicles: list[Vehicles | None] = [None] * len(tracks)  # that the page has been told
         self._chosen = [0] * len(tracks)  # agent whose beliefs it wants
         self._next_belief = [0] * len(tracks)
         self.answer = ""  # to its last order
@@ -230,10 +231,14 @@ class _Reader:
 
     def _news(self, index: int) -> list[str]:
         track = self._tracks[index]
+        told: list[str] = []
+        if (vehicles := track.vehicles) is not self._vehicles[index] and vehicles is not None:
+            self._vehicles[index] = vehicles
+            content = {"kind": "vehicles", "run": index, "told": vehicles.told, "answer": vehicles.answer}
+            told.append(json.dumps(content))
         number, info = track.info
         if info is None:
-            return []
-        told: list[str] = []
+            return told
         if number != self._run[index]:
             self._run[index], self._next_belief[index], self._state[index] = number, 0, "-"
             told.append(json.dumps({"kind": "begin", "run": index, "info": info, "runs": len(self._tracks)}))

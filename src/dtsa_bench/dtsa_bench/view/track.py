@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -12,6 +13,14 @@ from .moments import Moment
 MOST_MOMENTS = 12_000  # ten minutes at 20 a second
 MOST_BYTES = 256 << 20
 _OVERHEAD = 200  # bytes of a moment beside its contents
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicles:
+    """Crazyflies as their bridge sees them now."""
+
+    told: tuple[tuple[str, str, float, float, str], ...]  # name, state, battery in V, link quality 0 to 1, reason
+    answer: str = ""  # what has come of the last order
 
 
 class Track:
@@ -29,6 +38,8 @@ class Track:
         self._info: dict[str, Any] | None = None
         self._state = ""
         self._runs = 0
+        #: What is known of Crazyflies beside or without a run: replaced, never changed. None: there are none.
+        self.vehicles: Vehicles | None = None
 
     @property
     def info(self) -> tuple[int, dict[str, Any] | None]:

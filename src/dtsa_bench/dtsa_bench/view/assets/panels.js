@@ -23,20 +23,21 @@ const FIGURES = [
     return load ? [percent(load.success, 0), `collided ${percent(load.collision, 0)}, idle ${percent(load.idle, 0)}`, load.collision > 0.02 ? "bad" : ""] : ["–", ""];
   }],
   ["Agree on the sender", (run, row) => {
+    if (run.listener) return ["–", "not known to a listener"];
     const held = run.moments, first = Math.max(0, row - 20);
     let compared = 0, same = 0;
     for (let k = first; k <= row; k++) { compared += held.compared[k]; same += held.same[k]; }
     const tables = row >= 0 ? held.tables[row] : 0;
     return [compared ? percent(same / compared, 0) : "–", tables > 1 ? `${tables} different tables` : tables ? "all tables equal" : "", compared && same < compared ? "bad" : ""];
   }],
-  ["Closest pair", (run, row) => row < 0 ? ["–", ""] : [num(run.moments.closest[row], 3, "m"), run.moments.one[row] ? `cf${run.moments.one[row]} and cf${run.moments.other[row]}` : "", run.moments.closest[row] < run.collision_m ? "bad" : ""]],
+  ["Closest pair", (run, row) => row < 0 ? ["–", ""] : [num(run.moments.closest[row], 3, "m"), (run.moments.one[row] ? `cf${run.moments.one[row]} and cf${run.moments.other[row]}` : "") + (run.listener ? ", by their frames" : ""), run.moments.closest[row] < run.collision_m ? "bad" : ""]],
   ["Age, mean", (run, row) => {
     const held = run.moments, n = run.agents;
     let sum = 0, count = 0, most = 0;
     for (let k = 0; row >= 0 && k < n; k++) { const age = held.age[n * row + k]; if (age !== NOT_KNOWN) { sum += age; count++; most = Math.max(most, age); } }
-    return count ? [num(sum / count / 10, 1, "slots"), `worst agent ${num(most / 10, 1)}`] : ["–", ""];
+    return count ? [num(sum / count / 10, 1, "slots"), `${run.listener ? "here; " : ""}worst agent ${num(most / 10, 1)}`] : ["–", ""];
   }],
-  ["Channel's lag", (run, row) => run.mode === "realtime" && row >= 0 ? [num(run.moments.lag[row], 1, "ms"), `${whole(run.moments.stalls[row])} stalls`, run.moments.lag[row] > 500 * run.slot_s ? "bad" : ""] : ["–", "in lockstep nobody is late"]],
+  [run => run.listener ? "Frames leave late" : "Channel's lag", (run, row) => run.listener ? row < 0 ? ["–", ""] : [num(run.moments.lag[row], 1, "ms"), `${whole(run.moments.stalls[row])} datagrams not taken in`] : run.mode === "realtime" && row >= 0 ? [num(run.moments.lag[row], 1, "ms"), `${whole(run.moments.stalls[row])} stalls`, run.moments.lag[row] > 500 * run.slot_s ? "bad" : ""] : ["–", "in lockstep nobody is late"]],
 ];
 
 export class Panels {
@@ -44,16 +45,14 @@ export class Panels {
   constructor(run, order, choose) {
     this.run = run; this.choose = choose; this.listed = -1;
     this.values = FIGURES.map(() => [el("div", {class: "value"}), el("div", {class: "extra"})]);
-    this.figures = el("div", {class: "figures"}, ...FIGURES.map(([label], k) => el("div", {class: "figure"}, el("div", {class: "label"}, label), ...this.values[k])));
+    this.figures = el("div", {class: "figures"}, ...FIGURES.map(([label], k) => el("div", {class: "figure"}, el("div", {class: "label"}, typeof label === "string" ? label : label(run)), ...this.values[k])));
     this.rows = Array.from({length: run.agents}, (_, k) => this.row(k + 1));
     this.agents = el("section", {class: "agents"}, el("h2", {}, "Agents"),
-      el("p", {class: "what"}, "How many slots ago the others last heard each one. Choose one to see what it believes about the others: dashed, with the age in slots."),
+      el("p", {class: "what"}, run.listener ? "How many slots ago each one was last heard here." : "How many slots ago the others last heard each one. Choose one to see what it believes about the others: dashed, with the age in slots."),
       el("div", {class: "rows"}, ...this.rows.map(row => row.node)));
     this.list = el("ol", {class: "events"});
     this.events = el("section", {class: "log"}, el("h2", {}, "Events"), this.list);
     this.control = order ? this.orders(order) : null;
-    this.crazyflies = el("section", {class: "vehicles", hidden: ""});
-    this.order = order; this.flown = null;
   }
 
   row(id) {
@@ -105,27 +104,7 @@ export class Panels {
     this.tell();
   }
 
-  /* Crazyflies as their bridge sees them. To stop all motors takes two clicks within three seconds. */
-  showVehicles() {
-    const told = this.run.vehicles;
-    if (told === this.flown || !told.length) return;
-    this.flown = told;
-    if (this.crazyflies.hidden) {
-      this.crazyflies.hidden = false;
-      this.vehicleRows = el("tbody");
-      const stop = el("button", {type: "button", class: "danger", "data-order": "emergency", onclick: () => {
-        if (stop.dataset.sure) { this.order({kind: "emergency", value: "stop all motors"}); delete stop.dataset.sure; stop.textContent = "Emergency stop …"; return; }
-        stop.dataset.sure = "1"; stop.textContent = "Once more: all motors stop, all fall";
-        setTimeout(() => { delete stop.dataset.sure; stop.textContent = "Emergency stop …"; }, 3000);
-      }}, "Emergency stop …");
-      this.crazyflies.append(el("h2", {}, "Crazyflies"), el("table", {}, el("thead", {}, el("tr", {}, ...["", "State", "Battery", "Link"].map(name => el("th", {}, name)))), this.vehicleRows),
-        ...(this.order ? [el("div", {class: "line"}, el("button", {type: "button", "data-order": "land", onclick: () => this.order({kind: "land"})}, "Land all"), stop)] : []));
-    }
-    this.vehicleRows.replaceChildren(...told.map(([id, state, battery, link, reason]) => el("tr", {title: reason}, el("td", {}, `cf${id}`), el("td", {}, state), el("td", {}, num(battery, 2, "V")), el("td", {}, percent(link, 0)))));
-  }
-
   tell() {
-    this.showVehicles();
     const events = this.run.events, last = events.length ? events[events.length - 1] : null;
     if (last === this.listed) return;
     this.listed = last;

@@ -78,7 +78,7 @@ class LiveRecord {
 
 export class LiveRun {
   constructor(info, index) {
-    Object.assign(this, info, {index, crashes: [], events: [], lost: new Set(), state: "", watched: 0, dirty: true, time: 0});
+    Object.assign(this, info, {index, crashes: [], events: [], lost: new Set(), state: "", watched: 0, dirty: true, time: 0, begin: 0});
     const n = this.agents, ids = Array.from({length: n}, (_, k) => k + 1);
     this.scene = {ids, target: this.target};
     this.slots = {};
@@ -91,19 +91,31 @@ export class LiveRun {
     this.distance = new Series(["closest of all"]); this.ages = new Series(["mean of agents", "worst agent"]);
     this.shares = new Series(["success", "collision", "idle", "agents agree"]);
     this.counted = {slot: 0, sent: 0};
-    this.vehicles = []; // of Crazyflies: [id, state, battery (V), link quality, reason]
   }
 
   /* Takes in moments; number: of the first. */
   take(first, moments) {
     const held = this.moments;
-    if (!held.length && !held.dropped) this.number = first;
+    if (!held.length && !held.dropped) {
+      this.number = first;
+      if (moments.length) this.beginAt(moments[0]);
+    }
     else if (first !== this.number + held.dropped + held.length) { // some were gone before they could be sent
       held.drop(held.length); held.dropped = 0; this.number = first;
     }
     for (const moment of moments) this.takeOne(moment);
     this.dirty = true;
   }
+
+  /* Who comes late knows nothing of the slots before. */
+  beginAt(moment) {
+    const slot = new Uint32Array(bytes(moment.frames.slot)), at = new Uint32Array(bytes(moment.at));
+    this.record.first = Math.min(moment.slot, ...slot, ...at);
+    this.begin = this.record.first * this.slot_s;
+  }
+
+  /* The oldest time that is kept (s). */
+  get oldest() { return this.moments.dropped && this.moments.length ? this.moments.at[0] : this.begin; }
 
   takeOne(moment) {
     const n = this.agents, record = this.record, time = moment.slot * this.slot_s;
@@ -115,12 +127,11 @@ export class LiveRun {
     record.count = Math.max(record.count, moment.slot - record.first);
     const held = this.moments, row = held.more(1), near = record.frames ? closestOf(record.places, 3 * n * (record.frames - 1), n, this.scene.ids) : null;
     held.at[row] = time; held.compared[row] = moment.agree[0]; held.same[row] = moment.agree[1]; held.tables[row] = moment.tables;
-    held.lag[row] = moment.lag_ms ?? 0; held.stalls[row] = moment.stalls ?? 0; held.told[row] = 0;
+    held.lag[row] = moment.lag_ms ?? 0; held.stalls[row] = moment.stalls ?? moment.refused ?? 0; held.told[row] = 0;
     held.age.set(new Uint16Array(bytes(moment.age)), n * row); held.chosen.set(new Uint16Array(bytes(moment.chosen)), n * row);
     [held.closest[row], held.one[row], held.other[row]] = near ?? [NaN, 0, 0];
     this.time = Math.max(this.time, time);
     this.lost = new Set(moment.absent);
-    if (moment.vehicles) this.vehicles = moment.vehicles;
     for (const [slot, kind, text] of moment.events) this.events.push({time: slot * this.slot_s, kind, text});
     if (this.events.length > 300) this.events.splice(0, this.events.length - 300);
     for (const [slot, one, other, gap] of moment.crashes) this.takeCrash(slot, one, other, gap);

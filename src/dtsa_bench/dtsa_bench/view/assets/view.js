@@ -3,7 +3,10 @@
 import {Bodies} from "./bodies.js";
 import {LiveRun} from "./run.js";
 import {Panels} from "./panels.js";
+import {Crazyflies} from "./crazyflies.js";
 
+const MODES = {realtime: "real time", lockstep: "lockstep", udp: "on a network"};
+const LISTENER = "As one who listens on the network knows it: positions are those of the last frames, flown on until the next; ages are the listener's. Not known here: who received a frame, what the agents believe, whether they agree, and where they truly are. A slot in which nothing was heard counts as idle.";
 const FRAME_MS = 30, SLOW_MS = 90, LAG_S = 0.12, CHARTS_MS = 1000;
 sharpness.ratio = Math.min(2, devicePixelRatio || 1);
 Scene.bodies = Bodies.make;
@@ -22,7 +25,7 @@ root.append(el("header", {}, el("div", {}, el("p", {class: "kicker"}, "Live view
 const liveButton = el("button", {type: "button", class: "live", "aria-pressed": "false", onclick: () => follow(true)}, "Live");
 document.querySelector(".player > div").prepend(liveButton);
 const setClock = clock.set;
-clock.set = function (time) { follow(false); setClock.call(clock, time); };
+clock.set = function (time) { follow(false); setClock.call(clock, Math.max(+slider.min, time)); };
 function follow(on) {
   if (on && clock.playing) clock.toggle();
   live.on = on; live.play = false; liveButton.setAttribute("aria-pressed", String(on));
@@ -38,7 +41,7 @@ function tick(now) {
   const passed = Math.min(0.25, (now - before) / 1000);
   before = now;
   const shown = views.filter(Boolean), newest = Math.max(0, ...shown.map(view => view.run.time)), grown = shown.some(view => view.run.dirty);
-  if (grown) { DURATION = Math.max(0.001, newest); player.slot_s = shown[0].run.slot_s; }
+  if (grown) { slider.min = Math.min(newest, ...shown.map(view => view.run.oldest)); DURATION = Math.max(0.001, newest); player.slot_s = shown[0].run.slot_s; }
   if (now - live.charted > CHARTS_MS && grown) {
     live.charted = now;
     for (const view of shown) view.run.dirty = false;
@@ -63,8 +66,8 @@ function makeView(run) {
   const color = ["success", "collision", "idle"].map(name => () => theme.color(name));
   const series = (data, colors, most, unit, label, digits, suffix, limits = []) => lineChart({time: data.time, unit, label, digits, suffix, limits, height: 180, high: most,
     series: data.names.map((name, k) => ({name, values: data.values[k], color: colors[k], width: 1.6}))});
-  const node = el("div", {class: "run"}, el("h3", {class: "runname"}, el("span", {class: "dot", style: `background:${runColor(run.index)}`}), run.name), panels.figures,
-    el("div", {class: "stagebox"}, el("section", {class: "flight"}, drawn.node), el("div", {class: "side"}, panels.crazyflies, panels.control, panels.agents, panels.events)),
+  const node = el("div", {class: "run"}, el("h3", {class: "runname"}, el("span", {class: "dot", style: `background:${runColor(run.index)}`}), run.name), run.listener ? el("p", {class: "what listener"}, LISTENER) : null, panels.figures,
+    el("div", {class: "stagebox"}, el("section", {class: "flight"}, drawn.node), el("div", {class: "side"}, panels.control, panels.agents, panels.events)),
     el("section", {}, el("h2", {}, "Slots"), el("p", {class: "what"}, "Who sends in which slot, and why. The strip on top says what becomes of each slot. Click to go there."), strip.node, reasonLegend(run)),
     el("div", {class: "charts"},
       chart("Distances", "Between the two that are closest.", series(run.distance, [() => theme.color("ink")], () => Math.max(1, Math.min(3, run.distance.most)), "distance (m)", "Distance of the closest pair over time", 3, "m", [{name: `crash (${num(run.collision_m, 2, "m")})`, value: run.collision_m, color: "collision"}])),
@@ -98,16 +101,27 @@ function begin(message) {
   if (views[at]) { location.reload(); return; } // another run: everything anew
   const view = makeView(run);
   views[at] = view;
+  if (crazyflies[at]) view.node.querySelector(".side").prepend(crazyflies[at].node);
   main.replaceChildren(...views.filter(Boolean).map(one => one.node));
   root.classList.toggle("several", message.runs > 1);
   title.textContent = views.filter(Boolean).map(one => one.run.name).join("  ·  ");
   document.title = `${title.textContent} – DTSA`;
-  lede.textContent = message.runs === 1 ? `${run.agents} agents, ${run.moving.filter(Boolean).length} moving, policy ${run.policy}, estimator ${run.estimator}, avoider ${run.avoider}, ${run.mode === "realtime" ? "real time" : "lockstep"}` : "";
+  lede.textContent = message.runs === 1 ? `${run.agents} agents, ${run.moving.filter(Boolean).length} moving, policy ${run.policy}, estimator ${run.estimator}, avoider ${run.avoider}, ${MODES[run.mode] ?? run.mode}` : "";
   if (run.agents > 40) { scene.names = false; (scene.buttons.names ?? []).forEach(node => node.setAttribute("aria-pressed", "false")); }
   follow(Boolean(run.live));
   redrawAll();
   live.play = !run.live; // as soon as there is something
   document.documentElement.dataset.ready = "";
+}
+/* Beside a run where there is one; alone before it begins. */
+const crazyflies = [];
+function showVehicles(message) {
+  const at = message.run;
+  if (!crazyflies[at]) {
+    crazyflies[at] = new Crazyflies(DATA.control ? content => send({order: content}) : null);
+    (views[at] ? views[at].node.querySelector(".side") : main).prepend(crazyflies[at].node);
+  }
+  crazyflies[at].show(message.told, message.answer);
 }
 clock.listen(time => { for (const view of views) if (view) view.show(time); });
 
@@ -124,6 +138,7 @@ function connect() {
     if (message.kind === "begin") begin(message);
     else if (message.kind === "moments" && view) view.run.take(message.first, message.moments);
     else if (message.kind === "ghosts" && view) { view.run.takeGhosts(message); if (!clock.playing && !live.on) clock.tell(); }
+    else if (message.kind === "vehicles") showVehicles(message);
     else if (message.kind === "state" && view) { view.run.state = message.text; view.run.dirty = true; say(message.text || "live", message.text ? "plain" : "good"); }
     else if (message.kind === "answer") { live.answers.push(message.text); live.answers.splice(0, live.answers.length - 20); for (const one of views) if (one && one.panels.answer) one.panels.answer.textContent = message.text; }
   };

@@ -1,4 +1,4 @@
-"""A headless Chromium that a test steers by its own remote protocol (DevTools), with aiohttp and nothing else."""
+"""A headless Chromium that is steered by its own remote protocol (DevTools), with aiohttp and nothing else."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from types import TracebackType
 from typing import Any
 
 import aiohttp
+
+from .checks import met
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -34,6 +36,7 @@ class Browser:
     :param width: pixels.
     :param height: pixels.
     :param dark: whether it prefers dark pages.
+    :raises NotMet: where it does not start, or what it is asked for fails.
     """
 
     def __init__(self, directory: Path, width: int = 1400, height: int = 1000, dark: bool = False) -> None:
@@ -80,8 +83,8 @@ class Browser:
         told = self._profile / "DevToolsActivePort"
         deadline = time.monotonic() + PATIENCE_S
         while not told.is_file() or "\n" not in told.read_text():
-            assert time.monotonic() < deadline, "the browser does not start"
-            assert self._process.poll() is None, "the browser has ended"
+            met(time.monotonic() < deadline, "the browser does not start")
+            met(self._process.poll() is None, "the browser has ended")
             await asyncio.sleep(0.05)
         port = told.read_text().splitlines()[0]
         self._session = aiohttp.ClientSession()
@@ -117,7 +120,7 @@ class Browser:
         self._waiting[self._number] = answer = self._loop.create_future()
         await self._socket.send_str(json.dumps({"id": self._number, "method": method, "params": parameters}))
         content = await asyncio.wait_for(answer, PATIENCE_S)
-        assert "error" not in content, content
+        met("error" not in content, str(content))
         return content["result"]
 
     def open(self, url: str) -> None:
@@ -127,14 +130,14 @@ class Browser:
     def run(self, script: str) -> Any:
         """What an expression of JavaScript gives, as JSON types."""
         found = self._wait(self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True))
-        assert "exceptionDetails" not in found, found
+        met("exceptionDetails" not in found, str(found))
         return found["result"].get("value")
 
     def wait_for(self, condition: str) -> None:
         """Waits until an expression is true; one that fails is not true yet."""
         deadline = time.monotonic() + PATIENCE_S
         while not self.run(f"(() => {{ try {{ return Boolean({condition}); }} catch {{ return false; }} }})()"):
-            assert time.monotonic() < deadline, f"{condition} is not true; the page says {self._said}"
+            met(time.monotonic() < deadline, f"{condition} is not true; the page says {self._said}")
             time.sleep(0.05)
 
     def picture(self, path: Path | None = None) -> bytes:
@@ -148,9 +151,10 @@ class Browser:
         return data
 
     def heap(self) -> int:
-        """Bytes that the page's script uses, after a collection of garbage."""
+        """Bytes that the page's script uses, arrays among them, after a collection of garbage."""
         self._wait(self._call("HeapProfiler.collectGarbage"))
-        return int(self._wait(self._call("Runtime.getHeapUsage"))["usedSize"])
+        used = self._wait(self._call("Runtime.getHeapUsage"))
+        return int(used["usedSize"] + used.get("backingStorageSize", 0))
 
     def complaints(self) -> list[str]:
         """Errors that the page or its script have given."""
