@@ -47,6 +47,7 @@ setup(
             "genie-error = dtsa_bench.schemes:GenieError",
             "dominance = dtsa_bench.schemes:Dominance",
             "event-tdma = dtsa_bench.schemes:EventTdma",
+            "sense = dtsa_bench.schemes:Sense",
             "sotdma = dtsa_bench.schemes:Sotdma",
             "threshold-aloha = dtsa_bench.schemes:ThresholdAloha",
             "pure-aloha = dtsa_bench.schemes:PureAloha",

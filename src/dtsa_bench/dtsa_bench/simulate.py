@@ -17,6 +17,7 @@ from dtsa_agent.core import AbstractSwarm, Scenario, make_scenario
 from dtsa_agent.core.compiled import COMPILED
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.keys import with_key
+from dtsa_agent.plugin_watch import watched
 from dtsa_channel_sim import Channel
 from dtsa_channel_sim.model.verdict import SUCCESS
 
@@ -107,13 +108,12 @@ def simulate(
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
     shared = may_share(run) if shared_table is None else shared_table
-    swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared, core=core))
-    metrics = FlightMetrics(run, scenario, core)
     kept = Trace() if trace else None
-    if run.swarm.policy_row.unslotted:
-        _fly_unslotted(swarm, Channel(run.air), metrics, kept, observer, ages)
-    else:
-        _fly(swarm, Channel(run.air), metrics, kept, observer, ages)
+    with watched(run.swarm):
+        swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared, core=core))
+        metrics = FlightMetrics(run, scenario, core)
+        fly = _fly_unslotted if run.swarm.policy_row.unslotted else _fly
+        fly(swarm, Channel(run.air), metrics, kept, observer, ages)
     return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
 
 

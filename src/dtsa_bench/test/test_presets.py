@@ -17,7 +17,7 @@ from dtsa_bench.sweep.work import fly_one
 
 NAMED = (
     *("paper-12", "paper-18", "limits", "grid", "idle", "epsilon", "loss", "loss-idle"),
-    *("estimate", "trajectories", "scenarios"),
+    *("estimate", "trajectories", "scenarios", "access", "bounds"),
 )
 
 VOCABULARIES = {

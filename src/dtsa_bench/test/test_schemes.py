@@ -148,6 +148,16 @@ def test_dominance_prefers_those_who_turn() -> None:
     assert mean_error("dominance") < mean_error("tdma")
 
 
+def test_radios_that_listen_before_they_talk_need_no_leases() -> None:
+    """Without loss all have the same ranks; with it a few do that should not."""
+    sense, lease = (steady(policy, 12, 2, frame="extended").outcome for policy in ("sense", "lease"))
+    assert 0.5 < sense.age < lease.age
+    assert sense.collisions == 0
+    lossy = steady("sense", 12, 6, 0.3, frame="extended").outcome
+    assert 0 < lossy.collisions < 0.02 * lossy.slots
+    assert lossy.age < steady("lease", 12, 6, 0.3).outcome.age
+
+
 def test_every_scheme_flies_and_the_same_seed_gives_the_same_flight() -> None:
     for name in sorted(POLICIES.plug_ins()):
         if not POLICIES.factory(name).__module__.startswith("dtsa_bench.schemes"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,27 @@ from numpy.typing import NDArray
 from .errors import DtsaError, PluginError
 
 _METHODS = ("choose", "senders", "wake", "say", "heard", "slot_over", "estimate", "command")
+
+
+class Overdue(BaseException):
+    """Ends a call that does not return. No plug-in that catches its own errors catches it."""
+
+
+class Call:
+    """One call of a plug-in.
+
+    :param part: what is called: kind, name and method.
+    """
+
+    __slots__ = ("fault", "part")
+
+    def __init__(self, part: str) -> None:
+        self.part = part
+        self.fault = ""  # said by whoever ends it
+
+
+#: The call of a plug-in that each thread is in, by the thread's identifier: for a watch, which has a clock.
+RUNNING: dict[int, Call] = {}
 
 
 class Guarded:
@@ -112,11 +134,17 @@ class Guarded:
 
 def _guarded(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: object) -> Any:
+        thread, running = get_ident(), Call(part)
+        RUNNING[thread] = running
         try:
             return function(*arguments)
         except DtsaError:
             raise
+        except Overdue:
+            raise PluginError(part, running.fault) from None
         except Exception as error:
             raise PluginError.raised(part, error) from error
+        finally:
+            RUNNING.pop(thread, None)
 
     return call

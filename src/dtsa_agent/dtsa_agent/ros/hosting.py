@@ -15,6 +15,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.core.settings import Settings, setting
 from dtsa_agent.keys import with_key
+from dtsa_agent.plugin_watch import watched
 
 from .common import names
 from .common.loop import Stop
@@ -87,6 +88,19 @@ def host_agents(
     """
     if shared and not shareable(config):
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
+    with watched(config):
+        _run_agents(node, ids, config, stop, space, shared, spaces)
+
+
+def _run_agents(
+    node: Node,
+    ids: Sequence[int],
+    config: SwarmConfig,
+    stop: Stop,
+    space: str,
+    shared: bool,
+    spaces: Sequence[str] | None,
+) -> None:
     host = HostSettings(**declare_settings(node, HostSettings))
     swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared and host.mode == "lockstep"))
     if host.mode == "lockstep":

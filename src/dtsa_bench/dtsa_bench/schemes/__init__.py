@@ -7,9 +7,11 @@ Each is announced by entry point in the group ``dtsa.policies``, so ``--policy g
 from .contention import Dominance, ThresholdAloha
 from .event_tdma import EventTdma
 from .genie import GenieAge, GenieError
+from .sense import Sense
 from .sotdma import Sotdma
 from .unslotted import Beacons, Csma, PureAloha
 
 __all__ = [
-    "Beacons", "Csma", "Dominance", "EventTdma", "GenieAge", "GenieError", "PureAloha", "Sotdma", "ThresholdAloha",
+    "Beacons", "Csma", "Dominance", "EventTdma", "GenieAge", "GenieError", "PureAloha", "Sense", "Sotdma",
+    "ThresholdAloha",
 ]  # fmt: skip
