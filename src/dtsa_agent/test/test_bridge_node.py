@@ -12,7 +12,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import yaml
@@ -33,6 +35,8 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Empty, Trigger  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
+from dtsa_agent.crazyflie import bridge_node  # noqa: E402
+from dtsa_agent.crazyflie.state_machine import State  # noqa: E402
 from dtsa_bench.fly.domain import ros_domain  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
@@ -204,6 +208,18 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
             assert fleet.events(k, "land")
             assert fleet.flown(k)[2] == "landed"
         assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
+
+
+@pytest.mark.parametrize(("state", "code"), [(State.READY, 0), (State.LOST, 1)])
+def test_one_that_is_lost_on_the_way_down_is_named_at_the_end(state: State, code: int) -> None:
+    bridge, said = MagicMock(), []
+    bridge.in_air.return_value = ["cf1", "cf2"]
+    bridge.wait_landed.return_value = []
+    bridge.vehicles = {"cf1": SimpleNamespace(state=State.READY), "cf2": SimpleNamespace(state=state)}
+    node = SimpleNamespace(bridge=bridge, say=lambda level, line: said.append(line))
+    assert bridge_node._end(node, SimpleNamespace(count=1)) == code  # type: ignore[arg-type]
+    assert ("not known to have landed: cf2" in said) == bool(code)
+    bridge.close.assert_called_once_with()
 
 
 @flown_again_when_overloaded

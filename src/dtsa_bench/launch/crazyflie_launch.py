@@ -11,11 +11,14 @@ The first Ctrl-C lands all, a second one stops all motors. A mission brings its 
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 from ament_index_python.packages import get_package_prefix
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction, Shutdown
+from launch.events import matches_action
+from launch.events.process import SignalProcess
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -36,10 +39,13 @@ def _processes(context: LaunchContext) -> list:
         raise ConfigError("config", config, "the path of a swarm's YAML file")
     load_swarm(Path(config))  # what is wrong with it is said before anything starts
     actions = []
+    over = [Shutdown(reason="the Crazyflies have landed")]
     if LaunchConfiguration("simulated").perform(context) == "true":
-        fleet = [_bench("fake_crazyflie"), "--config", config, "--quiet"]
-        actions.append(ExecuteProcess(cmd=fleet, output="screen", name="fake_crazyflie"))
-    over = Shutdown(reason="the Crazyflies have landed")
+        words = [_bench("fake_crazyflie"), "--config", config, "--quiet", "--ignore-interrupt"]
+        fleet = ExecuteProcess(cmd=words, output="screen", name="fake_crazyflie", sigterm_timeout=LAND_S)
+        actions.append(fleet)
+        end = SignalProcess(signal_number=signal.SIGTERM, process_matcher=matches_action(fleet))
+        over.append(EmitEvent(event=end))
     if LaunchConfiguration("mission").perform(context) == "true":
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         out = LaunchConfiguration("out").perform(context)

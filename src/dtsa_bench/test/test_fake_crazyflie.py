@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import signal
 import socket
 import struct
 import subprocess
 import sys
+import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -217,9 +219,13 @@ def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "control port of a running fleet" in capsys.readouterr().err
 
 
-def test_a_running_fleet_answers_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ignores", [False, True])
+def test_a_running_fleet_answers_and_ends_with_ctrl_c_unless_others_still_have_to_land_it(
+    ignores: bool, tmp_path: Path
+) -> None:
     port, truth = free_base_port(2), tmp_path / "truth.jsonl"
     command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--count", "2", "--base-port", str(port)]
+    command += ["--ignore-interrupt"] if ignores else []
     with subprocess.Popen([*command, "--truth", str(truth)], stdout=subprocess.PIPE, text=True) as process:
         try:
             lines = [process.stdout.readline() for _ in range(3)]  # type: ignore[union-attr]
@@ -232,8 +238,11 @@ def test_a_running_fleet_answers_and_ends_with_ctrl_c(tmp_path: Path) -> None:
                 host.connect(("127.0.0.1", port - 1))
                 host.send(b"nonsense")
                 assert json.loads(host.recv(512))["ok"] is False
+            if ignores:
+                process.send_signal(signal.SIGINT)
+                time.sleep(0.1)
             assert cli.main(["--fault", "freeze", "--cf", "2", "--seconds", "0.2", "--base-port", str(port)]) == 0
-            process.send_signal(2)
+            process.send_signal(signal.SIGTERM if ignores else signal.SIGINT)
             assert process.wait(10) == 0
         finally:
             process.kill()

@@ -33,6 +33,7 @@ from dtsa_agent.crazyflie.positions import PositionSettings
 from dtsa_agent.crazyflie.preflight import FAIL, preflight
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
+from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.priority import stay_on_one_processor, take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
@@ -240,7 +241,7 @@ def check_node(node: BridgeNode, say: Callable[[str], None]) -> int:
 def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
     bridge = node.bridge
     bridge.end_heartbeat()  # from here on the bridge alone brings them down
-    flying = bridge.in_air(time.monotonic())
+    flying = first = bridge.in_air(time.monotonic())
     if flying:
         node.say("warn", f"landing {', '.join(flying)}; Ctrl-C again stops all motors")
         bridge.land_all("the bridge ends")
@@ -250,8 +251,11 @@ def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
         time.sleep(0.3)  # three packets a vehicle, then the links may close
     elif flying:
         node.say("error", f"still flying: {', '.join(flying)}")
+    lost = [name for name in first if name not in flying and bridge.vehicles[name].state == State.LOST]
+    if lost:
+        node.say("error", f"not known to have landed: {', '.join(lost)}")
     bridge.close()
-    return 0 if interrupts.count == 1 and not flying else 1
+    return 0 if interrupts.count == 1 and not (flying or lost) else 1
 
 
 def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = run_node) -> int:

@@ -46,6 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--priority", metavar="N", default="30", help="real-time priority, 0 to 90: the world waits for nobody [30]"
     )
     parser.add_argument("--quiet", action="store_true", help="no status line")
+    parser.add_argument(
+        "--ignore-interrupt",
+        action="store_true",
+        help="Ctrl-C is for whoever flies them, who still has to land them; SIGTERM ends them",
+    )
     radio = parser.add_argument_group("simulated radios", "Crazyradios in place of UDP; simulation only")
     radio.add_argument(
         "--simulated-radio",
@@ -156,6 +161,8 @@ def run(args: argparse.Namespace) -> int:
     take_priority(priority)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: fleet.stop())
+    if args.ignore_interrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     for uri in fleet.config.uris:
         print(uri)
     print(
