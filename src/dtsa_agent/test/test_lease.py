@@ -370,6 +370,42 @@ def test_turns_are_spread_evenly_over_those_that_move() -> None:
     assert 2.5 <= np.mean(ages) < 3.1  # (6 - 1) / 2 is the bound
 
 
+def test_movers_that_are_few_are_spaced_evenly() -> None:
+    """They give turns of their own away, too, but none waits for longer than a round; with losses they keep them."""
+    for agents, movers in ((12, 2), (12, 3), (18, 5)):
+        air = Air(make(agents, movers)).run(1800)
+        gaps = [np.diff([t for t in range(900, 1800) if air.sent[t] == (k,)]) for k in range(1, movers + 1)]
+        assert max(each.max() for each in gaps) <= agents
+        ages = [((each**2).sum() / each.sum() - 1.0) / 2.0 for each in gaps]
+        assert np.mean(ages) < (movers - 1) / 2 * 1.16 + 0.12  # (N_p - 1) / 2 is the bound; anchors, OPEN turns
+    given = [t for t in range(900, 1800) if t % 18 < 5 and air.sent[t] and air.sent[t] != (t % 18 + 1,)]
+    assert not any(is_anchor(t, 18) for t in given)
+    assert len(given) > 100
+    lossy = Air(make(18, 5), loss=0.1).run(1800).sent
+    assert sum(lossy[t] == (t % 18 + 1,) for t in range(900, 1800) if t % 18 < 5) > 0.95 * 250
+
+
+def test_who_knows_where_all_want_to_be_gives_turns_away_from_the_first_round_on() -> None:
+    """But not to those who are known to stand at their targets, nor where nobody knows that."""
+    for known in (False, True):
+        plain = still(12)
+        target = plain.target.copy()
+        target[0, [4, 9]] += 20.0
+        swarm = Swarm(
+            SwarmConfig(agents=12, policy="lease", avoider="none"),
+            Scenario(plain.start, target, plain.moving, goals_known=known),
+        )
+        swarm.active[:] = 0
+        air = Air(swarm).run(36)
+        assert air.sent[:12] == [(slot + 1,) for slot in range(12)]
+        said = {byte for slot in range(12) for byte in air.frames[slot].leases} - {0, OPEN}
+        assert said == {5, 10}
+        first = [slot for slot in range(12) if any(air.frames[slot].leases)]
+        assert (first[0] == 0) is known
+        late = sum(air.sent[slot] in ((5,), (10,)) for slot in range(12, 36))
+        assert (late >= 20) is known
+
+
 @pytest.mark.parametrize(("agents", "every"), [(3, 5), (5, 2), (2, 8)])
 def test_small_swarms_that_hear_late_relay_no_turn_that_nobody_gave_away(agents: int, every: int) -> None:
     """24 slots reach beyond their memory of (M + 2) N turns."""

@@ -8,6 +8,7 @@
  *   who has something to say, and who knows that it will rest          (goals)
  *   whether a turn is given away, and to whom of those not thought dead (contents; choose_lessee is prove_lessee)
  *   which turns are OPEN                                               (contents; is_open is prove_open)
+ *   whether a mover gives turns away                                   (contents; it may always, and need not)
  *   whom a speaker thinks dead, and whether a hearer thought it dead   (all that absence, silence and gossip can lead to)
  *   whether the wait that ends probation with adoption is over         (ages)
  *   whether an OPEN turn is taken, whether gossip names a waker        (draws, gossip)
@@ -104,9 +105,12 @@ static void start(void)
     config.r_min = 0.3;
     config.position_step = 0.002;
     config.lease.share = 1.0;
+    config.targets_known =
+        1; /* who is not heard of is known to set out: leases of any depth from the first round on */
     config.lease.patience = PATIENCE;
     config.start = places;
     config.target = places + 3 * n;
+    for (int k = 0; k < n; k++) places[3 * n + k] = 5.0;
     each = dtsa_agent_bytes(&config);
     memory = malloc(each * (size_t)n);
     for (int k = 0; k < n; k++) {
@@ -283,7 +287,7 @@ static void speak(int k, uint8_t *frame)
         a->table->in_ap[other] = 1;
         v.miss[other] = v.quiet[other] = 0;
     }
-    /* moving; idle, all of its turns given away; idle, none of them */
+    /* moving, those up to its next anchor given away or not; idle, all of its turns given away; idle, none of them */
     const int mood = own && !v.a->probation ? choose(dead ? 3 : 2) : 0;
     v.a->moving = mood == 0;
     v.a->idle_since = mood ? slot : -1;

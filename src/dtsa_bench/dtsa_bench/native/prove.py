@@ -17,10 +17,13 @@ _SPEED = "-O2"
 
 
 ANY = -1  # any number of times
-# Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody), and which are OPEN.
+# Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody), which are OPEN, and
+# whether movers give turns away (they may).
 _CHOICE = "choose_lessee(v, &who, turn)"
 _FREE_CHOICE = "prove_lessee(who.able, v->n)"
 _OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, &who, turn)", "mine && prove_open()"
+_LENDS, _FREE_LENDS = "few_move && v->a->lost < FEW;", "(few_move || 1);"
+_KEEPS = "(!idle && keeps(v, &who, turn))"
 _HEADER = '#include "lease.h"\n'
 _DECLARED = "int prove_lessee(const uint8_t *able, int count);\nint prove_open(void);\n"
 
@@ -156,6 +159,8 @@ def build(directory: Path, mutant: Mutant | None = None) -> Path:
     shutil.copytree(LEASE, copy, dirs_exist_ok=True)
     _replace(copy / "issue.c", _CHOICE, _FREE_CHOICE)
     _replace(copy / "issue.c", _OPEN_TURN, _FREE_OPEN_TURN)
+    _replace(copy / "issue.c", _LENDS, _FREE_LENDS)
+    _replace(copy / "issue.c", _KEEPS, "0")
     _replace(copy / "issue.c", _HEADER, f"{_HEADER}{_DECLARED}")
     if mutant is not None:
         _replace(copy / mutant.file, mutant.right, mutant.wrong)

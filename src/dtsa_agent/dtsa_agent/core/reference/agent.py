@@ -87,7 +87,7 @@ class Agent:
             return encode(own, rules.position_step)
         said = Said()
         if rules.policy == "lease":
-            said = say(self.memory, self.index, self.table.rows, slot, self.final, self.present == LEAVES)
+            said = say(self.memory, self.index, self.table, slot, self.final, self.present == LEAVES)
         used = -(-len(said.leases) // SECTION_BYTES) + bool(said.relay)
         carried = gossip.collect(self.table, self.index, slot, SECTIONS - used, rules) if rules.gossip else ()
         return encode_extended(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from ..arithmetic import minus, norm
 from ..frame_extended import LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH
-from ..table import Row
+from ..table import Table
 from .memory import MISSED, Lease, Memory
 
+FEW = 0.5  # more missed frames than this in 8 N slots: movers keep their turns
 BUSY = 0.5  # more wakers than this in N slots: a second OPEN turn
 
 
@@ -32,6 +33,8 @@ class Electorate:
     rests: list[bool]  # live, are not in A_p and not in probation: they give turns away, as far as is known
     settled: list[bool]  # of these, who knows that it will rest
     block: int  # one turn in so many is OPEN; 0: none
+    informed: bool  # all have spoken, or all know where all want to be
+    lends: bool  # movers give turns away, too: most rest, all of them settled, and no frames are lost
     last: list[int]  # slot in which each sent last, or is foreseen to send
     rights: list[list[int]] = field(default_factory=list)  # slots to come in which each is known to send
 
@@ -41,12 +44,12 @@ class Electorate:
         return sum(self.able)
 
 
-def say(memory: Memory, self_index: int, rows: Sequence[Row], slot: int, final: bool, leaves: bool) -> Said:
+def say(memory: Memory, self_index: int, table: Table, slot: int, final: bool, leaves: bool) -> Said:
     """What the agent's frame says about turns; the turns that it gives away are noted.
 
     :param memory: what the agent remembers.
     :param self_index: its own number, id - 1.
-    :param rows: its table.
+    :param table: its table.
     :param slot: the slot in which it sends.
     :param final: it knows that no further goal is scheduled for it.
     :param leaves: it will be switched off after its next own turn.
@@ -57,7 +60,7 @@ def say(memory: Memory, self_index: int, rows: Sequence[Row], slot: int, final: 
     c_s = count_absent_before(memory, self_index, slot) if claims else 0
     leases = b""
     if own_turn:
-        leases = issue(memory, self_index, rows, slot, c_s, 0 if leaving else None, final)
+        leases = issue(memory, self_index, table, slot, c_s, 0 if leaving else None, final)
     return Said(c_s, leaving, leases, relay(memory, self_index, slot, own_is_said=bool(leases)))
 
 
@@ -69,22 +72,39 @@ def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
     return count
 
 
-def electorate(memory: Memory, self_index: int, rows: Sequence[Row], slot: int, final: bool) -> Electorate:
+def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: bool) -> Electorate:
     """Who may be given a turn, and who else there is.
 
     :param final: the agent itself knows that no further goal is scheduled for it.
     """
-    agents = range(memory.rules.agents)
-    alive = [k == self_index or memory.alive(k) for k in agents]
-    able = [alive[k] and rows[k].in_ap and not memory.quiet[k] and memory.missed[k] < MISSED for k in agents]
+    rows, agents = table.rows, range(memory.rules.agents)
+    presumed = [is_presumed(memory, table, k, slot) for k in agents]
+    alive = [k == self_index or presumed[k] or memory.alive(k) for k in agents]
+    moves = [sets_out(memory, table, k) if presumed[k] else rows[k].in_ap for k in agents]
+    able = [alive[k] and moves[k] and not memory.quiet[k] and memory.missed[k] < MISSED for k in agents]
     able[self_index] = memory.moving
-    rests = [alive[k] and not rows[k].in_ap and not memory.quiet[k] for k in agents]
+    rests = [alive[k] and not moves[k] and not memory.quiet[k] for k in agents]
     rests[self_index] = not memory.moving and not memory.probation
-    settled = [rests[k] and memory.settled[k] for k in agents]
+    settled = [rests[k] and (presumed[k] or memory.settled[k]) for k in agents]
     settled[self_index] = rests[self_index] and final
+    informed = slot >= memory.rules.agents or table.known_goals is not None
+    few_move = sum(rests) == sum(settled) > 0 and 3 * sum(able) < memory.rules.agents
+    lends = informed and few_move and memory.lost < FEW
     last = [row.sent_slot if row.sent_slot >= 0 else slot - memory.rules.agents for row in rows]
     block = open_block(memory.rules.agents, memory.rules.open_every, memory.wakers, sum(rests), sum(settled))
-    return Electorate(sum(alive), able, rests, settled, block, last)
+    return Electorate(sum(alive), able, rests, settled, block, informed, lends, last)
+
+
+def is_presumed(memory: Memory, table: Table, k: int, slot: int) -> bool:
+    """Whether nothing is known of an agent but where it starts and wants to be: in the first round."""
+    first_round = memory.born == 0 and slot < memory.rules.agents
+    return first_round and table.known_goals is not None and table.rows[k].sent_slot < 0
+
+
+def sets_out(memory: Memory, table: Table, k: int) -> bool:
+    """Whether an agent has something to say when it starts (eq:remaining_t_slots)."""
+    assert table.known_goals is not None
+    return norm(minus(table.known_goals[k], table.start[k])) > memory.rules.r_min
 
 
 def open_block(agents: int, every: int, wakers: float, resting: int, settled: int) -> int:
@@ -112,14 +132,20 @@ def open_block(agents: int, every: int, wakers: float, resting: int, settled: in
 
 
 def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
-    """How many of its next turns an idle agent gives away: all if it is final, else floor(c x idle rounds)."""
+    """How many of its next turns an agent gives away: all if it rests and is final, else floor(c x idle rounds).
+
+    A mover gives away those up to its next anchor, where less than a third moves, all that rest are settled and no frames
+    are lost.
+    """
     rules = memory.rules
-    if memory.idle_since < 0 or not who.members or memory.deaf:
+    if not who.members or memory.deaf:
         return 0
     if who.members > rules.lease_share * who.alive:
         return 0
+    if memory.idle_since < 0:
+        return rules.anchor_every if who.lends else 0
     if final:
-        return 1 if slot < rules.agents else rules.main_every  # in the first round not all have spoken
+        return rules.main_every if who.informed else 1
     turns = rules.depth_rate * (slot - memory.idle_since) / rules.agents
     return int(min(turns, rules.anchor_every))
 
@@ -136,11 +162,17 @@ def is_spare(memory: Memory, who: Electorate, turn: int) -> bool:
     """Whether a turn is one that its owner gives away, as far as is known."""
     owner = memory.owner(turn)
     kept = memory.is_main(turn) if who.settled[owner] else memory.is_anchor(turn)
-    return who.rests[owner] and not kept
+    return who.rests[owner] and turn >= memory.rules.agents and not kept
+
+
+def is_lent(memory: Memory, who: Electorate, turn: int) -> bool:
+    """Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known."""
+    free = turn >= memory.rules.agents and turn not in memory.leases and not memory.is_anchor(turn)
+    return who.lends and who.able[memory.owner(turn)] and free
 
 
 def issue(
-    memory: Memory, self_index: int, rows: Sequence[Row], slot: int, c_s: int, own_depth: int | None, final: bool
+    memory: Memory, self_index: int, table: Table, slot: int, c_s: int, own_depth: int | None, final: bool
 ) -> bytes:
     """The lease bytes of a frame in an own turn: what was given away before is said again, what is new is noted.
 
@@ -148,56 +180,73 @@ def issue(
     :param own_depth: how many own turns at most; None: as :func:`depth` says.
     :returns: a byte a turn, up to the last that is given away.
     """
-    who = electorate(memory, self_index, rows, slot, final)
+    who = electorate(memory, self_index, table, slot, final)
+    idle = memory.idle_since >= 0
     foreseen = slot + 1  # up to here, excluded
     rounds_mine = depth(memory, who, slot, final) if own_depth is None else own_depth
-    rounds_adopted = memory.rules.anchor_every if memory.idle_since >= 0 else 1
+    rounds_adopted = memory.rules.anchor_every if idle else 1
     said = []
     for turn in memory.turns_of_leases(slot, c_s, LEASE_ROOM):
         mine = memory.owner(turn) == self_index
         rounds_ahead = -(-(turn - slot) // memory.rules.agents)  # rounded up
-        if mine and not final and memory.is_anchor(turn):
+        if mine and not (final and idle) and memory.is_anchor(turn):
             rounds_mine = 0
         reach = rounds_mine if mine else rounds_adopted
         if turn not in memory.leases and rounds_ahead <= reach and not memory.probation:
             lessee = 0
-            if mine and is_open(memory, who, turn):
+            if idle and mine and is_open(memory, who, turn):
                 lessee = OPEN
             elif who.members and (mine or not memory.deaf):
                 if foreseen == slot + 1:
-                    who.rights = look_ahead(memory, slot)
+                    who.rights = look_ahead(memory, who, slot)
                 foresee(memory, self_index, who, range(foreseen, turn))
                 foreseen = turn
                 lessee = choose_lessee(memory, who, turn) + 1
+                if mine and (lessee == self_index + 1 or (not idle and keeps(memory, who, turn))):
+                    lessee = 0
             if lessee:
                 memory.leases[turn] = Lease(lessee, self_index + 1)
         said.append(memory.leases[turn].lessee if turn in memory.leases else 0)
     return bytes(said).rstrip(b"\0")
 
 
-def look_ahead(memory: Memory, slot: int) -> list[list[int]]:
+def look_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
     """For each agent the slots to come in which it is known to send."""
     rights: list[list[int]] = [[] for _ in range(memory.rules.agents)]
     for turn in range(slot + 1, slot + memory.window):
         sender = memory.scheduled(turn)
-        if sender >= 0:
+        if sender >= 0 and not is_lent(memory, who, turn):
             rights[sender].append(turn)
     return rights
 
 
 def foresee(memory: Memory, self_index: int, who: Electorate, turns: range) -> None:
-    """Who will send in the turns to come: as far as is known; else, where the owner is settled, whom it will choose."""
+    """Who will send in the turns to come: as far as is known; else whom a settled owner or a mover will choose."""
     for turn in turns:
         sender, owner = memory.scheduled(turn), memory.owner(turn)
-        unsaid = turn not in memory.leases and who.settled[owner] and owner != self_index
-        if unsaid and is_spare(memory, who, turn) and not is_open(memory, who, turn):
+        spare = turn not in memory.leases and who.settled[owner] and is_spare(memory, who, turn)
+        lent = is_lent(memory, who, turn) and not keeps(memory, who, turn)
+        if owner != self_index and (lent or (spare and not is_open(memory, who, turn))):
             sender = choose_lessee(memory, who, turn)
         if sender >= 0:
             who.last[sender] = turn
 
 
+def keeps(memory: Memory, who: Electorate, turn: int) -> bool:
+    """Whether a mover keeps a turn of its own, for without it it would wait for longer than a round.
+
+    No later turn in that time is its, or can be given to it.
+    """
+    owner = memory.owner(turn)
+    end = who.last[owner] + memory.rules.agents
+    if any(turn < right <= end for right in who.rights[owner]):
+        return False
+    unsaid = (t for t in range(turn + 1, end + 1) if t not in memory.leases)
+    return not any(is_spare(memory, who, t) or is_lent(memory, who, t) for t in unsaid)
+
+
 def choose_lessee(memory: Memory, who: Electorate, turn: int) -> int:
-    """To whom a turn is worth most: the able agent with the largest p min(n, N_p + 1), then the lowest id; -1: nobody.
+    """To whom a turn is worth most: the able agent with the largest p min(n, N_p), then the lowest id; -1: nobody.
 
     p and n are the distances from the turn to that agent's previous and next slot, as far as they are known or
     foreseen; p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases
@@ -210,7 +259,7 @@ def choose_lessee(memory: Memory, who: Electorate, turn: int) -> int:
     def worth(k: int) -> int:
         before = min(turn - who.last[k], most)
         after = next((right - turn for right in who.rights[k] if right > turn), most)
-        return before * min(after, who.members + 1)
+        return before * min(after, who.members)
 
     able = [k for k in range(memory.rules.agents) if who.able[k]]
     return max(able, key=worth, default=-1)  # the first of several

@@ -1,14 +1,17 @@
 /* Policy lease: what an agent says about turns: those it gives away, and those it knows to be given away. */
+#include <math.h>
 #include <string.h>
 
 #include "lease.h"
 
-static const double BUSY = 0.5;
+static const double BUSY = 0.5, FEW = 0.5;
 
 typedef struct {
-    int alive;       /* N_alive: me and those heard of lately */
-    int members;     /* N_p: those in A_p that do not miss their turns */
-    int block;       /* one turn in so many is OPEN, 0: none */
+    int alive;    /* N_alive: me and those heard of lately */
+    int members;  /* N_p: those in A_p that do not miss their turns */
+    int block;    /* one turn in so many is OPEN, 0: none */
+    int informed; /* all have spoken, or all know where all want to be */
+    int lends; /* movers give turns away, too: most rest, all of them settled, and no frames are lost */
     int64_t *last;   /* (n) last slot in which each sent, or is foreseen to send */
     int64_t *next;   /* (n) next slot in which each is known to send */
     uint16_t *again; /* (w) slots from each turn to the next one of the same agent */
@@ -40,6 +43,25 @@ static int open_block(int every, const lease_scope *v, int resting, int settled)
     return block;
 }
 
+/* Whether nothing is known of an agent but where it starts and wants to be: in the first round. */
+static int is_presumed(const dtsa_agent *agent, const lease_scope *v, int k, int64_t slot)
+{
+    const dtsa_table *table = agent->table;
+    return v->a->born == 0 && slot < v->n && table->config->targets_known && k != agent->self &&
+           table->sent_slot[k] < 0;
+}
+
+/* Whether an agent has something to say when it starts. */
+static int sets_out(const dtsa_config *c, int k)
+{
+    double e2 = 0.0;
+    for (int i = 0; i < 3; i++) {
+        const double d = c->target[i * c->agents + k] - c->start[i * c->agents + k];
+        e2 += d * d;
+    }
+    return sqrt(e2) > c->r_min;
+}
+
 static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int64_t slot,
                              electorate *who)
 {
@@ -55,18 +77,23 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
     who->list = who->sure + v->n;
     who->alive = who->members = 0;
     for (int k = 0; k < v->n; k++) {
-        const int alive = k == self || lease_alive(v, k, slot);
+        const int presumed = is_presumed(agent, v, k, slot);
+        const int alive = k == self || presumed || lease_alive(v, k, slot);
         const int quiet = k == self ? v->a->probation : v->quiet[k];
-        const int moving = k == self ? v->a->moving : table->in_ap[k];
+        const int says = presumed ? sets_out(table->config, k) : table->in_ap[k];
+        const int moving = k == self ? v->a->moving : says;
         who->able[k] = k == self ? moving : alive && moving && !quiet && v->miss[k] < LEASE_MISSED;
         who->rests[k] = alive && !moving && !quiet;
         if (who->able[k]) who->list[who->members++] = (uint8_t)k;
         who->alive += alive;
         resting += who->rests[k];
-        who->sure[k] = who->rests[k] && (k == self ? agent->final : v->settled[k]);
+        who->sure[k] = who->rests[k] && (k == self ? agent->final : presumed || v->settled[k]);
         settled += who->sure[k];
         who->last[k] = table->sent_slot[k] < 0 ? slot - v->n : table->sent_slot[k];
     }
+    who->informed = slot >= v->n || table->config->targets_known;
+    const int few_move = settled && settled == resting && 3 * who->members < v->n;
+    who->lends = who->informed && few_move && v->a->lost < FEW;
     who->block = open_block(table->config->lease.open_every, v, resting, settled);
 }
 
@@ -78,7 +105,8 @@ static int count_absent_before(const lease_scope *v, int self, int64_t slot)
     return count;
 }
 
-/* To whom a turn is worth most: the longest wait before it, times the wait that follows. -1: nobody is able. */
+/* To whom a turn is worth most: the longest wait before it, times the wait that follows, as far as that is short. -1: nobody
+ * is able. */
 static int choose_lessee(const lease_scope *v, const electorate *who, int64_t turn)
 {
     int best = -1;
@@ -87,7 +115,7 @@ static int choose_lessee(const lease_scope *v, const electorate *who, int64_t tu
         const int k = who->list[i];
         const int64_t wait = turn - who->last[k], rest = who->next[k] - turn;
         const long before = wait <= v->n ? (long)wait : v->n + 1;
-        const long after = rest <= who->members ? (long)rest : who->members + 1;
+        const long after = rest < who->members ? (long)rest : who->members;
         if (best < 0 || before * after > worth) {
             best = k;
             worth = before * after;
@@ -100,8 +128,15 @@ static int choose_lessee(const lease_scope *v, const electorate *who, int64_t tu
 static int is_spare(const lease_scope *v, const electorate *who, int64_t turn)
 {
     const int owner = (int)(turn % v->n);
-    if (!who->rests[owner]) return 0;
+    if (!who->rests[owner] || turn < v->n) return 0;
     return who->sure[owner] ? !lease_is_main(v, turn) : !lease_is_anchor(v, turn);
+}
+
+/* Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known. */
+static int is_lent(const lease_scope *v, const electorate *who, int64_t turn)
+{
+    return who->lends && who->able[turn % v->n] && turn >= v->n && !lease_is_anchor(v, turn) &&
+           v->lessee[turn % v->window] == LEASE_NONE;
 }
 
 /* One turn in each block is for those who wake: the first one that its owner gives away. */
@@ -119,15 +154,28 @@ static void look_ahead(const lease_scope *v, electorate *who, int64_t slot)
     for (int k = 0; k < v->n; k++) who->next[k] = INT64_MAX;
     for (int64_t t = slot + v->window - 1; t > slot; t--) {
         const int k = lease_scheduled(v, t);
-        if (k < 0) continue;
+        if (k < 0 || is_lent(v, who, t)) continue;
         const int64_t rest = who->next[k] - t;
         who->again[t % v->window] = (uint16_t)(rest < UINT16_MAX ? rest : UINT16_MAX);
         who->next[k] = t;
     }
 }
 
-/* Who will send in the slots before a turn: as far as is known, and where a settled owner has not said it yet, the one to whom
- * it will be worth most.
+/* Whether a mover keeps a turn of its own, for without it it would wait for longer than a round: no later turn in that time
+ * is its, or can be given to it. */
+static int keeps(const lease_scope *v, const electorate *who, int64_t turn)
+{
+    const int owner = (int)(turn % v->n);
+    const int64_t end = who->last[owner] + v->n;
+    if (who->next[owner] <= end) return 0;
+    for (int64_t t = turn + 1; t <= end; t++)
+        if (v->lessee[t % v->window] == LEASE_NONE && (is_spare(v, who, t) || is_lent(v, who, t)))
+            return 0;
+    return 1;
+}
+
+/* Who will send in the slots before a turn: as far as is known, and where a settled owner or a mover has not said it yet, the
+ * one to whom it will be worth most.
  *
  * from: the first of these slots. */
 static void foresee(const lease_scope *v, electorate *who, int self, int64_t from, int64_t turn)
@@ -136,21 +184,22 @@ static void foresee(const lease_scope *v, electorate *who, int self, int64_t fro
         const int owner = (int)(t % v->n), given = v->lessee[t % v->window];
         int k = lease_scheduled(v, t);
         if (k >= 0 && who->next[k] == t) who->next[k] = t + who->again[t % v->window];
-        if (given == LEASE_NONE && who->sure[owner] && owner != self && is_spare(v, who, t) &&
-            !is_open(v, who, t))
-            k = choose_lessee(v, who, t);
+        const int spare = given == LEASE_NONE && who->sure[owner] && is_spare(v, who, t);
+        const int lent = is_lent(v, who, t) && !keeps(v, who, t);
+        if (owner != self && (lent || (spare && !is_open(v, who, t)))) k = choose_lessee(v, who, t);
         if (k >= 0) who->last[k] = t;
     }
 }
 
-/* How many of its next turns an idle agent gives away. */
+/* How many of its next turns an agent gives away. */
 static int depth(const dtsa_agent *agent, const lease_scope *v, const electorate *who, int64_t slot)
 {
     const dtsa_lease_config *c = &agent->table->config->lease;
     const lease_agent *a = v->a;
-    if (a->idle_since < 0 || !who->members || a->deaf > LEASE_DEAF) return 0;
+    if (!who->members || a->deaf > LEASE_DEAF) return 0;
     if (who->members > c->share * who->alive) return 0;
-    if (agent->final) return slot < v->n ? 1 : v->main; /* in the first round not all have spoken */
+    if (a->idle_since < 0) return who->lends ? v->every : 0;
+    if (agent->final) return who->informed ? v->main : 1;
     const double turns = c->depth_rate * (double)(slot - a->idle_since) / v->n;
     return turns < v->every ? (int)turns : v->every;
 }
@@ -162,22 +211,24 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
     const int self = agent->self, count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
     int64_t from = slot + 1;
     count_electorate(agent, v, slot, &who);
-    const int adopted = v->a->idle_since >= 0 ? v->every : 1;
+    const int idle = v->a->idle_since >= 0, adopted = idle ? v->every : 1;
     int own = e->leaving ? 0 : depth(agent, v, &who, slot);
     for (int i = 0; i < count; i++) {
         const int64_t turn = turns[i];
         const int mine = turn % v->n == self;
         uint8_t *given = &v->lessee[turn % v->window];
-        if (mine && !agent->final && lease_is_anchor(v, turn)) own = 0;
+        if (mine && !(agent->final && idle) && lease_is_anchor(v, turn)) own = 0;
         if (*given == LEASE_NONE && (turn - slot + v->n - 1) / v->n <= (mine ? own : adopted) &&
             !v->a->probation) {
-            if (mine && is_open(v, &who, turn)) {
+            if (idle && mine && is_open(v, &who, turn)) {
                 *given = LEASE_OPEN;
             } else if (who.members && (mine || v->a->deaf <= LEASE_DEAF)) {
                 if (from == slot + 1) look_ahead(v, &who, slot);
                 foresee(v, &who, self, from, turn);
                 from = turn;
                 *given = (uint8_t)(choose_lessee(v, &who, turn) + 1);
+                if (mine && (*given == self + 1 || (!idle && keeps(v, &who, turn))))
+                    *given = LEASE_NONE;
             }
             if (*given != LEASE_NONE) v->issuer[turn % v->window] = (uint8_t)(self + 1);
         }

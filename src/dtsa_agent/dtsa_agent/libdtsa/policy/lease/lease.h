@@ -5,8 +5,9 @@
 #include "../policy.h"
 
 enum {
-    LEASE_DEAF = 4,  /* more silent slots in a row than this, and an agent is presumed deaf */
-    LEASE_MISSED = 4 /* who missed so many expected turns gets no leases */
+    LEASE_DEAF = 4,   /* more silent slots in a row than this, and an agent is presumed deaf */
+    LEASE_MISSED = 4, /* who missed so many expected turns gets no leases */
+    LEASE_MEMORY = 8  /* rounds in which missed frames are counted */
 };
 
 /* State of one agent; followed in memory by heard (n), lessee (w), issuer (w), miss (n), quiet (n),
@@ -19,6 +20,7 @@ typedef struct lease_agent {
         woke; /* slot in which it woke or joined and since when nobody is known to have heard it, -1: none */
     int64_t claimed;  /* slot in which probation began or was last confirmed */
     double wakers;    /* agents that woke lately: about so many in the last n slots */
+    double lost;      /* frames missed lately: about so many in the last 8 n slots */
     int32_t expected; /* 0-based agent expected in this slot, -1: nobody in particular */
     int32_t deaf;     /* silent slots in a row */
     uint8_t started, heard_now, probation, anchored, attempts, moving, leaving;
