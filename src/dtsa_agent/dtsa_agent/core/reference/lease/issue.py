@@ -134,8 +134,8 @@ def open_block(agents: int, every: int, wakers: float, resting: int, settled: in
 def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
     """How many of its next turns an agent gives away: all if it rests and is final, else floor(c x idle rounds).
 
-    A mover gives away those up to its next anchor, where less than a third moves, all that rest are settled and no frames
-    are lost.
+    A mover gives away those up to its next anchor, where less than a third moves, all that rest are settled and no
+    frames are lost.
     """
     rules = memory.rules
     if not who.members or memory.deaf:
