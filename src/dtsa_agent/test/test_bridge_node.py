@@ -28,7 +28,7 @@ from builtin_interfaces.msg import Duration  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from dtsa_msgs.msg import Position, Status, VelocityWorld  # noqa: E402
 from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff  # noqa: E402
-from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
+from geometry_msgs.msg import Point, PoseStamped, TwistStamped  # noqa: E402
 from metronome import flown_again_when_overloaded  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
@@ -106,6 +106,7 @@ def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Gr
         config.write_text(yaml.safe_dump(data))
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         command = [sys.executable, "-m", "dtsa_agent.crazyflie.bridge_node", "--ros-args", "-p", f"config:={config}"]
+        command += ["-p", "teleop:=cf2"]
         process = subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -195,6 +196,20 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         )
         assert not answer.success
         assert "cf3: duration 0.10 s is too short for 0.50 m" in answer.message
+        # A person steers cf2 along its heading; nobody else listens.
+        place, q = graph.place(2), graph.last["/cf2/odom"].pose.pose.orientation
+        steering = graph.node.create_publisher(TwistStamped, "/cf2/cmd_vel", 1)
+        wait_for(lambda: steering.get_subscription_count() == 1)
+        assert not graph.node.get_subscriptions_info_by_topic("/cf1/cmd_vel")
+        forward = TwistStamped()
+        forward.twist.linear.x = 9.0
+        for _ in range(25):
+            steering.publish(forward)
+            time.sleep(0.02)
+        way = [b - a for a, b in zip(place, graph.place(2), strict=True)]
+        yaw = 2 * math.atan2(q.z, q.w)
+        assert way[0] * math.cos(yaw) + way[1] * math.sin(yaw) > 0.1
+        assert math.hypot(*way) < 0.8
         # The stream ends: the bridge holds. Landing one by service, the others by Ctrl-C.
         answer = graph.call(Land, "/cf3/land", height=0.0, duration=Duration(nanosec=200_000_000))
         assert answer.success

@@ -12,7 +12,7 @@ from typing import Any
 from builtin_interfaces.msg import Duration as DurationMsg
 from dtsa_msgs.msg import FullState, Hover, Position, VelocityWorld
 from dtsa_msgs.srv import Arm, GoTo, Land, NotifySetpointsStop, Takeoff
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, TwistStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Empty as EmptyMsg
@@ -22,6 +22,8 @@ from dtsa_agent.crazyflie import units
 from dtsa_agent.crazyflie.bridge import Bridge
 from dtsa_agent.crazyflie.limits import check_stream
 from dtsa_agent.crazyflie.pump import CommandPump
+from dtsa_agent.crazyflie.state_machine import State
+from dtsa_agent.crazyflie.steering import steered
 from dtsa_agent.crazyflie.units import to_world
 from dtsa_agent.crazyflie.vehicle import Vehicle
 
@@ -89,6 +91,7 @@ class Inputs:
         self._say = say
         self._node, self._bridge, self._pump = node, bridge, pump
         self._origin = bridge.settings.station.room_origin_in_world
+        self.teleop = ""  # name of the vehicle that a person steers; empty: of none
 
     def offer(self) -> None:
         """Create everything; `/all/emergency` is last: whoever waits for it knows that everything else is there."""
@@ -103,6 +106,10 @@ class Inputs:
                 self._pump.subscribe(kind, f"{name}/{topic}", partial(self._command, vehicle, callback), LATEST_ONLY)
             self._create_services(name, [name])
             self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
+        if self.teleop:
+            vehicle = self._bridge.vehicles[self.teleop]
+            callback = partial(self._command, vehicle, partial(self._steer, vehicle))
+            self._pump.subscribe(TwistStamped, f"{vehicle.name}/cmd_vel", callback, LATEST_ONLY)
         self._pump.start()
         self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.heartbeat(), LATEST_ONLY)
         self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
@@ -170,6 +177,14 @@ class Inputs:
 
     def _hover(self, m: Any, stamp: float) -> units.Setpoint:
         return units.hover(m.vx, m.vy, m.yaw_rate, m.z_distance, stamp)
+
+    @staticmethod
+    def _steer(vehicle: Vehicle, m: TwistStamped, stamp: float) -> units.Setpoint:
+        last = vehicle.last
+        if vehicle.state != State.FLYING or last is None:
+            raise ValueError(f"it is {vehicle.state.name.lower()}: it is steered between take-off and landing only")
+        v, w = m.twist.linear, m.twist.angular
+        return steered((v.x, v.y, v.z), w.z, last, vehicle.station, stamp)
 
     # -- services ---------------------------------------------------------------------------------------------------
     def _groups(self, name: str) -> int:

@@ -47,6 +47,10 @@ INTERFACES_DESCRIPTOR = ParameterDescriptor(
     description="whose messages, names and units: dtsa or crazyswarm2", read_only=True, dynamic_typing=True
 )
 
+TELEOP_DESCRIPTOR = ParameterDescriptor(
+    description="name of the vehicle that a person steers by cmd_vel; empty: of none", read_only=True
+)
+
 
 def safety_parameters(node: Node, given: SafetySettings) -> SafetySettings:
     """Declare one parameter a safety setting; a parameter that was set beats the YAML's value.
@@ -113,6 +117,9 @@ class BridgeNode(Node):
         if not given:
             raise ConfigError("config", "", "the path of a swarm's YAML file")
         settings = load_swarm(Path(given))
+        teleop = str(self.declare_parameter("teleop", "", TELEOP_DESCRIPTOR).value)
+        if teleop not in ("", *(robot.name for robot in settings.robots)):
+            raise ConfigError("teleop", teleop, "one of " + ", ".join(robot.name for robot in settings.robots))
         safety = safety_parameters(self, settings.station.safety)
         positions = position_parameters(self, settings.station.positions)
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
@@ -122,6 +129,7 @@ class BridgeNode(Node):
         self.pump = CommandPump(self._commands)
         self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
         self._inputs = (Inputs if foreign is None else foreign.inputs)(self, self.bridge, self.pump, self.say)
+        self._inputs.teleop = teleop
         self._cameras = helper_node(self, "positions") if positions.on else None
         self.positions = CommandPump(self._cameras) if self._cameras is not None else None
         if self.positions is not None:
