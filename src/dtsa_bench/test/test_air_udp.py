@@ -26,6 +26,7 @@ from dtsa_agent.stop import Stop
 from dtsa_bench.air.agent_bag import read
 from dtsa_bench.air.merge import merge, verified
 from dtsa_bench.air.timeline import Crossing, fit
+from dtsa_bench.cli import main
 from dtsa_bench.view.air import AirSource
 from dtsa_bench.view.track import MOST_MOMENTS, Track
 
@@ -227,6 +228,16 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> No
         cut.write_bytes(bad)
         with pytest.raises(DtsaError):
             merge([read(cut)])
+
+
+@pytest.mark.parametrize("command", ["verify", "report", "export"])
+def test_commands_for_other_bags_say_what_is_meant_for_these(
+    flight: Flight, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(flight.bags[0])]) == 2
+    said = capsys.readouterr().err
+    assert "`tools/dtsa merge`" in said
+    assert len(said.splitlines()) == 1
 
 
 def test_bags_that_do_not_belong_together_are_refused(flight: Flight) -> None:

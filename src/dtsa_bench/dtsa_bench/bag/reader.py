@@ -28,6 +28,8 @@ from dtsa_bench.bag.errors import BagError, UnusableBag
 from dtsa_bench.bag.place import find_file
 
 PACKED_MESSAGES = "its messages are compressed one by one; `ros2 bag convert` makes a plain bag of it"
+MERGED = "recorded on a network: `tools/dtsa merge` verifies the bags of all agents of a flight and has its results"
+_ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 
 class Message(NamedTuple):
@@ -113,6 +115,8 @@ class Bag:
         for identifier, channel in sorted(summary.channels.items()):
             schema = summary.schemas.get(channel.schema_id)
             if channel.message_encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
+                if schema is not None and schema.name.startswith(_ON_A_NETWORK):
+                    raise UnusableBag(self.given, MERGED)
                 encoding = f"{channel.message_encoding}/{schema.encoding if schema else 'no schema'}"
                 raise UnusableBag(
                     self.given,

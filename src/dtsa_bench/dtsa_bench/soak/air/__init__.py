@@ -9,11 +9,12 @@ from typing import Any
 from dtsa_bench.batch.task import Row
 from dtsa_bench.soak.item import Item, Soak
 
-from . import cost, flights
+from . import cost, flights, multirotor_flight
 
 
 def _run(item: Item, directory: Path) -> dict[str, Any]:
-    return (cost if item.settings.get("cost") else flights).run(item, directory)
+    module = cost if item.settings.get("cost") else multirotor_flight if item.settings.get("rotorpy") else flights
+    return module.run(item, directory)
 
 
 def _figures(rows: Sequence[Row]) -> dict[str, Any]:
@@ -27,7 +28,7 @@ SOAK = Soak(
     f"ages are the simulator's to {flights.AGE_MARGIN:.0%}; after kills, stand-stills, partitions, jamming, and among "
     "forged frames, all take part again. Seventy agents on one computer are as punctual as a bare timer, at half the "
     "cost of ROS nodes.",
-    (*flights.cold_starts(), *flights.faults(), *cost.items()),
+    (*flights.cold_starts(), *flights.faults(), *cost.items(), *multirotor_flight.items()),
     _run,
     _figures,
 )
