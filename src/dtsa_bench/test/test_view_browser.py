@@ -160,7 +160,10 @@ def test_a_lockstep_flight_tells_its_page_the_same_as_its_bag(tmp_path: Path) ->
                     break
         return got
 
-    with viewed_flight(tmp_path / "run", "--agents", "4", "--processes", "1", "--no-picture") as (process, url):
+    schedule = tmp_path / "channel.yaml"
+    schedule.write_text("schedule: [{slot: 100, until: 150, jam: true}]")
+    words = ("--agents", "4", "--processes", "1", "--no-picture", "--channel", str(schedule))
+    with viewed_flight(tmp_path / "run", *words) as (process, url):
         told = asyncio.run(moments(url))
         process.wait(PATIENCE_S)
     run = load_run(tmp_path / "run")
@@ -170,4 +173,9 @@ def test_a_lockstep_flight_tells_its_page_the_same_as_its_bag(tmp_path: Path) ->
     assert slots.tolist() == run.frames.slot[known].tolist()
     assert senders.tolist() == run.frames.sender[known].tolist()
     assert told[-1]["slot"] >= len(run.slots) - 1
-    assert any("the run has ended: completed" in event[2] for one in told for event in one["events"])
+    events = [event for one in told for event in one["events"]]
+    assert any("the run has ended: completed" in event[2] for event in events)
+    jam = [[100, "air", "jam is True from now on"], [150, "air", "jam is False from now on"]]
+    assert [event for event in events if event[1] == "air"] == jam
+    recorded = track_of(tmp_path / "run").since(0, MOST_MOMENTS)[1]
+    assert [e for one in recorded for e in json.loads(one.text)["events"] if e[1] == "air"] == jam

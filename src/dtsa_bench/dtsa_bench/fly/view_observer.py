@@ -50,7 +50,7 @@ class ViewObserver(ChannelObserver):
         carry_out: Callable[[Order], str],
     ) -> None:
         self._link, self._measurement, self._pace, self._carry_out = link, measurement, pace, carry_out
-        self._moments = Moments(measurement.scenario, run.swarm.slot_ns)
+        self._moments = Moments(measurement.scenario, run.swarm.slot_ns, run.air)
         self._oracle = run.swarm.estimator_row.needs_everybody
         self._agents = run.swarm.agents
         self._slot = 0
@@ -58,7 +58,11 @@ class ViewObserver(ChannelObserver):
         self._crashed = False
         self._answers: Answers | None = None
         self._ended = "over"
-        info = run_info(name, run, measurement.scenario) | {"live": True, "control": link.control}
+        info = run_info(name, run, measurement.scenario) | {
+            "live": True,
+            "control": link.control,
+            "kills": pace is not None,
+        }
         link.offer(record(BEGIN, 0, json.dumps(info)))
 
     def all_answered(self, slot: int, answers: Answers) -> None:
@@ -102,8 +106,7 @@ class ViewObserver(ChannelObserver):
             self._moments.event(self._slot, "back", f"cf{agent} takes part")
 
     def settings_changed(self, change: Change) -> None:
-        values = ", ".join(f"{name} is {value!r}" for name, value in change.values)
-        self._moments.event(change.slot, "air", f"{values} from now on")
+        self._moments.change(change)
 
     def idle(self, status: ChannelStatus) -> None:
         for content in self._link.orders()[:_MOST_ORDERS]:

@@ -27,14 +27,14 @@ from dtsa_channel_sim.model.verdict import SUCCESS
 
 from .checks import met
 from .chromium import CHROMIUM, Browser
-from .flights import PATIENCE_S, command, dtsa
+from .flights import PATIENCE_S, command, dtsa, end_all, until
 from .item import Item, Soak
 
 _NONE, _CLIENT, _PAGE = "nobody looks", "a client that does not render", "a page"
 _LOCKSTEP_PAIRS, _REALTIME_ROUNDS = 6, 3
 _FLIGHT = ("--agents", "12", "--no-picture", "--no-stop-on-crash")
 _MODES = {
-    "lockstep": ("--processes", "1", "--tail-s", "30"),
+    "lockstep": ("--processes", "1", "--tail-s", "60"),
     "realtime": ("--mode", "realtime", "--policy", "lease", "--slot-ms", "10", "--processes", "2", "--tail-s", "6"),
 }
 _SLOWER = 1.05  # with a client that does not render, at most
@@ -93,27 +93,27 @@ def _flight(directory: Path, mode: str, looker: str, seed: int) -> dict[str, Any
 
 
 def _watched(words: Sequence[str], looker: str, directory: Path) -> None:
-    with subprocess.Popen(
-        command(*words, "--view"),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
+    with (directory / "said.txt").open("w") as said:
+        nothing = subprocess.DEVNULL
+        process = subprocess.Popen(command(*words, "--view"), stdin=nothing, stdout=nothing, stderr=said)
         try:
-            assert process.stderr is not None
-            line = process.stderr.readline()
-            met(line.startswith("view: "), f"no page: {line}")
+            until(lambda: process.poll() is not None or "\n" in _said(directory), "the page is served")
+            met(_said(directory).startswith("view: "), f"no page: {_said(directory)[-300:]}")
+            url = _said(directory).split()[1]
             if looker == _PAGE:
                 with Browser(directory) as browser:
-                    browser.open(line.split()[1])
+                    browser.open(url)
                     process.wait(PATIENCE_S)
             else:
-                asyncio.run(_read(line.split()[1]))
+                asyncio.run(_read(url))
                 process.wait(PATIENCE_S)
         finally:
-            process.kill()
-    met(process.returncode == 0, "the flight fails")
+            end_all(process)
+        met(process.returncode == 0, f"the flight fails: {_said(directory).strip()[-300:]}")
+
+
+def _said(directory: Path) -> str:
+    return (directory / "said.txt").read_text(encoding="utf-8", errors="replace")
 
 
 async def _read(url: str) -> None:

@@ -62,7 +62,7 @@ class Follower:
         self.agents, self.steps = agents, steps
         self._tables = self._make_tables(run)
         self._oracle = run.swarm.estimator_row.needs_everybody
-        self._moments = Moments(self.scenario, run.swarm.slot_ns)
+        self._moments = Moments(self.scenario, run.swarm.slot_ns, run.air)
         self._every = self._wanted or self._moments.place_slots
         self._way = np.repeat(np.ascontiguousarray(self.scenario.start)[None], steps, axis=0)  # (S, 3, N) m
         self._chosen = np.zeros(agents, np.uint16)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from dtsa_agent.core import REASONS, AbstractSwarm, Scenario
 from dtsa_bench.report.data import flatten, pack
 from dtsa_bench.run_config import RunConfig
+from dtsa_channel_sim import Change, ChannelConfig
+from dtsa_channel_sim.model.timeline import scheduled_changes
 
 PLACES_HZ = 20.0  # positions in a simulated second
 MOST_FRAMES = 4000  # frames told in one moment: of more than these the last
@@ -77,9 +79,11 @@ class Moments:
 
     :param scenario: the run's scenario.
     :param slot_ns: ns, length of a slot.
+    :param air: the channel's settings: what changes by their schedule is told; None: nothing does.
     """
 
-    def __init__(self, scenario: Scenario, slot_ns: int) -> None:
+    def __init__(self, scenario: Scenario, slot_ns: int, air: ChannelConfig | None = None) -> None:
+        self._scheduled = deque([] if air is None else scheduled_changes(air))
         self.agents = scenario.start.shape[1]
         self.place_slots = max(1, round(1e9 / PLACES_HZ / slot_ns))  # slots from one position to the next
         self._moving = scenario.moving
@@ -134,6 +138,14 @@ class Moments:
         """
         self._events.append((slot, kind, text))
 
+    def change(self, change: Change) -> None:
+        """Takes in that settings of the channel have changed.
+
+        :param change: what, and when.
+        """
+        values = ", ".join(f"{name} is {value!r}" for name, value in change.values)
+        self.event(change.slot, "air", f"{values} from now on")
+
     def crash(self, slot: int, pair: tuple[int, int], distance_m: float) -> None:
         """Takes in that two agents have crashed.
 
@@ -161,6 +173,8 @@ class Moments:
         :param absent: ids of agents that have fallen silent.
         :param more: further values for the page.
         """
+        while self._scheduled and self._scheduled[0].slot <= slot:
+            self.change(self._scheduled.popleft())
         gone = sorted(absent)
         rows = np.array(self._frames, dtype=np.int64).reshape(-1, 5)
         kinds = zip(("slot", "sender", "outcome", "reason", "received"), ("<u4", "<u2", "u1", "u1", "u1"), strict=True)

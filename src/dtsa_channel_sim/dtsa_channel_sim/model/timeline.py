@@ -48,7 +48,7 @@ class Timeline:
         self._changes: list[Change] = []
         self._slots: list[int] = [0]  # slots at which settings change, ascending
         self._configs: list[ChannelConfig] = [self._base]
-        for change in _flattened(config):
+        for change in scheduled_changes(config):
             self.add(change)
 
     def add(self, change: Change) -> None:
@@ -83,8 +83,11 @@ class Timeline:
         return Epoch(self._slots[i], end, self._configs[i])
 
 
-def _flattened(config: ChannelConfig) -> Iterable[Change]:
-    """Turn entries with an end into changes that stay, at most one per slot."""
+def scheduled_changes(config: ChannelConfig) -> Iterable[Change]:
+    """Turn entries of the schedule, which may end, into changes that stay, at most one per slot.
+
+    :param config: the settings with their schedule.
+    """
     named = {name for entry in config.schedule for name, _ in entry.values}
     edges = sorted({e.slot for e in config.schedule} | {e.until for e in config.schedule if e.until is not None})
     before = {name: getattr(config, name) for name in named}

@@ -76,7 +76,7 @@ export class Panels {
     const partition = el("input", {type: "text", placeholder: groups, "aria-label": "groups of a partition", size: 16});
     const button = (text, content, name) => el("button", {type: "button", "data-order": name, onclick: () => order(content())}, text);
     return el("section", {class: "orders"}, el("h2", {}, "Control"),
-      this.run.mode === "realtime" ? el("div", {class: "line"}, agent, button("Kill", () => ({kind: "kill", agent: +agent.value}), "kill"), button("Start", () => ({kind: "start", agent: +agent.value}), "start")) : null,
+      this.run.kills ? el("div", {class: "line"}, agent, button("Kill", () => ({kind: "kill", agent: +agent.value}), "kill"), button("Start", () => ({kind: "start", agent: +agent.value}), "start")) : null,
       el("div", {class: "line"}, loss, "% loss", button("Set", () => ({kind: "loss", value: Math.min(1, Math.max(0, +loss.value / 100))}), "loss")),
       el("div", {class: "line"}, button("Jam", () => ({kind: "jam", value: true}), "jam"), button("Stop jamming", () => ({kind: "jam", value: false}), "clear")),
       el("div", {class: "line"}, partition, button("Part", () => ({kind: "partition", value: partition.value || groups}), "part"), button("Join", () => ({kind: "partition", value: ""}), "join")),

@@ -67,7 +67,7 @@ function makeView(run) {
   const series = (data, colors, most, unit, label, digits, suffix, limits = []) => lineChart({time: data.time, unit, label, digits, suffix, limits, height: 180, high: most,
     series: data.names.map((name, k) => ({name, values: data.values[k], color: colors[k], width: 1.6}))});
   const node = el("div", {class: "run"}, el("h3", {class: "runname"}, el("span", {class: "dot", style: `background:${runColor(run.index)}`}), run.name), run.listener ? el("p", {class: "what listener"}, LISTENER) : null, panels.figures,
-    el("div", {class: "stagebox"}, el("section", {class: "flight"}, drawn.node), el("div", {class: "side"}, panels.control, panels.agents, panels.events)),
+    el("div", {class: "stagebox"}, el("div", {class: "stagecolumn"}, el("section", {class: "flight"}, drawn.node), panels.control), el("div", {class: "side"}, panels.agents, panels.events)),
     el("section", {}, el("h2", {}, "Slots"), el("p", {class: "what"}, "Who sends in which slot, and why. The strip on top says what becomes of each slot. Click to go there."), strip.node, reasonLegend(run)),
     el("div", {class: "charts"},
       chart("Distances", "Between the two that are closest.", series(run.distance, [() => theme.color("ink")], () => Math.max(1, Math.min(3, run.distance.most)), "distance (m)", "Distance of the closest pair over time", 3, "m", [{name: `crash (${num(run.collision_m, 2, "m")})`, value: run.collision_m, color: "collision"}])),
