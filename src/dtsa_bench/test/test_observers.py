@@ -13,7 +13,7 @@ from node_helpers import end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_msgs.msg import Frame, Process, Report
+from dtsa_msgs.msg import Frame, Process, Report, Slot
 from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig
@@ -22,6 +22,7 @@ from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.stamps import header_of
 from dtsa_bench.fly.recorded_channel import RecordedFlight
 from dtsa_bench.run_config import RunConfig, RunLimits
@@ -172,17 +173,10 @@ class LateSender(ChannelObserver):
     def idle(self, status: ChannelStatus) -> None:
         run_id, slot_ns = self._channel.run_id, self._channel.slot_ns
         slot = max(0, round((time.monotonic() - self._begin_s) * 1e9) // slot_ns + 5) if self._begin_s else 0
-        nothing = [0.0] * 6
         settings = {"agents": 2, "slot_ms": slot_ns / 1e6, "steps": 1, "mode": "realtime"}
         shown = {"settings": json.dumps(settings), "settings_hash": settings_hash(settings)}
         self._processes.publish(Process(run=run_id, process=1, node="/test", agent=[1, 2], **shown))
-        self._reports.publish(
-            Report(
-                run=run_id, agent=[1, 2], slot=[slot], offset_ns=[0, 0], length=[0, 0],
-                chosen=[0, 0], reason=[0, 0], digest=[0, 0], score=[0.0, 0.0],
-                steps=1, track=nothing, velocity=nothing, command=nothing, goal=nothing,
-            )
-        )  # fmt: skip
+        self._report(slot if self._begin_s else names.FIRST_CALL)
         if slot > 50 and not self._sent:
             self._sent = True
             for agent, start in ((1, slot - 40), (2, slot)):
@@ -190,11 +184,59 @@ class LateSender(ChannelObserver):
                 data = encode_frame(RadioFrame(agent, slot, 1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
                 self._air.publish(Frame(header=header, run=run_id, slot=slot, agent=agent, data=data))
 
+    def _report(self, slot: int, place: float = 0.0) -> None:
+        places, nothing = [place] * 6, [0.0] * 6
+        self._reports.publish(
+            Report(
+                run=self._channel.run_id, agent=[1, 2], slot=[slot], offset_ns=[0, 0], length=[0, 0],
+                chosen=[0, 0], reason=[0, 0], digest=[0, 0], score=[0.0, 0.0],
+                steps=1, track=places, velocity=nothing, command=nothing, goal=nothing,
+            )
+        )  # fmt: skip
+
     def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         for row, sender in enumerate(verdict.senders):
             assert verdict.received is not None
             assert verdict.collided is not None
             self.frames.append((sender, verdict.received[row].tolist(), verdict.collided[row]))
+
+
+class LateAnswers(LateSender):
+    """Answers all calls but the first one when the run has begun, and says then that everybody is somewhere else."""
+
+    def __init__(self, node: Node, channel: RealtimeChannel) -> None:
+        super().__init__(node, channel)
+        self.slots = Feed(node, Slot, f"{names.SWARM}/{names.SLOT}", names.lockstep_qos(64))
+        self.late: list[int] = []
+        self.places: set[float] = set()
+
+    def begun(self, at_s: float) -> None:
+        super().begun(at_s)
+        while (message := self.slots.take()) is not None:
+            if message.phase == Slot.PREPARE and message.slot != names.FIRST_CALL:
+                self.late.append(message.slot)
+        for number in self.late:
+            self._report(number, 9.0)
+
+    def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        self.places.update(answers.position.ravel().tolist())
+
+
+@pytest.mark.ros
+def test_an_answer_to_a_call_that_comes_late_is_not_taken_for_what_was_done_in_a_slot(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        node = Node("channel", context=graph.node.context, enable_rosout=False)
+        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, referee=SlotLimit(40))
+        late = LateAnswers(graph.node, channel)
+        channel.observe(late)
+        try:
+            channel.run(stop=False)
+        finally:
+            late.slots.close()
+            channel.close()
+            node.destroy_node()
+    assert late.late
+    assert late.places == {0.0}
 
 
 @pytest.mark.ros

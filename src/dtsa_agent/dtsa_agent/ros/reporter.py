@@ -41,7 +41,7 @@ class Reporter:
     def add_slot(self, slot: int, offset_ns: NDArray[np.int64]) -> None:
         """Takes note of what all agents have decided for a slot, and of where they are; before they fly on.
 
-        :param slot: the slot.
+        :param slot: the slot; before slot 0 the number of a call.
         :param offset_ns: (L,) ns, start of each agent's slot or transmission, from the channel's start of the slot.
         """
         swarm, rows = self._swarm, self._rows
@@ -84,7 +84,8 @@ class Reporter:
             "heard_ns": array("q", at_ns).tobytes(),
             "heard_by": b"".join(self._heard_by),
         }
-        time_ns = names.slot_time_ns(self._slots[-1] if self._slots else 0, self._slot_ns)
+        last = self._slots[-1] if self._slots else 0
+        time_ns = names.slot_time_ns(last if last < names.FIRST_CALL else 0, self._slot_ns)
         self._publisher.publish(pack_report(time_ns, run_id, self._swarm.config.steps, rows))
         self._slots = []
         for values in self._rows.values():

@@ -53,8 +53,10 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
     verified = verify_bag(result.directory)
     if not verified.ok:
         raise NotMet(f"the recovered bag is not what the protocol gives: {verified.difference}")
-    if not verified.broken_off or verified.slots < 1:
+    if not verified.broken_off:
         raise NotMet("the recovered bag does not say that it breaks off")
+    if verified.slots < 1 and killed_s - growth[0][0] > _LOST_S:
+        raise NotMet(f"no slot is saved of {killed_s - growth[0][0]:.2f} s")
     if lost_s > _LOST_S:
         raise NotMet(f"{lost_s:.2f} s of wall time are lost")
     return {"mode": item.settings["mode"], "slots": verified.slots, "lost_s": round(lost_s, 3)}

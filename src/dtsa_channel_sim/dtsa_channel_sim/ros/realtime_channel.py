@@ -372,6 +372,8 @@ class RealtimeChannel(RosChannel):
             self._meet_processes()
         self.roster.check_sender(message.agent, self._reports.number, time.monotonic(), self._reports.sender)
         now = self._now()
+        if len(message.slot) and message.slot[0] >= names.FIRST_CALL:
+            return  # an answer to a call, which has come late
         self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
         heard = np.array(message.agent, dtype=np.intp) - 1
         self._heard_ns[heard] = np.maximum(self._heard_ns[heard], now)

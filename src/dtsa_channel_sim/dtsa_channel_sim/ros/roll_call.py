@@ -9,6 +9,7 @@ import numpy as np
 from dtsa_msgs.msg import Slot
 from rclpy.publisher import Publisher
 
+from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.report_fields import read_report
 
@@ -33,6 +34,7 @@ class RollCall:
 
         :param number: the answers name it.
         """
+        number += names.FIRST_CALL
         self._publisher.publish(Slot(run=self._run_id, phase=Slot.PREPARE, slot=number, data=self._calling))
 
     def answered(self, number: int) -> set[int]:
@@ -46,7 +48,7 @@ class RollCall:
                 message = read_report(data)
             except Exception:  # rclpy has no common base for what a message can do to it
                 continue
-            if message.run == self._run_id and message.slot.tolist() == [number]:
+            if message.run == self._run_id and message.slot.tolist() == [names.FIRST_CALL + number]:
                 found.update(message.agent)
         return found
 

@@ -158,7 +158,9 @@ class RosChannel:
             now = time.monotonic()
             if now - repeat > _REPEAT_S:
                 repeat = now
-                self._publisher.publish(Slot(run=self.run_id, phase=Slot.PREPARE, data=self._calling))
+                self._publisher.publish(
+                    Slot(run=self.run_id, phase=Slot.PREPARE, slot=names.FIRST_CALL, data=self._calling)
+                )
             self.loop.wait(_CALL_NS)  # what is said before the run begins does not count
             self._hear_processes()
             look_for_others()

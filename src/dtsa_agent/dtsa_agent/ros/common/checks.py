@@ -17,6 +17,8 @@ from nav_msgs.msg import Odometry
 from dtsa_agent.core.abstract_swarm import FRAME_MAX
 from dtsa_agent.core.errors import RemoteProtocolError
 
+from . import names
+
 UNREADABLE = "unreadable"  # not a message of its topic's type
 OTHER_RUN = "other run"
 OTHER_SENDER = "other sender"  # not of the publisher, or the process, that has sent so far
@@ -27,7 +29,7 @@ SLOT = "slot"  # of a slot that cannot be under way
 FORGED_END = "forged end"
 REASONS = (UNREADABLE, OTHER_RUN, OTHER_SENDER, UNKNOWN, SIZES, RANGE, SLOT, FORGED_END)
 
-LARGEST_SLOT = 2**31 - 1  # 248 days of 10 ms slots
+LARGEST_SLOT = names.FIRST_CALL - 1  # 248 days of 10 ms slots
 FARTHEST_M = 1e6  # no vehicle is farther from the room's centre, or faster, than this many m or m/s
 FARTHEST_ODOMETRY_M, FASTEST_ODOMETRY_MPS = 1000.0, 100.0  # of vehicles that really fly
 _WINDOW = 1000  # messages of one publisher that may have been missed
@@ -60,7 +62,7 @@ def check_slot(message: Slot, agents: int) -> None:
     count = len(senders)
     if phase > Slot.REFUSE:
         raise Unusable(RANGE, f"slot message of phase {phase}")
-    if message.slot > LARGEST_SLOT or message.heard_slot > LARGEST_SLOT:
+    if (message.slot > LARGEST_SLOT and phase != Slot.PREPARE) or message.heard_slot > LARGEST_SLOT:
         raise Unusable(SLOT, f"slot message for slot {message.slot}")
     if phase != Slot.RUN:
         if count or len(lengths) or len(received):

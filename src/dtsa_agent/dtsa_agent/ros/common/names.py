@@ -24,6 +24,10 @@ ODOMETRY = "odom"
 # In real time nobody waits for a process that gets no time: some seconds of messages wait for it instead.
 REALTIME_WAITING = 64
 
+# Calls before slot 0 are numbered from here on, as no slot is: an answer that comes late is not taken for what was done
+# in a slot.
+FIRST_CALL = 1 << 31
+
 # A player's /clock and the stamps of a bag must not start at 0, which ROS takes for "no time yet".
 TIME_ZERO_NS = 1_000_000_000
 
