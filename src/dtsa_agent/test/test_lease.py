@@ -385,6 +385,19 @@ def test_movers_that_are_few_are_spaced_evenly() -> None:
     assert sum(lossy[t] == (t % 18 + 1,) for t in range(900, 1800) if t % 18 < 5) > 0.95 * 250
 
 
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_who_arrives_says_so_for_three_rounds_where_frames_are_lost(loss: float) -> None:
+    """Who missed it would take it for a mover until its next main anchor."""
+    swarm = make(12, 6)
+    air = Air(swarm, loss).run(600)
+    swarm.goal[:, 2] = swarm.position[:, 2]
+    air.run(36)
+    own = [slot for slot in range(600, 636) if slot % 12 == 2]
+    assert [air.sent[slot] == (3,) for slot in own] == ([True] * 3 if loss else [True, False, False])
+    told = sum(any(air.frames[slot].leases) for slot in own if air.sent[slot] == (3,))
+    assert told == (0 if loss else 1)
+
+
 def test_who_knows_where_all_want_to_be_gives_turns_away_from_the_first_round_on() -> None:
     """But not to those who are known to stand at their targets, nor where nobody knows that."""
     for known in (False, True):

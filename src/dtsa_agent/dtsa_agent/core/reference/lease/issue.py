@@ -11,6 +11,7 @@ from ..table import Table
 from .memory import MISSED, Lease, Memory
 
 FEW = 0.5  # more missed frames than this in 8 N slots: movers keep their turns
+ROUNDS_TOLD = 3  # who has arrived says so for so many rounds, where frames are lost
 BUSY = 0.5  # more wakers than this in N slots: a second OPEN turn
 
 
@@ -135,7 +136,7 @@ def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
     """How many of its next turns an agent gives away: all if it rests and is final, else floor(c x idle rounds).
 
     A mover gives away those up to its next anchor, where less than a third moves, all that rest are settled and no
-    frames are lost.
+    frames are lost. Where frames are lost, who has just arrived gives nothing away: it says so again.
     """
     rules = memory.rules
     if not who.members or memory.deaf:
@@ -144,9 +145,12 @@ def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
         return 0
     if memory.idle_since < 0:
         return rules.anchor_every if who.lends else 0
+    idle = slot - memory.idle_since
+    if memory.idle_since > memory.born and idle < ROUNDS_TOLD * rules.agents and memory.lost >= FEW:
+        return 0
     if final:
         return rules.main_every if who.informed else 1
-    turns = rules.depth_rate * (slot - memory.idle_since) / rules.agents
+    turns = rules.depth_rate * idle / rules.agents
     return int(min(turns, rules.anchor_every))
 
 

@@ -6,6 +6,8 @@
 
 static const double BUSY = 0.5, FEW = 0.5;
 
+enum { ROUNDS_TOLD = 3 }; /* who has arrived says so for so many rounds, where frames are lost */
+
 typedef struct {
     int alive;    /* N_alive: me and those heard of lately */
     int members;  /* N_p: those in A_p that do not miss their turns */
@@ -199,6 +201,8 @@ static int depth(const dtsa_agent *agent, const lease_scope *v, const electorate
     if (!who->members || a->deaf > LEASE_DEAF) return 0;
     if (who->members > c->share * who->alive) return 0;
     if (a->idle_since < 0) return who->lends ? v->every : 0;
+    const int arrived = a->idle_since > a->born && slot - a->idle_since < ROUNDS_TOLD * v->n;
+    if (arrived && a->lost >= FEW) return 0;
     if (agent->final) return who->informed ? v->main : 1;
     const double turns = c->depth_rate * (double)(slot - a->idle_since) / v->n;
     return turns < v->every ? (int)turns : v->every;
