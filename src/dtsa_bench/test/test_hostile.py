@@ -218,9 +218,7 @@ def test_malformed_messages_of_every_kind_end_and_freeze_nobody_in_real_time(tmp
     def attack(stranger: Stranger, process: subprocess.Popen[str]) -> None:
         stranger.listen(3, process)
         run = stranger.last.run
-        hosted = Transmission(
-            run=run, slot=stranger.slot, agent=[1, 2], length=[0, 0], offset_ns=[2**62, -(2**62)]
-        )
+        hosted = Transmission(run=run, slot=stranger.slot, agent=[1, 2], length=[0, 0], offset_ns=[2**62, -(2**62)])
         for message in (hosted, Transmission(run=run, slot=4_000_000_000, agent=[1, 2], offset_ns=[0, 0])):
             stranger.publishers[names.TRANSMISSION].publish(message)
         for late_s in (2**31 - 1, 0):
