@@ -250,20 +250,22 @@ def keeps(memory: Memory, who: Electorate, turn: int) -> bool:
 
 
 def choose_lessee(memory: Memory, who: Electorate, turn: int) -> int:
-    """To whom a turn is worth most: the able agent with the largest p min(n, N_p), then the lowest id; -1: nobody.
+    """To whom a turn is worth most: the able agent with the largest p min(n, m), then the lowest id; -1: nobody.
 
     p and n are the distances from the turn to that agent's previous and next slot, as far as they are known or
     foreseen; p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases
-    will come in between.
+    will come in between: m is N_p, or 3/4 of it where movers give turns away, too, so that there the wait decides.
 
     :param turn: the turn to be given away.
     """
-    most = memory.rules.agents + 1
+    longest, most = memory.rules.agents + 1, who.members
+    if who.lends:
+        most = (3 * who.members + 3) // 4
 
     def worth(k: int) -> int:
-        before = min(turn - who.last[k], most)
-        after = next((right - turn for right in who.rights[k] if right > turn), most)
-        return before * min(after, who.members)
+        before = min(turn - who.last[k], longest)
+        after = next((right - turn for right in who.rights[k] if right > turn), longest)
+        return before * min(after, most)
 
     able = [k for k in range(memory.rules.agents) if who.able[k]]
     return max(able, key=worth, default=-1)  # the first of several

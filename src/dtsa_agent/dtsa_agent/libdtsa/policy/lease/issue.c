@@ -111,13 +111,14 @@ static int count_absent_before(const lease_scope *v, int self, int64_t slot)
  * is able. */
 static int choose_lessee(const lease_scope *v, const electorate *who, int64_t turn)
 {
+    const int most = who->lends ? (3 * who->members + 3) / 4 : who->members;
     int best = -1;
     long worth = 0;
     for (int i = 0; i < who->members; i++) {
         const int k = who->list[i];
         const int64_t wait = turn - who->last[k], rest = who->next[k] - turn;
         const long before = wait <= v->n ? (long)wait : v->n + 1;
-        const long after = rest < who->members ? (long)rest : who->members;
+        const long after = rest < most ? (long)rest : most;
         if (best < 0 || before * after > worth) {
             best = k;
             worth = before * after;
