@@ -28,6 +28,7 @@ from dtsa_bench.soak.flights import PATIENCE_S, command, flying, until
 from dtsa_bench.soak.item import Item, NotMet
 
 _WINDOW_S = 10.0
+_START_S = 3.0  # for each agent
 _SETTLED_S = 5.0  # after the last one has begun
 _ON_TIME_NS = 1_000_000
 _PUNCTUAL = 0.02  # share of frames on time may be smaller than the timer's by this
@@ -54,13 +55,16 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     )
     udp = over_udp(swarm, directory)
     frames, timer = udp["frames_on_time_share"], udp["timer_on_time_share"]
-    met(frames >= timer - _PUNCTUAL, f"{frames:.1%} of frames on time, {timer:.1%} of a bare timer's wake-ups")
+    met(frames >= timer - _PUNCTUAL, f"{frames:.1%} of frames on time, {timer:.1%} of a bare timer's wake-ups; {udp}")
     try:
         ros = over_ros(swarm, directory / "ros")
     except NotMet as error:
         return {"udp": udp, "ros": f"did not fly: {error}"}
     for name in ("processor_us_per_slot", "memory_pss_mb"):
-        met(udp[name] <= _SHARE * ros[name], f"{name}: {udp[name]:.4g}, as ROS nodes {ros[name]:.4g}")
+        met(
+            udp[name] <= _SHARE * ros[name],
+            f"{name}: {udp[name]:.4g}, as ROS nodes {ros[name]:.4g}; udp {udp}, ros {ros}",
+        )
     return {"udp": udp, "ros": ros}
 
 
@@ -97,7 +101,7 @@ def over_udp(swarm: SwarmConfig, directory: Path) -> dict[str, Any]:
                 raise NotMet(f"an agent has ended: {(directory / 'said.txt').read_text()[-300:]}")
             return len(heard) == swarm.agents
 
-        until(all_speak, "all agents speak")
+        until(all_speak, "all agents speak", PATIENCE_S + _START_S * swarm.agents)
         _listen(late, _SETTLED_S)
         words = [sys.executable, "-m", "dtsa_bench.soak.air.bare_timer", str(swarm.slot_ns), str(_WINDOW_S)]
         heard.clear()

@@ -21,7 +21,7 @@ from dtsa_channel_sim import ChannelConfig
 
 AGENTS = 12
 OVERLAP = 0.001  # of slots
-AGE_MARGIN, ERROR_MARGIN = 0.15, 0.5  # mean age and mean error may differ from the simulator's by this share
+AGE_MARGIN, ERROR_MARGIN = 0.05, 0.15  # mean age and mean error may differ from the simulator's by this share
 _SECONDS = 12.0
 _FAULT_S = 3.0
 _APART = f"1-{AGENTS // 2} | {AGENTS // 2 + 1}-{AGENTS}"
