@@ -33,6 +33,7 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.crazyflie.safety import SafetySettings
+from dtsa_bench.commands.fly import mission_problem
 from dtsa_bench.fake_crazyflie.truth import read_truth
 from dtsa_bench.fly.bringing import plan_moves
 from dtsa_bench.fly.domain import ros_domain
@@ -87,6 +88,12 @@ def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
     measured[0, 0] = 2.5
     with pytest.raises(MissionError, match=r"cf1 stands 1\.00 m outside .*; cf4 and cf5 stand 0\.10 m apart"):
         check_standing(names, measured, fence)
+
+
+def test_a_mission_after_which_somebody_may_still_fly_has_failed() -> None:
+    assert mission_problem("", []) == ""
+    assert mission_problem("", ["cf2"]) == "the exchange is complete; not known to have landed: cf2"
+    assert mission_problem("a reason", []) == "the exchange was cut short: a reason; all have landed"
 
 
 def check_records(out: Path) -> None:

@@ -7,7 +7,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -240,12 +240,24 @@ def run_crazyflies(args: argparse.Namespace) -> int:
                 config, settings, path, args.out, options, stop, attach=args.attach, page=page
             )
     _tell(args, flight)
-    if cut_short:
-        left = ", ".join(flight.summary["not_landed"])
-        end = f"not known to have landed: {left}" if left else "all have landed"
-        print(f"dtsa: the exchange was cut short: {cut_short}; {end}", file=sys.stderr)
+    not_landed = [] if stop and not cut_short else flight.summary.get("not_landed", [])
+    if problem := mission_problem(cut_short, not_landed):
+        print(f"dtsa: {problem}", file=sys.stderr)
         return 1
     return INTERRUPTED if stop else 0
+
+
+def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
+    """What went wrong in a mission; empty: nothing.
+
+    :param cut_short: why the exchange was; empty: it was not.
+    :param not_landed: names of those that may still fly.
+    """
+    if not (cut_short or not_landed):
+        return ""
+    exchange = f"the exchange was cut short: {cut_short}" if cut_short else "the exchange is complete"
+    end = f"not known to have landed: {', '.join(not_landed)}" if not_landed else "all have landed"
+    return f"{exchange}; {end}"
 
 
 def _tell(args: argparse.Namespace, flight: Any) -> None:
