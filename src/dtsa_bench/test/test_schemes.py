@@ -152,7 +152,7 @@ def test_radios_that_listen_before_they_talk_need_no_leases() -> None:
     """Without loss all have the same ranks; with it a few do that should not."""
     sense, lease = (steady(policy, 12, 2, frame="extended").outcome for policy in ("sense", "lease"))
     assert 0.5 < sense.age < lease.age
-    assert sense.collisions == 0
+    assert sense.collisions <= 1  # of two that have just set out
     lossy = steady("sense", 12, 6, 0.3, frame="extended").outcome
     assert 0 < lossy.collisions < 0.02 * lossy.slots
     assert lossy.age < steady("lease", 12, 6, 0.3).outcome.age

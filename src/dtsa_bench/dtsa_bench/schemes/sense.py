@@ -13,13 +13,14 @@ from .knowledge import moves
 class Sense:
     """The slot's owner first where it has something unexpected to say; else, after guard times, who moves.
 
-    TDMA's owner begins at once if it has set out or arrived and not said so yet, and in one of ``sense.rounds`` (15)
-    rounds, another one for each owner. Otherwise each agent under way waits for as many guard times as its rank says,
-    and gives up when it senses a frame. Of those that it takes for movers the one whose last turn is longest ago has
-    rank 1; ranks above ``sense.ranks`` (4) do not try. Turns are sensed, also where the frame is lost: the guard times
-    say whose it was. Where tables differ in who moves, two may have the same rank, and collide. No turn is given away,
-    so nobody needs to hear of it, and who wakes waits N slots at most. All sense each other. A guard time is the
-    turn-round of a radio and the time in which it senses, for which slots have to leave room.
+    TDMA's owner begins at once if it has set out and not said so yet, and in one of ``sense.rounds`` (15) rounds,
+    another one for each owner. Otherwise each agent that has said that it moves waits for as many guard times as its
+    rank says, and gives up when it senses a frame; who has arrived says so in its next turn. Of those that it takes for
+    movers the one whose last turn is longest ago has rank 1; who lets its turns pass has arrived; ranks above
+    ``sense.ranks`` (4) do not try. Turns are sensed, also where the frame is lost: the guard times say whose it was.
+    Where tables differ in who moves, two may have the same rank, and collide. No turn is given away, so nobody needs to
+    hear of it, and who wakes waits N slots at most. All sense each other. A guard time is the turn-round of a radio and
+    the time in which it senses, for which slots have to leave room.
     """
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
@@ -38,16 +39,16 @@ class Sense:
         """Indices of those that send."""
         n = np.arange(swarm.config.agents)
         owner = slot % len(n)
-        under_way, there = moves(swarm), swarm.present > 0
-        said = swarm.in_ap[owner, owner] > 0
+        there, said = swarm.present > 0, swarm.in_ap[n, n] > 0
         due = self._turn[owner] < 0 or (slot // len(n) + owner) % self._rounds == 0
-        contend = np.flatnonzero(under_way & there)
-        if there[owner] and (under_way[owner] != said or due):
+        if there[owner] and (due or (moves(swarm)[owner] and not said[owner])):
             return n[owner : owner + 1]
+        contend = np.flatnonzero(said & there)
         if not contend.size:
             return contend
         order = self._turn * len(n) + n
         rivals = swarm.in_ap[contend] > 0
-        rank = (rivals & (order < order[contend][:, None])).sum(axis=1) + 1
+        silent = slot - self._turn[None, :] > 2 * rivals.sum(axis=1)[:, None] + 4  # has arrived: its turns came
+        rank = (rivals & ~silent & (order < order[contend][:, None])).sum(axis=1) + 1
         first = int(rank.min())
         return contend[rank == first] if first <= self._ranks else contend[:0]
