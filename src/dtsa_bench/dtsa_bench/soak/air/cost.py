@@ -29,6 +29,7 @@ from dtsa_bench.soak.item import Item, NotMet
 
 _WINDOW_S = 10.0
 _START_S = 3.0  # for each agent
+_NEW_ROUNDS = 30  # of N slots: who is new speaks at its anchors only
 _SETTLED_S = 5.0  # after the last one has begun
 _ON_TIME_NS = 1_000_000
 _PUNCTUAL = 0.02  # share of frames on time may be smaller than the timer's by this
@@ -102,7 +103,7 @@ def over_udp(swarm: SwarmConfig, directory: Path) -> dict[str, Any]:
             return len(heard) == swarm.agents
 
         until(all_speak, "all agents speak", PATIENCE_S + _START_S * swarm.agents)
-        _listen(late, _SETTLED_S)
+        _listen(late, max(_SETTLED_S, _NEW_ROUNDS * swarm.agents * swarm.slot_s))
         words = [sys.executable, "-m", "dtsa_bench.soak.air.bare_timer", str(swarm.slot_ns), str(_WINDOW_S)]
         heard.clear()
         timer = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
