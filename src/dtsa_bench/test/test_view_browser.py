@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 pytest.importorskip("aiohttp")
 
 import aiohttp
+from metronome import flown_again_when_overloaded
 from view_helpers import AGENTS, PATIENCE_S, lossy_bag, numbers, track_of, viewed_flight
 from waiting import wait_for
 
@@ -111,13 +113,15 @@ def environment(process: int) -> dict[str, str]:
 
 @pytest.mark.ros
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@flown_again_when_overloaded
 def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path) -> None:
     from fly_helpers import pid_of
 
     from dtsa_bench.view.graph import GraphSource
 
     words = ("--mode", "realtime", "--policy", "lease", "--agents", "3", "--slot-ms", "40", "--tail-s", "90")
-    with Browser(tmp_path) as browser, viewed_flight(tmp_path / "run", *words, "--control") as (process, url):
+    page = viewed_flight(tmp_path / "run", *words, "--control")
+    with Browser(tmp_path) as browser, page as (process, url), ExitStack() as afterwards:
         browser.open(url)
         browser.wait_for("dtsa.views.length === 1 && dtsa.views[0].run.record.count > 20")
         domain = int(environment(pid_of(process.pid, 2))["ROS_DOMAIN_ID"])
@@ -125,6 +129,8 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
         source = GraphSource(listener, domain, control=True)
         listening = threading.Thread(target=source.run, daemon=True)
         listening.start()
+        afterwards.callback(listening.join, PATIENCE_S)
+        afterwards.callback(setattr, source, "stopped", True)
         wait_for(lambda: listener.since(0, 1)[1], what="nothing is heard on the graph")
         browser.run("document.querySelector('.orders select').value = '2'")
         browser.run("document.querySelector('[data-order=kill]').click()")
