@@ -55,8 +55,12 @@ def test_a_failed_item_is_in_the_record_and_is_tried_again(tmp_path: Path) -> No
     record = run_soak(soak_of(run), tmp_path / "journal", 1.0)
     assert record["failures"] == [{"item": "item 3", "reason": "NotMet: it fell over"}]
     assert record["figures"] == {"k": [0, 1, 2]}
+    assert "failed_before_they_passed" not in record
+    unfinished = run_soak(soak_of(run), tmp_path / "journal", 1e-9)
+    assert (unfinished["failures"], unfinished["finished"]) == (record["failures"], record["finished"])
     broken.clear()
-    assert run_soak(soak_of(run), tmp_path / "journal", 1.0)["failures"] == []
+    repeated = run_soak(soak_of(run), tmp_path / "journal", 1.0)
+    assert (repeated["failures"], repeated["failed_before_they_passed"]) == ([], record["failures"])
 
 
 def test_nothing_begins_after_the_limit_and_a_sample_is_a_part(tmp_path: Path) -> None:

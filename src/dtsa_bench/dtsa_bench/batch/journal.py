@@ -67,6 +67,15 @@ class Journal:
         wanted = {task.key for task in self.plan.tasks()}
         return {row["key"]: row for row in read_rows(self.path) if row["key"] in wanted and row["status"] != FAILED}
 
+    def failed(self) -> dict[str, list[Row]]:
+        """Runs of the plan that failed by key, the last one last, whether they were tried again or not."""
+        wanted = {task.key for task in self.plan.tasks()}
+        found: dict[str, list[Row]] = {}
+        for row in read_rows(self.path):
+            if row["key"] in wanted and row["status"] == FAILED:
+                found.setdefault(row["key"], []).append(row)
+        return found
+
     def append(self, rows: Iterable[Row]) -> None:
         """Writes rows; they are in the file's hands when this returns.
 

@@ -47,7 +47,7 @@ def run_soak(soak: Soak, directory: Path, minutes: float, sample: bool = False) 
     state = made_with()
     before = _load()
     with ending_on_signals(journal), Progress(journal) as progress:
-        rows = journal.rows()
+        rows, failed = journal.rows(), journal.failed()
         for task in plan.tasks():
             if task.key in rows:
                 continue
@@ -59,7 +59,7 @@ def run_soak(soak: Soak, directory: Path, minutes: float, sample: bool = False) 
             if row["status"] == FAILED:
                 print(f"{plan.name}: {plan.items[task.cell].name}: {row['reason']}", file=sys.stderr)
             progress.advance(1, task.cost)
-    record = record_of(plan, rows, state)
+    record = record_of(plan, rows, failed, state)
     return {**record, "load": {"before": before, "after": _load()}}
 
 
@@ -74,16 +74,21 @@ def _one(soak: Soak, item: Item, task: Task) -> Row:
     return {**row, "item": item.name, "wall_s": round(time.monotonic() - begin, 1), "load": load[0]}
 
 
-def record_of(plan: SoakPlan, rows: dict[str, Row], state: dict[str, Any]) -> dict[str, Any]:
+def record_of(
+    plan: SoakPlan, rows: dict[str, Row], failed: dict[str, list[Row]], state: dict[str, Any]
+) -> dict[str, Any]:
     """What is kept of a soak.
 
     :param plan: the items.
     :param rows: those that are finished, by key.
+    :param failed: those that failed in runs before, by key: no failure is forgotten, whatever came of it when repeated.
     :param state: what it ran on.
     """
     tasks = list(plan.tasks())
+    rows = {key: earlier[-1] for key, earlier in failed.items()} | rows
     done = [rows[task.key] for task in tasks if task.key in rows]
-    failures = [{"item": row["item"], "reason": row["reason"]} for row in done if row["status"] == FAILED]
+    failures = [_failure(row) for row in done if row["status"] == FAILED]
+    repeated = [_failure(row) for key, earlier in failed.items() if rows[key]["status"] != FAILED for row in earlier]
     return {
         "soak": plan.name,
         "promise": plan.soak.promise,
@@ -95,7 +100,12 @@ def record_of(plan: SoakPlan, rows: dict[str, Row], state: dict[str, Any]) -> di
         "load_of_items": [min((r["load"] for r in done), default=0.0), max((r["load"] for r in done), default=0.0)],
         "figures": plan.soak.figures([row for row in done if row["status"] != FAILED]),
         "failures": failures,
+        **({"failed_before_they_passed": repeated} if repeated else {}),
     }
+
+
+def _failure(row: Row) -> dict[str, str]:
+    return {"item": row["item"], "reason": row["reason"]}
 
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
