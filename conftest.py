@@ -26,6 +26,10 @@ settings.register_profile(
 )
 settings.load_profile("dtsa")
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # Started in the background of a script; what tests start would ignore Ctrl-C, too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 _LOCKS = "dtsa_locks"  # what workers are told about: the directory of their locks
 
 
