@@ -14,7 +14,15 @@ from pathlib import Path
 import pytest
 from node_helpers import ros_graph
 
-from dtsa_agent.ros.common.dds import PROFILE, PROFILES, RANGE, clean_shared_memory, limit_to_machine
+from dtsa_agent.ros.common.dds import (
+    PROFILE,
+    PROFILES,
+    PUNCTUAL,
+    RANGE,
+    clean_shared_memory,
+    limit_to_machine,
+    punctual,
+)
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -55,6 +63,9 @@ def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
         before = dict(other)
         limit_to_machine(other)
         assert other == before
+        assert punctual(other) == {}
+    wanted = {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(PUNCTUAL), PROFILES[1]: str(PUNCTUAL)}
+    assert punctual({RANGE: "LOCALHOST", "HOME": "/"}) == wanted
 
 
 @pytest.mark.ros
@@ -74,6 +85,17 @@ def test_a_node_listens_on_loopback_only_and_leaves_nothing_after_kill_9(tmp_pat
         node.wait()
         clean_shared_memory()
         assert not [name for name in segments if (SHARED_MEMORY / name).exists()]
+
+
+@pytest.mark.ros
+def test_a_node_that_has_to_be_punctual_has_no_port_in_shared_memory(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        graph.environment |= punctual(graph.environment)
+        node = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2")
+        names = graph.node.get_node_names_and_namespaces
+        graph.until(lambda: ("channel", "/swarm") in names())
+        assert addresses(node.pid) == {"127.0.0.1"}
+        assert segments_of(node.pid) == set()
 
 
 def test_only_what_nobody_has_locked_and_is_not_young_is_removed(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.dds import punctual
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.common.priority import give_way_by
@@ -157,7 +158,10 @@ def fly(
         directory = new_directory(out)
         (directory / "log").mkdir()
         context = Context()
-        children = Children(directory / "log", run_environment(domain, directory / "log"))
+        environment = run_environment(domain, directory / "log")
+        if run.mode != LOCKSTEP:
+            environment |= punctual(os.environ)
+        children = Children(directory / "log", environment)
         progress = progress or ProgressLine(label)
         try:
             # Started first: the interpreter of each process needs longer than all that follows here.
