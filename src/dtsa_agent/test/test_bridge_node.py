@@ -203,12 +203,15 @@ def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
         assert not graph.node.get_subscriptions_info_by_topic("/cf1/cmd_vel")
         forward = TwistStamped()
         forward.twist.linear.x = 9.0
-        for _ in range(25):
-            steering.publish(forward)
-            time.sleep(0.02)
-        way = [b - a for a, b in zip(place, graph.place(2), strict=True)]
         yaw = 2 * math.atan2(q.z, q.w)
-        assert way[0] * math.cos(yaw) + way[1] * math.sin(yaw) > 0.1
+
+        def steered() -> list[float]:
+            """The way so far, once it is some."""
+            steering.publish(forward)
+            way = [b - a for a, b in zip(place, graph.place(2), strict=True)]
+            return way if way[0] * math.cos(yaw) + way[1] * math.sin(yaw) > 0.1 else []
+
+        way = wait_for(steered)
         assert math.hypot(*way) < 0.8
         # The stream ends: the bridge holds. Landing one by service, the others by Ctrl-C.
         answer = graph.call(Land, "/cf3/land", height=0.0, duration=Duration(nanosec=200_000_000))

@@ -125,9 +125,9 @@ def reports(out: Path, agent: int) -> list[Report]:
 
 
 def life_and_afterlife(out: Path, agent: int) -> tuple[list[Report], list[Report]]:
-    """An agent's reports before and after it was away."""
+    """An agent's reports before and after it was away, which was longer than any report can have been late."""
     found = reports(out, agent)
-    back = next(k for k in range(1, len(found)) if found[k].slot > found[k - 1].slot + 1)
+    back = max(range(1, len(found)), key=lambda k: found[k].slot - found[k - 1].slot)
     return found[:back], found[back:]
 
 

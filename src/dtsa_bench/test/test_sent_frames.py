@@ -107,6 +107,9 @@ def test_spread_and_lateness_come_from_the_right_agents() -> None:
     assert summary["clock_spread_end_ms"] == pytest.approx(0.4)
     assert summary["sends_on_time_share"] == 0.5
     assert summary["send_offset_ms"]["3"] == {"median": pytest.approx(3.0), "max": pytest.approx(3.0)}
+    statistics.add(
+        np.zeros(0, np.uint32), [1, 2], np.zeros(0, np.int64), np.zeros(0, np.uint8)
+    )  # nothing but what was heard
     assert ClockStatistics(3).summary()["clock_spread_max_ms"] is None
 
 

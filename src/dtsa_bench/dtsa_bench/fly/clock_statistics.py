@@ -70,6 +70,8 @@ class ClockStatistics(ChannelObserver):
         :param lengths: (m n) bytes of each frame, 0: silent.
         """
         slots = np.asarray(slot, dtype=np.int64)
+        if not len(slots):
+            return  # a process that ends tells what it has heard since its last slot
         rows = slots % _OPEN
         for new in slots[self._slot[rows] < slots].tolist():
             self._sum_up(new % _OPEN)
