@@ -6,6 +6,7 @@ import asyncio
 import base64
 import json
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -15,6 +16,8 @@ from types import TracebackType
 from typing import Any
 
 import aiohttp
+
+from dtsa_bench.processes import end_process
 
 from .checks import met
 
@@ -65,12 +68,7 @@ class Browser:
     ) -> None:
         with suppress(Exception):  # whatever stands: the process is ended below
             self._wait(self._session.close())
-        self._process.terminate()
-        try:
-            self._process.wait(10)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        end_process(self._process, 10, signal.SIGTERM)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(10)
         if not self._thread.is_alive():

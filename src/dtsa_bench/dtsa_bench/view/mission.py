@@ -9,11 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from dtsa_agent.core.errors import DtsaError
+from dtsa_bench.processes import end_process
 
 from .link import OWN_GROUP
 
@@ -71,12 +72,6 @@ def _address(process: subprocess.Popen[Any]) -> str:
 
 
 def _end(process: subprocess.Popen[Any]) -> None:
-    with suppress(ProcessLookupError):
-        process.send_signal(signal.SIGTERM)
-    try:
-        process.wait(_END_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    end_process(process, _END_S, signal.SIGTERM)
     if process.stdout is not None:
         process.stdout.close()
