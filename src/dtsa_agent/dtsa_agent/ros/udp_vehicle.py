@@ -11,6 +11,7 @@ import numpy as np
 from dtsa_msgs.msg import VelocityWorld
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -30,6 +31,7 @@ _LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LONGEST_PREDICTION_S = 0.15
 _SLACK_M = 0.5  # odometry may be off by this from one message to the next
 _HOLD_GAIN, _HOLD_MPS = 1.0, 0.3  # 1/s, m/s: of an agent that hovers
+_STOPS, _STOPS_S = 5, 0.1  # how often an agent that ends says to its vehicle to stop, within which time
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +93,19 @@ class OdometryVehicle:
         self._next_service_s = 0.0
 
     def close(self) -> None:
-        """The agent has ended: the vehicle shall stand."""
-        self._command(np.zeros(3))
-        self._feed.close()
-        self._executor.shutdown(timeout_sec=0)
+        """The agent has ended, however that came: the vehicle shall stand.
+
+        One message may be lost, above all one whose publisher is gone a moment later: it is said several times, and
+        who takes it reliably has a while to say that it has it.
+        """
+        try:
+            for _ in range(_STOPS):
+                self._command(np.zeros(3))
+                time.sleep(_STOPS_S / _STOPS)
+            self._publisher.wait_for_all_acked(Duration(seconds=_STOPS_S))
+        finally:
+            self._feed.close()
+            self._executor.shutdown(timeout_sec=0)
 
     def ready(self) -> bool:
         """Whether odometry has come, and is fresh."""
