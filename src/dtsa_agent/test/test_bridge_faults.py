@@ -238,15 +238,16 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, prot
 def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_control(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 6, "--arming", "mixed") as fleet, flight(settings(fleet)) as pilot:
         assert pilot.bridge.connect() == []
-        climbing = threading.Timer(1.5, lambda: fleet.fault("freeze", 1, seconds=0.65))
+        climbing = threading.Timer(1.5, lambda: fleet.fault("close", 1, seconds=0.65))
         climbing.start()
         pilot.take_off()
         climbing.join()
         pilot.velocity["cf4"] = (0.0, 0.4, 0.0)
         pilot.bridge.vehicles["cf6"].land("before the gap")
         time.sleep(0.7)
-        for cf, gap in ((2, 0.3), (3, 0.55), (4, 0.6), (5, 0.65), (6, 0.65)):
-            fleet.fault("freeze", cf, seconds=gap)
+        gaps = ((2, "close", 0.3), (3, "close", 0.55), (4, "freeze", 0.6), (5, "close", 0.65), (6, "close", 0.65))
+        for cf, silence, gap in gaps:
+            fleet.fault(silence, cf, seconds=gap)
         down = (State.READY, State.ARMED)
         wait_for(lambda: all(pilot.state(cf) in down for cf in (1, 3, 4, 5, 6)))
         assert pilot.state(2) is State.FLYING
@@ -255,6 +256,11 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
             assert fleet.flown(cf)[-1] != "locked"
             assert len(fleet.events(cf, "land")) == 1 or cf != 6  # it landed by itself all the while
         assert not [e for e in fleet.events() if e["event"] in ("hard landing", "collision", "crash")]
+        # One that was switched off and on has forgotten its log.
+        link = pilot.bridge.vehicles["cf6"].link
+        fleet.fault("reboot", 6)
+        forgotten = link.received
+        wait_for(lambda: link.received > forgotten + 20)
 
 
 @flown_again_when_overloaded

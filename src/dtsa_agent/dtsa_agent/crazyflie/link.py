@@ -56,6 +56,9 @@ def require_cflib() -> None:
     if not cflib.crtp.CLASSES:
         cflib.crtp.init_drivers()
     keep_links_open()
+    from dtsa_agent.crazyflie import udp_link
+
+    udp_link.install()
     # Its own warnings are about what the bridge reports by itself, in terms of the swarm.
     for name in ("cflib", "cflib.crazyflie", "cflib.crtp"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -270,6 +273,7 @@ class Link:
         cf.connection_failed.add_callback(broken)
         cf.connection_lost.add_callback(broken)
         cf.add_port_callback(CRTPPort.SETPOINT_HL, self._answer)
+        cf.packet_received.add_callback(lambda packet: self._reached(cf))
         cf.link_statistics.link_quality_updated.add_callback(self._quality)
         cf.link_statistics.uplink_rssi_updated.add_callback(self._rssi)
         self._cf = cf
@@ -299,8 +303,16 @@ class Link:
         if len(packet.data) > 3:
             self._on_answer(packet.data[0], packet.data[3])
 
+    def _reached(self, cf: Any) -> None:
+        """A packet came: with no acknowledgements that tells that the Crazyflie is there."""
+        if self._cf is cf and self.connected and self._radio is None:
+            self._acknowledged()
+
     def _quality(self, percent: float) -> None:
         self.radio_quality = percent / 100
+        self._acknowledged()
+
+    def _acknowledged(self) -> None:
         if self._heard.acknowledge(time.monotonic()) and self.guarded:  # its watchdog has not much time left
             self.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
 
@@ -351,14 +363,15 @@ class Link:
 
     def _drop(self) -> None:
         """Forget the connection. If there is one, a zero setpoint is sent: only for one that does not fly."""
-        silent = not self.connected or self._radio is None or not self._radio.wait_for_room(0.0)
+        radio, self._radio = self._radio, None
+        deaf = self._heard.age(time.monotonic()) > STUCK_S if radio is None else not radio.wait_for_room(0.0)
+        silent = deaf or not self.connected
         self.connected = False
         cf, self._cf = self._cf, None
-        radio, self._radio = self._radio, None
         if radio is not None:
             radio.close()
         if cf is not None:
-            if silent and RadioPort.of(cf) is not None:  # the setpoint would wait in vain, or meet one that flies
+            if silent and cf.link is not None:  # the setpoint would wait in vain, or meet one that flies
                 link, cf.link = cf.link, None
                 link.close()
             with contextlib.suppress(Exception):  # whatever state it is in, we are done with it

@@ -190,11 +190,11 @@ class Heard:
         self._lock = threading.Lock()
 
     def age(self, now: float) -> float:
-        """Seconds since something was acknowledged; infinite over other ways than the air."""
+        """Seconds since something was acknowledged, or came over another way than the air; infinite before that."""
         return now - self._acknowledged
 
     def acknowledge(self, now: float) -> bool:
-        """Something was acknowledged at a time (s, monotonic); whether that ends a gap."""
+        """Something was acknowledged, or came, at a time (s, monotonic); whether that ends a gap."""
         gap = self.age(now) > GAP_S
         if gap:
             self.since = now
