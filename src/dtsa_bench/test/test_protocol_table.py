@@ -15,9 +15,9 @@ from dtsa_bench.batch import pool
 from dtsa_bench.batch.journal import Journal
 from dtsa_bench.batch.pool import run_all
 from dtsa_bench.cli import main
-from dtsa_bench.protocol_bench.cases import PROTOCOLS, cases, run_case
+from dtsa_bench.protocol_bench.cases import AGED, PROTOCOLS, cases, run_case
 from dtsa_bench.protocol_bench.plan import WORK, ProtocolPlan
-from dtsa_bench.protocol_bench.table import as_text, by_case, run_table, summarise
+from dtsa_bench.protocol_bench.table import as_text, by_case, long_table, run_table, summarise
 
 
 def case(name: str):  # type: ignore[no-untyped-def]
@@ -90,7 +90,7 @@ def test_files_and_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 def test_the_table_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [case("join of 1 of 12, 12 moving, no loss"), case("12/6 moving, no loss")]
-    plan = ProtocolPlan(rows, range(1001, 1003), 4000)
+    plan = ProtocolPlan(rows, 2, 4000)
     whole = by_case(plan, run_all(plan, WORK))
     assert list(whole) == [(row.name, protocol) for row in rows for protocol in row.protocols]
     assert whole[rows[1].name, "lease"] == [run_case(rows[1], "lease", seed, 4000) for seed in (1001, 1002)]
@@ -118,6 +118,29 @@ def test_a_directory_of_a_sweep_is_not_the_tables(tmp_path: Path, capsys: pytest
     assert main([*words, "--preset", "trajectories"]) == 0
     assert main([*words, "--preset", "protocol"]) == 2
     assert "this one holds sweep trajectories" in capsys.readouterr().err
+
+
+def test_each_column_has_its_own_number_of_seeds_and_slots_unless_others_are_asked_for() -> None:
+    rows = [case("12/6 moving, no loss"), case("join of 1 of 12, 12 moving, no loss")]
+    own = [(t.seed, t.settings["slots"]) for t in ProtocolPlan(rows).tasks() if t.settings["protocol"] == "lease"]
+    assert own == [*((seed, 6000) for seed in (1001, 1002, 1003)), *((seed, 20_000) for seed in range(1001, 1009))]
+    asked = {t.settings["protocol"]: t.settings["slots"] for t in ProtocolPlan(rows, 2, 9000, 5).tasks()}
+    assert asked == dict.fromkeys(PROTOCOLS, 9000)
+    assert {t.seed for t in ProtocolPlan(rows, 2, 9000, 5).tasks()} == {5, 6}
+
+
+def test_the_documented_table_is_the_one_that_the_preset_writes() -> None:
+    rows = [row for row in cases() if row.kind in AGED]
+    one = replace(run_case(rows[0], "tdma", 1, 700), age=5.554, true_age=110.4, first=(7,))
+    found = {(row.name, name): [one] for row in rows for name in row.protocols}
+    lines = long_table(summarise(rows, found)).splitlines()
+    assert lines[2].endswith("|" + " 5.55 |" * 6 + " 1.00 |")
+    assert sum(" 110 |" in line for line in lines) == 6
+    page = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8").splitlines()
+    begin = page.index(lines[0])
+    shown = page[begin : begin + len(lines)]
+    assert [line.split("|")[1] for line in shown] == [line.split("|")[1] for line in lines]
+    assert page[begin + len(lines)] == ""
 
 
 def test_show_tells_what_the_preset_runs(capsys: pytest.CaptureFixture[str]) -> None:

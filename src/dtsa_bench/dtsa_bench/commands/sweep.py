@@ -84,15 +84,15 @@ def _protocol(args: argparse.Namespace) -> int:
     if args.json:
         raise ConfigError("json", True, f"nothing with --preset {PROTOCOL}, which writes results.json")
     changed = _base(args.set)
-    slots = changed.pop("slots", plan.SLOTS)
+    slots = changed.pop("slots", None)
     for name in changed:
         raise ConfigError(f"set {name}", changed[name], f"slots=NUMBER with --preset {PROTOCOL}")
     if args.cluster:
         raise ConfigError("cluster", args.cluster, f"nothing with --preset {PROTOCOL}: it runs on this machine")
     return table.run_table(
         Path(args.out) if args.out else Path("runs") / PROTOCOL,
-        plan.SEEDS if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1000),
-        slots=whole_number(str(slots), "slots", 4000, 10_000_000),
+        None if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1000),
+        slots=None if slots is None else whole_number(str(slots), "slots", 4000, 10_000_000),
         jobs=_jobs(args),
         first_seed=plan.FIRST_SEED
         if args.first_seed is None

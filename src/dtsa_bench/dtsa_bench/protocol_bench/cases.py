@@ -26,6 +26,10 @@ PROTOCOLS: dict[str, dict[str, Any]] = {
 }
 LEASE = ("lease S=0", "lease")
 GENIES = ("genie (age)", "genie (error)")
+AGED = ("steady", "start", "stop-and-go")  # kinds of cases whose rows are ages
+SEEDS, SLOTS = 8, 20_000
+#: Columns that have fewer seeds and slots in rows of ages, because they take long.
+FEWER: dict[str, tuple[int, int]] = {**dict.fromkeys(LEASE, (3, 6000)), **dict.fromkeys(GENIES, (2, SLOTS))}
 # Plain DTSA computes N^2 priorities for every agent in every slot: with many agents and loss so much must do.
 DTSA_SLOTS, DTSA_MANY = 2000, 20
 GENIE_SLOTS = 4000  # the bounds are written in Python
@@ -60,6 +64,13 @@ class Case:
         if protocol == "dtsa" and self.agents > DTSA_MANY and not self.shared(protocol):
             return min(slots, self.warmup + DTSA_SLOTS)
         return min(slots, self.warmup + GENIE_SLOTS) if protocol in GENIES else slots
+
+    def effort(self, protocol: str) -> tuple[int, int]:
+        """Number of seeds and slots of a column, unless others are asked for.
+
+        :param protocol: the column.
+        """
+        return FEWER.get(protocol, (SEEDS, SLOTS)) if self.kind in AGED else (SEEDS, SLOTS)
 
     def shared(self, protocol: str) -> bool:
         """Whether one table may serve all agents: nothing is lost, and with plain DTSA all compute the same from it.

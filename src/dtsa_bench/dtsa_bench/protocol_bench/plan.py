@@ -11,10 +11,10 @@ from typing import Any
 import yaml
 
 from ..batch.task import Row, Task, Work, attempt, code_digest, key_of
-from .cases import PROTOCOLS, Case, Result, cases, run_case
+from .cases import FEWER, PROTOCOLS, SEEDS, SLOTS, Case, Result, cases, run_case
 
 NAME = "protocol"
-SEEDS, SLOTS, FIRST_SEED = 8, 20_000, 1001
+FIRST_SEED = 1001
 TITLE = "The slot protocols alone: ages, waking, joins, deaths, jams, partitions"
 
 
@@ -29,17 +29,21 @@ class ProtocolPlan:
     """Every case with each of its protocols and every seed.
 
     :param rows: the cases.
-    :param seeds: seeds of the runs.
-    :param slots: length of steady and stop-and-go runs.
+    :param seeds: number of seeds; None: each column's own.
+    :param slots: length of steady and stop-and-go runs; None: each column's own.
+    :param first_seed: first of the seeds.
     """
 
     name = NAME
 
-    def __init__(self, rows: Sequence[Case], seeds: Sequence[int], slots: int) -> None:
-        self._rows, self._seeds, self._slots = rows, seeds, slots
+    def __init__(
+        self, rows: Sequence[Case], seeds: int | None = None, slots: int | None = None, first_seed: int = FIRST_SEED
+    ) -> None:
+        self._rows, self._seeds, self._slots, self._first_seed = rows, seeds, slots, first_seed
         self.cells = [Cell({"case": case.name, "protocol": protocol}) for case in rows for protocol in case.protocols]
+        names = [case.name for case in rows]
         self.source: dict[str, Any] = {
-            "title": TITLE, "seeds": list(seeds), "slots": slots, "cases": [case.name for case in rows]
+            "title": TITLE, "seeds": seeds, "slots": slots, "first_seed": first_seed, "cases": names
         }  # fmt: skip
 
     def tasks(self) -> Iterator[Task]:
@@ -47,10 +51,13 @@ class ProtocolPlan:
         index = 0
         for case in self._rows:
             for protocol in case.protocols:
+                seeds, slots = case.effort(protocol)
+                seeds = seeds if self._seeds is None else self._seeds
+                slots = slots if self._slots is None else self._slots
                 many = 20 if protocol == "dtsa" and case.loss else 1
-                cost = float(case.agents * case.slots(protocol, self._slots) * many)
-                for seed in self._seeds:
-                    settings = {"case": case.name, "protocol": protocol, "seed": seed, "slots": self._slots}
+                cost = float(case.agents * case.slots(protocol, slots) * many)
+                for seed in range(self._first_seed, self._first_seed + seeds):
+                    settings = {"case": case.name, "protocol": protocol, "seed": seed, "slots": slots}
                     yield Task(key_of(settings), index, seed, settings, cost)
                 index += 1
 
@@ -93,6 +100,9 @@ WORK = Work(run_one, fingerprint)
 def as_yaml() -> str:
     """What the preset runs, for `sweep --show`."""
     rows = [{name: list(v) if isinstance(v, tuple) else v for name, v in asdict(case).items()} for case in cases()]
-    content = {"title": TITLE, "seeds": SEEDS, "slots": SLOTS, "protocols": PROTOCOLS, "cases": rows}
+    fewer = {name: {"seeds": seeds, "slots": slots} for name, (seeds, slots) in FEWER.items()}
+    content = {
+        "title": TITLE, "seeds": SEEDS, "slots": SLOTS, "fewer": fewer, "protocols": PROTOCOLS, "cases": rows
+    }  # fmt: skip
     head = "# Runs without flight: for `tools/dtsa sweep --preset protocol`, not for --file.\n"
     return head + yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)

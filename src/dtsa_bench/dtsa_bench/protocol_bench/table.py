@@ -14,9 +14,12 @@ from dtsa_agent.core.errors import DtsaError
 from ..batch.progress import run_batch
 from ..batch.table import by_cell, markdown, write_results
 from ..batch.task import FAILED, Row
-from .cases import LEASE, PROTOCOLS, Case, Result, cases
+from .cases import AGED, LEASE, PROTOCOLS, Case, Result, cases
 from .cost import slot_cost_us
-from .plan import FIRST_SEED, NAME, SEEDS, SLOTS, WORK, ProtocolPlan, result_of
+from .plan import FIRST_SEED, NAME, WORK, ProtocolPlan, result_of
+
+# In stop-and-go a second line counts ages from the waking on, heard or not.
+_AGES = (("", "ages"), (", also before they are heard", "true ages"))
 
 
 def _age_row(case: Case, by: dict[str, list[Result]]) -> dict[str, Any]:
@@ -67,7 +70,7 @@ def summarise(rows: Sequence[Case], found: dict[tuple[str, str], list[Result]]) 
     table = []
     for case in rows:
         by = {protocol: found[case.name, protocol] for protocol in case.protocols}
-        row = _age_row(case, by) if case.kind in ("steady", "start", "stop-and-go") else _fault_row(case, by)
+        row = _age_row(case, by) if case.kind in AGED else _fault_row(case, by)
         slots = {name: sum(r.slots for r in results) for name, results in by.items()}
         row["collided share"] = {name: sum(r.collisions for r in by[name]) / slots[name] for name in by}
         strict, default = by.get("lease S=0", []), by.get("lease", [])
@@ -77,7 +80,7 @@ def summarise(rows: Sequence[Case], found: dict[tuple[str, str], list[Result]]) 
         )
         row["ok"] = bool(row["ok"] and not row["broken rules"] and not any(r.collisions for r in strict))
         # A single fault is rarer in a flight than once in so short a run: the share counts where nothing is provoked.
-        if case.kind in ("steady", "start", "stop-and-go") and default:
+        if case.kind in AGED and default:
             row["ok"] = row["ok"] and row["collided share"]["lease"] <= 0.001
         table.append({"case": case.name, "kind": case.kind, "warm-up": case.warmup, "target": case.target, **row})
     return table
@@ -109,7 +112,7 @@ def as_text(table: Sequence[dict[str, Any]]) -> str:
 def _age_lines(row: dict[str, Any], names: Sequence[str]) -> list[list[str]]:
     """Cells of a row with ages; in stop-and-go a second line counts those that have not been heard yet."""
     lines = []
-    for label, key in (("", "ages"), (", also before they are heard", "true ages")):
+    for label, key in _AGES:
         if key in row:
             ages = row[key]
             cells = [f"{ages[n]:.2f} ({1000 * row['collided share'][n]:.2g})" if n in ages else "" for n in names]
@@ -117,6 +120,31 @@ def _age_lines(row: dict[str, Any], names: Sequence[str]) -> list[list[str]]:
             factor = f"{ages['lease'] / ages['tdma']:.3f}"
             lines.append([row["case"] + label, str(row["warm-up"]), *cells, factor, *last])
     return lines
+
+
+_LONG = {
+    "tdma": "TDMA", "tdma+gossip": "TDMA + gossip", "dtsa": "DTSA",
+    "genie (age)": "genie (age)", "genie (error)": "genie (error)", "lease": "lease",
+}  # fmt: skip
+
+
+def long_table(table: Sequence[dict[str, Any]]) -> str:
+    """Mean ages alone, as docs/protocol.md shows them, in Markdown.
+
+    :param table: from :func:`summarise`.
+    """
+    lines = []
+    for row in table:
+        for label, key in _AGES:
+            if key in row:
+                ages = row[key]
+                cells = [_digits(ages[name]) if name in ages else "" for name in _LONG]
+                lines.append([row["case"] + label, *cells, f"{ages['lease'] / ages['tdma']:.2f}"])
+    return markdown(["agents/moving, loss", *_LONG.values(), "lease / TDMA"], lines)
+
+
+def _digits(age: float) -> str:
+    return f"{age:.2f}" if age < 100 else f"{age:.0f}"
 
 
 def _pair(value: dict[str, float]) -> str:
@@ -129,17 +157,17 @@ def _mark(row: dict[str, Any]) -> str:
 
 def run_table(
     out: Path,
-    seeds: int = SEEDS,
-    slots: int = SLOTS,
+    seeds: int | None = None,
+    slots: int | None = None,
     jobs: int | None = None,
     first_seed: int = FIRST_SEED,
     only: str = "",
 ) -> int:
-    """Runs the preset, writes ``protocol.md``, ``protocol.csv`` and ``protocol.json``, prints the table.
+    """Runs the preset, writes ``protocol.md``, ``long.md``, ``protocol.csv`` and ``protocol.json``, prints the table.
 
     :param out: directory for the results.
-    :param seeds: number of seeds.
-    :param slots: length of steady and stop-and-go runs.
+    :param seeds: number of seeds; None: each column's own.
+    :param slots: length of steady and stop-and-go runs; None: each column's own.
     :param jobs: processes; default: one a core.
     :param first_seed: first of the seeds.
     :param only: run only cases whose name contains this.
@@ -147,7 +175,7 @@ def run_table(
     """
     begun = time.monotonic()
     rows = [case for case in cases() if only in case.name]
-    plan = ProtocolPlan(rows, range(first_seed, first_seed + seeds), slots)
+    plan = ProtocolPlan(rows, seeds, slots, first_seed)
     finished = run_batch(plan, WORK, out, jobs=jobs)
     failed = [row for row in finished.values() if row["status"] == FAILED]
     if failed:
@@ -157,6 +185,7 @@ def run_table(
     missed = [row["case"] for row in table if not row["ok"]]
     text = f"{as_text(table)}\n\n{_sums(table, found, missed)}"
     (out / "protocol.md").write_text(text + "\n", encoding="utf-8")
+    (out / "long.md").write_text(long_table(table) + "\n", encoding="utf-8")
     values = [asdict(result) for group in found.values() for result in group]
     write_results(out, NAME, [spec.name for spec in fields(Result)] if values else ["case"], values, table)
     print(text)
