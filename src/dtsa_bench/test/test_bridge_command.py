@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import runpy
 import signal
+import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import yaml
@@ -20,6 +25,7 @@ pytest.importorskip("cflib")
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
+from ament_index_python.packages import get_package_prefix
 from bridge_helpers import fake_fleet
 from bridge_helpers import settings as fleet_settings
 from builtin_interfaces.msg import Duration
@@ -29,16 +35,20 @@ from node_helpers import Graph, ros_graph
 from std_srvs.srv import Empty
 from waiting import wait_for
 
+from dtsa_agent.crazyflie.config import load_swarm
+from dtsa_bench.commands.bridge import simulated
+from dtsa_bench.fake_crazyflie import ports
+from dtsa_bench.fake_crazyflie.ports import free_base_port
+
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 NAMES = ("cf1", "cf2")
 PATIENT = {"link_age_s": 3.0, "command_age_s": 0.45}  # not what is tested here
 
 
 class Bridge:
-    """The command's process, and what it prints."""
+    """A bridge's process, and what it prints."""
 
-    def __init__(self, environment: dict[str, str], config: Path, *options: str) -> None:
-        command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), *options]
+    def __init__(self, environment: dict[str, str], command: Sequence[str]) -> None:
         self.process = subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -64,9 +74,14 @@ class Bridge:
         return [int(child) for task in tasks.iterdir() for child in (task / "children").read_text().split()]
 
 
+def bridge(environment: dict[str, str], config: Path, *options: str) -> AbstractContextManager[Bridge]:
+    """That of `dtsa bridge`."""
+    return running(environment, [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), *options])
+
+
 @contextmanager
-def bridge(environment: dict[str, str], config: Path, *options: str) -> Iterator[Bridge]:
-    started = Bridge(environment, config, *options)
+def running(environment: dict[str, str], command: Sequence[str]) -> Iterator[Bridge]:
+    started = Bridge(environment, command)
     try:
         yield started
     finally:
@@ -140,6 +155,61 @@ def test_take_off_landing_and_ctrl_c(tmp_path: Path) -> None:
         assert "Traceback" not in started.text()
 
 
+def launched(monkeypatch: pytest.MonkeyPatch, **arguments: str) -> list[SimpleNamespace]:
+    """What crazyflie_launch.py starts, its words as `cmd`. In place of `launch`, which pip does not have: its names."""
+
+    def action(*_: object, **values: Any) -> SimpleNamespace:
+        return SimpleNamespace(**values)
+
+    def node(package: str, executable: str, **values: Any) -> SimpleNamespace:
+        program = os.path.join(get_package_prefix(package), "lib", package, executable)
+        words = [word for name, value in values["parameters"][0].items() for word in ("-p", f"{name}:={value}")]
+        return action(cmd=[program, "--ros-args", *words], **values)
+
+    actions = MagicMock(ExecuteProcess=action, EmitEvent=action, Shutdown=action, Node=node)
+    events = MagicMock(matches_action=lambda found: found, SignalProcess=action)
+    value = MagicMock(LaunchConfiguration=lambda name: MagicMock(perform=lambda context: arguments[name]))
+    modules = {"launch": value, "launch.actions": actions, "launch.substitutions": value, "launch_ros": actions}
+    modules |= {"launch.events": events, "launch.events.process": events, "launch_ros.actions": actions}
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    file = Path(__file__).parents[1] / "launch" / "crazyflie_launch.py"
+    found: list[SimpleNamespace] = runpy.run_path(str(file))["_processes"](None)
+    return found
+
+
+def test_ctrl_c_in_a_launch_lands_simulated_ones_before_they_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, base = swarm_yaml(tmp_path, "usb://{}"), free_base_port(2)
+    data = yaml.safe_load(config.read_text())
+    for k, robot in enumerate(data["robots"].values()):
+        robot["uri"] = f"udp://127.0.0.1:{base + k}"
+    config.write_text(yaml.safe_dump(data))
+    words = {"config": str(config), "simulated": "true", "mission": "false", "interfaces": "dtsa"}
+    simulated, node = launched(monkeypatch, **words)
+    with (
+        ros_graph(tmp_path) as graph,
+        running(graph.environment, simulated.cmd) as fleet,
+        running(graph.environment, node.cmd) as started,
+    ):
+        station = Station(graph, started)
+        station.all("ready")
+        station.call(Arm, "/all/arm", arm=True)
+        station.all("armed")
+        station.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
+        station.all("flying")
+        for one in (fleet, started):  # a terminal's Ctrl-C is for all
+            one.process.send_signal(signal.SIGINT)
+        assert started.end() == 0, started.text()
+        assert "landing cf1, cf2" in started.text()
+        assert fleet.process.poll() is None
+        (last,) = (over.event for over in node.on_exit if hasattr(over, "event"))
+        assert last.process_matcher is simulated
+        fleet.process.send_signal(last.signal_number)
+        assert fleet.end() == 0
+
+
 def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 3) as fleet:
         data = fleet_settings(fleet, {"safety": {"geofence_max": [1.0, 2.3, 0.95]}, "priority": 0})
@@ -192,6 +262,18 @@ def test_killed_it_takes_the_simulated_ones_along(tmp_path: Path) -> None:
         (fleet,) = started.children()
         started.process.kill()
         wait_for(lambda: gone(fleet))
+
+
+def test_simulated_ones_take_other_ports_where_others_have_just_taken_theirs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = free_base_port(3)
+    found = iter((taken, taken + 1, taken + 1))  # free, not free any more, others
+    monkeypatch.setattr(ports, "free_base_port", lambda count, first=None: next(found))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other, ExitStack() as stack:
+        other.bind(("127.0.0.1", taken - 1))
+        path = simulated(swarm_yaml(tmp_path, "usb://{}"), stack)
+        assert load_swarm(path).robots[0].uri == f"udp://127.0.0.1:{taken + 1}"
 
 
 def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:

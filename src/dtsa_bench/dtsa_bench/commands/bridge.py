@@ -123,15 +123,19 @@ def simulated(config: Path, stack: ExitStack) -> Path:
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))
     robots = load_swarm(config).robots
-    base = free_base_port(len(robots), FIRST)
-    for index, robot in enumerate(robots):
-        data["robots"][robot.name]["uri"] = f"udp://127.0.0.1:{base + index}"
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dtsa-bridge-")))
     path = folder / config.name
-    path.write_text(yaml.safe_dump(data), encoding="utf-8")
-    try:
-        line = stack.enter_context(running_fleet(["--config", str(path)]))
-    except FleetError as error:  # their process has said why
-        raise SystemExit(error.code) from None
+    for first in (FIRST, None):
+        base = free_base_port(len(robots), first)
+        for index, robot in enumerate(robots):
+            data["robots"][robot.name]["uri"] = f"udp://127.0.0.1:{base + index}"
+        path.write_text(yaml.safe_dump(data), encoding="utf-8")
+        try:
+            line = stack.enter_context(running_fleet(["--config", str(path)]))
+            break
+        except FleetError as error:  # their process has said why
+            if first is None or free_base_port(len(robots), base) == base:
+                raise SystemExit(error.code) from None
+            # Others that started just now have taken the ports: any other ones will do.
     print(line.partition("; Ctrl-C")[0], flush=True)
     return path

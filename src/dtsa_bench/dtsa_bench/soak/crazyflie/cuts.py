@@ -56,9 +56,11 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
             else:
                 when = fleet.fault("freeze", victim)
             code = flight.end(_PATIENCE_S)
-            met(code == CODES[way], f"exit code {code}: {flight.said().strip()[-300:]}")
+            said = flight.said().strip()[-300:]
+            met(code == CODES[way], f"exit code {code}: {said}")
     others = [k for k in range(COUNT) if way != LOST or k != victim - 1]
     before, after = _closest(fleet.truth, others, when)
+    met(np.isfinite(after), f"it was over before it was cut short: {said}")
     met(after >= CLOSEST_M, f"two that fly came to {after:.3f} m after it was cut short (before: {before:.3f} m)")
     return {**item.settings, "closest_before_m": round(before, 3), "closest_after_m": round(after, 3)}
 

@@ -1,7 +1,8 @@
-"""Gaps of the air in flight: six vehicles over three dongles, a gap of its own each, all at one time."""
+"""Gaps of the link in flight: six vehicles over three dongles or UDP, a gap of its own each, all at one time."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 import time
@@ -19,6 +20,7 @@ from .fleets import RunningFleet, running, station_priority
 COUNT = 6
 FLIGHTS = 5  # for each phase: 30 gaps, 0.1 to 3 s
 PHASES = ("take-off", "commands", "landing")
+KINDS = {"gaps": 0.01, "closed ports": None}  # on the air, with that share of packets lost; of UDP
 SURVIVED_S = 0.75
 STEP_S = 0.02
 LOW_M = 0.1  # m: it stands, or nearly so
@@ -28,12 +30,11 @@ _FLEW_ON, _LANDED, _OFF = "flew on", "landed", "motors off"
 
 def items() -> Iterator[Item]:
     """All lengths in all phases."""
-    for phase in PHASES:
-        for flight in range(1, FLIGHTS + 1):
-            lengths = [round(0.1 * (flight + FLIGHTS * k), 1) for k in range(COUNT)]
-            settings = {"part": "gap", "phase": phase, "gaps": lengths}
-            sample = phase == "commands" and flight == 1
-            yield Item(f"gaps in {phase}, {flight}", settings, flight, 25.0, sample=sample)
+    for kind, phase, flight in itertools.product(KINDS, PHASES, range(1, FLIGHTS + 1)):
+        lengths = [round(0.1 * (flight + FLIGHTS * k), 1) for k in range(COUNT)]
+        settings = {"part": "gap", "kind": kind, "phase": phase, "gaps": lengths}
+        sample = (kind, phase, flight) == ("gaps", "commands", 1)
+        yield Item(f"{kind} in {phase}, {flight}", settings, flight, 25.0, sample=sample)
 
 
 def run(item: Item, directory: Path) -> dict[str, Any]:
@@ -45,9 +46,10 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
 
     station = {"toc_cache": str(directory / "cache"), "safety": {"geofence": False}}
     options = ["--radio-seed", str(item.seed), "--seed", str(item.seed)]
-    with running(directory, COUNT, 0.01, options, station) as fleet, station_priority():
+    loss = KINDS[str(item.settings["kind"])]
+    with running(directory, COUNT, loss, options, station) as fleet, station_priority():
         before = os.environ.get(SIMULATED_RADIO)
-        os.environ[SIMULATED_RADIO] = str(fleet.radio)
+        os.environ[SIMULATED_RADIO] = str(fleet.radio or "")
         try:
             begun, lost = _fly(fleet, str(item.settings["phase"]), list(item.settings["gaps"]))
         finally:
@@ -84,7 +86,7 @@ def _fly(fleet: RunningFleet, phase: str, gaps: list[float]) -> tuple[float, lis
             bridge.land_all("the landing that is disturbed")
             time.sleep(0.4)
         for cf, seconds in enumerate(gaps, 1):
-            begun = fleet.fault("drop", cf, rate=1.0, seconds=seconds)
+            begun = fleet.fault("close", cf, seconds=seconds)  # on the air nothing is heard, in both directions
         time.sleep(max(gaps) + (_CLIMB_S if phase == "take-off" else 0.0) + 1.0)
         over.set()
         _until(lambda: all(v.state != State.LOST for v in bridge.vehicles.values()), "all are heard again", 8.0, False)
@@ -132,14 +134,14 @@ def _outcome(fleet: RunningFleet, cf: int, begun: float) -> str:
 
 
 def figures(rows: Sequence[Row]) -> dict[str, Any]:
-    """By phase: lengths of gaps (s) by what the vehicle did."""
+    """By kind and phase: lengths of gaps (s) by what the vehicle did."""
     found: dict[str, Any] = {}
-    for phase in PHASES:
+    for kind, phase in itertools.product(KINDS, PHASES):
         by: dict[str, list[float]] = {}
         for row in rows:
-            if row["phase"] == phase:
+            if (row["kind"], row["phase"]) == (kind, phase):
                 for seconds, outcome in row["table"]:
                     by.setdefault(outcome, []).append(seconds)
         if by:
-            found[f"gaps in {phase}, s"] = {outcome: sorted(seconds) for outcome, seconds in sorted(by.items())}
+            found[f"{kind} in {phase}, s"] = {outcome: sorted(seconds) for outcome, seconds in sorted(by.items())}
     return found
