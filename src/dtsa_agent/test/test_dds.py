@@ -5,14 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
-import socket
-import struct
 import subprocess
 import time
 from pathlib import Path
 
 import pytest
 from node_helpers import ros_graph
+from process_helpers import addresses, segments_of
 
 from dtsa_agent.ros.common.dds import (
     PROFILE,
@@ -21,33 +20,10 @@ from dtsa_agent.ros.common.dds import (
     RANGE,
     clean_shared_memory,
     limit_to_machine,
-    punctual,
 )
+from dtsa_agent.ros.common.process import in_real_time
 
 SHARED_MEMORY = Path("/dev/shm")
-
-
-def addresses(pid: int) -> set[str]:
-    """Local addresses of all UDP and TCP sockets of a process."""
-    inodes = set()
-    for entry in Path(f"/proc/{pid}/fd").iterdir():
-        target = os.readlink(entry)
-        if target.startswith("socket:["):
-            inodes.add(target[8:-1])
-    found = set()
-    for table in ("udp", "tcp", "udp6", "tcp6"):
-        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
-            fields = line.split()
-            if fields[9] in inodes:
-                raw = fields[1].split(":")[0]
-                found.add(socket.inet_ntoa(struct.pack("<I", int(raw, 16))) if len(raw) == 8 else raw)
-    return found
-
-
-def segments_of(pid: int) -> set[str]:
-    """Names of the shared memory segments and ports whose locks a process has open: its own."""
-    targets = (os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir())
-    return {Path(target).name[:-3] for target in targets if target.startswith("/dev/shm/fast")}
 
 
 def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
@@ -63,9 +39,22 @@ def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
         before = dict(other)
         limit_to_machine(other)
         assert other == before
-        assert punctual(other) == {}
-    wanted = {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(PUNCTUAL), PROFILES[1]: str(PUNCTUAL)}
-    assert punctual({RANGE: "LOCALHOST", "HOME": "/"}) == wanted
+    # Supervisor and node may have it otherwise.
+    limit_to_machine(plain, shared_memory=False)
+    assert plain == {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(PUNCTUAL), PROFILES[1]: str(PUNCTUAL)}
+    limit_to_machine(plain)
+    assert plain[PROFILES[0]] == str(PROFILE)
+
+
+def test_real_time_is_seen_in_the_command_line(tmp_path: Path) -> None:
+    live, lockstep = tmp_path / "live.yaml", tmp_path / "lockstep.yaml"
+    live.write_text("/**:\n  ros__parameters:\n    agents: 12\n    mode: realtime\n")
+    lockstep.write_text("/**:\n  ros__parameters:\n    mode: lockstep  # not realtime\n    recording_mode: realtime\n")
+    ros = ["agent", "--ros-args"]
+    assert in_real_time([*ros, "-p", "id:=1", "-p", "mode:=realtime"])
+    assert in_real_time([*ros, "--params-file", str(lockstep), "--params-file", str(live)])
+    for words in ([], ["-p"], ["-p", "mode:=lockstep"], ["--params-file", str(lockstep)], ["--params-file", "none"]):
+        assert not in_real_time([*ros, *words])
 
 
 @pytest.mark.ros
@@ -88,10 +77,9 @@ def test_a_node_listens_on_loopback_only_and_leaves_nothing_after_kill_9(tmp_pat
 
 
 @pytest.mark.ros
-def test_a_node_that_has_to_be_punctual_has_no_port_in_shared_memory(tmp_path: Path) -> None:
+def test_a_node_in_real_time_has_no_port_in_shared_memory(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
-        graph.environment |= punctual(graph.environment)
-        node = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2")
+        node = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2", "-p", "mode:=realtime")
         names = graph.node.get_node_names_and_namespaces
         graph.until(lambda: ("channel", "/swarm") in names())
         assert addresses(node.pid) == {"127.0.0.1"}

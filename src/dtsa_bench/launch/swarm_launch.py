@@ -20,6 +20,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import settings_of
 from dtsa_agent.ros.common import names
 from dtsa_bench.fly.agent_parameters import clock_parameters
+from dtsa_bench.fly.options import FlightOptions
+from dtsa_bench.options import whole_number
 from dtsa_bench.run_config import FROM_SWARM, MODES, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
@@ -64,6 +66,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
     run = _run_config(context, config, channel)
     space = "/" + LaunchConfiguration("swarm_namespace").perform(context).strip("/")
     processes = LaunchConfiguration("processes").perform(context)
+    priority = whole_number(LaunchConfiguration("priority").perform(context), "priority", 0, 90)
     recorded = {
         **swarm,
         **channel,
@@ -71,6 +74,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
         **{CLOCKS + name: value for name, value in _given(context, ClockConfig, CLOCKS).items()},
         "mode": run.mode,
         "align": run.align,
+        "priority": priority and priority + 1,
         "out": LaunchConfiguration("out").perform(context),
         "channel_file": LaunchConfiguration("channel_file").perform(context),
     }
@@ -93,7 +97,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
                 executable="agent",
                 namespace=names.agent_namespace(agent, space),
                 name="agent",
-                parameters=[{**shared, "id": agent, **clock_parameters(run, [agent])}],
+                parameters=[{**shared, "id": agent, **clock_parameters(run, [agent], priority)}],
                 output="screen",
             )
             for agent in range(1, config.agents + 1)
@@ -110,7 +114,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
             executable="swarm_host",
             namespace=space,
             name=f"swarm_host_{index + 1}",
-            parameters=[{**shared, "ids": ids, **clock_parameters(run, ids)}],
+            parameters=[{**shared, "ids": ids, **clock_parameters(run, ids, priority)}],
             output="screen",
         )
         nodes.append(host)
@@ -143,6 +147,11 @@ def generate_launch_description() -> LaunchDescription:
             "swarm_namespace",
             default_value=names.SWARM,
             description="namespace of the swarm's topics; agents are in it unless it is the default",
+        ),
+        DeclareLaunchArgument(
+            "priority",
+            default_value=str(FlightOptions().priority),
+            description="real time: real-time priority of the agents, one more for the channel, where allowed; 0: none",
         ),
         DeclareLaunchArgument("out", default_value="flight", description="new directory for the bag and the results"),
         DeclareLaunchArgument("channel_file", default_value="", description="YAML file with settings of the channel"),

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from fly_helpers import command
 from metronome import flown_again_when_overloaded
+from process_helpers import addresses, may_be_real_time, real_time, segments_of
 from waiting import wait_for
 
 from dtsa_agent.core.delays import Delays
@@ -117,11 +118,16 @@ def test_a_channel_that_stood_still_shows_in_what_the_agents_knew_and_makes_nobo
 def test_the_clock_on_the_wall_ends_a_flight(tmp_path: Path, mode: str) -> None:
     words = ("--agents", "3", "--moving", "2", "--policy", "tdma", "--tail-s", "3600", "--timeout-s", "3600")
     limit = ("--processes", "1", "--wall-timeout-s", "3", "--mode", mode, "--no-picture")
-    done = subprocess.run(
-        command("--out", str(tmp_path / "out"), *words, *limit), capture_output=True, text=True, timeout=PATIENCE_S
-    )
-    assert done.returncode == 1
-    assert "the flight took longer than 3 s by the clock on the wall" in done.stderr
+    with flight(tmp_path / "out", *words, *limit) as process:
+        nodes = [process.pid, *children(process.pid)]
+        assert len(nodes) == 2
+        # What is limited to this machine cannot be reached from outside, and real time has no port in shared memory.
+        assert [addresses(pid) for pid in nodes] == [{"127.0.0.1"}] * 2
+        assert all(bool(segments_of(pid)) == (mode == "lockstep") for pid in nodes)
+        assert all(real_time(pid) == (mode == "realtime" and may_be_real_time()) for pid in nodes)
+        said = process.communicate(timeout=PATIENCE_S)[1]
+    assert process.returncode == 1
+    assert "the flight took longer than 3 s by the clock on the wall" in said
     assert "longer than 3 s" in summary_of(tmp_path / "out")["cut_short"]
     assert verify_bag(tmp_path / "out").ok
 

@@ -8,6 +8,7 @@ and `safety`.
 from __future__ import annotations
 
 import dataclasses
+import os
 import signal
 import sys
 import threading
@@ -34,6 +35,7 @@ from dtsa_agent.crazyflie.preflight import FAIL, preflight
 from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_agent.crazyflie.state_machine import State
+from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.priority import stay_on_one_processor, take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
@@ -273,6 +275,7 @@ def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = r
     """
     argv = list(sys.argv if args is None else args)
     follow_supervisor()
+    limit_to_machine(os.environ, shared_memory=False)
     try:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy's errors for a wrong command line have no common base

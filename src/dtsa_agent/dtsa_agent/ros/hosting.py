@@ -20,7 +20,7 @@ from dtsa_agent.plugin_watch import watched
 from .common import names
 from .common.loop import Stop
 from .common.parameters import declare_settings
-from .common.priority import give_way_by
+from .common.priority import PrioritySettings, give_way_by, take_priority
 from .swarm_node import SwarmNode
 
 
@@ -102,11 +102,12 @@ def _run_agents(
     spaces: Sequence[str] | None,
 ) -> None:
     host = HostSettings(**declare_settings(node, HostSettings))
+    priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
     swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared and host.mode == "lockstep"))
     if host.mode == "lockstep":
         agents: SwarmNode = SwarmNode(node, swarm, space)
     else:
-        agents = _realtime(node, swarm, space)
+        agents = _realtime(node, swarm, space, priority)
     if host.odometry:
         agents.offer_odometry(spaces)
     logger = node.get_logger()
@@ -121,7 +122,7 @@ def _run_agents(
         agents.loop.close()
 
 
-def _realtime(node: Node, swarm: AbstractSwarm, space: str) -> SwarmNode:
+def _realtime(node: Node, swarm: AbstractSwarm, space: str, priority: int) -> SwarmNode:
     from .realtime import RealtimeNode
 
     count = len(swarm.ids)
@@ -138,11 +139,14 @@ def _realtime(node: Node, swarm: AbstractSwarm, space: str) -> SwarmNode:
         2,
         "from the order to send until a receiver has the frame: for any frame, and more for each of its bytes (ns)",
     )
-    text = "by how much this process gives way to others, the channel above all: nice, 0 to 19"
+    text = (
+        "without real-time priority: by how much this process gives way to others, the channel above all: nice, 0 to 19"
+    )
     nice = _declare(node, "nice", 0, text, ParameterType.PARAMETER_INTEGER)
     if not 0 <= nice <= 19:
         raise ConfigError("nice", nice, "0 to 19")
-    if nice:
+    first = priority and not take_priority(priority)
+    if nice and not first:
         give_way_by(nice)
     text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
     places = list(_declare(node, "resume_at", [0.0], text, ParameterType.PARAMETER_DOUBLE_ARRAY))

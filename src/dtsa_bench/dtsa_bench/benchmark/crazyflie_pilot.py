@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -19,6 +20,8 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Empty
 
+from dtsa_agent.ros.common.dds import limit_to_machine
+
 from .stamped_fleet import STEP_MPS
 
 Step = Callable[[str, Callable[[], object]], None]
@@ -33,6 +36,7 @@ class Pilot:
 
     def __init__(self, domain: int, count: int) -> None:
         self._context = Context()
+        limit_to_machine(os.environ, shared_memory=False)
         rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node("benchmark", context=self._context, enable_rosout=False, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import signal
 import socket
 import sys
@@ -13,6 +14,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.signals import SignalHandlerOptions
 
+from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.priority import take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
 from dtsa_bench.fake_crazyflie.cameras import DATAGRAM, half_turn, read_picture
@@ -42,6 +44,7 @@ def main(argv: list[str] | None = None) -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", args.port))
         take_priority(args.priority)  # in a laboratory this is a machine of its own
+        limit_to_machine(os.environ, shared_memory=False)
         rclpy.init(args=QUIET, signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node("motion_capture", enable_rosout=False, start_parameter_services=False)
         publishers: dict[int, Any] = {}

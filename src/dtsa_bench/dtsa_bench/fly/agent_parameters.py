@@ -8,15 +8,17 @@ from typing import Any
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_channel_sim import make_clocks
 
-# Process priority in real time: agents give way to the channel, which goes first where it may.
+# Process priority in real time where there is no real-time priority: agents give way to the channel, which goes first
+# where it may.
 AGENTS_NICE, CHANNEL_NICE = 5, -10
 
 
-def clock_parameters(run: RunConfig, ids: Sequence[int]) -> dict[str, Any]:
-    """The clocks of some agents, and how long a frame takes, in real time; nothing in lockstep.
+def clock_parameters(run: RunConfig, ids: Sequence[int], priority: int) -> dict[str, Any]:
+    """The clocks of some agents, how long a frame takes, and who goes first, in real time; nothing in lockstep.
 
     :param run: the run.
     :param ids: the agents' ids.
+    :param priority: real-time priority of their process; 0: none.
     """
     if run.mode == LOCKSTEP:
         return {}
@@ -31,4 +33,5 @@ def clock_parameters(run: RunConfig, ids: Sequence[int]) -> dict[str, Any]:
         "align": run.align,
         "flight_time_ns": [fixed + link, airtime.total_ns(1) - fixed],
         "nice": AGENTS_NICE,
+        "priority": priority,
     }

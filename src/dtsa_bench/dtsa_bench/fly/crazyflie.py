@@ -133,7 +133,7 @@ def fly_crazyflies(
         directory = new_directory(out)
         logs = directory / "log"
         logs.mkdir()
-        environment = run_environment(domain, logs)
+        environment = run_environment(domain, logs, shared_memory=False)
         shown.enter_context(mission_page(domain, environment, page))
         context = Context()
         progress = ProgressLine("fly")

@@ -23,10 +23,10 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.dds import punctual
+from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
-from dtsa_agent.ros.common.priority import give_way_by
+from dtsa_agent.ros.common.priority import give_way_by, take_priority
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
@@ -61,14 +61,16 @@ QUIET = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
 END_S = 1.0  # wall time in which the nodes are to hear of the end; those that have not are ended then
 
 
-def run_environment(domain: int, logs: Path) -> dict[str, str]:
+def run_environment(domain: int, logs: Path, shared_memory: bool = True) -> dict[str, str]:
     """Variables for the processes of a run; this process gets those that its own node needs.
 
     :param domain: ROS domain.
     :param logs: directory for ROS's logs.
+    :param shared_memory: whether nodes of this process use it: not in real time.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    limit_to_machine(os.environ, shared_memory)
     os.environ["ROS_LOG_DIR"] = str(logs.resolve())
     return {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs.resolve())}
 
@@ -158,9 +160,7 @@ def fly(
         directory = new_directory(out)
         (directory / "log").mkdir()
         context = Context()
-        environment = run_environment(domain, directory / "log")
-        if run.mode != LOCKSTEP:
-            environment |= punctual(os.environ)
+        environment = run_environment(domain, directory / "log", shared_memory=run.mode == LOCKSTEP)
         children = Children(directory / "log", environment)
         progress = progress or ProgressLine(label)
         try:
@@ -212,7 +212,7 @@ def _fly(
         ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
         failure: DtsaError | None = None
         try:
-            _run(channel, ended, shown)
+            _run(channel, ended, shown, options.priority)
         except DtsaError as error:
             failure = error
         progress.end()
@@ -233,9 +233,9 @@ def _fly(
         node.destroy_node()
 
 
-def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress) -> None:
+def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress, priority: int) -> None:
     """The flight itself; the channel is closed afterwards."""
-    first = isinstance(channel, RealtimeChannel) and not give_way_by(CHANNEL_NICE)
+    first = isinstance(channel, RealtimeChannel) and _go_first(priority)
     try:
         channel.run(ended)
         shown.show()
@@ -246,7 +246,15 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: Fli
             channel.close()
         finally:
             if first and not ended.stop:  # who has been told to end does so before all else
+                take_priority(0)
                 give_way_by(0)
+
+
+def _go_first(priority: int) -> bool:
+    """The channel before its agents, and both before all else if that is allowed; whether anything was."""
+    if priority and not take_priority(priority + 1, inherited=False):
+        return True
+    return not give_way_by(CHANNEL_NICE)
 
 
 def _cut_short(channel: Any, ended: EarlyEnd, failure: DtsaError | None) -> dict[str, str]:
@@ -273,7 +281,7 @@ def _start_agents(
         for agent in range(1, swarm.agents + 1):
             if stop:
                 raise KeyboardInterrupt
-            place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_arguments(run, [agent])]
+            place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_arguments(run, [agent], options.priority)]
             start = partial(children.start, f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
             if agent in options.late:
                 late.append(LateStart(options.late[agent], agent, start))
@@ -286,12 +294,15 @@ def _start_agents(
             raise KeyboardInterrupt
         own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_table:={shared}"]
         name = f"swarm_host_{number} with {named(ids)}"
-        children.start(name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_arguments(run, ids)])
+        children.start(
+            name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_arguments(run, ids, options.priority)]
+        )
     return late
 
 
-def _clock_arguments(run: RunConfig, ids: list[int]) -> list[str]:
-    return [word for name, value in clock_parameters(run, ids).items() for word in ("-p", f"{name}:={_plain(value)}")]
+def _clock_arguments(run: RunConfig, ids: list[int], priority: int) -> list[str]:
+    values = clock_parameters(run, ids, priority)
+    return [word for name, value in values.items() for word in ("-p", f"{name}:={_plain(value)}")]
 
 
 def _plain(value: object) -> str:

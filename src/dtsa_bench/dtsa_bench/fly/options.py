@@ -38,6 +38,12 @@ class FlightOptions(AnswerLimits):
         minimum=1,
         maximum=864000,
     )
+    priority: int = setting(
+        10,
+        "real time: real-time priority of the agents, one more for the channel, where allowed; 0: none",
+        minimum=0,
+        maximum=90,
+    )
     pictures: bool = setting(True, "draw trajectories.png")
 
     def __post_init__(self) -> None:

@@ -19,6 +19,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_setting, declare_settings
+from dtsa_agent.ros.common.priority import PrioritySettings, take_priority
 from dtsa_agent.ros.common.process import run_node
 from dtsa_agent.ros.common.runs import Run
 from dtsa_bench.options import new_directory
@@ -155,8 +156,11 @@ def _body(stop: Stop, supervised: bool) -> None:
         check_key(run.swarm)
         directory = new_directory(declare_setting(node, Setting("out", "text", "flight", "directory for the results")))
         wait = AnswerLimits(**declare_settings(node, AnswerLimits))
+        first = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
         flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s, space=space)
         try:
+            if run.mode != LOCKSTEP:
+                take_priority(first)
             flight.channel.run(stop)
         finally:
             flight.channel.close()

@@ -21,6 +21,7 @@ from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.names import MODES
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_settings, from_parameter
+from dtsa_agent.ros.common.priority import PrioritySettings, take_priority
 from dtsa_agent.ros.common.process import run_node
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, ChannelConfig
@@ -110,6 +111,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         values = declare_channel(node, ChannelConfig(agents=12))
         run = ChannelNodeSettings(**declare_settings(node, ChannelNodeSettings))
         config = ChannelConfig.from_dict(values)
+        first = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
         medium, referee = Channel(config), SlotLimit(run.slots)
         kind = LockstepChannel if run.mode == MODES[0] else RealtimeChannel
         channel = kind(
@@ -118,6 +120,8 @@ def _body(stop: Stop, supervised: bool) -> None:
         try:
             watch(channel, node, {"mode": run.mode, "channel": config.to_dict()}, space)
             follow_parameters(node, medium, channel.change_settings)
+            if run.mode != MODES[0]:
+                take_priority(first)
             channel.run(stop)
         finally:
             channel.close()

@@ -7,7 +7,7 @@ import os
 import re
 import struct
 import time
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, MutableMapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -28,34 +28,27 @@ _PORT = struct.Struct("<7I")
 _MOST_LISTENERS, _FLAGS = 1024, 8
 
 
-def limit_to_machine(environment: MutableMapping[str, str], profile: Path = PROFILE) -> None:
-    """Makes ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` mean loopback and shared memory alone.
+def limit_to_machine(environment: MutableMapping[str, str], shared_memory: bool = True) -> None:
+    """Makes ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` mean loopback, and shared memory, alone.
 
     rmw_fastrtps adds a UDP transport of its own under LOCALHOST, which listens on all interfaces. With SYSTEM_DEFAULT
     it takes the transports of our profile instead. Another range, another middleware, or a profile of the user stays.
 
+    Shared memory is faster, but not for what has to be punctual: a process that sends to another one for the first time
+    looks whether its port is alive, and if that one is idle sleeps for a third of a second: often in the thread that
+    receives. Nothing is heard in that time.
+
     :param environment: variables of a process that has not used the middleware yet; changed in place.
-    :param profile: the one to take.
+    :param shared_memory: whether it uses shared memory: not in real time.
     """
     foreign = not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
-    if environment.get(RANGE) != "LOCALHOST" or foreign or any(name in environment for name in PROFILES):
+    ours = all(environment.get(name) in map(str, (PROFILE, PUNCTUAL)) for name in PROFILES)  # a supervisor's
+    plain = environment.get(RANGE) == "LOCALHOST" and not any(name in environment for name in PROFILES)
+    if foreign or not (ours or plain):
         return
     environment[RANGE] = "SYSTEM_DEFAULT"
     for name in PROFILES:
-        environment[name] = str(profile)
-
-
-def punctual(environment: Mapping[str, str]) -> dict[str, str]:
-    """Variables that keep processes from shared memory: for agents in real time.
-
-    A process that sends to another one for the first time looks whether its port in shared memory is alive, and if that
-    one is idle sleeps for a third of a second: often in the thread that receives. Nothing is heard in that time.
-
-    :param environment: variables that the processes would have; a wish that is not ours stays.
-    """
-    found = dict(environment)
-    limit_to_machine(found, PUNCTUAL)
-    return {name: found[name] for name in (RANGE, *PROFILES) if found.get(name) != environment.get(name)}
+        environment[name] = str(PROFILE if shared_memory else PUNCTUAL)
 
 
 def clean_shared_memory(directory: Path = _SHARED_MEMORY) -> list[str]:

@@ -10,16 +10,34 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
+from dtsa_agent.core.settings import Settings, setting
 
-def take_priority(level: int) -> str:
-    """Lets all threads of this process run before everything ordinary (SCHED_RR); those that they start, too.
+
+@dataclass(frozen=True, slots=True)
+class PrioritySettings(Settings):
+    """Who goes first on a computer.
+
+    :raises ConfigError: for values that are not allowed.
+    """
+
+    priority: int = setting(
+        0, "in real time: real-time priority of this process, where allowed; 0: none", minimum=0, maximum=90
+    )
+
+
+def take_priority(level: int, inherited: bool = True) -> str:
+    """Lets all threads of this process run before everything ordinary (SCHED_RR).
 
     :param level: 1 (low) to 99; 0: ordinary.
+    :param inherited: whether threads and processes that they start do so, too.
     :returns: why not, or an empty text.
     """
     policy = os.SCHED_RR if level else os.SCHED_OTHER
+    if level and not inherited:
+        policy |= os.SCHED_RESET_ON_FORK
     try:
         _for_all_threads(lambda task: os.sched_setscheduler(task, policy, os.sched_param(level)))
     except OSError as error:

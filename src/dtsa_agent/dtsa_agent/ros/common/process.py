@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -16,10 +20,12 @@ from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
+from . import names
 from .dds import clean_shared_memory, limit_to_machine
 from .loop import Stop
 
 _PR_SET_PDEATHSIG = 1
+_REALTIME = re.compile(rf"""^\s*["']?mode["']?\s*:\s*["']?{names.MODES[1]}\b""", re.MULTILINE)
 SUPERVISOR = "DTSA_SUPERVISOR"  # process id of the supervisor that started this node, if one did
 
 
@@ -48,16 +54,34 @@ def node_options(supervised: bool) -> dict[str, Any]:
     return {"start_parameter_services": False, "enable_rosout": False, "parameter_overrides": [silent]}
 
 
-def run_node(name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None) -> int:
+def in_real_time(words: Sequence[str]) -> bool:
+    """Whether a command line asks for ``mode:=realtime``: the middleware wants to know before there is a node.
+
+    :param words: with ROS's arguments; parameter files are looked into.
+    """
+    for option, value in pairwise(words):
+        if option in ("-p", "--param") and value == f"mode:={names.MODES[1]}":
+            return True
+        if option == "--params-file":
+            with suppress(OSError, UnicodeError):  # rclpy says what is wrong with it
+                if _REALTIME.search(Path(value).read_text(encoding="utf-8")):
+                    return True
+    return False
+
+
+def run_node(
+    name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None, real_time: bool = False
+) -> int:
     """Runs a node until it ends by itself or by SIGINT or SIGTERM.
 
     :param name: what it calls itself in error messages.
     :param body: creates the node and runs it; gets the signal flag and whether a supervisor started this process.
     :param args: command line, default ``sys.argv``.
+    :param real_time: whether it is in real time always; otherwise its command line says so.
     :returns: exit code: 0 for a clean end (by a signal, too), 2 for settings that are not usable, 1 for other errors.
     """
     supervised = follow_supervisor()
-    limit_to_machine(os.environ)
+    limit_to_machine(os.environ, shared_memory=not (real_time or in_real_time(sys.argv if args is None else args)))
     if not supervised:  # a supervisor does that for all of them
         clean_shared_memory()  # of the process, killed, whose place this one may take
     with Stop() as stop:
