@@ -174,6 +174,11 @@ class FlightMetrics:
             if self.split_slot < 0:
                 self.split_slot = slot
 
+    @property
+    def agreed(self) -> tuple[int, int]:
+        """Slots in which decisions were compared so far, and those in which all took the same agent for the sender."""
+        return self._compared, self._compared - self._torn
+
     def closest(self) -> tuple[float, tuple[int, int]]:
         """Smallest distance so far, m, and the ids of the two agents."""
         sums = self._kernel.result()

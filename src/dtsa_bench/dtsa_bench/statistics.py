@@ -46,6 +46,22 @@ class Mean:
     count: int  # values it is the mean of
 
 
+def median_interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, float]:
+    """Two of the values between which the true median lies, whatever the distribution (sign test).
+
+    :param values: independent ones.
+    :param level: probability that it does, at least; with fewer than six values it is less than 0.95.
+    :raises ValueError: without values.
+    """
+    ordered = sorted(values)
+    if not ordered:
+        raise ValueError("values: got none; allowed: one or more")
+    count, cut, below = len(ordered), 0, 1  # values left out at either end; ways in which so few lie on one side
+    while (below := below + math.comb(count, cut + 1)) <= (1.0 - level) * 2.0 ** (count - 1):
+        cut += 1
+    return ordered[cut], ordered[-1 - cut]
+
+
 def wilson(count: int, total: int, level: float = LEVEL) -> Share:
     """The share k / n with the interval of Wilson (1927), which stays honest at 0 of n and n of n.
 

@@ -240,9 +240,9 @@ def test_a_link_to_a_server_that_stands_still_never_waits() -> None:
     """What it cannot take is dropped; that a process stands still is what SIGSTOP makes of it."""
     link = ViewLink()
     try:
-        assert link.offer(record(BEGIN, 0, "{}"))
+        assert link.offer(record(BEGIN, {}))
         os.kill(link.process_id, signal.SIGSTOP)
-        data = record(BEGIN, 0, json.dumps("x" * 100_000))
+        data = record(BEGIN, "x" * 100_000)
         begin = time.monotonic()
         taken = sum(link.offer(data) for _ in range(100))
         assert time.monotonic() - begin < 1.0

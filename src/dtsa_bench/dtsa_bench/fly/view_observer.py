@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,7 +12,7 @@ from rclpy.parameter import Parameter
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_bench.run_config import RunConfig
 from dtsa_bench.view.link import BEGIN, END, ViewLink, record
-from dtsa_bench.view.moments import Moments, estimate_now, run_info
+from dtsa_bench.view.moments import Gathered, Moments, estimate_now, run_info
 from dtsa_bench.view.orders import Order, read_order
 from dtsa_channel_sim import Change
 from dtsa_channel_sim.model.verdict import Verdict
@@ -31,6 +30,9 @@ _MOST_ORDERS = 10  # carried out at a time
 
 class ViewObserver(ChannelObserver):
     """Tells a flight moment by moment.
+
+    Between the last answer and the next slot all agents wait for the channel: what is told is only copied then. It is
+    sent when the next slot is on its way, and put into words by the server.
 
     :param link: to the server.
     :param name: what the page calls the flight.
@@ -52,18 +54,19 @@ class ViewObserver(ChannelObserver):
         self._link, self._measurement, self._pace, self._carry_out = link, measurement, pace, carry_out
         self._moments = Moments(measurement.scenario, run.swarm.slot_ns, run.air)
         self._oracle = run.swarm.estimator_row.needs_everybody
-        self._agents = run.swarm.agents
         self._slot = 0
         self._next_s = 0.0  # time.monotonic() before which no further moment is told
         self._crashed = False
+        self._agreed = 0, 0  # of the metrics, at the last moment
         self._answers: Answers | None = None
+        self._gathered: Gathered | None = None  # to be sent in this slot
         self._ended = "over"
         info = run_info(name, run, measurement.scenario) | {
             "live": True,
             "control": link.control,
             "kills": pace is not None,
         }
-        link.offer(record(BEGIN, 0, json.dumps(info)))
+        link.offer(record(BEGIN, info))
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         self._slot, self._answers = slot, answers
@@ -73,9 +76,9 @@ class ViewObserver(ChannelObserver):
         now = time.monotonic()
         if now >= self._next_s and self._link.ready():  # until then all that comes in waits for the next moment
             self._next_s = now + _PERIOD_S
-            self._tell(slot, answers)
+            self._gathered = self._gather(slot, answers)
 
-    def _tell(self, slot: int, answers: Answers) -> None:
+    def _gather(self, slot: int, answers: Answers) -> Gathered:
         metrics, tables = self._measurement.metrics, self._measurement.tables
         if metrics.collided_pair and not self._crashed:
             self._crashed = True
@@ -83,17 +86,18 @@ class ViewObserver(ChannelObserver):
         estimate_now(tables, self._oracle, slot, answers.position)
         lag_ms, stalls = self._pace() if self._pace else (0.0, 0)
         lost = sorted(metrics.lost)
-        more = {"lag_ms": round(lag_ms, 2), "stalls": stalls}
-        self._link.moment(self._moments.make(slot, tables, answers.chosen, answers.digest, lost, **more))
+        compared, same = metrics.agreed
+        agree = [compared - self._agreed[0], same - self._agreed[1]]
+        self._agreed = compared, same
+        more = {"lag_ms": round(lag_ms, 2), "stalls": stalls, "agree": agree}
+        return self._moments.gather(slot, tables, answers.chosen, answers.digest, lost, **more)
 
-    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+    def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        if self._gathered is not None:
+            self._link.moment(self._gathered)
+            self._gathered = None
         if verdict.senders:
             self._moments.frames(slot, verdict.outcome, verdict.senders, answers.reason, verdict.received)
-        lost = self._measurement.metrics.lost
-        chosen = answers.chosen
-        if lost:
-            chosen = chosen[[agent not in lost for agent in range(1, self._agents + 1)]]
-        self._moments.choices(chosen)
 
     def stalled(self, from_ns: int, to_ns: int) -> None:
         self._moments.event(self._slot, "bad", f"the channel stood still for {(to_ns - from_ns) / 1e6:.0f} ms")
@@ -123,9 +127,11 @@ class ViewObserver(ChannelObserver):
     def close(self) -> None:
         """Tells the last moment."""
         with suppress(DtsaError):
+            if self._gathered is not None:
+                self._link.moment(self._gathered)
             if self._answers is not None:
-                self._tell(self._slot, self._answers)
-        self._link.last(record(END, 0, json.dumps(self._ended)))
+                self._link.moment(self._gather(self._slot, self._answers))
+        self._link.last(record(END, self._ended))
 
 
 class Control:

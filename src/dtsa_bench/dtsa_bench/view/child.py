@@ -12,12 +12,13 @@ from contextlib import suppress
 
 from dtsa_agent.core.errors import DtsaError
 
-from .link import BEGIN, END, HEAD, LONGEST, MOMENT, give_way
-from .moments import Moment
+from .link import BEGIN, END, MOMENT, give_way, read_record
+from .moments import told
 from .orders import Order
 from .server import ViewServer, new_token
 from .track import Track
 
+_BUFFER = 1 << 20  # bytes that have come and are not taken in yet
 _LAST_S = 2.0  # for pages to take the end of a flight
 
 
@@ -40,21 +41,20 @@ class _Orders:
 
 async def _take_in(reader: asyncio.StreamReader, track: Track) -> None:
     """Takes in records until the flight has gone."""
+    moving: list[bool] = []
     while True:
-        kind, slot, *sizes = HEAD.unpack(await reader.readexactly(HEAD.size))
-        if max(sizes) > LONGEST:
-            return
-        text, heard, believed = [await reader.readexactly(size) for size in sizes]
+        kind, content = await read_record(reader)
         if kind == BEGIN:
-            track.begin(json.loads(text))
+            moving = content.get("moving", [])
+            track.begin(content)
         elif kind == MOMENT:
-            track.add(Moment(slot, text.decode(), heard, believed))
+            track.add(told(content, moving))
         elif kind == END:
-            track.end(json.loads(text))
+            track.end(content)
 
 
 async def _serve(connection: socket.socket, port: int, control: bool) -> None:
-    reader, writer = await asyncio.open_connection(sock=connection)
+    reader, writer = await asyncio.open_connection(sock=connection, limit=_BUFFER)
     track = Track("flight")
     server = ViewServer([track], new_token(), _Orders(writer) if control else None)
     try:

@@ -9,33 +9,52 @@ import struct
 import subprocess
 import sys
 import time
+from asyncio import StreamReader
+from collections.abc import Sequence
 from contextlib import suppress
+from itertools import accumulate
 from typing import Any
 
 from dtsa_agent.core.errors import DtsaError
 
-from .moments import Moment
+from .moments import Gathered
 
 BEGIN, MOMENT, END = 0, 1, 2  # kinds of records
-HEAD = struct.Struct("<BIIII")  # kind, slot, bytes of text, of ages, of beliefs
-LONGEST = 64 << 20  # bytes of a part of a record
+HEAD = struct.Struct("<BI9I")  # kind, slot, bytes of text and of what is gathered of a moment
+LONGEST = 64 << 20  # bytes of a record
 _START_S = 30.0
 _ORDERS_BYTES = 1 << 16  # of orders that wait; what sends more is not our page
 _NICE = 10
 OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
 
 
-def record(kind: int, slot: int, text: str, heard: bytes = b"", believed: bytes = b"") -> bytes:
+def record(kind: int, content: Any, slot: int = 0, parts: Sequence[bytes] = (b"",) * 8) -> bytes:
     """A record as it goes to the server.
 
     :param kind: BEGIN, MOMENT or END.
+    :param content: what goes as JSON; of a moment, `Gathered.more`.
     :param slot: of a moment.
-    :param text: JSON.
-    :param heard: as in :class:`Moment`.
-    :param believed: as in :class:`Moment`.
+    :param parts: of a moment, the other fields of :class:`Gathered`.
     """
-    data = text.encode()
-    return b"".join((HEAD.pack(kind, slot, len(data), len(heard), len(believed)), data, heard, believed))
+    text = json.dumps(content, separators=(",", ":")).encode()
+    return b"".join((HEAD.pack(kind, slot, len(text), *map(len, parts)), text, *parts))
+
+
+async def read_record(reader: StreamReader) -> tuple[int, Any]:
+    """The next record: its kind, and its content; of a moment, a :class:`Gathered`.
+
+    :param reader: the connection to the flight.
+    :raises IncompleteReadError: if no more comes.
+    :raises ValueError: if it is none.
+    """
+    kind, slot, *sizes = HEAD.unpack(await reader.readexactly(HEAD.size))
+    if sum(sizes) > LONGEST:
+        raise ValueError(f"a record of {sum(sizes)} bytes")
+    data = await reader.readexactly(sum(sizes))
+    ends = list(accumulate(sizes))
+    text, *parts = [data[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+    content = json.loads(text)
+    return kind, Gathered(slot, *parts, content) if kind == MOMENT else content
 
 
 class ViewLink:
@@ -121,9 +140,11 @@ class ViewLink:
                 found.append(json.loads(line))
         return found
 
-    def moment(self, moment: Moment) -> bool:
-        """Offers a moment; whether it was taken."""
-        return self.offer(record(MOMENT, moment.slot, moment.text, moment.heard, moment.believed))
+    def moment(self, gathered: Gathered) -> bool:
+        """Offers what a moment is made of; whether it was taken."""
+        one = gathered
+        parts = (one.frames, one.at, one.place, one.chosen, one.digest, one.in_ap, one.sent_slot, one.estimate)
+        return self.offer(record(MOMENT, one.more, one.slot, parts))
 
     def last(self, data: bytes, patience_s: float = 1.0) -> None:
         """Sends the last records; waits a moment for a server that is behind.

@@ -1,8 +1,9 @@
-"""What a page shows of one moment of a run, thinned where it arises, and how it travels."""
+"""What a page shows of one moment of a run: gathered where it arises, told where nobody waits for it."""
 
 from __future__ import annotations
 
 import json
+from array import array
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ UNKNOWN = 65535  # an age that is not known
 _AGE_STEPS = 10  # mean ages are told in tenths of slots
 _MM = 1000.0  # believed positions are told in mm
 _FARTHEST = 32767
+_FRAME = (("slot", "<u4"), ("sender", "<u2"), ("outcome", "u1"), ("reason", "u1"), ("received", "u1"))
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +40,22 @@ class Moment:
     text: str  # what the page takes in, a JSON object
     heard: bytes  # (N, N) uint16, slots since each observer heard each agent; empty: not told
     believed: bytes  # (N, 3, N) int16 mm, frame map, where each observer takes each agent to be; empty: not told
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """What has come in between two moments, and what the agents know now: bytes as they are, quickly made."""
+
+    slot: int  # slots flown; positions are those at the start of this one
+    frames: bytes  # (F, 5) int64, slot, sender, outcome, reason and share of receivers of each frame
+    at: bytes  # (P,) uint32, slots of the positions
+    place: bytes  # (P, 3, N) float32 m, frame map
+    chosen: bytes  # (N,) uint16, ids that the agents take for the sender
+    digest: bytes  # (N,) uint32, of their tables; empty: not known
+    in_ap: bytes  # (M, N) uint8, what the tables hold; empty: not known
+    sent_slot: bytes  # (M, N) int64, likewise
+    estimate: bytes  # (M, 3, N) float64 m, frame map, likewise; empty: not told
+    more: dict[str, Any]  # the rest as JSON types; absent: ids of agents that have fallen silent
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +93,7 @@ def run_info(name: str, run: RunConfig, scenario: Scenario) -> dict[str, Any]:
 
 
 class Moments:
-    """Collects what happens in a run, and tells it moment by moment; all that it holds is bounded.
+    """Collects what happens in a run, and gives it away moment by moment; all that it holds is bounded.
 
     :param scenario: the run's scenario.
     :param slot_ns: ns, length of a slot.
@@ -86,11 +104,10 @@ class Moments:
         self._scheduled = deque([] if air is None else scheduled_changes(air))
         self.agents = scenario.start.shape[1]
         self.place_slots = max(1, round(1e9 / PLACES_HZ / slot_ns))  # slots from one position to the next
-        self._moving = scenario.moving
+        self._moving = scenario.moving.tolist()
         most = max(1, self.agents - 1)
         self._shares = [min(255, round(255 * count / most)) for count in range(self.agents + 1)]  # by receivers
-        self._own = np.eye(self.agents, dtype=bool)
-        self._frames: deque[tuple[int, int, int, int, int]] = deque(maxlen=MOST_FRAMES)
+        self._frames = array("q")  # the columns of one frame after the other
         self._places: deque[tuple[int, bytes]] = deque(maxlen=MOST_PLACES)
         self._events: deque[tuple[int, str, str]] = deque(maxlen=MOST_EVENTS)
         self._crashes: deque[tuple[int, int, int, float]] = deque(maxlen=MOST_EVENTS)
@@ -109,7 +126,9 @@ class Moments:
         """
         for row, sender in enumerate(senders):
             share = 255 if received is None else self._shares[np.count_nonzero(received[row])]
-            self._frames.append((slot, sender, outcome, reason.item(sender - 1), share))
+            self._frames.extend((slot, sender, outcome, reason.item(sender - 1), share))
+        if len(self._frames) > 2 * len(_FRAME) * MOST_FRAMES:  # not at every frame: all that is left moves
+            del self._frames[: -len(_FRAME) * MOST_FRAMES]
 
     def choices(self, chosen: NDArray[Any]) -> None:
         """Takes in whom the agents take for a slot's sender.
@@ -155,7 +174,7 @@ class Moments:
         """
         self._crashes.append((slot, *pair, round(distance_m, 4)))
 
-    def make(
+    def gather(
         self,
         slot: int,
         tables: AbstractSwarm | None,
@@ -163,7 +182,7 @@ class Moments:
         digest: NDArray[Any] | None,
         absent: Iterable[int] = (),
         **more: Any,
-    ) -> Moment:
+    ) -> Gathered:
         """All that has come in since the last moment, and what the agents know now.
 
         :param slot: the slot that starts.
@@ -175,56 +194,100 @@ class Moments:
         """
         while self._scheduled and self._scheduled[0].slot <= slot:
             self.change(self._scheduled.popleft())
-        gone = sorted(absent)
-        rows = np.array(self._frames, dtype=np.int64).reshape(-1, 5)
-        kinds = zip(("slot", "sender", "outcome", "reason", "received"), ("<u4", "<u2", "u1", "u1", "u1"), strict=True)
-        here = np.ones(self.agents, dtype=bool)
-        here[[agent - 1 for agent in gone]] = False
-        content = {
-            "slot": slot,
-            "at": pack(np.array([at for at, _ in self._places], "<u4")),
-            "place": pack(np.frombuffer(b"".join(data for _, data in self._places), "<f4")),
-            "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(kinds)},
-            "agree": [self._compared, self._same],
-            "tables": 0 if digest is None else len(set(digest[here].tolist())),
-            "chosen": pack(chosen.astype("<u2")),
-            "age": pack(self._mean_ages(slot, tables)),
-            "absent": gone,
-            "events": list(self._events),
-            "crashes": list(self._crashes),
-            **more,
-        }
-        heard, believed = self._beliefs(slot, tables)
-        self._frames.clear()
+        in_ap = sent_slot = estimate = b""
+        if tables is not None:
+            in_ap, sent_slot = tables.in_ap.tobytes(), tables.sent_slot.tobytes()
+            if self.agents <= BELIEFS and len(tables.sent_slot) == self.agents:
+                estimate = tables.estimate_position.tobytes()
+        gathered = Gathered(
+            slot,
+            self._frames[-len(_FRAME) * MOST_FRAMES :].tobytes(),
+            array("I", [at for at, _ in self._places]).tobytes(),
+            b"".join([place for _, place in self._places]),
+            chosen.astype("<u2").tobytes(),
+            b"" if digest is None else digest.astype("<u4").tobytes(),
+            in_ap,
+            sent_slot,
+            estimate,
+            {
+                "agree": [self._compared, self._same],  # of those that `choices` has taken in
+                "absent": sorted(absent),
+                "events": list(self._events),
+                "crashes": list(self._crashes),
+                **more,
+            },
+        )
+        del self._frames[:]
         self._places.clear()
         self._events.clear()
         self._crashes.clear()
         self._compared = self._same = 0
-        return Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed)
+        return gathered
 
-    def _mean_ages(self, slot: int, tables: AbstractSwarm | None) -> NDArray[np.uint16]:
-        """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
-        told = np.full(self.agents, UNKNOWN, np.uint16)
-        if tables is None:
-            return told
-        counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & self._moving
-        if len(counted) == self.agents:
-            counted &= ~self._own
-        observers = counted.sum(axis=0)
-        some = observers > 0
-        old = np.where(counted, slot - 1 - tables.sent_slot, 0).sum(axis=0)
-        told[some] = np.minimum(UNKNOWN - 1, np.rint(_AGE_STEPS * np.maximum(0, old[some]) / observers[some]))
-        return told
+    def make(
+        self,
+        slot: int,
+        tables: AbstractSwarm | None,
+        chosen: NDArray[Any],
+        digest: NDArray[Any] | None,
+        absent: Iterable[int] = (),
+        **more: Any,
+    ) -> Moment:
+        """The moment of what `gather` gives, with the same parameters."""
+        return told(self.gather(slot, tables, chosen, digest, absent, **more), self._moving)
 
-    def _beliefs(self, slot: int, tables: AbstractSwarm | None) -> tuple[bytes, bytes]:
-        if tables is None or self.agents > BELIEFS or len(tables.sent_slot) != self.agents:
-            return b"", b""
-        age = np.clip(slot - 1 - tables.sent_slot, 0, UNKNOWN - 1).astype("<u2")
-        age[tables.sent_slot < 0] = UNKNOWN
-        place = tables.estimate_position * _MM
-        np.clip(place, -_FARTHEST, _FARTHEST, out=place)
-        place[place != place] = 0.0  # not a number: of somebody never heard
-        return age.tobytes(), np.rint(place, out=place).astype("<i2").tobytes()
+
+def told(gathered: Gathered, moving: Sequence[bool]) -> Moment:
+    """The moment as it goes to a page.
+
+    :param gathered: what it is made of.
+    :param moving: (N,) which agents move.
+    :raises ValueError: if its parts do not fit together.
+    """
+    agents, slot = len(moving), gathered.slot
+    rows = np.frombuffer(gathered.frames, np.int64).reshape(-1, len(_FRAME))
+    here = np.ones(agents, dtype=bool)
+    here[[agent - 1 for agent in gathered.more["absent"]]] = False
+    in_ap = np.frombuffer(gathered.in_ap, np.uint8).reshape(-1, agents)
+    sent_slot = np.frombuffer(gathered.sent_slot, np.int64).reshape(-1, agents)
+    estimate = np.frombuffer(gathered.estimate).reshape(-1, 3, agents)
+    content = {
+        "slot": slot,
+        "at": pack(np.frombuffer(gathered.at, np.uint32).astype("<u4")),
+        "place": pack(np.frombuffer(gathered.place, "<f4")),
+        "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(_FRAME)},
+        "tables": len(set(np.frombuffer(gathered.digest, "<u4")[here].tolist())) if gathered.digest else 0,
+        "chosen": pack(np.frombuffer(gathered.chosen, "<u2")),
+        "age": pack(_mean_ages(slot, in_ap, sent_slot, np.array(moving, dtype=bool))),
+        **gathered.more,
+    }
+    heard, believed = _beliefs(slot, sent_slot, estimate) if len(estimate) else (b"", b"")
+    return Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed)
+
+
+def _mean_ages(
+    slot: int, in_ap: NDArray[np.uint8], sent_slot: NDArray[np.int64], moving: NDArray[np.bool_]
+) -> NDArray[np.uint16]:
+    """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
+    ages = np.full(len(moving), UNKNOWN, np.uint16)
+    counted = (in_ap != 0) & (sent_slot >= 0) & moving
+    if len(counted) == len(moving):
+        np.fill_diagonal(counted, False)
+    observers = counted.sum(axis=0)
+    some = observers > 0
+    old = np.where(counted, slot - 1 - sent_slot, 0).sum(axis=0)
+    ages[some] = np.minimum(UNKNOWN - 1, np.rint(_AGE_STEPS * np.maximum(0, old[some]) / observers[some]))
+    return ages
+
+
+def _beliefs(slot: int, sent_slot: NDArray[np.int64], estimate: Floats) -> tuple[bytes, bytes]:
+    """Age and place in mm of each agent as each observer knows them."""
+    age = np.clip(slot - 1 - sent_slot, 0, UNKNOWN - 1).astype("<u2")
+    age[sent_slot < 0] = UNKNOWN
+    place = estimate * _MM
+    np.clip(place, -_FARTHEST, _FARTHEST, out=place)
+    place[place != place] = 0.0  # not a number: of somebody never heard
+    return age.tobytes(), np.rint(place, out=place).astype("<i2").tobytes()
 
 
 def estimate_now(tables: AbstractSwarm, oracle: bool, slot: int, position: Floats) -> None:
