@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm
 from dtsa_agent.core.abstract_swarm import SwarmWrapper
-from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins import PluginSwarm
+from dtsa_agent.core.unslotted import next_wake
 from dtsa_channel_sim import Channel
 from dtsa_channel_sim.model.air import Air
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
@@ -84,11 +84,7 @@ class UnslottedTraffic:
         if not self._swarm.present[index]:
             return end_ns
         policy, table = self._parts.policies[index], self._parts.tables[index]
-        again = policy.wake(table, now_ns, _Radio(self, index, now_ns))
-        if not isinstance(again, (int, np.integer)) or again <= now_ns:
-            fault = f"gave {again!r} ns; allowed: whole numbers above {now_ns}, the present time"
-            raise PluginError(f"{policy.name}, wake", fault)
-        return int(again)
+        return next_wake(policy, policy.wake(table, now_ns, _Radio(self, index, now_ns)), now_ns)
 
     def busy(self, index: int, now_ns: int) -> bool:
         """Whether a radio finds the air in use.

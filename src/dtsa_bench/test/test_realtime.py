@@ -14,6 +14,9 @@ from metronome import flown_again_when_overloaded
 
 pytest.importorskip("dtsa_msgs.msg")
 
+from dtsa_agent.core import AgentGroup, SwarmConfig
+from dtsa_agent.core.plugins import make_swarm
+from dtsa_agent.ros.common import names
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.soak.flights import children, process_with
 from dtsa_bench.verify import verify_bag
@@ -53,6 +56,29 @@ def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path:
     assert results[tmp_path / "apart"].safety["frames_collided"] > 20
     # A busy machine may make a frame late now and then; clocks do not.
     assert results[aligned].safety["frames_collided"] < results[tmp_path / "apart"].safety["frames_collided"] / 4
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_beacons_begin_when_their_own_timers_say_and_overlap_by_time_on_the_air(tmp_path: Path) -> None:
+    words = ("--agents", "4", "--policy", "beacons", "--processes", "2", "--mode", "realtime", "--seed", "5")
+    summary = fly(tmp_path / "out", *words, "--bitrate", "40000", "--timeout-s", "1", "--no-picture")
+    assert summary["sends_on_time_share"] is None
+    result = verify_bag(tmp_path / "out")
+    assert result.ok, result.difference
+    assert result.safety["frames_collided"] > 10
+    agents = AgentGroup(make_swarm(SwarmConfig(agents=4, policy="beacons", seed=5)))
+    due, late = {}, []
+    for slot in range(100):
+        for index in agents.on_slot(slot):  # two of them begin 0.6 ms apart
+            due[slot, index + 1] = int(agents.swarm.send_offset_ns[index])
+        agents.on_slot_end()
+    with Bag(tmp_path / "out" / "bag") as bag:
+        for _, said in bag.typed([f"{names.SWARM}/{names.AIR_FRAME}"]):
+            begin = said.header.stamp.sec * 1_000_000_000 + said.header.stamp.nanosec - names.TIME_ZERO_NS
+            late.append(begin - int(said.slot) * 10_000_000 - due[int(said.slot), int(said.agent)])
+    assert len(late) > 30
+    assert 0 == min(late) <= max(late) <= 5_000_000  # who is later than half a slot is silent
 
 
 def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path: Path) -> None:

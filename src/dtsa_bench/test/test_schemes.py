@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import dtsa
-from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
 from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.registry import POLICIES
+from dtsa_agent.core.unslotted import check_slotted
 from dtsa_bench.fly.flight import FlightOptions, check_options
 from dtsa_bench.protocol_bench.experiment import Experiment
 from dtsa_bench.run_config import RunConfig
 from dtsa_bench.schemes.optimum import optimum
 from dtsa_bench.simulate import simulate
+from dtsa_bench.sweep.spec import run_config
 from dtsa_bench.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.airtime import Airtime
@@ -127,6 +130,50 @@ def test_beacons_come_at_their_rate_and_two_with_one_phase_collide_for_good() ->
     assert sum(heard[:500]) == pytest.approx(sum(heard[500:]), abs=20)  # the same ones, period after period
 
 
+def test_agents_that_open_their_own_slots_send_when_those_of_the_simulator_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[tuple[int, int]] = []
+    plain = UnslottedTraffic.send
+    monkeypatch.setattr(
+        UnslottedTraffic, "send", lambda self, k, now_ns: plain(self, k, now_ns) and not begun.append((now_ns, k))
+    )
+    for policy, options in (("beacons", {"beacons.jitter_ms": 3.0}), ("pure-aloha", {})):
+        begun.clear()
+        run = run_config({"agents": 5, "policy": policy, "seed": 3, "timeout_s": 1.0, "options": options})
+        simulate(run)
+        agents = AgentGroup(make_swarm(run.swarm))
+        sent = set()
+        for slot in range(100):
+            senders = agents.on_slot(slot)
+            assert np.flatnonzero(agents.swarm.chosen).tolist() == list(senders)
+            offsets = agents.swarm.send_offset_ns[list(senders)].tolist()
+            sent |= {(slot * run.swarm.slot_ns + offset, k) for k, offset in zip(senders, offsets, strict=True)}
+            agents.swarm.fly(slot)
+            agents.on_slot_end()
+        # Of two frames that one of them would begin in a slot, the first.
+        first = {(now_ns // run.swarm.slot_ns, k): now_ns for now_ns, k in reversed(begun)}
+        assert sent == {(now_ns, k) for (_, k), now_ns in first.items()}
+        assert len(sent) > 80
+
+
+def test_what_policies_without_slots_do_wrong_in_nodes_is_named() -> None:
+    class Rogue:
+        port = ("send",)
+
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            self.listens = config.options.get("rogue.listens", 0.0) > 0
+
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            return now_ns + 1 if not (self.listens and radio.busy()) else 0
+
+    dtsa.register("policy", "rogue", Rogue)
+    for options, said in (
+        ({"rogue.listens": 1.0}, "without 'busy' in its port"),
+        ({}, "more than 10000 times in a slot"),
+    ):
+        with pytest.raises(PluginError, match=said):
+            AgentGroup(make_swarm(SwarmConfig(agents=2, policy="rogue", options=options))).on_slot(0)
+
+
 def test_event_triggered_tdma_is_silent_while_it_would_say_nothing_new() -> None:
     busy, quiet = (steady(policy, 12, 4).outcome for policy in ("tdma", "event-tdma"))
     assert busy.idle == 0
@@ -171,12 +218,17 @@ def test_every_scheme_flies_and_the_same_seed_gives_the_same_flight() -> None:
 def test_nodes_refuse_what_nodes_cannot_do() -> None:
     for policy, options, mode in (
         ("beacons", FlightOptions(processes=1), "lockstep"),
+        ("beacons", FlightOptions(respawn=1.0), "realtime"),
+        ("csma", FlightOptions(), "realtime"),
         ("genie-age", FlightOptions(processes=2), "lockstep"),
         ("genie-age", FlightOptions(processes=1), "realtime"),
     ):
         with pytest.raises(ConfigError, match="policy"):
             check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode=mode), options)
     check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="genie-age")), FlightOptions(processes=1))
+    check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime"), FlightOptions())
+    with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: a slotted one here"):
+        check_slotted("pure-aloha")
     with pytest.raises(ConfigError, match="policy"):
         make_swarm(SwarmConfig(agents=4, policy="genie-age"), local=[1, 2])
 

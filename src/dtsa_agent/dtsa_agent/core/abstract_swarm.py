@@ -74,6 +74,7 @@ class SwarmState:
     digest: Hashes  # (L,) of each agent's table
     score: Floats  # (L,) g of the chosen
     sends: Bytes  # (L,)
+    send_offset_ns: Slots  # (L,) ns, when each begins to send, after its slot's start; 0 but for policies without slots
     frame_length: Bytes  # (L,) bytes, 0: silent
     frames: Bytes  # (L, FRAME_MAX)
     lease_state: Bytes  # (L, bytes of policy lease), of the compiled core
@@ -136,6 +137,7 @@ class SwarmState:
         self.reason, self.sends, self.frame_length = (np.zeros(count, dtype=np.uint8) for _ in range(3))
         self.digest = np.zeros(count, dtype=np.uint32)
         self.score = np.zeros(count)
+        self.send_offset_ns = np.zeros(count, dtype=np.int64)
         self.frames = np.zeros((count, FRAME_MAX), dtype=np.uint8)
         self.lease_state = np.zeros((count, 0), dtype=np.uint8)
 

@@ -20,7 +20,8 @@ def check_joinable(policy: str) -> None:
 
     :raises ConfigError: if they never could agree with the others.
     """
-    if not POLICIES.row(policy).may_join:
+    row = POLICIES.row(policy)
+    if not row.may_join or row.unslotted:  # who comes late takes its time from a frame that begins with a slot
         joinable = [row.name for row in POLICIES.rows.values() if row.may_join]
         raise ConfigError("policy", policy, f"{', '.join(joinable)}, to come into a flight that is under way")
 

@@ -28,6 +28,7 @@ from .plugin_guard import Guarded
 from .registry import ESTIMATORS, POLICIES, REASONS, Registry
 from .scenario import Scenario
 from .swarm import Swarm
+from .unslotted import SILENT, Wakes
 
 Array = NDArray[np.float64]
 
@@ -221,6 +222,8 @@ class PluginSwarm(SwarmWrapper):
         everybody = self.config.policy_row.needs_everybody and bool(self.ids)
         self._genie = self._guarded(POLICIES, 0) if everybody else None
         self._policies, self._estimators, self._avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
+        unslotted = self.config.policy_row.unslotted
+        self._wakes = Wakes(self._policies, self._tables, self.config.slot_ns) if unslotted else None
         self._list_speakers()
 
     def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
@@ -257,6 +260,9 @@ class PluginSwarm(SwarmWrapper):
         if not self._policies:
             self.inner.decide(slot)
             return
+        if self._wakes is not None:
+            self._act(self._wakes, slot)
+            return
         for index, agent in enumerate(self.ids):
             policy = self._policies[index]
             chosen = policy.chosen(policy.choose(self._tables[index], slot), slot, self.config.agents)
@@ -270,6 +276,14 @@ class PluginSwarm(SwarmWrapper):
         self.sends[:] = 0
         for agent in senders:
             self.sends[agent - 1] = self.present[agent - 1] > 0
+        self._note_decision()
+
+    def _act(self, wakes: Wakes, slot: int) -> None:
+        """Lets policies without slots act; who sends has chosen itself, the others nobody."""
+        for index, offset in enumerate(wakes.act(slot, self.present)):
+            self.sends[index] = offset != SILENT
+            self.send_offset_ns[index] = max(0, offset)
+            self.chosen[index] = self.ids[index] if self.sends[index] else 0
         self._note_decision()
 
     def _note_decision(self) -> None:

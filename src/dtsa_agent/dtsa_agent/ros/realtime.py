@@ -105,7 +105,9 @@ class RealtimeNode(SwarmNode):
         self._shift: NDArray[np.int64] = np.zeros(count, dtype=np.int64)  # ns, what each has learned to wait
         self._starts: tuple[int | None, NDArray[np.int64]] = None, self._shift  # of the slot asked for last
         self._ideal = not (self._offset.any() or self._drift.any())  # all clocks show the channel's time
-        self._aligners = [ClockAligner() for _ in range(count)] if align else []
+        self._slotted = not self.config.policy_row.unslotted
+        self._aligners = [ClockAligner() for _ in range(count)] if align and self._slotted else []
+        self._free_ns = [0] * count  # when each radio has done with its last frame; of policies without slots
         self._jitter_ns = jitter_ns
         self._random = [generator(self.config.seed, STREAM_CLOCKS, agent) for agent in self.swarm.ids]
         self._fixed_ns, self._per_byte_ns = flight_time_ns
@@ -380,6 +382,16 @@ class RealtimeNode(SwarmNode):
         if self._reporter.due():
             self._reporter.publish(self.run_id)
 
+    def _still_sends(self, index: int, begin_ns: int) -> bool:
+        """Whether a radio is still busy with its last frame; it takes the next one if not. With slots it never is."""
+        if self._slotted:
+            return False
+        if begin_ns < self._free_ns[index]:
+            return True
+        length = int(self.swarm.frame_length[index])
+        self._free_ns[index] = begin_ns + self._fixed_ns + self._per_byte_ns * length
+        return False
+
     def _send(self, slot: int, senders: Sequence[int], starts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Hands the frames of a slot over to the channel, before anything else is done.
 
@@ -392,8 +404,9 @@ class RealtimeNode(SwarmNode):
         for index in senders:
             jitter = self._jitter_ns * self._random[index].standard_normal() if self._jitter_ns else 0.0
             now = time.monotonic_ns() - self._zero - slot * self.slot_ns
-            offset = max(int(starts[index] + jitter), now)
-            if offset - starts[index] > self.slot_ns // 2:
+            due = starts[index] + swarm.send_offset_ns[index]
+            offset = max(int(due + jitter), now)
+            if offset - due > self.slot_ns // 2 or self._still_sends(index, slot * self.slot_ns + offset):
                 # The turn is as good as over: speaking now would disturb whoever has the next one.
                 swarm.frame_length[index] = 0
                 self.unsent += 1

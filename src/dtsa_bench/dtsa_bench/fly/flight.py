@@ -121,8 +121,11 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
 def _check_policy(run: RunConfig, options: FlightOptions) -> None:
     """What the policy asks of a flight of nodes."""
     row = run.swarm.policy_row
-    if row.unslotted:
-        raise ConfigError("policy", row.name, "a slotted one; what sends at any instant is for simulate and sweep")
+    if row.unslotted and "busy" in row.port:
+        why = "one that does not listen before it sends: messages between processes take longer than a frame"
+        raise ConfigError("policy", row.name, f"{why}; simulate and sweep can")
+    if row.unslotted and run.mode == LOCKSTEP:
+        raise ConfigError("policy", row.name, "with --mode realtime: in lockstep all frames begin with their slot")
     if row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or run.swarm.agents) > 1):
         raise ConfigError("policy", row.name, "in lockstep with --processes 1 only: it looks into all agents")
 

@@ -68,6 +68,7 @@ class RealtimeChannel(RosChannel):
     :param steps: control instants in a slot.
     :param answer_s: not used: nobody waits.
     :param swarm_namespace: namespace of the swarm's topics.
+    :param slotted: frames begin with slots; others lie here for up to two slots before they begin.
     :param more: as for :class:`RosChannel`.
     """
 
@@ -80,6 +81,7 @@ class RealtimeChannel(RosChannel):
         steps: int,
         answer_s: float = 0.0,
         swarm_namespace: str = names.SWARM,
+        slotted: bool = True,
         **more: Any,
     ) -> None:
         super().__init__(
@@ -94,7 +96,7 @@ class RealtimeChannel(RosChannel):
         self.late_frames = 0  # came when the air had been settled past their start, and were dropped
         self.round_ms: float | None = None  # of a round of messages before slot 0, median
         self.returned: set[int] = set()  # ids of those that were, and report again
-        self._steps = steps
+        self._steps, self._slotted = steps, slotted
         self._zero = 0
         self._told = 0.0  # time.monotonic() of the last start message
         self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
@@ -248,7 +250,8 @@ class RealtimeChannel(RosChannel):
 
     def _at_leisure(self, now: int) -> bool:
         """Whether there is time for the rest: no frame waits for its delivery, or the rest has waited for a slot."""
-        if self._ends and now - self._leisure_ns < self.slot_ns:
+        waits = bool(self._ends) and (self._slotted or self._spare_ns(now) < _TICK_NS)
+        if waits and now - self._leisure_ns < self.slot_ns:
             return False
         self._leisure_ns = now
         return True
