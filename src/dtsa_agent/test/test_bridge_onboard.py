@@ -61,22 +61,22 @@ def test_parameters_logs_and_trajectories(tmp_path: Path) -> None:
         assert one.onboard.remove_log("own") == ""
         assert one.onboard.remove_log("own") == "own is not logged"
         # Trajectories, stored as they are and compressed: one arms itself, the other one waits to be told.
-        assert one.upload_trajectory(along_x(0, -0.4)) == ""
-        assert two.upload_trajectory(along_x(0, -0.4, pieces=40)) == ""
+        assert one.trajectories.upload(along_x(0, -0.4)) == ""
+        assert two.trajectories.upload(along_x(0, -0.4, pieces=40)) == ""
         two.arm(True)
         wait_for(lambda: two.state == State.ARMED)
         assert {v.takeoff(0.95, 2.0, arm=True) for v in (one, two)} == {""}
         time.sleep(2.3)
         order = {"reverse": False, "relative": True}
-        assert one.start_trajectory(5, 1.0, **order) == "cf1: trajectory 5 was not uploaded"
-        assert "uploaded on the ground" in one.upload_trajectory(along_x(0, -0.2))
-        refused = two.start_trajectory(0, 1.0, **order)
+        assert one.trajectories.start(5, 1.0, **order) == "cf1: trajectory 5 was not uploaded"
+        assert "uploaded on the ground" in one.trajectories.upload(along_x(0, -0.2))
+        refused = two.trajectories.start(0, 1.0, **order)
         assert refused.startswith("cf2: trajectory 0: (-1.")
         assert refused.endswith("m outside the geofence in x")
         assert two.go_to((-0.4, 0.0, 0.95), 0.0, 2.0, False) == ""
-        assert one.start_trajectory(0, 1.0, **order) == ""
+        assert one.trajectories.start(0, 1.0, **order) == ""
         wait_for(lambda: abs(one.last.position[0] - 0.8) < 0.05 and abs(two.last.position[0] + 0.4) < 0.05)  # type: ignore[union-attr]
-        assert two.start_trajectory(0, 1.0, **order) == ""
+        assert two.trajectories.start(0, 1.0, **order) == ""
         wait_for(lambda: abs(two.last.position[0] + 0.8) < 0.05)  # type: ignore[union-attr]
         assert [e["duration"] for e in fleet.events(name="trajectory")] == [1.5, pytest.approx(1.5 + 39 * 0.02)]
         f.bridge.land_all("the test ends")

@@ -56,7 +56,7 @@ def test_a_link_that_cflib_closes_is_opened_again_in_flight(tmp_path: Path) -> N
         one = pilot.bridge.vehicles["cf1"]
         still = (0.0,) * 8
         aside = Piece((0.0, -0.2, *still[2:]), still, still, still, 1.0)
-        assert one.upload_trajectory(Trajectory(0, 0, (aside,))) == ""
+        assert one.trajectories.upload(Trajectory(0, 0, (aside,))) == ""
         pilot.take_off()
         link = one.link
         link._cf.link.link_error_callback("Too many packets lost")  # as cflib does it after 100 of them

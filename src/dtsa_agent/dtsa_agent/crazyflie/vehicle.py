@@ -11,7 +11,7 @@ from typing import Any
 
 from dtsa_agent.crazyflie.config import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.controls import SLOW_MPS, Controls, end_of_stream
-from dtsa_agent.crazyflie.delivery import GO_TO, TAKEOFF, TRAJECTORY
+from dtsa_agent.crazyflie.delivery import GO_TO, TAKEOFF
 from dtsa_agent.crazyflie.landing import Landing
 from dtsa_agent.crazyflie.landing_places import SINK, Descent
 from dtsa_agent.crazyflie.limits import outside_fence
@@ -20,7 +20,7 @@ from dtsa_agent.crazyflie.onboard import Onboard
 from dtsa_agent.crazyflie.paths import too_short
 from dtsa_agent.crazyflie.senses import Senses
 from dtsa_agent.crazyflie.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
-from dtsa_agent.crazyflie.trajectories import Planned, Trajectory, why_not
+from dtsa_agent.crazyflie.trajectory_orders import TrajectoryOrders
 from dtsa_agent.crazyflie.units import Quaternion, Setpoint, Vector, VehicleState, yaw_of
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
@@ -76,6 +76,7 @@ class Vehicle:
         )
         self.controls = Controls(self.link)
         self.onboard = Onboard(self.link)
+        self.trajectories = TrajectoryOrders(self)
 
         def next_step(down_to: float, since: float) -> Descent:
             return descent(self, down_to, since) if self.state == State.LANDING else SINK
@@ -202,7 +203,14 @@ class Vehicle:
             self.controls.stream(setpoint)
             return True
 
-    def _high_level(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
+    def not_led(self) -> str:
+        """Why it takes no orders to fly somewhere; empty if it does."""
+        if self.state == State.FLYING and not self._deaf:
+            return ""
+        return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
+
+    def fly(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
+        """Give an order to the high-level commander; parameters as of `Controls.fly`. The lock is held."""
         self.landing.cancel()
         self.controls.fly(kind, action, duration, time.monotonic(), again=again)
 
@@ -253,20 +261,18 @@ class Vehicle:
             self.action = self.machine.reason
             if on_ground or self.last is None:
                 self.controls.streaming = True  # the zero setpoint that closed the link before may still be in force
-                self._high_level(
-                    TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration
-                )
+                self.fly(TAKEOFF, lambda cf: cf.high_level_commander.takeoff(height, duration, yaw=None), duration)
             else:  # the firmware takes off from the ground only
                 x, y, _ = self.last.position
                 yaw = yaw_of(self.last.orientation)
-                self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
+                self.fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
             return ""
 
     def go_to(self, place: tuple[float, float, float], yaw: float, duration: float, relative: bool) -> str:
         """Fly to a place (m, world; relative: an offset) within a duration (s); why not, or an empty text."""
         with self.lock:
-            if self.state != State.FLYING or self._deaf:
-                return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
+            if problem := self.not_led():
+                return problem
             here = (0.0, 0.0, 0.0) if relative or self.last is None else self.last.position
             goal = place
             if relative and self.last is not None:
@@ -278,61 +284,11 @@ class Vehicle:
                 return f"{self.name}: {problem}"
             self.action = "go_to"
             x, y, z = place
-            self._high_level(
+            self.fly(
                 GO_TO,
                 lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, duration, relative),
                 duration,
                 again=not relative,
-            )
-            return ""
-
-    def upload_trajectory(self, trajectory: Trajectory) -> str:
-        """Write a trajectory to its memory, on the ground; waits; why not, or an empty text."""
-        if self.state not in (State.READY, State.ARMED):  # in the air it might be flying what is there
-            return f"{self.name} is {self.standing}: trajectories are uploaded on the ground"
-        problem = self.onboard.upload(trajectory)
-        return f"{self.name}: trajectory {trajectory.number}: {problem}" if problem else ""
-
-    def trajectory_problem(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> str:
-        """Why it must not start a trajectory; empty if it may."""
-        with self.lock:
-            if self.state != State.FLYING or self._deaf or self.last is None:
-                return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
-            if self.senses.wrong:
-                return f"{self.name}: {self.senses.wrong}"
-            trajectory = self.onboard.trajectories.get(number)
-            if trajectory is None:
-                return f"{self.name}: trajectory {number} was not uploaded"
-            here = self.last.position
-            problem = why_not(trajectory, here, self.station, timescale, reverse=reverse, relative=relative)
-            return f"{self.name}: {problem}" if problem else ""
-
-    def planned(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> Planned | None:
-        """Where a trajectory would lead it; None: it has none of that number, or does not know where it is."""
-        with self.lock:
-            trajectory = self.onboard.trajectories.get(number)
-            if trajectory is None or self.last is None:
-                return None
-            return Planned(self.name, trajectory, self.last.position, timescale, reverse, relative)
-
-    def start_trajectory(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> str:
-        """Fly a trajectory of its memory, then hold its end; why not, or an empty text.
-
-        :param timescale: it takes that many times as long as it says.
-        :param reverse: from its end to its beginning.
-        :param relative: moved so that it begins where the vehicle is.
-        """
-        with self.lock:
-            if problem := self.trajectory_problem(number, timescale, reverse=reverse, relative=relative):
-                return problem
-            self.action = f"trajectory {number}"
-            self._high_level(
-                TRAJECTORY,
-                lambda cf: cf.high_level_commander.start_trajectory(
-                    number, timescale, relative_position=relative, reversed=reverse
-                ),
-                timescale * self.onboard.trajectories[number].duration,
-                again=False,  # it would begin once more
             )
             return ""
 
@@ -359,7 +315,7 @@ class Vehicle:
                     return
                 x, y, z = self.last.position
                 z, yaw = max(z, 0.1), yaw_of(self.last.orientation)
-                self._high_level(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
+                self.fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, z, yaw, HOLD_S), 0.0)
                 self.controls.held = stale
 
             self.controls.held = stale

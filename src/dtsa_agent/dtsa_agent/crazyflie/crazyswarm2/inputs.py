@@ -117,11 +117,11 @@ class Crazyswarm2Inputs(Inputs):
         """Start all that are addressed, or nobody."""
         number, timescale, group = request.trajectory_id, request.timescale, request.group_mask
         how = {"reverse": request.reversed, "relative": request.relative}
-        self._each(names, lambda v: v.trajectory_problem(number, timescale, **how), response, group)
+        self._each(names, lambda v: v.trajectories.problem(number, timescale, **how), response, group)
         if response.success and (problem := self._meeting(names, number, timescale, how, group)):
             response.success, response.message = False, problem
         if response.success:
-            self._each(names, lambda v: v.start_trajectory(number, timescale, **how), response, group)
+            self._each(names, lambda v: v.trajectories.start(number, timescale, **how), response, group)
         return response
 
     def _meeting(self, names: list[str], number: int, timescale: float, how: dict[str, bool], group: int) -> str:
@@ -129,7 +129,9 @@ class Crazyswarm2Inputs(Inputs):
         station = self._bridge.settings.station
         flying = {n: v for n, v in self._bridge.vehicles.items() if v.state == State.FLYING and v.last is not None}
         led = [name for name in names if name in flying and (not group or self._groups(name) & group)]
-        plans = [plan for name in led if (plan := flying[name].planned(number, timescale, **how)) is not None]
+        plans = [
+            plan for name in led if (plan := flying[name].trajectories.planned(number, timescale, **how)) is not None
+        ]
         hovering = {n: v.last.position for n, v in flying.items() if n not in led and v.last is not None}
         problem = meeting(plans, hovering, station.safety.min_distance_m)
         return f"{problem} (station.safety.min_distance_m is {station.safety.min_distance_m:g})" if problem else ""
@@ -142,7 +144,7 @@ class Crazyswarm2Inputs(Inputs):
         except ValueError as error:
             problem = f"{vehicle.name}: {error}"
         else:
-            problem = vehicle.upload_trajectory(trajectory)
+            problem = vehicle.trajectories.upload(trajectory)
         order = f"order /{vehicle.name}/upload_trajectory (id {number}, {count} pieces)"
         self._say("warn" if problem else "info", f"{order}: {problem or 'done'}")
         return response
