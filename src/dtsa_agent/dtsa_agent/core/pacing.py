@@ -7,7 +7,6 @@ from .config import SwarmConfig
 # Of a slot: an agent that has heard all it waits for decides this long before its slot starts, mostly as soon as it has
 # heard: one wake-up of its process less, and its frame leaves on time.
 LEAD = 0.7
-LONGEST_LEAD = 0.95  # where every wake-up counts: when it has heard, as soon as it has
 LATEST_LEAD = 0.06  # while it misses the frame of the slot before, only this long
 MOST_EARLY = 64  # frames of slots that are still to come, kept until they do
 BETWEEN = 0.2  # on a network, between a frame that left late and the next slot: clocks differ, nobody waits any longer

@@ -17,7 +17,7 @@ from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtoc
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import check_joinable
-from dtsa_agent.core.pacing import BETWEEN, LEAD, LONGEST_LEAD, MOST_EARLY, latest_send_ns, too_long_ns
+from dtsa_agent.core.pacing import BETWEEN, LEAD, MOST_EARLY, latest_send_ns, too_long_ns
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
 from dtsa_agent.keys import authenticator
@@ -79,15 +79,14 @@ class UdpAgent:
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally()
         self._slot_ns = config.slot_ns
-        longest, self._lead_ns, latest = (round(lead * self._slot_ns) for lead in (LONGEST_LEAD, LEAD, BETWEEN))
-        self._leads_ns = {None: self._lead_ns, True: latest, False: longest}
+        self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
         self._flight_ns = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
         self._latest_send_ns = latest_send_ns(self._slot_ns, self._flight_ns)
         self._too_long_ns = too_long_ns(config)
         self._ordinary = ""  # why it has no real-time priority
         self.slot = -1  # the slot that is open
         self._first = 0  # slot with which it began, or began anew
-        self._awaits: bool | None = None  # the slot's sender has not been heard yet; None: there is none to hear
+        self._awaits = False  # the slot's sender is another one, and has not been heard yet
         self._waiting = b""  # frame of this slot, ready to be sent
         self._early: list[tuple[int, int, bytes, Datagram]] = []
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
@@ -129,40 +128,40 @@ class UdpAgent:
         began = time.monotonic_ns()
         deadline = self._clock.monotonic_ns(self.time.start(self._clock.local_ns(began)))
         while not self._ended(stop, end):
-            due = deadline if self.time.state == LISTENING else self._due_ns()
-            heard = self._wait(due)
             if self.time.state == LISTENING:
+                self._await_frame(deadline)
                 self._take_in()
                 if self.time.wake(self._clock.local_ns(time.monotonic_ns())):
                     self._begin_anew()
             elif self._waiting:
-                if time.monotonic_ns() >= due:
+                if _slept_until(self._due_ns()):
                     self._send()
-                else:
-                    self._take_in()
-            else:
-                if heard:
-                    self._take_in()
-                if time.monotonic_ns() >= self._due_ns() and not self._waiting:
+            elif _slept_until(self._due_ns(self._lead_ns)):
+                # One wake-up a slot: frames wait in the socket, and the kernel has noted when they arrived.
+                more = self._take_in()
+                due = self._due_ns(self._latest_lead_ns if more or self._awaits else self._lead_ns)
+                if time.monotonic_ns() >= due:
                     self._step()
+                elif not more:
+                    self._await_frame(due)
         self._tell(self._close_slot())
         self.tally.ended_ns = time.monotonic_ns()
 
-    def _wait(self, due: int) -> bool:
-        """Waits for a frame, or until a time; whether there may be a frame."""
-        remaining = due - time.monotonic_ns()
-        if remaining <= 0:
-            return True
-        return bool(select.select([self._socket], [], [], min(remaining / _SECOND, _PATIENCE_S))[0])
+    def _await_frame(self, until_ns: int) -> None:
+        """Waits for a frame, or until a time; ns, CLOCK_MONOTONIC."""
+        remaining = until_ns - time.monotonic_ns()
+        if remaining > 0:
+            select.select([self._socket], [], [], min(remaining / _SECOND, _PATIENCE_S))
 
-    def _due_ns(self) -> int:
-        """When to do something of one's own accord: to send, or to decide the next slot; ns, CLOCK_MONOTONIC."""
-        if self._waiting:
-            return self._clock.monotonic_ns(self.time.slot_start_ns(self.slot))
-        return self._clock.monotonic_ns(self.time.slot_start_ns(self.slot + 1) - self._leads_ns[self._awaits])
+    def _due_ns(self, lead_ns: int = 0) -> int:
+        """When to send the frame that lies ready, or to decide the next slot, this long ahead; ns, CLOCK_MONOTONIC."""
+        slot = self.slot if self._waiting else self.slot + 1
+        return self._clock.monotonic_ns(self.time.slot_start_ns(slot) - lead_ns)
 
     def _ended(self, stop: Stop, end: int | None) -> bool:
         """Whether to end now: after a second signal, when it has said that it leaves, or has no time left to."""
+        if not stop and end is None:
+            return False
         now = time.monotonic_ns()
         if not stop and (end is None or now < end):
             return False
@@ -176,14 +175,17 @@ class UdpAgent:
 
     # What is heard.
 
-    def _take_in(self) -> None:
-        for datagram in self._socket.receive(_BURST):
+    def _take_in(self) -> bool:
+        """Takes in what has arrived; whether there may be more."""
+        arrived = self._socket.receive(_BURST)
+        for datagram in arrived:
             if not datagram.own:
                 reason = self._take(datagram)
                 if reason:
                     self.tally.refused[reason] += 1
                     if self.watcher is not None:
                         self.watcher.other(reason, datagram.data, self._clock.local_ns(datagram.arrival_ns))
+        return len(arrived) == _BURST
 
     def _take(self, datagram: Datagram) -> str:
         """Takes in a datagram; why not, or an empty text."""
@@ -262,7 +264,7 @@ class UdpAgent:
         if following is None:
             raise LocalProtocolError("an agent that listens has no slots")
         self._first, self.slot = following + 1, following
-        self._waiting, self._awaits = b"", None
+        self._waiting, self._awaits = b"", False
         self._early.clear()
         self._group.restart(0, self._first)
         self.tally.begun(self._first, time.monotonic_ns())
@@ -285,7 +287,7 @@ class UdpAgent:
         self._vehicle.sense(swarm)
         sends = bool(self._group.on_slot(slot))
         self.slot = slot
-        self._awaits = True if int(swarm.chosen[0]) not in (0, self.own.id) else None
+        self._awaits = int(swarm.chosen[0]) not in (0, self.own.id)
         frame = swarm.frame(0) if sends else b""
         self._record = None if self.watcher is None else self._recorded(slot, frame, present)
         self._waiting = frame
@@ -380,3 +382,15 @@ class UdpAgent:
             "position_m": [round(float(x), 4) for x in swarm.position[:, 0]],
             "arrived": bool(np.sqrt((away * away).sum()) <= self.config.r_min and swarm.final[0]),
         }
+
+
+def _slept_until(until_ns: int) -> bool:
+    """Sleeps until a time, or a while, so that signals are noticed; whether it is that time.
+
+    :param until_ns: ns, CLOCK_MONOTONIC.
+    """
+    remaining = until_ns - time.monotonic_ns()
+    if remaining <= 0:
+        return True
+    time.sleep(min(remaining / _SECOND, _PATIENCE_S))
+    return time.monotonic_ns() >= until_ns

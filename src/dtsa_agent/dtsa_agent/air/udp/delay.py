@@ -9,6 +9,7 @@ from the slots of those that hear little.
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from collections.abc import Sequence
 
 _SHARE = 64  # of which the estimate moves by a part with a frame: slowly, so that it does not follow the slots
@@ -25,23 +26,17 @@ class Delay:
     :param limit_ns: ns; what is off by more, either way, counts as this.
     """
 
-    __slots__ = ("_agent", "_hears", "_limit_ns", "_said", "_turn", "error_ns")
+    __slots__ = ("_agent", "_hears", "_limit_ns", "_said", "_sum_of", "_sums", "_turn", "error_ns")
 
     def __init__(self, agent: int, limit_ns: int) -> None:
         self._agent, self._limit_ns = agent, limit_ns
         self._hears: dict[int, int] = {}  # how much later than expected each other one is heard, ns
         self._said: dict[int, int] = {}  # how much later than expected each other one says to hear this one, ns
+        self._sum_of: dict[int, int] = {}  # of both, where both are known: own slots that move change none
+        self._sums: list[int] = []  # the same, ascending
         self._turn = 0
         #: How much longer frames are under way than supposed, ns.
         self.error_ns = 0
-
-    def _median(self) -> int:
-        """Half the sum over the pairs that are known, their median, ns."""
-        sums = sorted(self._hears[peer] + said for peer, said in self._said.items() if peer in self._hears)
-        if not sums:
-            return self.error_ns
-        middle = len(sums) // 2
-        return (sums[middle] + sums[~middle]) // 4
 
     def hear(self, sender: int, offset_ns: int, peers: Sequence[Peer]) -> None:
         """A frame was heard.
@@ -54,8 +49,22 @@ class Delay:
         for peer, late_ns in peers:
             if peer == self._agent:
                 self._said[sender] = self._limited(late_ns)
-        step = self._median() - self.error_ns
+        if sender in self._said:
+            self._pair(sender, self._hears[sender] + self._said[sender])
+        sums = self._sums
+        if not sums:
+            return
+        middle = len(sums) // 2
+        step = (sums[middle] + sums[~middle]) // 4 - self.error_ns  # half the sum, the median over all pairs
         self.error_ns += min(max(step, -_STEP_NS), _STEP_NS) // _SHARE
+
+    def _pair(self, peer: int, total: int) -> None:
+        """The sum of a pair is known, or another one."""
+        before = self._sum_of.get(peer)
+        if before is not None:
+            del self._sums[bisect_left(self._sums, before)]
+        self._sum_of[peer] = total
+        insort(self._sums, total)
 
     def tell(self) -> tuple[Peer, ...]:
         """What the next datagram says: the others in turn."""
@@ -70,6 +79,8 @@ class Delay:
 
         :param by_ns: ns, later.
         """
+        if not by_ns:
+            return
         for values, by in ((self._hears, -by_ns), (self._said, by_ns)):
             for peer in values:
                 values[peer] += by
@@ -78,6 +89,8 @@ class Delay:
         """Another time was taken over."""
         self._hears.clear()
         self._said.clear()
+        self._sum_of.clear()
+        self._sums.clear()
 
     def _limited(self, offset_ns: int) -> int:
         return min(max(offset_ns, -self._limit_ns), self._limit_ns)

@@ -6,6 +6,7 @@ import fcntl
 import socket
 import struct
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -17,9 +18,11 @@ _SIOCGIFADDR = 0x8915
 _IP_MULTICAST_ALL = 49  # Linux: 0: only groups that this socket has joined
 _SO_TIMESTAMPNS = 35
 _STAMP = struct.Struct("@ll")
+_ROOM = socket.CMSG_SPACE(_STAMP.size)  # bytes for a stamp beside a datagram
 _LONGEST = 512  # bytes of a datagram that are looked at; frames of ours are far shorter
 _SECOND = 1_000_000_000
 _STEP_NS = 1_000_000  # the clock of the stamps has been set if it moved by this between two looks
+_EXACT_NS = 2_000  # between two looks at one clock: good enough for the other one in between
 _OLDEST_NS = 60 * _SECOND  # a stamp cannot be older than the longest sleep of a process
 
 
@@ -34,8 +37,8 @@ class Datagram(NamedTuple):
 class StampClock:
     """Turns the kernel's stamps of arrival, which are CLOCK_REALTIME, into CLOCK_MONOTONIC.
 
-    Both clocks are looked at after each datagram. When the first one has been set since the last look, stamps of before
-    are worth nothing, and the time of the look stands for them.
+    Both clocks are looked at after datagrams have been read. When the first one has been set since the last look,
+    stamps of before are worth nothing, and the time of the look stands for them.
     """
 
     def __init__(self) -> None:
@@ -44,7 +47,7 @@ class StampClock:
         self.steps = 0  # how often the clock of the stamps has been set
 
     def look(self) -> None:
-        """A datagram has been read: looks at both clocks."""
+        """Datagrams have been read: looks at both clocks."""
         ahead, self._now_ns = _look()
         self._usable = abs(ahead - self._ahead_ns) <= _STEP_NS
         self.steps += not self._usable
@@ -66,9 +69,9 @@ def _look() -> tuple[int, int]:
     best = (1 << 62, 0, 0)
     for _ in range(3):
         before, real, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after - before < _EXACT_NS:
+            return real - (before + after) // 2, after
         best = min(best, (after - before, real - (before + after) // 2, after))
-        if best[0] < 2_000:
-            break
     return best[1], best[2]
 
 
@@ -110,6 +113,7 @@ class MulticastSocket:
             where = f"{settings.interface}, group {group}:{port}"
             raise ConfigError("interface", where, f"one that takes part in the group ({error.strerror})") from None
         self._self = self._out.getsockname()
+        self._read = self._in.recvmsg
 
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
@@ -132,20 +136,19 @@ class MulticastSocket:
 
         :param most: datagrams at a time.
         """
-        found: list[Datagram] = []
-        while len(found) < most:
-            try:
-                data, ancillary, _, source = self._in.recvmsg(_LONGEST, socket.CMSG_SPACE(_STAMP.size))
-            except (BlockingIOError, InterruptedError):
-                break
-            except OSError:  # an interface that has gone, for example: it may come back
-                self.unreadable += 1
-                break
-            self._stamps.look()  # for each: this process may have been kept waiting since the last one
-            stamp = next((_stamp(value) for level, kind, value in ancillary
-                          if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS)), None)  # fmt: skip
-            found.append(Datagram(data, self._stamps.arrival_ns(stamp), source == self._self))
-        return found
+        arrived = []
+        try:
+            while len(arrived) < most:
+                arrived.append(self._read(_LONGEST, _ROOM))
+        except (BlockingIOError, InterruptedError):
+            pass
+        except OSError:  # an interface that has gone, for example: it may come back
+            self.unreadable += 1
+        if not arrived:
+            return []
+        self._stamps.look()  # afterwards: however long this process was kept waiting, all have arrived before
+        when, own = self._stamps.arrival_ns, self._self
+        return [Datagram(data, when(_stamp(notes)), source == own) for data, notes, _, source in arrived]
 
     @property
     def clock_steps(self) -> int:
@@ -164,11 +167,13 @@ class MulticastSocket:
         self.close()
 
 
-def _stamp(data: bytes) -> int | None:
-    if len(data) < _STAMP.size:
-        return None
-    seconds, nanoseconds = _STAMP.unpack_from(data)
-    return int(seconds) * _SECOND + int(nanoseconds)
+def _stamp(notes: Sequence[tuple[int, int, bytes]]) -> int | None:
+    """The kernel's stamp of a datagram, CLOCK_REALTIME, ns; None: it has given none."""
+    for level, kind, value in notes:
+        if kind == _SO_TIMESTAMPNS and level == socket.SOL_SOCKET and len(value) >= _STAMP.size:
+            seconds, nanoseconds = _STAMP.unpack_from(value)
+            return int(seconds) * _SECOND + int(nanoseconds)
+    return None
 
 
 def interface_address(name: str) -> str:

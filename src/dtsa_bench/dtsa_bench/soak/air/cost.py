@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -10,8 +11,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +28,26 @@ from dtsa_bench.soak.checks import met
 from dtsa_bench.soak.flights import PATIENCE_S, command, flying, until
 from dtsa_bench.soak.item import Item, NotMet
 
-_WINDOW_S = 10.0
+_WINDOW_S = 20.0
 _START_S = 3.0  # for each agent
 _NEW_ROUNDS = 30  # of N slots: who is new speaks at its anchors only
 _SETTLED_S = 5.0  # after the last one has begun
 _ON_TIME_NS = 1_000_000
 _PUNCTUAL = 0.02  # share of frames on time may be smaller than the timer's by this
 _SHARE = 0.5  # of the other form's cost
+_COSTS = ("processor_us_per_slot", "memory_pss_mb")
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 def items() -> Iterator[Item]:
-    """Twelve and seventy agents."""
-    for agents, slot_ms, seconds in ((12, 10.0, 60.0), (70, 20.0, 300.0)):
-        settings = {"agents": agents, "slot_ms": slot_ms, "cost": True}
+    """Twelve agents, both forms at the same time; seventy, one form after the other: two processors hold no more."""
+    for agents, slot_ms, seconds in ((12, 10.0, 90.0), (70, 20.0, 420.0)):
+        settings = {"agents": agents, "slot_ms": slot_ms, "cost": True, "together": agents == 12}
         yield Item(f"{agents} agents, {slot_ms:g} ms: cost and punctuality", settings, 1, seconds)
 
 
 def run(item: Item, directory: Path) -> dict[str, Any]:
-    """Flies both forms, one after the other.
+    """Flies both forms.
 
     :param item: one of this module's.
     :param directory: an empty one.
@@ -54,23 +56,84 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     swarm = SwarmConfig(
         agents=item.settings["agents"], slot_ms=item.settings["slot_ms"], policy="lease", auth=True, auth_session=1
     )
-    udp = over_udp(swarm, directory)
+    found: dict[str, Any] = {"together": item.settings["together"]}
+    if item.settings["together"]:
+        with over_udp(swarm, directory) as udp, over_ros(swarm, directory / "ros") as ros:
+            _settle(udp, swarm)
+            found |= _window(swarm, udp, ros)
+    else:
+        with over_udp(swarm, directory) as udp:
+            _settle(udp, swarm)
+            found |= _window(swarm, udp)
+        try:
+            with over_ros(swarm, directory / "ros") as ros:
+                time.sleep(_SETTLED_S)
+                found |= _window(swarm, ros=ros)
+        except NotMet as error:
+            found["ros"] = f"did not fly: {error}"
+    _judge(found)
+    return found
+
+
+def _judge(found: dict[str, Any]) -> None:
+    """Compares with the bare timer, and with the other form."""
+    udp, ros = found["udp"], found["ros"]
     frames, timer = udp["frames_on_time_share"], udp["timer_on_time_share"]
-    met(frames >= timer - _PUNCTUAL, f"{frames:.1%} of frames on time, {timer:.1%} of a bare timer's wake-ups; {udp}")
-    try:
-        ros = over_ros(swarm, directory / "ros")
-    except NotMet as error:
-        return {"udp": udp, "ros": f"did not fly: {error}"}
-    for name in ("processor_us_per_slot", "memory_pss_mb"):
-        met(
-            udp[name] <= _SHARE * ros[name],
-            f"{name}: {udp[name]:.4g}, as ROS nodes {ros[name]:.4g}; udp {udp}, ros {ros}",
-        )
-    return {"udp": udp, "ros": ros}
+    met(frames >= timer - _PUNCTUAL, f"{frames:.1%} of frames on time, {timer:.1%} of a bare timer's wake-ups; {found}")
+    if isinstance(ros, dict):
+        found["share"] = {name: udp[name] / ros[name] for name in _COSTS}
+        met(max(found["share"].values()) <= _SHARE, f"more than half of the cost as ROS nodes: {found}")
 
 
-def over_udp(swarm: SwarmConfig, directory: Path) -> dict[str, Any]:
-    """Agents on the loopback interface, without bags: what they cost, how late their frames leave.
+class Udp:
+    """Agents on the loopback interface, without bags.
+
+    :param swarm: the settings that all share.
+    :param group: theirs.
+    :param key: theirs.
+    :param processes: theirs.
+    :param ears: hears them.
+    """
+
+    def __init__(
+        self, swarm: SwarmConfig, group: str, key: str, processes: Sequence[subprocess.Popen[bytes]],
+        ears: MulticastSocket,
+    ) -> None:  # fmt: skip
+        self._ears, self.processes, self.swarm = ears, processes, swarm
+        self.pids = [process.pid for process in processes]
+        self._wrapping = Wrapping(swarm, Authenticator.from_hex(key, swarm.auth_session))
+        self.heard: set[int] = set()
+
+    def late(self) -> list[int]:
+        """How late the frames left that have come since the last call, ns."""
+        found = []
+        for datagram in self._ears.receive(256):
+            said = self._wrapping.read(datagram.data)
+            if not said.fault:
+                self.heard.add(said.sender)
+                found.append(said.late_ns)
+        return found
+
+    def listen(self, seconds: float) -> list[int]:
+        """How late the frames of a time left, ns.
+
+        :param seconds: how long.
+        """
+        found, end = [], time.monotonic() + seconds
+        while time.monotonic() < end:
+            time.sleep(0.02)
+            found += self.late()
+        return found
+
+
+def _settle(udp: Udp, swarm: SwarmConfig) -> None:
+    """Who is new speaks at its anchors only: waits until nobody is any more."""
+    udp.listen(max(_SETTLED_S, _NEW_ROUNDS * swarm.agents * swarm.slot_s))
+
+
+@contextmanager
+def over_udp(swarm: SwarmConfig, directory: Path) -> Iterator[Udp]:
+    """Agents on the loopback interface that all have spoken.
 
     :param swarm: the settings that all share.
     :param directory: for what they say.
@@ -83,82 +146,68 @@ def over_udp(swarm: SwarmConfig, directory: Path) -> dict[str, Any]:
         MulticastSocket(UdpSettings(interface="lo", group=group)) as ears,
         _agents(swarm, group, key, directory) as all_of,
     ):
-        heard: set[int] = set()
-        wrapping = Wrapping(swarm, Authenticator.from_hex(key, swarm.auth_session))
-
-        def late() -> list[int]:
-            found = []
-            for datagram in ears.receive(256):
-                said = wrapping.read(datagram.data)
-                if not said.fault:
-                    heard.add(said.sender)
-                    found.append(said.late_ns)
-            return found
+        udp = Udp(swarm, group, key, all_of, ears)
 
         def all_speak() -> bool:
-            late()
-            ended = [process for process in all_of if process.poll() is not None]
-            if ended:
+            udp.late()
+            if any(process.poll() is not None for process in all_of):
                 raise NotMet(f"an agent has ended: {(directory / 'said.txt').read_text()[-300:]}")
-            return len(heard) == swarm.agents
+            return len(udp.heard) == swarm.agents
 
         until(all_speak, "all agents speak", PATIENCE_S + _START_S * swarm.agents)
-        _listen(late, max(_SETTLED_S, _NEW_ROUNDS * swarm.agents * swarm.slot_s))
-        words = [sys.executable, "-m", "dtsa_bench.soak.air.bare_timer", str(swarm.slot_ns), str(_WINDOW_S)]
-        heard.clear()
-        timer = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        pids = [process.pid for process in all_of]
-        before, begin = _processor_s(pids), time.monotonic()
-        lates = _listen(late, _WINDOW_S)
-        used, took = _processor_s(pids) - before, time.monotonic() - begin
-        memory = _pss_mb(pids)
-        bare = json.loads(timer.communicate(timeout=PATIENCE_S)[0])
-        missing = swarm.agents - len(heard)
-    met(not missing, f"{missing} agents were not heard within {_WINDOW_S:g} s")
-    return {
-        "frames": len(lates),
-        "slots": round(took * 1e9 / swarm.slot_ns),
-        **_punctual("frames", lates),
-        **_punctual("timer", bare),
-        "processor_us_per_slot": used / (took * 1e9 / swarm.slot_ns) / swarm.agents * 1e6,
-        "processors": used / took,
-        "memory_pss_mb": memory,
-    }
+        yield udp
 
 
-def over_ros(swarm: SwarmConfig, directory: Path) -> dict[str, Any]:
-    """The same agents as ROS nodes in real time, a process each: what these cost, without channel and recorder.
+@contextmanager
+def over_ros(swarm: SwarmConfig, directory: Path) -> Iterator[list[int]]:
+    """The same agents as ROS nodes in real time, a process each, without the channel's and the recorder's.
 
     :param swarm: the settings that all share.
     :param directory: for the flight.
-    :raises NotMet: if the flight does not begin.
+    :raises NotMet: if the flight does not begin, or ends.
     """
-    words = [
-        "--mode",
-        "realtime",
-        "--policy",
-        "lease",
-        "--agents",
-        str(swarm.agents),
-        "--slot-ms",
-        f"{swarm.slot_ms:g}",
-    ]
-    words += ["--processes", "per-agent", "--no-picture", "--timeout-s", "3600", "--tail-s", "3600"]
-    with flying(directory, *words) as flight:
-        pids = [flight.pid_of(agent) for agent in range(1, swarm.agents + 1)]
-        time.sleep(_SETTLED_S)
-        before, begin = _processor_s(pids), time.monotonic()
-        time.sleep(_WINDOW_S)
-        used, took = _processor_s(pids) - before, time.monotonic() - begin
-        memory = _pss_mb(pids)
+    words = ["--mode", "realtime", "--policy", "lease", "--agents", str(swarm.agents)]
+    words += ["--slot-ms", f"{swarm.slot_ms:g}", "--processes", "per-agent", "--no-picture", "--no-stop-on-crash"]
+    with flying(directory, *words, "--timeout-s", "3600", "--tail-s", "3600") as flight:
+        try:
+            yield [flight.pid_of(agent) for agent in range(1, swarm.agents + 1)]
+        except OSError as error:  # a process that is asked for what it has used is gone
+            raise NotMet(f"a node has ended: {error}; {flight.said().strip()[-300:]}") from error
         met(flight.process.poll() is None, f"the flight has ended: {flight.said().strip()[-300:]}")
         flight.process.send_signal(signal.SIGINT)
         flight.end()
-    return {
-        "processor_us_per_slot": used / (took * 1e9 / swarm.slot_ns) / swarm.agents * 1e6,
-        "processors": used / took,
-        "memory_pss_mb": memory,
-    }
+
+
+def _window(swarm: SwarmConfig, udp: Udp | None = None, ros: Sequence[int] = ()) -> dict[str, Any]:
+    """What agents use within a time, both forms the same time; how late frames over UDP and a bare timer are."""
+    forms = {"udp": [] if udp is None else udp.pids, "ros": list(ros)}
+    words = [sys.executable, "-m", "dtsa_bench.soak.air.bare_timer", str(swarm.slot_ns), str(_WINDOW_S)]
+    with contextlib.ExitStack() as stack:
+        timer = None if udp is None else stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        before, begin = {name: _processor_s(pids) for name, pids in forms.items()}, time.monotonic()
+        lates: list[int] = []
+        if udp is None:
+            time.sleep(_WINDOW_S)
+        else:
+            udp.heard.clear()
+            lates = udp.listen(_WINDOW_S)
+        used = {name: _processor_s(pids) - before[name] for name, pids in forms.items()}
+        slots = (time.monotonic() - begin) / swarm.slot_s
+        found = {
+            name: {
+                "processor_us_per_slot": used[name] / slots / len(pids) * 1e6,
+                "processors": used[name] / slots / swarm.slot_s,
+                "memory_pss_mb": _pss_mb(pids),
+            }
+            for name, pids in forms.items()
+            if pids
+        }
+        if udp is not None and timer is not None:
+            bare = json.loads(timer.communicate(timeout=PATIENCE_S)[0])
+            met(len(udp.heard) == swarm.agents, f"only {len(udp.heard)} agents were heard within {_WINDOW_S:g} s")
+            found["udp"] |= {"frames": len(lates), "slots": round(slots)}
+            found["udp"] |= {**_punctual("frames", lates), **_punctual("timer", bare)}
+    return found
 
 
 @contextmanager
@@ -177,20 +226,11 @@ def _agents(swarm: SwarmConfig, group: str, key: str, directory: Path) -> Iterat
         for process in found:
             process.send_signal(signal.SIGTERM)
         for process in found:
-            with suppress(subprocess.TimeoutExpired):
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(10.0)
             process.kill()
             process.wait()
         said.close()
-
-
-def _listen(late: Callable[[], list[int]], seconds: float) -> list[int]:
-    """How late the frames of a time left, ns."""
-    found, end = [], time.monotonic() + seconds
-    while time.monotonic() < end:
-        time.sleep(0.02)
-        found += late()
-    return found
 
 
 def _punctual(name: str, late_ns: Sequence[int]) -> dict[str, Any]:
