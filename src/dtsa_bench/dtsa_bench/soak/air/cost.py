@@ -56,15 +56,14 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     swarm = SwarmConfig(
         agents=item.settings["agents"], slot_ms=item.settings["slot_ms"], policy="lease", auth=True, auth_session=1
     )
-    found: dict[str, Any] = {"together": item.settings["together"]}
+    found: dict[str, Any] = {}
     if item.settings["together"]:
-        with over_udp(swarm, directory) as udp, over_ros(swarm, directory / "ros") as ros:
-            _settle(udp, swarm)
-            found |= _window(swarm, udp, ros)
-    else:
+        with contextlib.suppress(_Apart):
+            found = _together(swarm, directory)
+    if not found:
         with over_udp(swarm, directory) as udp:
-            _settle(udp, swarm)
-            found |= _window(swarm, udp)
+            _settle(udp)
+            found = {"together": False, **_window(swarm, udp)}
         try:
             with over_ros(swarm, directory / "ros") as ros:
                 time.sleep(_SETTLED_S)
@@ -73,6 +72,21 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
             found["ros"] = f"did not fly: {error}"
     _judge(found)
     return found
+
+
+class _Apart(NotMet):
+    """The machine does not hold both forms at the same time."""
+
+
+def _together(swarm: SwarmConfig, directory: Path) -> dict[str, Any]:
+    """Both forms at the same time: what else the machine does weighs on both alike."""
+    with over_udp(swarm, directory) as udp:
+        try:
+            with over_ros(swarm, directory / "ros-beside") as ros:
+                _settle(udp)
+                return {"together": True, **_window(swarm, udp, ros)}
+        except NotMet as error:
+            raise _Apart(str(error)) from error
 
 
 def _judge(found: dict[str, Any]) -> None:
@@ -126,9 +140,9 @@ class Udp:
         return found
 
 
-def _settle(udp: Udp, swarm: SwarmConfig) -> None:
+def _settle(udp: Udp) -> None:
     """Who is new speaks at its anchors only: waits until nobody is any more."""
-    udp.listen(max(_SETTLED_S, _NEW_ROUNDS * swarm.agents * swarm.slot_s))
+    udp.listen(max(_SETTLED_S, _NEW_ROUNDS * udp.swarm.agents * udp.swarm.slot_s))
 
 
 @contextmanager
