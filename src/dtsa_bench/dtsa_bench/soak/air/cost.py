@@ -28,7 +28,8 @@ from dtsa_bench.soak.checks import met
 from dtsa_bench.soak.flights import PATIENCE_S, command, flying, until
 from dtsa_bench.soak.item import Item, NotMet
 
-_WINDOW_S = 20.0
+_WINDOW_S = 20.0  # at least
+_ANCHORS = 1.5  # within so many times the longest silence of one that rests, all are heard
 _START_S = 3.0  # for each agent
 _NEW_ROUNDS = 30  # of N slots: who is new speaks at its anchors only
 _SETTLED_S = 5.0  # after the last one has begun
@@ -195,16 +196,17 @@ def over_ros(swarm: SwarmConfig, directory: Path) -> Iterator[list[int]]:
 def _window(swarm: SwarmConfig, udp: Udp | None = None, ros: Sequence[int] = ()) -> dict[str, Any]:
     """What agents use within a time, both forms the same time; how late frames over UDP and a bare timer are."""
     forms = {"udp": [] if udp is None else udp.pids, "ros": list(ros)}
-    words = [sys.executable, "-m", "dtsa_bench.soak.air.bare_timer", str(swarm.slot_ns), str(_WINDOW_S)]
+    window_s = max(_WINDOW_S, _ANCHORS * (swarm.main_every + 1) * swarm.agents * swarm.slot_s)
+    words = [sys.executable, "-m", "dtsa_bench.soak.air.bare_timer", str(swarm.slot_ns), str(window_s)]
     with contextlib.ExitStack() as stack:
         timer = None if udp is None else stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
         before, begin = {name: _processor_s(pids) for name, pids in forms.items()}, time.monotonic()
         lates: list[int] = []
         if udp is None:
-            time.sleep(_WINDOW_S)
+            time.sleep(window_s)
         else:
             udp.heard.clear()
-            lates = udp.listen(_WINDOW_S)
+            lates = udp.listen(window_s)
         used = {name: _processor_s(pids) - before[name] for name, pids in forms.items()}
         slots = (time.monotonic() - begin) / swarm.slot_s
         found = {
@@ -218,7 +220,7 @@ def _window(swarm: SwarmConfig, udp: Udp | None = None, ros: Sequence[int] = ())
         }
         if udp is not None and timer is not None:
             bare = json.loads(timer.communicate(timeout=PATIENCE_S)[0])
-            met(len(udp.heard) == swarm.agents, f"only {len(udp.heard)} agents were heard within {_WINDOW_S:g} s")
+            met(len(udp.heard) == swarm.agents, f"only {len(udp.heard)} agents were heard within {window_s:g} s")
             found["udp"] |= {"frames": len(lates), "slots": round(slots)}
             found["udp"] |= {**_punctual("frames", lates), **_punctual("timer", bare)}
     return found
