@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,23 @@ def test_the_papers_figures_have_its_settings() -> None:
             ("dtsa", "linear"),
         }
         assert {(run.epsilon, run.r_min, run.slot_ms) for run in runs} == {(0.5, 0.3, 10.0)}
+
+
+@pytest.mark.parametrize("name", ["limits", "idle", "loss", "grid"])
+def test_gossip_and_genies_fly_in_the_settings_of_the_preset_beside_which_they_stand(name: str) -> None:
+    plain, bounds = spec.load_preset(name), spec.load_preset(f"{name}-bounds")
+
+    def flown(sweep: spec.Sweep) -> set[str]:
+        """What is flown with TDMA."""
+        runs = [cell.run(1001).swarm for cell in sweep.cells]
+        tdma = [repr(replace(run, frame="auto")) for run in runs if run.policy == "tdma"]
+        return {text for text in tdma if name in ("grid", "idle") or "estimator='linear'" in text}
+
+    channels = [{repr(cell.run(1001).air) for cell in sweep.cells} for sweep in (plain, bounds)]
+    assert flown(plain) == flown(bounds)
+    assert channels[0] == channels[1]
+    assert set(bounds.seeds) <= set(plain.seeds)
+    assert {cell.labels["scheme"] for cell in bounds.cells} == {"TDMA + gossip", "genie (age)", "genie (error)"}
 
 
 def test_the_published_ordering_appears_and_its_cause_is_named() -> None:
