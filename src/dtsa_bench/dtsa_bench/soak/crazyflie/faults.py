@@ -98,13 +98,15 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
         words = ("--backend", "cflib", "--config", str(fleet.config), "--slot-ms", "20", "--no-picture")
         with flying(directory / "mission", *words, "--seed", str(item.seed), begun=False) as flight:
             wait_for_events(fleet.truth, '"takeoff"', COUNT)
-            begin = time.monotonic()
+            begin, given = time.monotonic(), []
             for fault in faults:
                 time.sleep(max(0.0, begin + fault.after_s - time.monotonic()))
-                fleet.fault(cf=fault.cf, **fault.request)
+                given.append(fleet.fault(cf=fault.cf, **fault.request))
             code = flight.end(_PATIENCE_S)
             said = flight.said().strip()
         met(code in (0, 1) and "Traceback" not in said, f"exit code {code}: {said[-300:]}")
+    times, positions, _ = read_truth(fleet.truth)
+    met(positions[times >= given[0], 2].max() > FLYING_M, f"it was over before the first fault: {said[-300:]}")
     off = stopped_in_air(fleet)
     closest = closest_with_motors_m(fleet.truth, off)
     told = ", ".join(f"cf{fault.cf} {fault.kind} {fault.request} at {fault.after_s} s" for fault in faults)
