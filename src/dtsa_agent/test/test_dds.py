@@ -14,6 +14,7 @@ from node_helpers import ros_graph
 from process_helpers import addresses, segments_of
 
 from dtsa_agent.ros.common.dds import (
+    PEERS,
     PROFILE,
     PROFILES,
     PUNCTUAL,
@@ -35,6 +36,7 @@ def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
         {RANGE: "SUBNET"},
         {RANGE: "LOCALHOST", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
         {RANGE: "LOCALHOST", PROFILES[0]: "/mine.xml"},
+        {RANGE: "LOCALHOST", PEERS: "10.0.0.2;10.0.0.3"},
     ):
         before = dict(other)
         limit_to_machine(other)

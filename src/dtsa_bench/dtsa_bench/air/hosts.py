@@ -23,6 +23,7 @@ from dtsa_agent.core.errors import DtsaError
 CABLE = "air0"  # the interface of each host
 _NET = "10.68"
 _CLONE_NEWNET, _CLONE_NEWTIME = 0x40000000, 0x80
+_CLONE_NEWNS, _MS_REC, _MS_PRIVATE = 0x00020000, 0x4000, 0x40000
 _TUNSETIFF, _IFF_TAP, _IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
 _SIOCSIFADDR, _SIOCSIFNETMASK, _SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8916, 0x891C, 0x8913, 0x8914
 _IFF_UP = 1
@@ -42,18 +43,27 @@ class Host:
     cable: int  # file descriptor of the switch's end
     namespace: int  # file descriptor
 
-    def start(self, command: Sequence[str], clock_ahead_s: int = 0, **more: Any) -> subprocess.Popen[str]:
+    def start(
+        self, command: Sequence[str], clock_ahead_s: int = 0, own_memory: bool = False, **more: Any
+    ) -> subprocess.Popen[str]:
         """Starts a process on it.
 
         :param command: its command line.
         :param clock_ahead_s: s, by how much its CLOCK_MONOTONIC is ahead of everybody else's, where Linux has time
             namespaces; CLOCK_REALTIME is one for all.
+        :param own_memory: whether it shares no memory (``/dev/shm``) with any other process.
         :param more: as for ``subprocess.Popen``.
         """
         libc, namespace = _libc(), self.namespace
 
         def enter() -> None:
             if libc.setns(namespace, _CLONE_NEWNET):
+                os._exit(126)
+            if own_memory and (
+                libc.unshare(_CLONE_NEWNS)
+                or libc.mount(b"none", b"/", None, _MS_REC | _MS_PRIVATE, None)
+                or libc.mount(b"none", b"/dev/shm", b"tmpfs", 0, None)
+            ):
                 os._exit(126)
             if clock_ahead_s and not libc.unshare(_CLONE_NEWTIME):
                 with suppress(OSError), open("/proc/self/timens_offsets", "w") as offsets:

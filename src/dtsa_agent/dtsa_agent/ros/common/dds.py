@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+PEERS = "ROS_STATIC_PEERS"
 # Fast DDS 2 reads the first, Fast DDS 3 the second.
 PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 PROFILE = Path(__file__).with_name("loopback.xml")
@@ -32,7 +33,8 @@ def limit_to_machine(environment: MutableMapping[str, str], shared_memory: bool 
     """Makes ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` mean loopback, and shared memory, alone.
 
     rmw_fastrtps adds a UDP transport of its own under LOCALHOST, which listens on all interfaces. With SYSTEM_DEFAULT
-    it takes the transports of our profile instead. Another range, another middleware, or a profile of the user stays.
+    it takes the transports of our profile instead. Another range, peers elsewhere, another middleware, or a profile of
+    the user stays.
 
     Shared memory is faster, but not for what has to be punctual: a process that sends to another one for the first time
     looks whether its port is alive, and if that one is idle sleeps for a third of a second: often in the thread that
@@ -44,7 +46,7 @@ def limit_to_machine(environment: MutableMapping[str, str], shared_memory: bool 
     foreign = not environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
     ours = all(environment.get(name) in map(str, (PROFILE, PUNCTUAL)) for name in PROFILES)  # a supervisor's
     plain = environment.get(RANGE) == "LOCALHOST" and not any(name in environment for name in PROFILES)
-    if foreign or not (ours or plain):
+    if foreign or environment.get(PEERS) or not (ours or plain):
         return
     environment[RANGE] = "SYSTEM_DEFAULT"
     for name in PROFILES:
