@@ -83,6 +83,12 @@ def test_the_papers_figures_have_its_settings() -> None:
         assert {(run.epsilon, run.r_min, run.slot_ms) for run in runs} == {(0.5, 0.3, 10.0)}
 
 
+def test_the_genie_by_error_flies_where_access_decides() -> None:
+    plain, bounds = (spec.load_preset(name).source for name in ("access", "access-bounds"))
+    assert bounds["axes"]["swarm"] == plain["axes"]["swarm"]
+    assert bounds["base"] == plain["base"]
+
+
 @pytest.mark.parametrize("name", ["limits", "idle", "loss", "grid"])
 def test_gossip_and_genies_fly_in_the_settings_of_the_preset_beside_which_they_stand(name: str) -> None:
     plain, bounds = spec.load_preset(name), spec.load_preset(f"{name}-bounds")
