@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from dtsa_agent.air.udp import UdpAgent
     from dtsa_agent.core import SwarmConfig
+    from dtsa_agent.stop import Stop
 
 DESCRIPTION = """\
 Flies one agent, with a simulated vehicle, whose frames go to a multicast group: one process a computer, no channel
@@ -82,9 +84,6 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
     from dtsa_agent.keys import check_key
     from dtsa_agent.stop import Stop
-    from dtsa_bench.air.recorder import AgentRecorder
-    from dtsa_bench.bag.errors import BagError
-    from dtsa_bench.commands.simulate import describe
     from dtsa_bench.options import given, new_directory
 
     own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
@@ -99,16 +98,27 @@ def run(args: argparse.Namespace) -> int:
         if directory is None:
             agent.run(stop)
         else:
-            with AgentRecorder(directory / f"cf{own.id}.mcap", own, config, udp) as recorder:
-                agent.watcher = recorder
-                agent.run(stop)
-                recorder.finish(agent.summary())
-            failure = recorder.failure
+            failure = _run_recorded(agent, stop, directory)
     summary = agent.summary()
     text = json.dumps(summary, indent=2) + "\n"
     if directory is not None:
         Path(directory / "summary.json").write_text(text, encoding="utf-8")
+    from dtsa_bench.commands.simulate import describe  # what is needed afterwards only takes no memory in flight
+
     print(text if args.json else describe(summary), end="")
     if failure:
+        from dtsa_bench.bag.errors import BagError
+
         raise BagError(failure)
     return 0
+
+
+def _run_recorded(agent: UdpAgent, stop: Stop, directory: Path) -> str:
+    """Flies, and records it; why the record is not whole, or an empty text."""
+    from dtsa_bench.air.recorder import AgentRecorder
+
+    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, agent.udp) as recorder:
+        agent.watcher = recorder
+        agent.run(stop)
+        recorder.finish(agent.summary())
+    return recorder.failure
