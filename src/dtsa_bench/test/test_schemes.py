@@ -15,6 +15,9 @@ from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.unslotted import check_slotted
+from dtsa_agent.crazyflie.config import StationSettings, SwarmSettings
+from dtsa_agent.ros.common.loop import Stop
+from dtsa_bench.fly.crazyflie import fly_crazyflies
 from dtsa_bench.fly.flight import FlightOptions, check_options
 from dtsa_bench.protocol_bench.experiment import Experiment
 from dtsa_bench.run_config import RunConfig
@@ -229,6 +232,10 @@ def test_nodes_refuse_what_nodes_cannot_do() -> None:
     check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime"), FlightOptions())
     with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: a slotted one here"):
         check_slotted("pure-aloha")
+    mission = RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime")
+    settings = SwarmSettings((), StationSettings())
+    with pytest.raises(ConfigError, match="policy: got 'beacons'; allowed: a slotted one here"):
+        fly_crazyflies(mission, settings, Path("swarm.yaml"), Path("out"), FlightOptions(), Stop())
     with pytest.raises(ConfigError, match="policy"):
         make_swarm(SwarmConfig(agents=4, policy="genie-age"), local=[1, 2])
 

@@ -26,7 +26,8 @@ def check_slotted(policy: str) -> None:
     :raises ConfigError: if it sends at any instant.
     """
     if POLICIES.row(policy).unslotted:
-        raise ConfigError("policy", policy, "a slotted one here; what sends at any instant flies with mode realtime")
+        allowed = "a slotted one here; what sends at any instant is for simulated vehicles in real time"
+        raise ConfigError("policy", policy, allowed)
 
 
 class SlotRadio:

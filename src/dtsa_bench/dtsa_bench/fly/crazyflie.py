@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.unslotted import check_slotted
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.link import require_cflib
 from dtsa_agent.keys import check_key
@@ -123,6 +124,7 @@ def fly_crazyflies(
     if run.mode == LOCKSTEP:
         raise ConfigError("mode", run.mode, "realtime: vehicles do not wait for the agents")
     check_key(run.swarm)
+    check_slotted(run.swarm.policy)
     require_cflib()
     scenario = check_places(settings, run.swarm)
     shared = attach or settings.station.positions.on
