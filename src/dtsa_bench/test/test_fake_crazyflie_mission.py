@@ -13,6 +13,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -36,9 +37,15 @@ from dtsa_agent.crazyflie.safety import SafetySettings
 from dtsa_bench.commands.fly import mission_problem
 from dtsa_bench.fake_crazyflie.truth import read_truth
 from dtsa_bench.fly.bringing import plan_moves
+from dtsa_bench.fly.crazyflie import CrashWatch
 from dtsa_bench.fly.domain import ros_domain
+from dtsa_bench.fly.mission import Ended
 from dtsa_bench.fly.places import MissionError, assign_places, check_standing, crossings
+from dtsa_bench.metrics import FlightMetrics
 from dtsa_bench.report.data import run_data
+from dtsa_bench.run_config import RunConfig, RunLimits, from_swarm
+from dtsa_channel_sim import ChannelConfig
+from dtsa_channel_sim.ros.observer import ChannelStatus
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 COUNT = 4
@@ -94,6 +101,19 @@ def test_a_mission_after_which_somebody_may_still_fly_has_failed() -> None:
     assert mission_problem("", []) == ""
     assert mission_problem("", ["cf2"]) == "the exchange is complete; not known to have landed: cf2"
     assert mission_problem("a reason", []) == "the exchange was cut short: a reason; all have landed"
+
+
+def test_two_as_near_as_in_a_crash_cut_the_exchange_short() -> None:
+    """A run that ended by itself was taken for complete, and nobody came to rest before they landed."""
+    swarm = SwarmConfig(agents=3)
+    run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
+    metrics, ended = FlightMetrics(run, make_scenario(swarm)), Ended(MagicMock())
+    watch, status = CrashWatch(metrics, ended), ChannelStatus(0, {}, [])
+    watch.idle(status)
+    assert not ended.reason
+    metrics.update(0, np.array([[[0.0, 0.19, 2.0], [0.0] * 3, [0.0] * 3]]), None, 0)
+    watch.idle(status)
+    assert ended.reason == "cf1 and cf2 came within 0.19 m of each other (collision_m is 0.2)"
 
 
 def check_records(out: Path) -> None:

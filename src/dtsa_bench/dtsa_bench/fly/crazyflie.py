@@ -28,6 +28,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.common.priority import give_way, take_priority
+from dtsa_bench.metrics import FlightMetrics
 from dtsa_bench.options import new_directory, whole_number
 from dtsa_bench.processes import end_process
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
@@ -94,6 +95,25 @@ class _BridgeWatch(ChannelObserver):
 
     def idle(self, status: ChannelStatus) -> None:
         self._mission.bridge_alive()
+
+
+class CrashWatch(ChannelObserver):
+    """Ends the exchange when two are as near as in a crash. A run that ended by itself would not let all come to rest.
+
+    :param metrics: know where all are, by their own estimates.
+    :param ended: is told who and how near.
+    """
+
+    def __init__(self, metrics: FlightMetrics, ended: Ended) -> None:
+        self._metrics, self._ended = metrics, ended
+
+    def idle(self, status: ChannelStatus) -> None:
+        if self._metrics.collided_pair and not self._ended.reason:
+            a, b = self._metrics.collided_pair
+            distance, limit = self._metrics.closest()[0], self._metrics.run.limits.collision_m
+            self._ended.reason = (
+                f"cf{a} and cf{b} came within {distance:.2f} m of each other (collision_m is {limit:g})"
+            )
 
 
 def fly_crazyflies(
@@ -214,11 +234,15 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
     node = Node("channel", namespace=names.SWARM, context=context)
     try:
         declare_channel(node, run.air)
+        stop_on_crash = run.limits.stop_on_crash
+        run = dataclasses.replace(run, limits=dataclasses.replace(run.limits, stop_on_crash=False))
         flight = RecordedFlight(node, run, directory, options.startup_s, answer_s=2.0, end_s=END_S)
         channel, measurement = flight.channel, flight.measurement
         assert isinstance(channel, RealtimeChannel)
         shown = FlightProgress(progress, measurement, channel)
         channel.observe(_BridgeWatch(mission), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
+        if stop_on_crash:
+            channel.observe(CrashWatch(measurement.metrics, ended))
         try:
             channel.run(_Rest(ended, mission, channel))
             ended.reason = ended.reason or channel.fell_behind
