@@ -57,4 +57,4 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
 def test_the_league_can_be_flown() -> None:
     """Every scheme of the preset exists, and every cell is valid."""
     sweep = spec.load_preset("league", seeds=1)
-    assert len(list(sweep.tasks())) == 6 * 4 * 15
+    assert len(list(sweep.tasks())) == 8 * 4 * 15
