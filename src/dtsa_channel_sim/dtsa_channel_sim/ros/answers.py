@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from dtsa_agent.ros.common.wire import split_frames
 
 Array = NDArray[np.float64]
 _MOTION = ("track", "velocity", "command", "goal")
+_ONES = b"\1" * 65536  # at most so many agents have ids
 
 
 @dataclass(slots=True)
@@ -43,13 +45,17 @@ class Answers:
 
     def __init__(self, agents: int, steps: int) -> None:
         self.agents, self.steps = agents, steps
-        self.answered = np.zeros(agents, dtype=np.bool_)
+        # Vectors that lie in bytes: those of a message are put into their place as they are.
+        self._answered, self._told = bytearray(agents), bytearray(agents)
+        self._chosen, self._reason = bytearray(2 * agents), bytearray(agents)
+        self._digest, self._score = bytearray(4 * agents), bytearray(8 * agents)
+        self.answered = np.frombuffer(self._answered, dtype=np.bool_)
         self.missing = agents
         self.frames: dict[int, bytes] = {}  # by id, of those that send
-        self.chosen = np.zeros(agents, dtype=np.uint16)
-        self.reason = np.zeros(agents, dtype=np.uint8)
-        self.digest = np.zeros(agents, dtype=np.uint32)
-        self.score = np.zeros(agents)
+        self.chosen = np.frombuffer(self._chosen, dtype=np.uint16)
+        self.reason = np.frombuffer(self._reason, dtype=np.uint8)
+        self.digest = np.frombuffer(self._digest, dtype=np.uint32)
+        self.score = np.frombuffer(self._score)
         # All motion lies in one array, as in a message: who answers is written into it at once.
         self._motion = np.zeros((3 * steps + 9, agents))
         self.track = self._motion[:-9].reshape(steps, 3, agents)  # m, at the control instants of the slot before
@@ -58,7 +64,7 @@ class Answers:
         self.goal = self._motion[-3:]  # m
         self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
         self.taken_in: list[TakenIn] | None = None  # real time: what the agents say to have taken in during the slot
-        self._told = np.zeros(agents, dtype=np.bool_)  # whose goals have been told
+        self._goal_told = np.frombuffer(self._told, dtype=np.bool_)
         self._layouts: dict[bytes, tuple[int, slice | NDArray[np.intp]]] = {}
         # Numbers an agent in each field of a message, beside the frames' bytes.
         self._sizes = {
@@ -78,7 +84,7 @@ class Answers:
 
     def open(self) -> None:
         """Begins a new slot."""
-        self.answered[:] = False
+        self._answered[:] = bytes(self.agents)
         self.missing = self.agents
         self.frames = {}
 
@@ -90,7 +96,11 @@ class Answers:
         :raises Unusable: if its fields do not fit together, naming the agents as far as it does.
         """
         count, at = self._where(message.agent)
-        if self.answered[at].any():
+        if isinstance(at, slice):
+            first, last = at.start, at.stop
+            if 1 in self._answered[first:last]:
+                return False
+        elif self.answered[at].any():
             return False
         fields = message if isinstance(message, TransmissionFields) else self._fields(message, count)
         frames: list[bytes] = []
@@ -98,20 +108,27 @@ class Answers:
             check_frames(fields.length, fields.data)
             frames = split_frames(fields.data, fields.length)
         motion = np.frombuffer(b"".join((fields.track, fields.velocity, fields.command, fields.goal)))
-        score = np.frombuffer(fields.score)
-        chosen = np.frombuffer(fields.chosen, dtype=np.uint16)
-        self._check_numbers(message, motion, score, chosen)
+        self._check_numbers(message, motion, fields)
         self._motion[: len(motion) // count, at] = motion.reshape(-1, count)
-        if fields.goal:
-            self._told[at] = True
-        self.chosen[at] = chosen
-        self.reason[at] = np.frombuffer(fields.reason, dtype=np.uint8)
-        self.digest[at] = np.frombuffer(fields.digest, dtype=np.uint32)
-        self.score[at] = score
+        if isinstance(at, slice):
+            self._chosen[2 * first : 2 * last] = fields.chosen
+            self._reason[at] = fields.reason
+            self._digest[4 * first : 4 * last] = fields.digest
+            self._score[8 * first : 8 * last] = fields.score
+            self._answered[at] = _ONES[:count]
+            if fields.goal:
+                self._told[at] = _ONES[:count]
+        else:
+            self.chosen[at] = np.frombuffer(fields.chosen, dtype=np.uint16)
+            self.reason[at] = np.frombuffer(fields.reason, dtype=np.uint8)
+            self.digest[at] = np.frombuffer(fields.digest, dtype=np.uint32)
+            self.score[at] = np.frombuffer(fields.score)
+            self.answered[at] = True
+            if fields.goal:
+                self._goal_told[at] = True
         for agent, frame in zip(message.agent, frames, strict=False):
             if frame:
                 self.frames[agent] = frame
-        self.answered[at] = True
         self.missing -= count
         return True
 
@@ -131,7 +148,7 @@ class Answers:
         for name, values in decided.items():
             getattr(self, name)[at] = values
         self.offset_ns[at] = offset_ns
-        self._told[at] = self.answered[at] = True
+        self._goal_told[at] = self.answered[at] = True
         self.missing -= count
 
     def _fields(self, message: Transmission, count: int) -> TransmissionFields:
@@ -149,20 +166,19 @@ class Answers:
         return TransmissionFields(0, message.run, message.slot, message.agent, **told)
 
     def _check_numbers(
-        self, message: TransmissionFields | Transmission, motion: Array, score: Array, chosen: NDArray[np.uint16]
+        self, message: TransmissionFields | Transmission, motion: Array, fields: TransmissionFields
     ) -> None:
         """Whether the numbers of a message can be.
 
         :raises Unusable: if they cannot.
         """
-        largest = chosen.max()
+        largest = max(memoryview(fields.chosen).cast("H"))
         if largest > self.agents:
             raise self._unusable(RANGE, message, f"{largest} chosen of {self.agents} agents")
         # A sum of squares is finite only if all its terms are, and small only if they are.
         if not motion.dot(motion) <= FARTHEST_M**2:
             raise self._unusable(RANGE, message, "positions, velocities or goals that are no numbers, or far away")
-        squares = score.dot(score)
-        if squares != squares:
+        if any(map(isnan, memoryview(fields.score).cast("d"))):
             raise self._unusable(RANGE, message, "scores that are no numbers")
 
     @staticmethod
@@ -179,7 +195,7 @@ class Answers:
             self.track[:, :, gone] = before.position[:, gone]
             self.digest[gone], self.chosen[gone] = before.digest[gone], 0
         # A goal is told when it changes.
-        untold = ~self._told
+        untold = ~self._goal_told
         self.goal[:, untold] = before.goal[:, untold]
 
     def _where(self, ids: Any) -> tuple[int, slice | NDArray[np.intp]]:
