@@ -172,6 +172,6 @@ def test_what_waits_for_a_server_is_limited() -> None:
     moments, reason = Moments(swarm.scenario, swarm.config.slot_ns), np.zeros(AGENTS, np.uint8)
     for slot in range(5 * MOST_FRAMES // 2):
         moments.frames(slot, SUCCESS, (slot % AGENTS + 1,), reason, None)
-    kept = frames_of([moments.make(slot, None, swarm.chosen, None)])
+    kept = frames_of([moments.moment(moments.gather(slot, None, swarm.chosen, None))])
     assert [one[0] for one in kept] == list(range(slot - MOST_FRAMES + 1, slot + 1))
     assert len(moments._frames) == 0

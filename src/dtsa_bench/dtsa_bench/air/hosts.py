@@ -28,6 +28,8 @@ _TUNSETIFF, _IFF_TAP, _IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
 _SIOCSIFADDR, _SIOCSIFNETMASK, _SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8916, 0x891C, 0x8913, 0x8914
 _IFF_UP = 1
 _OWN = "/proc/self/ns/net"
+_BURST = 64  # frames of a host at a time
+LONGEST = 2048  # bytes of an Ethernet frame
 
 
 class Unavailable(DtsaError):
@@ -87,6 +89,19 @@ def hosts(count: int) -> Iterator[list[Host]]:
             if _libc().setns(home, _CLONE_NEWNET):
                 os._exit(1)  # whatever this process did from here on would be in the wrong place
         yield found
+
+
+def arrived(cable: int) -> Iterator[bytes]:
+    """Ethernet frames that wait on a host's cable, one after the other; not more than others can wait for.
+
+    :param cable: its descriptor, which does not block.
+    """
+    for _ in range(_BURST):
+        try:
+            frame = os.read(cable, LONGEST)
+        except (BlockingIOError, InterruptedError):
+            return
+        yield frame
 
 
 def why_not() -> str:

@@ -8,11 +8,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from .hosts import Host
+from .hosts import Host, arrived
 
-_LONGEST = 2048  # bytes of an Ethernet frame
 _MULTICAST = b"\x01\x00\x5e"  # Ethernet addresses of IPv4's groups begin so
-_BURST = 64  # frames from a cable at a time
 _ASK_S = 0.02
 
 
@@ -50,11 +48,7 @@ class Lan:
                 self._read(cable)
 
     def _read(self, cable: int) -> None:
-        for _ in range(_BURST):
-            try:
-                frame = os.read(cable, _LONGEST)
-            except (BlockingIOError, InterruptedError):
-                return
+        for frame in arrived(cable):
             self.carried += 1
             target = None if frame[0] & 1 else self._behind.get(frame[:6])
             if frame[:3] == _MULTICAST:

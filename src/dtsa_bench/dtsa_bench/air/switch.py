@@ -23,10 +23,8 @@ from dtsa_agent.air.udp.precision import wake_precisely
 from dtsa_agent.core.frame import named_in
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
-from .hosts import Host
+from .hosts import LONGEST, Host, arrived
 
-_LONGEST = 2048
-_BURST = 64  # frames of a host at a time
 _ETHERNET, _IPV4, _UDP = 14, 0x0800, 17
 _SECOND = 1_000_000_000
 
@@ -122,11 +120,7 @@ class Switch:
             self._deliver()
 
     def _read(self, cable: int) -> None:
-        for _ in range(_BURST):
-            try:
-                frame = os.read(cable, _LONGEST)
-            except (BlockingIOError, InterruptedError):
-                return
+        for frame in arrived(cable):
             payload = self._payload(frame)
             named = named_in(payload[HEADER:]) if payload else None
             if named is None:
@@ -192,5 +186,5 @@ class Switch:
         """Throws away what the hosts have sent and nobody has read."""
         for cable in self._hosts:
             with suppress(OSError):
-                while os.read(cable, _LONGEST):
+                while os.read(cable, LONGEST):
                     pass

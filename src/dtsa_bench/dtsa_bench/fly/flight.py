@@ -26,7 +26,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
-from dtsa_agent.ros.common.priority import give_way_by, take_priority
+from dtsa_agent.ros.common.priority import give_way_by, take_place, take_priority
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
@@ -238,7 +238,8 @@ def _fly(
 
 def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress, priority: int) -> None:
     """The flight itself; the channel is closed afterwards."""
-    first = isinstance(channel, RealtimeChannel) and _go_first(priority)
+    # Before its agents, and both before all else if that is allowed.
+    first = isinstance(channel, RealtimeChannel) and not take_place(priority and priority + 1, CHANNEL_NICE, False)
     try:
         channel.run(ended)
         shown.show()
@@ -251,13 +252,6 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: Fli
             if first and not ended.stop:  # who has been told to end does so before all else
                 take_priority(0)
                 give_way_by(0)
-
-
-def _go_first(priority: int) -> bool:
-    """The channel before its agents, and both before all else if that is allowed; whether anything was."""
-    if priority and not take_priority(priority + 1, inherited=False):
-        return True
-    return not give_way_by(CHANNEL_NICE)
 
 
 def _cut_short(channel: Any, ended: EarlyEnd, failure: DtsaError | None) -> dict[str, str]:

@@ -186,7 +186,7 @@ def _endless() -> tuple[dict[str, Any], Iterator[Moment]]:
             moments.place(first, scenario.start * np.array([[np.cos(turn)], [np.sin(turn)], [1.0]]))
             for slot in range(first, first + moments.place_slots):
                 moments.frames(slot, SUCCESS, [slot % 12 + 1], reason, None)
-            yield moments.make(first, None, chosen, None)
+            yield moments.moment(moments.gather(first, None, chosen, None))
 
     return {**run_info("endless", RunConfig(config), scenario), "live": True}, told()
 

@@ -105,7 +105,8 @@ class HeardRun:
         self._moments.place(self.slot, self._tables.estimate_position[0])
         late = statistics.median(self._late_ns) / 1e6 if self._late_ns else 0.0
         more = {"lag_ms": round(late, 2), "refused": refused.total(), "age": pack(self._ages())}
-        self._track.add(self._moments.make(self.slot, self._tables, self._nobody, None, self._absent, **more))
+        gathered = self._moments.gather(self.slot, self._tables, self._nobody, None, self._absent, **more)
+        self._track.add(self._moments.moment(gathered))
 
     def _ages(self) -> NDArray[np.uint16]:
         """(N,) tenths of slots since each was heard, also those that rest."""

@@ -188,7 +188,8 @@ class Follower:
         if self._tables is not None:
             estimate_now(self._tables, self._oracle, slot, self._way[-1])
         more: dict[str, Any] = {"lag_ms": round(self._lag_ms, 2)}
-        self._track.add(self._moments.make(slot, self._tables, self._chosen, self._digest, self._absent, **more))
+        gathered = self._moments.gather(slot, self._tables, self._chosen, self._digest, self._absent, **more)
+        self._track.add(self._moments.moment(gathered))
 
     def _find_crashes(self, slot: int) -> None:
         if self.agents > _PAIRS or self.agents < 2 or self._run is None:

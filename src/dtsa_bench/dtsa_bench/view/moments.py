@@ -224,17 +224,12 @@ class Moments:
         self._compared = self._same = 0
         return gathered
 
-    def make(
-        self,
-        slot: int,
-        tables: AbstractSwarm | None,
-        chosen: NDArray[Any],
-        digest: NDArray[Any] | None,
-        absent: Iterable[int] = (),
-        **more: Any,
-    ) -> Moment:
-        """The moment of what `gather` gives, with the same parameters."""
-        return told(self.gather(slot, tables, chosen, digest, absent, **more), self._moving)
+    def moment(self, gathered: Gathered) -> Moment:
+        """The moment as it goes to a page.
+
+        :param gathered: what :meth:`gather` has given.
+        """
+        return told(gathered, self._moving)
 
 
 def told(gathered: Gathered, moving: Sequence[bool]) -> Moment:

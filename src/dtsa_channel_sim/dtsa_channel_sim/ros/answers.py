@@ -16,7 +16,6 @@ from dtsa_agent.ros.common.transmission_fields import TransmissionFields
 from dtsa_agent.ros.common.wire import split_frames
 
 Array = NDArray[np.float64]
-_MOTION = ("track", "velocity", "command", "goal")
 _ONES = b"\1" * 65536  # at most so many agents have ids
 
 

@@ -80,3 +80,16 @@ def give_way_by(nice: int) -> str:
     except OSError as error:
         return f"{error.strerror}; see ulimit -e"
     return ""
+
+
+def take_place(priority: int, nice: int, inherited: bool = True) -> str:
+    """Real-time priority for this process where it may have it, nice otherwise.
+
+    :param priority: 1 (low) to 99; 0: none.
+    :param nice: as for :func:`give_way_by`.
+    :param inherited: as for :func:`take_priority`.
+    :returns: why neither, or an empty text.
+    """
+    if priority and not take_priority(priority, inherited):
+        return ""
+    return give_way_by(nice) if nice else ""
