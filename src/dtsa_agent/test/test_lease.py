@@ -18,7 +18,7 @@ from dtsa_agent.core.frame_extended import (
     encode_extended,
 )
 from dtsa_agent.core.reference.lease.issue import open_block
-from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.reference.lease.memory import HANDED, Lease, Memory
 from dtsa_agent.core.reference.rules import Rules
 
 FAR = 1e6
@@ -359,6 +359,63 @@ def test_who_knows_that_it_will_rest_speaks_at_main_anchors_only() -> None:
         ]
     assert all(air.sent[slot] == (12,) for slot in range(1000, 3000) if slot % 12 == 11 and is_anchor(slot, 12))
     assert all(len(senders) <= 1 for senders in air.sent)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_who_has_arrived_hands_its_turns_on(loss: float) -> None:
+    """Within reach all but the last one: it goes to those that move on; without OPEN turns nobody does that."""
+    sent = {}
+    for handing in (True, False):
+        swarm = make(24, 4, open_every=11 if handing else 0, anchor_rest=1)
+        swarm.final[3] = 0  # gives away none of its own turns for now
+        air = Air(swarm, loss).run(900)
+        swarm.goal[:, 3] = swarm.position[:, 3]
+        air.run(72)
+        sent[handing] = air.sent[912:972].count((4,))
+        assert all(len(senders) <= 1 for senders in air.sent)
+    assert 3 <= sent[True] <= 0.6 * sent[False]
+
+
+def test_who_wakes_is_given_turns_by_those_that_have_plenty() -> None:
+    """Owners have given theirs away for rounds to come: agent 5 has one turn of its own a round."""
+    swarm = make(24, 4)
+    swarm.final[4] = 0
+    air = Air(swarm).run(905)
+    swarm.goal[0, 4] = FAR
+    air.run(120)
+    assert air.sent[930:1020].count((5,)) >= 10  # three own turns, and a fair share is 18
+
+
+def test_a_turn_is_changed_by_its_lessee_alone() -> None:
+    memory = Memory(Rules(agents=6, slot_s=0.01))
+    memory.start(0)
+    memory.leases = {9: Lease(3, 2), 8: Lease(3, 1), 11: Lease(3, HANDED), 13: Lease(3, 2)}
+    for turn in (8, 9, 11):
+        memory.note(0, 4, turn, 2, 0)  # agent 4 relays what it knows
+        assert memory.leases[turn].lessee == 3
+        memory.note(0, 3, turn, 5, 0)  # agent 3 hands it on
+        assert memory.leases[turn].lessee == 5
+    memory.note(0, 5, 9, 1, 0)
+    assert memory.leases[9] == Lease(1, 2)
+    for turn in (8, 11):  # agent 1 itself has given them away
+        memory.note(0, 5, turn, 1, 0)
+        memory.note(0, 2, turn, 1, 2)
+        assert memory.leases[turn].lessee == 5
+    memory.note(0, 6, 13, 4, 6)  # adopted
+    assert memory.leases[13].lessee == 3
+    memory.note(0, 6, 13, 1, 6)
+    assert memory.leases[13] == Lease(1, 6)
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_who_rests_is_thought_dead_later(rests: bool) -> None:
+    """It may speak in its main anchors only: two of them lost mean nothing."""
+    swarm = make(40, 10)
+    air = Air(swarm).run(1200)
+    quiet = 20 if rests else 2
+    swarm.present[quiet - 1] = 0
+    air.run(1300)
+    assert bool(swarm.lease_status(0)["absent"]) is not rests
 
 
 def test_turns_are_spread_evenly_over_those_that_move() -> None:

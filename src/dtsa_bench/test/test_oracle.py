@@ -35,7 +35,7 @@ def test_flights_are_equal_in_which_the_dead_are_adopted_and_some_come_back(seed
         (issue, "MISSED", 1),
         (issue, "RELAY_IDS", 1),
         (listen, "DEAF", 0),
-        (issue, "BUSY", -1.0),
+        (issue, "OFTEN", 50.0),
     ],
 )
 def test_a_rule_that_differs_is_found(monkeypatch: pytest.MonkeyPatch, module: object, name: str, value: float) -> None:

@@ -30,7 +30,8 @@ def test_by_default_two_senders_only_in_turns_that_are_counted(chunk: int) -> No
         out = random_misfortune(seed + 5000, SLOTS).experiment().run(SLOTS)
         assert out.ledger is not None
         assert out.ledger.broken == [], seed
-        known = out.ledger.open_collisions + out.ledger.adopted_collisions + out.ledger.anchor_collisions
+        book = out.ledger
+        known = book.open_collisions + book.adopted_collisions + book.anchor_collisions + book.handed_collisions
         assert out.collisions == known
 
 

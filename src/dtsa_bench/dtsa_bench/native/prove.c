@@ -7,6 +7,7 @@
  *
  *   who has something to say, and who knows that it will rest          (goals)
  *   whether a turn is given away, and to whom of those not thought dead (contents; choose_lessee is prove_lessee)
+ *   whether a turn is handed on, and to whom                           (contents; choose_next is prove_next)
  *   which turns are OPEN                                               (contents; is_open is prove_open)
  *   whether a mover gives turns away                                   (contents; it may always, and need not)
  *   whom a speaker thinks dead, and whether a hearer thought it dead   (all that absence, silence and gossip can lead to)
@@ -61,6 +62,17 @@ int prove_lessee(const uint8_t *able, int count)
     return who[choose(found)];
 }
 
+/* In the place of choose_next. */
+int prove_next(const uint8_t *able, int self, int64_t owner, int count);
+
+int prove_next(const uint8_t *able, int self, int64_t owner, int count)
+{
+    int who[MOST_WINDOW] = {-1}, found = 1;
+    for (int k = 0; k < count; k++)
+        if (able[k] && k != self && k != owner) who[found++] = k;
+    return who[choose(found)];
+}
+
 int prove_open(void); /* in the place of is_open */
 
 uint64_t mix64(uint64_t x) { return x; } /* digests of tables do not count */
@@ -78,8 +90,10 @@ enum { RESTART, DEATH, RETURN, CLAIM }; /* budgets */
 enum { PATIENCE = 6 };                  /* slots; only whether it is over counts */
 
 typedef struct ledger {
-    uint8_t owner;  /* what its owner gave the turn away as */
-    uint8_t others; /* bit k: an adopter gave it to agent k */
+    uint8_t owner;             /* what its owner gave the turn away as */
+    uint8_t others;            /* bit k: an adopter gave it to agent k */
+    uint8_t forgotten;         /* bit k: agent k has handed it on, in an earlier life */
+    uint8_t next[MOST_AGENTS]; /* id of the agent to whom each has handed it on, 0: it has not */
 } ledger;
 
 static dtsa_config config;
@@ -134,6 +148,30 @@ static uint8_t *at;
 
 static void put(int64_t value) { *at++ = (uint8_t)value; }
 
+static int64_t take(void) { return *at++; }
+
+/* Turns are handed on where there is adoption, and there are OPEN turns. */
+static int hands_on(void) { return config.lease.open_every && config.lease.adoption; }
+
+/* An entry of an agent's ring. Who gave a turn away makes no difference without adoption: it was its owner. */
+static int entry_byte(int lessee, int issuer)
+{
+    const int by = !config.lease.adoption ? 0 : issuer == LEASE_HANDED ? 7 : issuer;
+    return (lessee == LEASE_OPEN ? 7 : lessee) | by << 3;
+}
+
+static void put_handed(const ledger *entry)
+{
+    put(entry->forgotten);
+    for (int k = 0; k < n; k++) put(entry->next[k]);
+}
+
+static void take_handed(ledger *entry)
+{
+    entry->forgotten = (uint8_t)take();
+    for (int k = 0; k < n; k++) entry->next[k] = (uint8_t)take();
+}
+
 static int pack(uint8_t *out)
 {
     at = out;
@@ -143,6 +181,7 @@ static int pack(uint8_t *out)
         if (main_anchor(t)) continue;
         put(book[t % MOST_WINDOW].owner);
         if (config.lease.adoption) put(book[t % MOST_WINDOW].others);
+        if (hands_on()) put_handed(&book[t % MOST_WINDOW]);
     }
     for (int k = 0; k < n; k++) {
         const lease_scope v = lease_of(agents[k]);
@@ -150,12 +189,11 @@ static int pack(uint8_t *out)
         const int waking = config.lease.open_every && a->woke >= 0;
         put(agents[k]->present | a->started << 2 | a->probation << 3 |
             (a->probation && a->anchored) << 4 | (a->started && waking) << 5);
-        for (int64_t t = slot; t < slot + reach; t++) put(a->started ? v.lessee[t % v.window] : 0);
+        for (int64_t t = slot; t < slot + reach; t++)
+            put(a->started ? entry_byte(v.lessee[t % v.window], v.issuer[t % v.window]) : 0);
     }
     return (int)(at - out);
 }
-
-static int64_t take(void) { return *at++; }
 
 static void unpack(const uint8_t *in)
 {
@@ -168,6 +206,7 @@ static void unpack(const uint8_t *in)
         if (main_anchor(t)) continue;
         book[t % MOST_WINDOW].owner = (uint8_t)take();
         if (config.lease.adoption) book[t % MOST_WINDOW].others = (uint8_t)take();
+        if (hands_on()) take_handed(&book[t % MOST_WINDOW]);
     }
     for (int k = 0; k < n; k++) {
         agent_forget(agents[k]);
@@ -182,7 +221,11 @@ static void unpack(const uint8_t *in)
         a->woke = flags >> 5 & 1 ? slot - 1 : -1;
         a->idle_since = -1;
         a->born = a->now = a->claimed = slot - 1;
-        for (int64_t t = slot; t < slot + reach; t++) v.lessee[t % v.window] = (uint8_t)take();
+        for (int64_t t = slot; t < slot + reach; t++) {
+            const int byte = (int)take();
+            v.lessee[t % v.window] = (uint8_t)((byte & 7) == 7 ? LEASE_OPEN : byte & 7);
+            v.issuer[t % v.window] = (uint8_t)(byte >> 3 == 7 ? LEASE_HANDED : byte >> 3);
+        }
         for (int i = 0; i < n; i++) v.heard[i] = slot - 1;
     }
 }
@@ -194,31 +237,85 @@ static void rule(int holds, const char *name)
     if (!holds && !broken) broken = name;
 }
 
-/* What a frame gives away, read without the agents' own code for it. */
-static void write_down(int sender, const uint8_t *data)
+/* Whether a turn that was given away first to agent `first` (an id) is agent k's by now; each hands it on once. */
+static int is_last(const ledger *entry, int first, int k)
 {
-    extended_frame e;
-    rule(extended_decode(data, EXTENDED_LENGTH, config.position_step, &e) == FRAME_OK, "frame");
-    if (broken || !e.lease_count) return;
+    if (first == LEASE_OPEN || !first) return 0;
+    for (int i = 0; i < n && entry->next[first - 1]; i++) first = entry->next[first - 1];
+    return first == k + 1;
+}
+
+/* Whether a turn that was given away first to agent `first` was agent `id`'s then or later. */
+static int is_reached(const ledger *entry, int first, int id)
+{
+    for (int i = 0; i < n && first != id && first != LEASE_OPEN && first; i++)
+        first = entry->next[first - 1];
+    return first == id;
+}
+
+/* Whether agent k was given a turn, by its owner or an adopter, or by who had it before, and has not handed it on. */
+static int is_given(const ledger *entry, int k)
+{
+    int given = is_last(entry, entry->owner, k);
+    for (int i = 0; i < n; i++) given |= entry->others >> i & 1 && is_last(entry, i + 1, k);
+    return given;
+}
+
+/* Whether agent k has been named for a turn before. */
+static int is_named(const ledger *entry, int k)
+{
+    return entry->owner == k + 1 || entry->others >> k & 1 || entry->next[k];
+}
+
+/* Turns that a frame hands on: whose turn it is names another one. */
+static void write_handed(int sender, const extended_frame *e)
+{
+    for (int d = 1, i = 0; d <= RELAY_REACH; d++) {
+        if (!(e->relay_mask >> (d - 1) & 1)) continue;
+        const int64_t turn = slot + d;
+        const int lessee = e->relay_ids[i++];
+        ledger *entry = &book[turn % MOST_WINDOW];
+        if (!is_given(entry, sender) || lessee == sender + 1) continue;
+        if (lessee == LEASE_OPEN || is_named(entry, lessee - 1))
+            continue; /* relayed, from before */
+        rule(hands_on(), "2: hands a turn on where nobody may");
+        rule(!main_anchor(turn), "4: hands a main anchor on");
+        entry->next[sender] = (uint8_t)lessee;
+    }
+}
+
+/* Turns that a frame gives away. */
+static void write_given(int sender, const extended_frame *e)
+{
     rule(slot % n == sender, "2: gives away in an own turn only");
-    rule(config.lease.adoption || !e.c_s, "2: adopts where there is no adoption");
+    rule(config.lease.adoption || !e->c_s, "2: adopts where there is no adoption");
     int place = 0, own = 1;
     for (int j = 1; j <= config.lease.main_every; j++)
-        for (int i = e.c_s; i >= 0; i--) {
+        for (int i = e->c_s; i >= 0; i--) {
             const int64_t turn = slot + (int64_t)j * n - i;
             ledger *entry = &book[turn % MOST_WINDOW];
             if (main_anchor(turn) && !i) own = 0;
             if (i ? anchor(turn) : !own) continue;
-            const int given = place < e.lease_count ? e.leases[place++] : 0;
+            const int given = place < e->lease_count ? e->leases[place++] : 0;
             if (!given) continue;
             if (i)
                 entry->others |= (uint8_t)(1 << (given - 1));
             else
-                rule(!entry->owner || entry->owner == given, "3: gives a turn away once");
-            if (!i) entry->owner = (uint8_t)given;
+                rule(!entry->owner || is_reached(entry, entry->owner, given),
+                     "3: gives a turn away once");
+            if (!i && !entry->owner) entry->owner = (uint8_t)given;
         }
-    rule(place >= e.lease_count || !e.leases[place],
+    rule(place >= e->lease_count || !e->leases[place],
          "4: gives no main anchor away, nothing beyond it");
+}
+
+/* What a frame says of turns, read without the agents' own code for it. */
+static void write_down(int sender, const uint8_t *data)
+{
+    extended_frame e;
+    rule(extended_decode(data, EXTENDED_LENGTH, config.position_step, &e) == FRAME_OK, "frame");
+    if (!broken && e.lease_count) write_given(sender, &e);
+    if (!broken) write_handed(sender, &e);
 }
 
 /* Whether its owner sends in an anchor of which it does not know that it has given it away, in an earlier life. */
@@ -230,17 +327,16 @@ static int taken_back(int sender, int probation)
 static void judge(int sender, int probation, int64_t woke)
 {
     const ledger *entry = &book[slot % MOST_WINDOW];
-    const int owner = slot % n == sender, lent = entry->others >> sender & 1;
+    const int owner = slot % n == sender;
+    const int lent = is_given(entry, sender) || entry->forgotten >> sender & 1;
     if (entry->owner == LEASE_OPEN && !lent)
         rule(woke >= 0 || taken_back(sender, probation), "2: only who wakes takes OPEN turns");
     rule(entry->owner != LEASE_OPEN || config.lease.open_every, "2: OPEN where there is none");
     if (owner)
-        rule(!entry->owner || entry->owner == sender + 1 || lent || entry->owner == LEASE_OPEN ||
-                 taken_back(sender, probation),
+        rule(!entry->owner || lent || entry->owner == LEASE_OPEN || taken_back(sender, probation),
              "3: does not send in a turn that it gave away");
     else
-        rule(entry->owner == sender + 1 || entry->owner == LEASE_OPEN || lent,
-             "2: owner, lessee or waker");
+        rule(entry->owner == LEASE_OPEN || lent, "2: owner, lessee or waker");
     if (probation)
         rule((owner && anchor(slot)) || entry->owner == LEASE_OPEN, "8: probation: anchors only");
 }
@@ -255,13 +351,24 @@ static int befalls(int budget)
     return 1;
 }
 
+/* What an agent has handed on it does not know in its next life. */
+static void forget(int k)
+{
+    for (int64_t t = slot; t < slot + reach; t++) {
+        ledger *entry = &book[t % MOST_WINDOW];
+        if (entry->next[k]) entry->forgotten |= (uint8_t)(1 << k);
+    }
+}
+
 static void happen(int k)
 {
     const lease_scope v = lease_of(agents[k]);
     if (!agents[k]->present) {
         agents[k]->present = (uint8_t)befalls(RETURN);
+        if (agents[k]->present) forget(k);
     } else if (v.a->started && befalls(RESTART)) {
         agent_forget(agents[k]);
+        forget(k);
     } else if (agents[k]->present == 1 && befalls(DEATH)) {
         if (choose(2))
             dtsa_agent_leave(agents[k]);
@@ -346,12 +453,12 @@ static void step(void)
         senders[count++] = k;
     }
     const ledger *entry = &book[slot % MOST_WINDOW];
-    rule(count < 2 || entry->owner == LEASE_OPEN || entry->others || returned,
+    rule(count < 2 || entry->owner == LEASE_OPEN || entry->others || entry->forgotten || returned,
          "1: at most one sends");
     for (int k = 0; k < n && count; k++)
         if (agents[k]->present && !agents[k]->decision.sends) hear(k, senders, count, frames);
     for (int k = 0; k < n; k++) finish(k);
-    book[slot % MOST_WINDOW] = (ledger){0, 0};
+    book[slot % MOST_WINDOW] = (ledger){0};
     slot++;
 }
 
@@ -438,7 +545,8 @@ int main(int argc, char **argv)
     base = (1000 / period + 1) * (int64_t)period;
     if (reach > MOST_WINDOW / 2 || period + n > 250) return 2;
     start();
-    size = 5 + reach * (1 + config.lease.adoption) + n * (1 + reach); /* at most */
+    size = 5 + reach * (1 + config.lease.adoption + hands_on() * (1 + n)) +
+           n * (1 + reach); /* at most */
     places_in_table = 2 * most + 7;
     states = malloc((size_t)most * (size_t)size);
     table = calloc((size_t)places_in_table, sizeof *table);

@@ -17,15 +17,20 @@ _SPEED = "-O2"
 
 
 ANY = -1  # any number of times
-# Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody), which are OPEN, and
-# whether movers give turns away (they may).
+# Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody, also when it is
+# handed on), which are OPEN, and whether movers give turns away (they may).
 _CHOICE = "choose_lessee(v, &who, turn)"
 _FREE_CHOICE = "prove_lessee(who.able, v->n)"
 _OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, &who, turn)", "mine && prove_open()"
 _LENDS, _FREE_LENDS = "few_move && v->a->lost < FEW;", "(few_move || 1);"
 _KEEPS = "(!idle && keeps(v, &who, turn))"
+_NEXT, _FREE_NEXT = "choose_next(v, &who, idle, turn)", "prove_next(who.able, v->self, turn % v->n, v->n)"
+_LAST = "if (idle && turn == last) break;"
 _HEADER = '#include "lease.h"\n'
-_DECLARED = "int prove_lessee(const uint8_t *able, int count);\nint prove_open(void);\n"
+_DECLARED = (
+    "int prove_lessee(const uint8_t *able, int count);\nint prove_open(void);\n"
+    "int prove_next(const uint8_t *able, int self, int64_t owner, int count);\n"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +108,7 @@ class Mutant:
 _PLAIN, _RESTART = World("plain", 2, restarts=0, deaths=0), World("restart", 2, restarts=1, deaths=0)
 _RESTS = World("rests", 2, anchor_rest=2, open_every=1, adoption=True, restarts=1, deaths=0)
 _OPEN, _ADOPTS = World("open", 2, open_every=3, deaths=0), World("adopts", 2, adoption=True)
+_HANDS = World("hands on", 3, open_every=4, adoption=True, restarts=0, deaths=0, returns=0, claims=0)
 MUTANTS = (
     Mutant(
         "who comes later begins in probation", "lease.c",
@@ -137,6 +143,10 @@ MUTANTS = (
         "no adoption where it is switched off", "issue.c",
         "agent->table->config->lease.adoption && !v.a->probation", "!v.a->probation", World("dies", 2),
     ),
+    Mutant(
+        "who has handed a turn on never takes it for its own again", "lease.c",
+        "(given || handed)", "(given && !handed)", _HANDS,
+    ),
 )  # fmt: skip
 
 
@@ -161,6 +171,8 @@ def build(directory: Path, mutant: Mutant | None = None) -> Path:
     _replace(copy / "issue.c", _OPEN_TURN, _FREE_OPEN_TURN)
     _replace(copy / "issue.c", _LENDS, _FREE_LENDS)
     _replace(copy / "issue.c", _KEEPS, "0")
+    _replace(copy / "issue.c", _NEXT, _FREE_NEXT)
+    _replace(copy / "issue.c", _LAST, "")
     _replace(copy / "issue.c", _HEADER, f"{_HEADER}{_DECLARED}")
     if mutant is not None:
         _replace(copy / mutant.file, mutant.right, mutant.wrong)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from dtsa_agent.core import AbstractSwarm, SwarmConfig
+from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig
 
-from .knowledge import ages, counts, moves, squared_errors
+from .knowledge import ages, counts, moves, squared_errors, whittle_index
 
 
 class GenieAge:
@@ -22,6 +22,29 @@ class GenieAge:
     def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
         """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
         weight = np.where(counts(swarm), ages(swarm, slot), 0.0).sum(axis=0)
+        best = int(weight.argmax())
+        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+
+
+class Whittle:
+    """The agent with the largest sum of Whittle's indices of the true ages at all receivers.
+
+    The index is that of one link; a frame that reaches several receivers counts the sum of theirs. Option:
+    ``whittle.loss`` (0): the probability that a receiver loses a frame, which has to be known.
+
+    :raises ConfigError: for a probability that is none.
+    """
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del agent
+        self._loss = config.options.get("whittle.loss", 0.0)
+        if not 0.0 <= self._loss < 1.0:
+            raise ConfigError("whittle.loss", self._loss, "0 to below 1")
+
+    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        index = whittle_index(ages(swarm, slot) + 1.0, self._loss)
+        weight = np.where(counts(swarm), index, 0.0).sum(axis=0)
         best = int(weight.argmax())
         return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
 

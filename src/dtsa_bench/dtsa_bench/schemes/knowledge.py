@@ -79,3 +79,16 @@ def error_about_self(swarm: AbstractSwarm, slot: int) -> Floats:
     off = swarm.position - moved
     error = np.sqrt((off * off).sum(axis=0))
     return np.where(swarm.sent_slot[n, n] < 0, np.inf, error)
+
+
+def whittle_index(age: Floats, loss: float) -> Floats:
+    """What a transmission is worth at an age: the price at which waiting for a slot more costs as much, slots.
+
+    For one link whose age costs 1 a slot: p h (h + 2 / p - 1) / 2 with p = 1 - loss (Kadota and others, arXiv
+    1801.01803).
+
+    :param age: slots, h, 1: heard in the slot that has just ended.
+    :param loss: probability that a frame is lost, below 1.
+    """
+    arrives = 1.0 - loss
+    return np.asarray(0.5 * arrives * age * (age + 2.0 / arrives - 1.0))

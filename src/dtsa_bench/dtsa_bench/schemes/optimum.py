@@ -7,11 +7,15 @@ iteration over all states, with ages cut off at a cap.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .knowledge import whittle_index
 
 #: Pairs (receiver, sender) whose ages are the state, by axis.
 PAIRS = tuple((j, k) for j in range(3) for k in range(3) if j != k)
@@ -24,6 +28,8 @@ class Optimum:
     loss: float
     best: float
     greedy: float
+    whittle: float
+    """By the sum of Whittle's indices."""
     tdma: float
     cap: int
 
@@ -37,11 +43,20 @@ def optimum(loss: float, cap: int = 9, tolerance: float = 1e-6) -> Optimum:
     """
     ages = np.indices((cap + 1,) * len(PAIRS), dtype=np.int8)
     cost = np.asarray(ages.sum(axis=0) / len(PAIRS), dtype=np.float64)
-    sums = np.stack([sum(ages[i] for i, (_, k) in enumerate(PAIRS) if k == sender) for sender in range(3)])
-    greedy = sums.argmax(axis=0)
+    greedy = _largest_sum(list(ages))
+    whittle = _largest_sum([whittle_index(age + 1.0, loss) for age in ages])
     del ages
-    best = _mean_cost(cost, loss, tolerance, None)
-    return Optimum(loss, best, _mean_cost(cost, loss, tolerance, greedy), _round_robin(loss), cap)
+    best, of_greedy, of_whittle = (_mean_cost(cost, loss, tolerance, choice) for choice in (None, greedy, whittle))
+    return Optimum(loss, best, of_greedy, of_whittle, _round_robin(loss), cap)
+
+
+def _largest_sum(weights: Sequence[NDArray[Any]]) -> NDArray[np.intp]:
+    """The sender with the largest sum over its receivers, for each state.
+
+    :param weights: by pair, of each state.
+    """
+    sums = [sum(weights[i] for i, (_, k) in enumerate(PAIRS) if k == sender) for sender in range(3)]
+    return np.asarray(np.stack(sums).argmax(axis=0))
 
 
 def _round_robin(loss: float) -> float:

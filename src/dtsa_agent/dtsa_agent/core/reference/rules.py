@@ -37,7 +37,7 @@ class Rules:
     main_every: int = 5  # K M
     open_every: int = 11  # S; 0: none
     adoption: bool = True
-    depth_rate: float = 0.1  # c
+    depth_rate: float = 0.2  # c
     lease_share: float = 1.0
 
     @property

@@ -122,7 +122,7 @@ typedef struct dtsa_lease_config {
     double depth_rate; /* c: turns given away per round of idleness */
     double share;      /* no leases when more than this share of those alive has something to say */
     int64_t
-        patience; /* slots of silence after which an agent is thought absent; 0: max(1000, 6 M N) */
+        patience; /* slots of silence after which an agent is thought absent; 0: max(1000, 6 M N), 6 K M N if it rests */
     int main_every; /* K M: every so many rounds an anchor is a main one, a multiple of M, 15 at most; 0: M */
 } dtsa_lease_config;
 

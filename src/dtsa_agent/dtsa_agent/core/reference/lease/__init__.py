@@ -1,4 +1,4 @@
-"""Policy ``lease``: only the owner gives its slot away. Rules, events and proof: docs/protocol.md.
+"""Policy ``lease``: only whose turn it is gives it away. Rules, events and proof: docs/protocol.md.
 
 * :mod:`.memory`: what an agent remembers, and what that says about a turn
 * :mod:`.decide`: who sends in a slot

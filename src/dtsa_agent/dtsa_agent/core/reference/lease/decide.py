@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..arithmetic import mix64, share_of
 from ..frame_extended import OPEN
 from ..selection import Choice
-from .memory import NEVER, Memory
+from .memory import HANDED, NEVER, Memory
 
 CROWD = 8.0  # chance of an OPEN turn: 1 / ((1 + CROWD w) 2^a)
 _OPEN_DRAW = 0x4F50454E  # "OPEN": these draws are none of another policy's
@@ -30,7 +30,7 @@ def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> C
     if lease is not None and lease.lessee == OPEN:
         return Choice(self_index if takes_open(memory, self_index, slot) else -1, "open")
     if lease is not None:
-        adopted = lease.issuer not in (0, owner + 1)
+        adopted = lease.issuer not in (0, owner + 1, HANDED)
         memory.expected = lease.lessee - 1
         # A lease that I hear of while others may think me dead, or I them, may be one of two.
         mine_but_quiet = memory.expected == self_index and memory.probation

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from ..arithmetic import minus, norm
 from ..frame_extended import LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH
 from ..table import Table
-from .memory import MISSED, Lease, Memory
+from .memory import HANDED, MISSED, Lease, Memory
 
 FEW = 0.5  # more missed frames than this in 8 N slots: movers keep their turns
+MUCH_MORE = 3  # a mover hands on turns that are worth so many times as much to somebody else
 ROUNDS_TOLD = 3  # who has arrived says so for so many rounds, where frames are lost
-BUSY = 0.5  # more wakers than this in N slots: a second OPEN turn
+OFTEN = 2.0  # at least so many OPEN turns for each that wakes
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,8 @@ def say(memory: Memory, self_index: int, table: Table, slot: int, final: bool, l
     leases = b""
     if own_turn:
         leases = issue(memory, self_index, table, slot, c_s, 0 if leaving else None, final)
-    return Said(c_s, leaving, leases, relay(memory, self_index, slot, own_is_said=bool(leases)))
+    handed = hand_on(memory, self_index, table, slot, final)
+    return Said(c_s, leaving, leases, relay(memory, self_index, slot, handed, own_is_said=bool(leases)))
 
 
 def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
@@ -111,8 +113,8 @@ def sets_out(memory: Memory, table: Table, k: int) -> bool:
 def open_block(agents: int, every: int, wakers: float, resting: int, settled: int) -> int:
     """Slots of which one turn goes to those who wake; 0: none.
 
-    S turns of those that rest lie in so many. Half as many more where all of them are settled; half of it while many
-    wake. It has no factor in common with N, or the same few owners would always pay.
+    S turns of those that rest lie in so many; half as many more where all of them are settled; fewer while many wake,
+    so that each of them finds two. It has no factor in common with N, or the same few owners would always pay.
 
     :param agents: N.
     :param every: S.
@@ -125,8 +127,8 @@ def open_block(agents: int, every: int, wakers: float, resting: int, settled: in
     block = -(-every * agents // resting)  # rounded up
     if settled == resting:
         block += block // 2
-    if wakers > BUSY:
-        block = (block + 1) // 2
+    if block * OFTEN * wakers > agents:
+        block = max(2, int(agents / (OFTEN * wakers)))
     while math.gcd(block, agents) > 1:
         block += 1
     return block
@@ -249,38 +251,79 @@ def keeps(memory: Memory, who: Electorate, turn: int) -> bool:
     return not any(is_spare(memory, who, t) or is_lent(memory, who, t) for t in unsaid)
 
 
-def choose_lessee(memory: Memory, who: Electorate, turn: int) -> int:
-    """To whom a turn is worth most: the able agent with the largest p min(n, m), then the lowest id; -1: nobody.
+def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
+    """What a turn is worth to an agent: p min(n, m).
 
-    p and n are the distances from the turn to that agent's previous and next slot, as far as they are known or
-    foreseen; p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases
-    will come in between: m is N_p, or 3/4 of it where movers give turns away, too, so that there the wait decides.
-
-    :param turn: the turn to be given away.
+    p and n are the distances from the turn to the agent's previous and next slot, as far as they are known or foreseen;
+    p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases will come
+    in between: m is N_p, or 3/4 of it where movers give turns away, too, so that there the wait decides.
     """
     longest, most = memory.rules.agents + 1, who.members
     if who.lends:
         most = (3 * who.members + 3) // 4
-
-    def worth(k: int) -> int:
-        before = min(turn - who.last[k], longest)
-        after = next((right - turn for right in who.rights[k] if right > turn), longest)
-        return before * min(after, most)
-
-    able = [k for k in range(memory.rules.agents) if who.able[k]]
-    return max(able, key=worth, default=-1)  # the first of several
+    before = min(turn - who.last[k], longest)
+    after = next((right - turn for right in who.rights[k] if right > turn), longest)
+    return before * min(after, most)
 
 
-def relay(memory: Memory, self_index: int, slot: int, own_is_said: bool) -> tuple[tuple[int, int], ...]:
-    """The next leases that an agent knows of, so that who missed them learns of them in time.
+def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> int:
+    """To whom a turn is worth most, the lowest id of several; -1: nobody is able.
 
+    :param turn: the turn to be given away.
+    :param but: an agent that is not asked.
+    """
+    able = [k for k in range(memory.rules.agents) if who.able[k] and k != but]
+    return max(able, key=lambda k: worth(memory, who, k, turn), default=-1)  # the first of several
+
+
+def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: bool) -> list[int]:
+    """Hands on turns that the agent was given and can name in a relay; not the next slot's: frames may arrive late.
+
+    If it rests, all but the last one, for in that it can hand on further ones; if it moves, those that are worth much
+    more to somebody else. The turn's owner, which has given it away, is left out.
+
+    :returns: the turns handed on, at most eight.
+    """
+    handed: list[int] = []
+    idle = memory.idle_since >= 0
+    if not memory.rules.open_every or not memory.rules.adoption or memory.probation or memory.deaf:
+        return handed
+    within = range(slot + 2, slot + min(RELAY_REACH, memory.window - 1) + 1)
+    given = [t for t in within if t in memory.leases and memory.leases[t].lessee == self_index + 1]
+    if idle:
+        given = given[:-1]
+    if not given:
+        return handed
+    who = electorate(memory, self_index, table, slot, final)
+    who.rights = look_ahead(memory, who, slot)
+    who.last[self_index] = slot
+    foreseen = slot + 1  # up to here, excluded
+    for turn in given:
+        if len(handed) == RELAY_IDS:
+            break
+        foresee(memory, self_index, who, range(foreseen, turn))
+        foreseen = turn
+        k = choose_lessee(memory, who, turn, but=self_index)
+        if k < 0 or k == memory.owner(turn):
+            continue
+        if idle or worth(memory, who, k, turn) >= MUCH_MORE * worth(memory, who, self_index, turn):
+            memory.leases[turn] = Lease(k + 1, HANDED)
+            handed.append(turn)
+    return handed
+
+
+def relay(
+    memory: Memory, self_index: int, slot: int, handed: list[int], own_is_said: bool
+) -> tuple[tuple[int, int], ...]:
+    """Leases that an agent hands on now, and the next ones that it knows of: who missed them learns of them in time.
+
+    :param handed: turns that are handed on.
     :param own_is_said: the frame's lease bytes speak of the own turns already.
     :returns: (slots ahead, lessee), at most eight.
     """
-    known = []
-    for ahead in range(1, min(RELAY_REACH, memory.window - 1) + 1):
-        lease = memory.leases.get(slot + ahead)
-        if lease is None or (own_is_said and memory.owner(slot + ahead) == self_index):
-            continue
-        known.append((ahead, lease.lessee))
-    return tuple(known[:RELAY_IDS])
+    turns = list(handed)
+    for turn in range(slot + 1, slot + min(RELAY_REACH, memory.window - 1) + 1):
+        said = own_is_said and memory.owner(turn) == self_index
+        if turn in memory.leases and turn not in handed and not said and len(turns) < RELAY_IDS:
+            turns.append(turn)
+    return tuple((turn - slot, memory.leases[turn].lessee) for turn in sorted(turns))

@@ -26,6 +26,7 @@ def listen(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, wak
     memory.quiet[sender] = frame.probation
     memory.heard[sender] = GONE if frame.leaving else slot
     judge_claim(memory, self_index, slot, frame, was_absent)
+    memory.resting[sender] = frame.own.c_r == 0
     for entry in frame.gossip:
         hear_gossip(memory, self_index, entry.agent - 1, slot - entry.age)
     turns = memory.turns_of_leases(slot, frame.c_s, len(frame.leases))
@@ -33,9 +34,9 @@ def listen(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, wak
     if memory.owner(slot) == sender:
         memory.settled[sender] = any(memory.owner(turn) == sender and memory.is_anchor(turn) for turn, _ in given)
     for turn, lessee in given:
-        memory.note(turn, lessee, frame.own.sender)
+        memory.note(self_index, sender + 1, turn, lessee, sender + 1)
     for ahead, lessee in frame.relay:
-        memory.note(slot + ahead, lessee, 0)
+        memory.note(self_index, sender + 1, slot + ahead, lessee, 0)
 
 
 def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, was_absent: bool) -> None:

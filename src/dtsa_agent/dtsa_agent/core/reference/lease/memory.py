@@ -11,6 +11,7 @@ DEAF = 4  # more silent slots in a row than this, and an agent does not trust it
 MISSED = 4  # who missed so many expected turns gets no leases
 ROUNDS = 8  # in which missed frames are counted
 GONE = -(2**61)  # in ``heard``: said that it leaves
+HANDED = 255  # in place of an issuer: the agent itself was given the turn, and has handed it on
 NEVER = -1  # in ``heard``, ``woke``, ``idle_since``
 
 
@@ -19,7 +20,7 @@ class Lease:
     """A turn that is given away."""
 
     lessee: int  # id, or OPEN
-    issuer: int  # id of who gave it away, 0: known by a relay only
+    issuer: int  # id of who gave it away, 0: known by a relay only; HANDED
 
 
 @dataclass(slots=True)
@@ -38,6 +39,7 @@ class Memory:
     missed: list[int] = field(default_factory=list)  # expected turns that each missed in a row
     quiet: list[bool] = field(default_factory=list)  # in probation: sends in anchors only
     settled: list[bool] = field(default_factory=list)  # gives anchors away, for it knows that it will rest
+    resting: list[bool] = field(default_factory=list)  # had nothing to say in its last frame
     moving: bool = False
     idle_since: int = NEVER
     woke: int = NEVER  # slot in which it woke or joined, and since when nobody is known to have heard it
@@ -52,10 +54,13 @@ class Memory:
     claimed: int = 0  # slot in which probation began or was last confirmed
     leaving: bool = False  # said in this slot that it leaves
 
-    @property
-    def patience(self) -> int:
-        """Slots without a sign of life after which an agent is thought absent."""
-        return max(1000, 6 * self.rules.anchor_every * self.rules.agents)
+    def patience(self, k: int) -> int:
+        """Slots without a sign of life after which an agent is thought absent: six times as many as it may be silent.
+
+        Who rests may speak in its main anchors only, and so may who was never heard.
+        """
+        rests = self.resting[k] or self.heard[k] == NEVER
+        return max(1000, 6 * (self.rules.main_every if rests else self.rules.anchor_every) * self.rules.agents)
 
     @property
     def window(self) -> int:
@@ -83,12 +88,12 @@ class Memory:
 
     def alive(self, k: int) -> bool:
         """Whether an agent was heard of lately."""
-        return self.heard[k] >= 0 and self.now - self.heard[k] <= self.patience
+        return self.heard[k] >= 0 and self.now - self.heard[k] <= self.patience(k)
 
     def absent(self, k: int, slot: int) -> bool:
         """Whether an agent is thought dead: no sign of life for long, or it said that it leaves."""
         sign = self.born if self.heard[k] == NEVER else self.heard[k]
-        return slot - sign > self.patience
+        return slot - sign > self.patience(k)
 
     def scheduled(self, turn: int) -> int:
         """Who is expected in a turn, -1: nobody in particular."""
@@ -100,22 +105,32 @@ class Memory:
             return -1
         return owner
 
-    def note(self, turn: int, lessee: int, issuer: int) -> None:
-        """Takes note of a lease. An entry is never revoked; of two different ones, which adoption alone can cause, the
+    def note(self, self_index: int, sender: int, turn: int, lessee: int, issuer: int) -> None:
+        """Takes note of what a frame says of a turn.
 
-        smaller id stays, so that all who know both agree.
+        Who has been given a turn may hand it on, in a frame of its own; what is relayed later changes nothing. What the
+        agent itself has given away or handed on never is its own again. Of two that gave the turn away, which adoption
+        alone can cause, the smaller lessee stays, so that all who know both agree.
 
+        :param self_index: the agent's number.
+        :param sender: id of who says it.
         :param turn: the slot that is given away.
         :param lessee: id or OPEN.
-        :param issuer: id of who gave it away, 0: known by a relay only.
+        :param issuer: id of who gave it away, 0: the sender relays it.
         """
         if not self.now < turn < self.now + self.window or self.is_main(turn):
             return
         there = self.leases.get(turn)
-        if there is None or lessee < there.lessee:
+        if there is None:
             self.leases[turn] = Lease(lessee, issuer)
-        elif lessee == there.lessee and not there.issuer:
-            there.issuer = issuer
+        elif there.issuer in (self_index + 1, HANDED) and (sender != there.lessee or lessee == self_index + 1):
+            return
+        elif lessee == there.lessee:
+            there.issuer = there.issuer or issuer
+        elif sender == there.lessee:
+            there.lessee = lessee
+        elif issuer and there.issuer and issuer != there.issuer and lessee < there.lessee:
+            self.leases[turn] = Lease(lessee, issuer)
 
     def turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
         """The turns that the lease bytes of a frame speak of, in order; the same for sender and receiver.
@@ -146,7 +161,7 @@ class Memory:
         self.started = True
         self.born = self.now = self.claimed = slot
         self.heard, self.missed = [NEVER] * n, [0] * n
-        self.quiet, self.settled = [False] * n, [False] * n
+        self.quiet, self.settled, self.resting = ([False] * n for _ in range(3))
         if slot > 0:
             self.probation = True
             self.woke = slot

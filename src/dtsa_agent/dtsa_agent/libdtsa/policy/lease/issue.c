@@ -4,9 +4,12 @@
 
 #include "lease.h"
 
-static const double BUSY = 0.5, FEW = 0.5;
+static const double OFTEN = 2.0, FEW = 0.5;
 
-enum { ROUNDS_TOLD = 3 }; /* who has arrived says so for so many rounds, where frames are lost */
+enum {
+    ROUNDS_TOLD = 3, /* who has arrived says so for so many rounds, where frames are lost */
+    MUCH_MORE = 3 /* a mover hands on turns that are worth so many times as much to somebody else */
+};
 
 typedef struct {
     int alive;    /* N_alive: me and those heard of lately */
@@ -34,13 +37,17 @@ static int common_factor(int a, int b)
 }
 
 /* Slots of which one turn goes to those who wake: S turns of those that rest lie in so many; half as many more where all of
- * them are settled, half of it while many wake. No factor in common with n, or the same few owners would always pay. */
+ * them are settled; OFTEN for each that wakes, if that is more. No factor in common with n, or the same few owners would always
+ * pay. */
 static int open_block(int every, const lease_scope *v, int resting, int settled)
 {
     if (!every || !resting) return 0;
     int block = (every * v->n + resting - 1) / resting;
     if (settled == resting) block += block / 2;
-    if (v->a->wakers > BUSY) block = (block + 1) / 2;
+    if (block * OFTEN * v->a->wakers > v->n) {
+        const int often = (int)(v->n / (OFTEN * v->a->wakers));
+        block = often > 2 ? often : 2;
+    }
     while (common_factor(block, v->n) > 1) block++;
     return block;
 }
@@ -100,29 +107,34 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
 }
 
 /* Number of consecutive ids before me that nobody has heard of for long. */
-static int count_absent_before(const lease_scope *v, int self, int64_t slot)
+static int count_absent_before(const lease_scope *v, int64_t slot)
 {
     int count = 0;
-    while (count < v->n - 1 && lease_absent(v, (self - 1 - count + v->n) % v->n, slot)) count++;
+    while (count < v->n - 1 && lease_absent(v, (v->self - 1 - count + v->n) % v->n, slot)) count++;
     return count;
 }
 
-/* To whom a turn is worth most: the longest wait before it, times the wait that follows, as far as that is short. -1: nobody
- * is able. */
-static int choose_lessee(const lease_scope *v, const electorate *who, int64_t turn)
+/* What a turn is worth to an agent: its wait before it, times the wait that follows, as far as that is short.
+ *
+ * next: slot in which it is known to send after the turn. */
+static long worth(const lease_scope *v, const electorate *who, int k, int64_t turn, int64_t next)
 {
     const int most = who->lends ? (3 * who->members + 3) / 4 : who->members;
+    const int64_t wait = turn - who->last[k], rest = next - turn;
+    return (wait <= v->n ? (long)wait : v->n + 1) * (rest < most ? (long)rest : most);
+}
+
+/* To whom a turn is worth most. -1: nobody is able. */
+static int choose_lessee(const lease_scope *v, const electorate *who, int64_t turn)
+{
     int best = -1;
-    long worth = 0;
+    long most = 0;
     for (int i = 0; i < who->members; i++) {
         const int k = who->list[i];
-        const int64_t wait = turn - who->last[k], rest = who->next[k] - turn;
-        const long before = wait <= v->n ? (long)wait : v->n + 1;
-        const long after = rest < most ? (long)rest : most;
-        if (best < 0 || before * after > worth) {
-            best = k;
-            worth = before * after;
-        }
+        const long value = worth(v, who, k, turn, who->next[k]);
+        if (best >= 0 && value <= most) continue;
+        best = k;
+        most = value;
     }
     return best;
 }
@@ -151,11 +163,13 @@ static int is_open(const lease_scope *v, const electorate *who, int64_t turn)
     return 1;
 }
 
-/* Notes when each will send next, and after each turn again, as far as is known. */
-static void look_ahead(const lease_scope *v, electorate *who, int64_t slot)
+/* Notes when each will send next, and after each turn again, as far as is known.
+ *
+ * turns: so many are looked at; n more than those whose worth is asked for are enough. */
+static void look_ahead(const lease_scope *v, electorate *who, int64_t slot, int turns)
 {
     for (int k = 0; k < v->n; k++) who->next[k] = INT64_MAX;
-    for (int64_t t = slot + v->window - 1; t > slot; t--) {
+    for (int64_t t = slot + (turns < v->window ? turns : v->window - 1); t > slot; t--) {
         const int k = lease_scheduled(v, t);
         if (k < 0 || is_lent(v, who, t)) continue;
         const int64_t rest = who->next[k] - t;
@@ -181,7 +195,7 @@ static int keeps(const lease_scope *v, const electorate *who, int64_t turn)
  * one to whom it will be worth most.
  *
  * from: the first of these slots. */
-static void foresee(const lease_scope *v, electorate *who, int self, int64_t from, int64_t turn)
+static void foresee(const lease_scope *v, electorate *who, int64_t from, int64_t turn)
 {
     for (int64_t t = from; t < turn; t++) {
         const int owner = (int)(t % v->n), given = v->lessee[t % v->window];
@@ -189,7 +203,8 @@ static void foresee(const lease_scope *v, electorate *who, int self, int64_t fro
         if (k >= 0 && who->next[k] == t) who->next[k] = t + who->again[t % v->window];
         const int spare = given == LEASE_NONE && who->sure[owner] && is_spare(v, who, t);
         const int lent = is_lent(v, who, t) && !keeps(v, who, t);
-        if (owner != self && (lent || (spare && !is_open(v, who, t)))) k = choose_lessee(v, who, t);
+        if (owner != v->self && (lent || (spare && !is_open(v, who, t))))
+            k = choose_lessee(v, who, t);
         if (k >= 0) who->last[k] = t;
     }
 }
@@ -213,7 +228,7 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
 {
     int64_t turns[LEASE_ROOM];
     electorate who;
-    const int self = agent->self, count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
+    const int self = v->self, count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
     int64_t from = slot + 1;
     count_electorate(agent, v, slot, &who);
     const int idle = v->a->idle_since >= 0, adopted = idle ? v->every : 1;
@@ -228,8 +243,8 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
             if (idle && mine && is_open(v, &who, turn)) {
                 *given = LEASE_OPEN;
             } else if (who.members && (mine || v->a->deaf <= LEASE_DEAF)) {
-                if (from == slot + 1) look_ahead(v, &who, slot);
-                foresee(v, &who, self, from, turn);
+                if (from == slot + 1) look_ahead(v, &who, slot, v->window - 1);
+                foresee(v, &who, from, turn);
                 from = turn;
                 *given = (uint8_t)(choose_lessee(v, &who, turn) + 1);
                 if (mine && (*given == self + 1 || (!idle && keeps(v, &who, turn))))
@@ -242,28 +257,84 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
     }
 }
 
-static void relay(const lease_scope *v, int self, int64_t slot, extended_frame *e)
+/* Whether a mover's turn is worth much more to somebody else. */
+static int is_dispensable(const lease_scope *v, const electorate *who, int k, int64_t turn)
+{
+    const long own = worth(v, who, v->self, turn, turn + who->again[turn % v->window]);
+    return worth(v, who, k, turn, who->next[k]) >= MUCH_MORE * own;
+}
+
+/* To whom this agent hands a turn on that it was given. -1: to nobody. Its owner has given it away. */
+static int choose_next(const lease_scope *v, const electorate *who, int idle, int64_t turn)
+{
+    const int k = choose_lessee(v, who, turn);
+    if (k < 0 || k == v->self || k == turn % v->n) return -1;
+    return idle || is_dispensable(v, who, k, turn) ? k : -1;
+}
+
+/* Hands on turns within reach that this agent was given: all but the last one if it rests, for in that it can hand on further
+ * ones; if it moves, those that are worth much more to somebody else. Not the next slot's: frames may arrive late.
+ *
+ * -> mask of the turns handed on, as in relay_mask. */
+static uint32_t hand_on(const dtsa_agent *agent, lease_scope *v, int64_t slot)
+{
+    const dtsa_lease_config *c = &agent->table->config->lease;
+    const int64_t end = slot + (RELAY_REACH < v->window - 1 ? RELAY_REACH : v->window - 1);
+    const int idle = v->a->idle_since >= 0, mine = v->self + 1;
+    int64_t last = end, from = slot + 1;
+    int count = 0;
+    uint32_t mask = 0;
+    electorate who;
+    if (!c->open_every || !c->adoption || v->a->probation || v->a->deaf > LEASE_DEAF) return 0;
+    while (last > slot + 1 && v->lessee[last % v->window] != mine) last--;
+    for (int64_t turn = slot + 2; turn <= last && count < RELAY_IDS; turn++) {
+        uint8_t *given = &v->lessee[turn % v->window];
+        if (*given != mine) continue;
+        if (idle && turn == last) break;
+        if (from == slot + 1) {
+            count_electorate(agent, v, slot, &who);
+            look_ahead(v, &who, slot, RELAY_REACH + v->n);
+            who.last[v->self] = slot;
+        }
+        foresee(v, &who, from, turn);
+        from = turn;
+        const int k = choose_next(v, &who, idle, turn);
+        if (k < 0) continue;
+        if (who.next[v->self] == turn) who.next[v->self] = turn + who.again[turn % v->window];
+        *given = (uint8_t)(k + 1);
+        v->issuer[turn % v->window] = LEASE_HANDED;
+        mask |= 1u << (turn - slot - 1);
+        count++;
+    }
+    return mask;
+}
+
+/* Relays leases: those that are handed on now, and the next ones. */
+static void relay(const lease_scope *v, int64_t slot, uint32_t handed, extended_frame *e)
 {
     int count = 0;
+    for (uint32_t rest = handed; rest; rest &= rest - 1) count++;
+    e->relay_mask = handed;
     for (int d = 1; d <= RELAY_REACH && d < v->window && count < RELAY_IDS; d++) {
         const int64_t turn = slot + d;
-        const int given = v->lessee[turn % v->window];
-        if (given == LEASE_NONE || (e->lease_count && turn % v->n == self)) continue;
+        const int said = e->lease_count && turn % v->n == v->self; /* by the lease bytes */
+        if (v->lessee[turn % v->window] == LEASE_NONE || said || handed >> (d - 1) & 1) continue;
         e->relay_mask |= 1u << (d - 1);
-        e->relay_ids[count++] = (uint8_t)given;
+        count++;
     }
+    for (int d = 1, i = 0; d <= RELAY_REACH; d++)
+        if (e->relay_mask >> (d - 1) & 1) e->relay_ids[i++] = v->lessee[(slot + d) % v->window];
 }
 
 void lease_fill(dtsa_agent *agent, int64_t slot, extended_frame *e)
 {
-    const int self = agent->self;
     lease_scope v = lease_of(agent);
-    const int own_turn = slot % v.n == self;
+    const int own_turn = slot % v.n == v.self;
     e->probation = v.a->probation;
     e->leaving = own_turn && agent->present == PRESENT_LEAVING;
     v.a->leaving = (uint8_t)e->leaving;
     if (agent->table->config->lease.adoption && !v.a->probation && !e->leaving)
-        e->c_s = count_absent_before(&v, self, slot);
+        e->c_s = count_absent_before(&v, slot);
     if (own_turn) issue(agent, &v, slot, e);
-    relay(&v, self, slot, e);
+    relay(&v, slot, hand_on(agent, &v, slot), e);
 }

@@ -1,7 +1,8 @@
 /* Policy lease: an agent's decisions. Who may send in a slot, and what silence means.
  *
- * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its next main anchor: so whoever
- * sends in a turn is its owner or the one agent that its owner named. docs/protocol.md has states, events and proof.
+ * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its next main anchor; who was given
+ * it may hand it on in the same way. So whoever sends in a turn is its owner or the last one that was named for it.
+ * docs/protocol.md has states, events and proof.
  */
 #include <string.h>
 
@@ -20,12 +21,12 @@ static int ring_length(const dtsa_config *c) { return (main_every(c) + 2) * c->a
 static size_t state_bytes(const dtsa_config *c)
 {
     const size_t n = (size_t)c->agents;
-    return (sizeof(lease_agent) + 8 * n + 2 * (size_t)ring_length(c) + 3 * n + 7) / 8 * 8;
+    return (sizeof(lease_agent) + 8 * n + 2 * (size_t)ring_length(c) + 4 * n + 7) / 8 * 8;
 }
 
-static int64_t patience(const dtsa_config *c)
+static int64_t patience(const dtsa_config *c, int rounds)
 {
-    const int64_t silence = 6 * (int64_t)c->lease.anchor_every * c->agents;
+    const int64_t silence = 6 * (int64_t)rounds * c->agents;
     if (c->lease.patience) return c->lease.patience;
     return silence > 1000 ? silence : 1000;
 }
@@ -35,10 +36,12 @@ lease_scope lease_of(const dtsa_agent *agent)
     const dtsa_config *c = agent->table->config;
     lease_scope v;
     v.n = c->agents;
+    v.self = agent->self;
     v.every = c->lease.anchor_every;
     v.main = main_every(c);
     v.window = ring_length(c);
-    v.patience = patience(c);
+    v.patience = patience(c, v.every);
+    v.long_patience = patience(c, v.main);
     v.a = agent->state;
     v.heard = (int64_t *)(v.a + 1);
     v.lessee = (uint8_t *)(v.heard + v.n);
@@ -46,6 +49,7 @@ lease_scope lease_of(const dtsa_agent *agent)
     v.miss = v.issuer + v.window;
     v.quiet = v.miss + v.n;
     v.settled = v.quiet + v.n;
+    v.resting = v.settled + v.n;
     return v;
 }
 
@@ -59,15 +63,21 @@ int lease_is_main(const lease_scope *v, int64_t slot)
     return (slot / v->n + slot % v->n) % v->main == 0;
 }
 
+/* Who rests may speak in its main anchors only, and so may who was never heard. */
+static int64_t patience_with(const lease_scope *v, int k)
+{
+    return v->resting[k] || v->heard[k] == -1 ? v->long_patience : v->patience;
+}
+
 int lease_alive(const lease_scope *v, int k, int64_t slot)
 {
-    return v->heard[k] >= 0 && slot - v->heard[k] <= v->patience;
+    return v->heard[k] >= 0 && slot - v->heard[k] <= patience_with(v, k);
 }
 
 int lease_absent(const lease_scope *v, int k, int64_t slot)
 {
     const int64_t sign = v->heard[k] == -1 ? v->a->born : v->heard[k];
-    return slot - sign > v->patience;
+    return slot - sign > patience_with(v, k);
 }
 
 int lease_scheduled(const lease_scope *v, int64_t slot)
@@ -79,17 +89,25 @@ int lease_scheduled(const lease_scope *v, int64_t slot)
     return owner;
 }
 
-void lease_note(lease_scope *v, int64_t turn, int lessee, int issuer)
+void lease_note(lease_scope *v, int sender, int64_t turn, int lessee, int issuer)
 {
     if (lessee == LEASE_NONE || turn <= v->a->now || turn >= v->a->now + v->window ||
         lease_is_main(v, turn))
         return;
     uint8_t *there = &v->lessee[turn % v->window], *by = &v->issuer[turn % v->window];
-    /* Two leases of one turn: only adoption can do that. The smaller id, so that all who know both agree. */
-    if (*there == LEASE_NONE || lessee < *there) {
+    /* What I have given away or handed on never is mine again. */
+    const int given = *by == v->self + 1, handed = *by == LEASE_HANDED;
+    if ((given || handed) && (sender != *there || lessee == v->self + 1)) return;
+    if (*there == LEASE_NONE) {
         *there = (uint8_t)lessee;
         *by = (uint8_t)issuer;
-    } else if (lessee == *there && !*by) {
+    } else if (lessee == *there) {
+        if (!*by) *by = (uint8_t)issuer;
+    } else if (sender == *there) { /* whose turn it was hands it on */
+        *there = (uint8_t)lessee;
+    } else if (issuer && *by && issuer != *by && lessee < *there) {
+        /* Two have given it away: only adoption can do that. The smaller id, so that all who know both agree. */
+        *there = (uint8_t)lessee;
         *by = (uint8_t)issuer;
     }
 }
@@ -216,8 +234,8 @@ static choice lease_decide(dtsa_agent *agent, int64_t slot)
     if (given == LEASE_OPEN)
         return expect(takes_open(agent, &v, slot) ? self : -1, DTSA_REASON_LEASE_OPEN);
     a->expected = given - 1;
-    const int reason = issuer && issuer != (int)(slot % v.n) + 1 ? DTSA_REASON_LEASE_ADOPTED
-                                                                 : DTSA_REASON_LEASE_LEASED;
+    const int adopted = issuer && issuer != LEASE_HANDED && issuer != (int)(slot % v.n) + 1;
+    const int reason = adopted ? DTSA_REASON_LEASE_ADOPTED : DTSA_REASON_LEASE_LEASED;
     /* A lease that I hear of while others may think me dead, or I them, may be one of two. */
     return expect(a->expected == self && a->probation ? -1 : a->expected, reason);
 }
@@ -270,19 +288,21 @@ static void lease_listen(dtsa_agent *agent, int64_t slot, const extended_frame *
     v.quiet[sender] = (uint8_t)e->probation;
     v.heard[sender] = e->leaving ? GONE : slot;
     judge_claim(agent, &v, slot, e, was_absent);
+    v.resting[sender] = !e->own.c_r;
     hear_gossip(agent, &v, slot, e);
     if (slot % v.n == sender) v.settled[sender] = 0;
     if (e->lease_count) {
         int64_t turns[SECTIONS * SECTION_BYTES];
         const int count = lease_turns(&v, slot, e->c_s, turns, e->lease_count);
         for (int i = 0; i < count; i++) {
-            lease_note(&v, turns[i], e->leases[i], e->own.sender);
+            lease_note(&v, e->own.sender, turns[i], e->leases[i], e->own.sender);
             if (e->leases[i] && turns[i] % v.n == sender && lease_is_anchor(&v, turns[i]))
                 v.settled[sender] = 1;
         }
     }
     for (int d = 0, i = 0; d < RELAY_REACH && e->relay_mask >> d; d++)
-        if (e->relay_mask >> d & 1) lease_note(&v, slot + 1 + d, e->relay_ids[i++], 0);
+        if (e->relay_mask >> d & 1)
+            lease_note(&v, e->own.sender, slot + 1 + d, e->relay_ids[i++], 0);
 }
 
 /* ---- the slot is over ---- */
