@@ -21,11 +21,12 @@ COMPILE_FLAGS = [
 ]
 
 LIBRARY, SIMULATOR, BINDING = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/core/_kernel"
+HEARING = "dtsa_agent/air/udp/_hearing"
+OF_THE_LIBRARY = ("draw", "frame", "tag", "timebase")  # what an agent on a network uses without Python between
 
 
-def files(suffix: str) -> list[str]:
+def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR, BINDING)) -> list[str]:
     """Sources of the compiled core with a suffix: one agent, many agents, Python's door."""
-    folders = (LIBRARY, SIMULATOR, BINDING)
     return [path for folder in folders for path in sorted(glob(f"{folder}/**/*{suffix}", recursive=True))]
 
 
@@ -42,9 +43,18 @@ setup(
             extra_compile_args=COMPILE_FLAGS,
             py_limited_api=True,  # module.c says so, too: one compiled file for Python 3.10 and later
             libraries=["m"],
-        )
+        ),
+        Extension(
+            "dtsa_agent.air.udp._hearing",
+            sources=[*files(".c", (HEARING,)), *(f"{LIBRARY}/{name}.c" for name in OF_THE_LIBRARY)],
+            depends=[*files(".h", (LIBRARY, HEARING)), "setup.py"],
+            include_dirs=[f"{LIBRARY}/include", LIBRARY, HEARING],
+            define_macros=[("_GNU_SOURCE", None)],  # recvmmsg, ppoll
+            extra_compile_args=COMPILE_FLAGS,
+            py_limited_api=True,
+        ),
     ],
-    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml", "libdtsa*/**/*.[ch]"]},
+    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml", "libdtsa*/**/*.[ch]", "air/**/*.[ch]"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

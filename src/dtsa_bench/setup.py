@@ -53,6 +53,8 @@ setup(
             "pure-aloha = dtsa_bench.schemes:PureAloha",
             "beacons = dtsa_bench.schemes:Beacons",
             "csma = dtsa_bench.schemes:Csma",
+            "dtr = dtsa_bench.schemes:Dtr",
+            "whittle = dtsa_bench.schemes:Whittle",
         ],
     },
 )

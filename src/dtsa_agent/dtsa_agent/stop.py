@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import faulthandler
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -13,9 +15,13 @@ class Stop:
     """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that whoever runs ends in good order.
 
     A context manager that puts the old handlers back.
+
+    :param patience_s: s after the first signal; a process that has not come to the end of the context by then writes
+        down where each of its threads stands, and ends with exit code 1. 0: it has as long as it wants.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, patience_s: float = 0.0) -> None:
+        self._patience_s = patience_s
         self.signal = 0  # the first one; 0: none yet
         self.count = 0  # how many have come
         self._raises = False
@@ -27,6 +33,8 @@ class Stop:
         return self
 
     def __exit__(self, *unused: object) -> None:
+        if self and self._patience_s:
+            faulthandler.cancel_dump_traceback_later()
         for number, handler in self._old.items():
             signal.signal(number, handler)
 
@@ -48,6 +56,8 @@ class Stop:
             self._raises = False
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if not self and self._patience_s and sys.__stderr__ is not None:
+            faulthandler.dump_traceback_later(self._patience_s, exit=True, file=sys.__stderr__)
         self.signal = self.signal or number
         self.count += 1
         if self._raises:

@@ -16,7 +16,8 @@ import pytest
 from dtsa_agent.core.errors import DtsaError
 
 STILL_S = 0.25  # a machine that stands still for longer cannot fly in real time,
-LOAD = 2.0  # nor one with so many threads a core that want to run
+LOAD = 2.0  # nor one with so many threads a core that want to run,
+STOLEN = 0.05  # nor a virtual one that does not get so much of its cores' time
 ATTEMPTS = 4
 _BEAT_S = 0.01
 _LOOK_BEATS = 10  # between looks at how many threads want to run
@@ -28,6 +29,8 @@ class Metronome:
     def __init__(self) -> None:
         self.late_s = 0.0
         self._running: list[int] = []  # threads that wanted to run, look by look
+        self._began = time.monotonic()
+        self._stolen_s = _stolen_s()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -36,7 +39,9 @@ class Metronome:
         """Whether nothing can be said about times."""
         # The mean of the last minute lags behind: a test may be over before it knows.
         running = sum(self._running) / max(1, len(self._running))
-        return self.late_s > STILL_S or max(running, os.getloadavg()[0]) > LOAD * (os.cpu_count() or 1)
+        cores = os.cpu_count() or 1
+        stolen = (_stolen_s() - self._stolen_s) / max(0.1, time.monotonic() - self._began) / cores
+        return self.late_s > STILL_S or max(running, os.getloadavg()[0]) > LOAD * cores or stolen > STOLEN
 
     def __enter__(self) -> Metronome:
         self._thread.start()
@@ -56,6 +61,12 @@ class Metronome:
             beats += 1
             if beats % _LOOK_BEATS == 0:
                 self._running.append(int(Path("/proc/loadavg").read_text().split()[3].partition("/")[0]))
+
+
+def _stolen_s() -> float:
+    """Time that a hypervisor has given to others while this machine wanted to run, s, of all cores."""
+    fields = Path("/proc/stat").read_text().split("\n", 1)[0].split()
+    return int(fields[8]) / os.sysconf("SC_CLK_TCK") if len(fields) > 8 else 0.0
 
 
 def flown_again_when_overloaded(test: Callable[..., None]) -> Callable[..., None]:

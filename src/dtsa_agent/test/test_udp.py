@@ -123,13 +123,15 @@ def test_stamps_of_a_clock_that_has_been_set_are_not_believed(monkeypatch: pytes
     arrived = time.monotonic_ns() - 2_000_000
     assert abs(stamps.arrival_ns(arrived + ahead[0]) - arrived) < 500_000
     ahead[0] += 3600 * 10**9  # somebody sets the clock
+    before = time.monotonic_ns()
     stamps.look()
     assert stamps.steps == 1
-    assert abs(stamps.arrival_ns(arrived + 10**18) - time.monotonic_ns()) < 50_000_000
+    assert before <= stamps.arrival_ns(arrived + 10**18) <= time.monotonic_ns()
+    before = time.monotonic_ns()
     stamps.look()  # from now on stamps are of the new time
     assert abs(stamps.arrival_ns(arrived + ahead[0]) - arrived) < 500_000
-    assert abs(stamps.arrival_ns(0) - time.monotonic_ns()) < 50_000_000
-    assert abs(stamps.arrival_ns(None) - time.monotonic_ns()) < 50_000_000
+    assert before <= stamps.arrival_ns(0) <= time.monotonic_ns()
+    assert before <= stamps.arrival_ns(None) <= time.monotonic_ns()
 
 
 def test_arrivals_are_exact_however_long_a_process_was_kept_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,8 +156,9 @@ def test_arrivals_are_exact_however_long_a_process_was_kept_waiting(monkeypatch:
         while len(found) < 2:
             assert time.monotonic_ns() - sent[0] < 10 * 10**9
             found += end.receive(16)
-    for datagram, at in zip(found, sent, strict=True):
-        assert 0 <= datagram.arrival_ns - at < 20_000_000
+    first, second = (datagram.arrival_ns for datagram in found)
+    assert sent[0] <= first < sent[1] - 40_000_000  # before it stood still
+    assert sent[1] <= second
 
 
 def test_who_took_its_time_from_a_late_frame_takes_it_anew() -> None:
@@ -250,12 +253,13 @@ def test_who_wakes_late_sends_as_long_as_the_next_turn_is_not_disturbed(
     with UdpAgent(AgentSettings(id=1), config, udp) as agent:
         now = [time.monotonic_ns()]
         monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
-        agent.time.hear(101, now[0])
+        monkeypatch.setattr(agent, "_late_ns", lambda slot: now[0] - agent.hearing.slot_start_ns(slot))
+        agent.hearing.hear_slot(101, now[0])
         agent._begin_anew()
         own = agent.slot + 2 - agent.slot % 2  # a turn of agent 1
         counts = []
         for slot, late in ((own, latest), (own + 2, latest + 1), (own + 4, 1_000)):
-            now[0] = agent.time.slot_start_ns(slot) + late
+            now[0] = agent.hearing.slot_start_ns(slot) + late
             agent._open(slot)
             counts.append((agent.tally.summary()["sent"], agent.tally.unsent))
         assert counts == [(1, 0), (1, 1), (2, 1)]

@@ -103,7 +103,7 @@ class FlightMetrics:
             self._frames[length] += 1
         if self.lost:
             track = track.copy()
-            for agent in self.lost:  # its vehicle hovers where it was last known
+            for agent in self.lost:  # its vehicle hovers where it was last known, or nobody knows
                 track[:, :, agent - 1] = self._last[:, agent - 1]
         self._last = track[-1].copy()
         state = self._kernel.update(done, track, tables)
@@ -127,11 +127,16 @@ class FlightMetrics:
             self.end = TIMED_OUT if self.completion_slot < 0 else COMPLETED
         return self.end
 
-    def lose(self, agent: int) -> None:
-        """An agent fell out of the flight: its vehicle hovers where it was last known, and its way counts no more.
+    def lose(self, agent: int, hovers: bool = True) -> None:
+        """An agent fell out of the flight, and its way counts no more.
 
         :param agent: its id.
+        :param hovers: its vehicle hovers where it was last known; otherwise nobody knows where it is, and distances
+            to it are left out until it is back.
         """
+        if not hovers:
+            self._last = self._last.copy()
+            self._last[:, agent - 1] = np.nan
         self.lost.add(agent)
         self._torn_ways.add(agent)
         self._kernel.drop(agent - 1)
@@ -145,6 +150,13 @@ class FlightMetrics:
         """
         self.lost.discard(agent)
         self.awaited.discard(agent)
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """(N,) agents whose state is in the ages and errors: movers that have never been lost."""
+        counted = np.asarray(self.scenario.moving, dtype=np.bool_).copy()
+        counted[[agent - 1 for agent in self._torn_ways]] = False
+        return counted
 
     def _others_arrived(self) -> bool:
         """Whether movers are left, and those that came back are at their targets, too, and no more will come."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from metronome import flown_again_when_overloaded
 
 from dtsa_bench.run_config import RunLimits
 from dtsa_bench.soak.air.multirotor_flight import fly, missing
@@ -12,6 +13,7 @@ from dtsa_bench.soak.air.multirotor_flight import fly, missing
 
 @pytest.mark.ros
 @pytest.mark.skipif(bool(missing()), reason=missing() or "RotorPy is there")
+@flown_again_when_overloaded
 def test_agents_fly_multirotors_of_somebody_else_to_their_goals(tmp_path: Path) -> None:
     pytest.importorskip("dtsa_msgs.msg")
     found = fly(3, tmp_path)

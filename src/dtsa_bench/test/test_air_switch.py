@@ -16,14 +16,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from metronome import flown_again_when_overloaded
 
+import dtsa
 from dtsa_agent.air.udp.datagram import Wrapping
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_bench.air.hosts import Host, hosts, why_not
 from dtsa_bench.air.intruder import Intruder
-from dtsa_bench.air.merge import merge, verified
+from dtsa_bench.air.merge import Merge, verified
+from dtsa_bench.air.merged_run import lay
+from dtsa_bench.air.merged_writer import write
 from dtsa_bench.air.switch import Links, Switch
 from dtsa_bench.air.trial import NotFlown, Trial, flight_time, under_way
+from dtsa_bench.verify import verify_bag
 from dtsa_channel_sim import ChannelConfig
 
 GROUP = ("239.1.2.3", 4567)
@@ -170,6 +175,7 @@ SWARM = SwarmConfig(
 
 
 @pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+@flown_again_when_overloaded
 def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_path: Path) -> None:
     """Cold start in random order, drifts, losses; one is killed and comes back; the air is cut in two for a while."""
     trial = Trial(SWARM, {"loss": 0.1}, seconds=2.0, spread_s=0.3, drift_ppm=50.0)
@@ -191,7 +197,8 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
         stranger = Intruder(flight.switch, 1)
         flight.carry(0.5)
         flight.end()
-        found = merge(flight.bags())
+        merged = Merge(flight.bags())
+        found = merged.judge()
     assert os.readlink("/proc/self/ns/net") == home
     assert found["broken_off"] == ["cf2"]
     assert (found["bags"], found["missing"], found["not_on_the_time_line"]) == (5, [], [])
@@ -201,6 +208,12 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
     assert stranger.said > 10
     refused = {reason for counts in found["not_taken_in"].values() for reason in counts}
     assert {"other time", "repeated", "rejected"} <= refused
+    whole = tmp_path / "whole"
+    write(whole, lay(merged, found), found)
+    assert verify_bag(whole).to_dict()["difference"] is None
+    run = dtsa.read_bag(whole)
+    assert run.summary == found["flight"]
+    assert run.frames.lost.sum() > 0
 
 
 @pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")

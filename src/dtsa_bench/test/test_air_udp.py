@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import os
 import signal
@@ -17,16 +18,25 @@ from typing import Any
 import air_helpers as helpers
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
+import dtsa
 from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.stop import Stop
 from dtsa_bench.air.agent_bag import read
-from dtsa_bench.air.merge import merge, verified
+from dtsa_bench.air.merge import Merge, merge, verified
+from dtsa_bench.air.merged_messages import MergedMessages
+from dtsa_bench.air.merged_run import MergedRun, lay
+from dtsa_bench.air.merged_writer import write
 from dtsa_bench.air.timeline import Crossing, fit
+from dtsa_bench.bag.reader import Bag
+from dtsa_bench.bag.writer import BagWriter
 from dtsa_bench.cli import main
+from dtsa_bench.report.data import run_data
+from dtsa_bench.verify import verify_bag
 from dtsa_bench.view.air import AirSource
 from dtsa_bench.view.track import MOST_MOMENTS, Track
 
@@ -43,6 +53,8 @@ class Flight:
     bags: list[Path]
     summaries: dict[int, dict[str, Any]]
     merged: dict[str, Any]
+    run: MergedRun
+    whole: Path  # directory with the merged bag
     sniffed: dict[str, Any]  # by who has listened since they count alike
     told: list[dict[str, Any]]  # what a page gets of one who listens
 
@@ -89,8 +101,12 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
             del os.environ["DTSA_AUTH_KEY"]
         else:
             os.environ["DTSA_AUTH_KEY"] = old
-    merged = merge([read(path) for path in reversed(paths)])
-    return Flight(paths, {one.agent.own.id: one.agent.summary() for one in flying}, merged, sniffed, told())
+    together = Merge([read(path) for path in reversed(paths)])
+    merged, whole = together.judge(), directory / "whole"
+    run = lay(together, merged)
+    write(whole, run, merged)
+    summaries = {one.agent.own.id: one.agent.summary() for one in flying}
+    return Flight(paths, summaries, merged, run, whole, sniffed, told())
 
 
 def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
@@ -230,6 +246,102 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> No
             merge([read(cut)])
 
 
+def test_a_merged_flight_is_kept_as_a_bag_like_others(flight: Flight) -> None:
+    found, run = flight.merged["flight"], dtsa.read_bag(flight.whole)
+    assert json.loads((flight.whole / "summary.json").read_text())["flight"] == found
+    assert verify_bag(flight.whole).to_dict()["difference"] is None
+    assert run.summary == found
+    seen = run.ages_by_observer[run.ages_by_observer.counted]
+    assert seen.age_slots.mean() == pytest.approx(found["age_mean_slots"], rel=1e-12)
+    assert seen.error_m.max() == found["estimate_error_max_m"]
+    page = run_data(flight.whole)
+    assert page["summary"]["age_mean_slots"] == found["age_mean_slots"]
+    assert page["slots"]["count"] == len(run.slots)
+    assert page["distances"]["time"]
+    with Reader(flight.whole / "bag") as foreign:  # rosbag2's metadata, and every message, by an independent reader
+        assert foreign.message_count == sum(1 for _ in foreign.messages())
+        assert {"/swarm/frame", "/swarm/reception", "/cf1/odom"} <= foreign.topics.keys()
+    with Bag(flight.whole) as bag:
+        said: dict[str, list[Any]] = {}
+        for message, decoded in bag.typed():
+            said.setdefault(message.topic, []).append(decoded)
+    pictures = [[(one.action, one.id) for one in picture.markers] for picture in said["/swarm/markers"]]
+    assert pictures[0] == [(3, 0)]  # DELETEALL: who vanishes is not left standing
+    assert {agent for picture in pictures for action, agent in picture if action == 0} == {1, 2, 3}
+    assert said["/swarm/status"][0].lost.tolist() == [4]
+    assert said["/swarm/status"][-1].reason == "merged from 3 agents' bags"
+
+
+def test_of_an_agent_without_a_bag_nothing_is_known(flight: Flight) -> None:
+    run = dtsa.read_bag(flight.whole)
+    assert set(run.states.agent) == set(run.decisions.agent) == {1, 2, 3}
+    assert run.receptions.received[run.receptions.receiver == 4].isna().all()
+    whole = run.receptions[(run.receptions.receiver < 4) & (run.receptions.slot < run.slots.slot.max() // 2)]
+    assert whole.received.notna().all()
+    assert (run.slots.outcome.isna() == run.slots.sender.isna()).all()
+    assert set(run.slots.outcome.dropna()) == {"success"}  # whether cf4 has sent in the others nobody knows
+    assert run.frames.collided.isna().all()
+    page = run_data(flight.whole)
+    assert any("no bag of cf4" in note for note in page["notes"])
+    assert page["slots"]["unknown"] == run.slots.slot[run.slots.outcome.isna()].tolist()
+    assert page["summary"]["slots"]["idle"] == 0
+    assert page["table"][3].keys() & {"path", "heard"} == {"heard"}
+    assert page["table"][3]["heard"] is None
+
+
+def test_verify_finds_what_was_changed_in_a_merged_bag(flight: Flight, tmp_path: Path) -> None:
+    topics = ("/swarm/decision", "/cf2/odom")
+    with Bag(flight.whole) as bag:
+        for number, topic in enumerate(topics):
+            with BagWriter(tmp_path / f"{number}", None, custom_data=bag.custom_data) as copy:
+                channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
+                for message in bag.messages():
+                    last = message.topic == topic and message.sequence == bag.topics[topic].count - 1
+                    data = (
+                        message.data[:-5] + bytes([message.data[-5] ^ 1]) + message.data[-4:] if last else message.data
+                    )
+                    copy.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
+            difference = verify_bag(tmp_path / f"{number}").difference
+            assert difference is not None
+            assert difference.what == topic
+    liar = flight.run.lives[(2, 0)].slots[-20]
+    said, liar.chosen = liar.chosen, 4 if liar.chosen != 4 else 1
+    try:
+        write(tmp_path / "lie", flight.run, {})
+    finally:
+        liar.chosen = said
+    difference = verify_bag(tmp_path / "lie").difference
+    assert difference is not None
+    assert (difference.what, difference.slot, difference.agent) == ("report.chosen", liar.slot, 2)
+
+
+def test_merge_keeps_the_whole_flight_or_nothing(
+    flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a bag that breaks off what is whole is kept, and nothing is made up for the rest."""
+    cut = tmp_path / "cf1.mcap"
+    cut.write_bytes(flight.bags[0].read_bytes()[: flight.bags[0].stat().st_size * 2 // 3])
+    out, words = tmp_path / "out", ["merge", str(cut), *map(str, flight.bags[1:]), "--out", str(tmp_path / "out")]
+
+    def interrupted(self: MergedMessages) -> Any:
+        yield self._configuration()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MergedMessages, "__iter__", interrupted)
+        assert main(words) == 130
+        assert not out.exists()
+    assert main([*words, "--json"]) == 0
+    states = dtsa.read_bag(out).states
+    ends = states.groupby("agent").time_s.max()
+    assert ends[1] < ends[2] - 0.1
+    assert verify_bag(out).ok
+    assert any("cf1 break off" in note for note in run_data(out)["notes"])
+    capsys.readouterr()
+    assert main(words) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 @pytest.mark.parametrize("command", ["verify", "report", "export"])
 def test_commands_for_other_bags_say_what_is_meant_for_these(
     flight: Flight, command: str, capsys: pytest.CaptureFixture[str]
@@ -244,8 +356,15 @@ def test_bags_that_do_not_belong_together_are_refused(flight: Flight) -> None:
     one = read(flight.bags[0])
     with pytest.raises(ConfigError, match="one process of cf1 at a time"):
         merge([one, read(flight.bags[0])])
+    other = read(flight.bags[1])
+    other.swarm = dataclasses.replace(CONFIG, auth_session=8)
+    with pytest.raises(ConfigError, match="auth_session 8, there 7"):
+        merge([one, other])
     with pytest.raises(ConfigError, match="bags"):
         merge([])
+    alone = Merge([one])
+    with pytest.raises(ConfigError, match="hear each other"):
+        lay(alone, alone.judge())
 
 
 def test_offsets_and_drifts_are_found_among_frames_that_were_held_up() -> None:
@@ -302,12 +421,16 @@ def test_the_command_flies_until_a_signal_and_merges(tmp_path: Path) -> None:
     words = ["agent", "--id", "2", "--agents", "2", "--interface", "lo", "--group", helpers.own_group(), "--no-seal"]
     with subprocess.Popen(_command(*words, "--json", "--out", str(out)), stdout=subprocess.PIPE, text=True) as process:
         wait_for(lambda: (out / "cf2.mcap").exists() and (out / "cf2.mcap").stat().st_size > 4000)
+        maps = Path(f"/proc/{process.pid}/maps").read_text()
         process.send_signal(signal.SIGTERM)
         said, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     summary = json.loads(said)
     assert summary == json.loads((out / "summary.json").read_text())
     assert (summary["state"], summary["sealed"], summary["heard_of"]) == ("alone", False, [])
+    # In flight it has no memory for what its command line needed: random numbers, hashes.
+    assert "_hearing" in maps
+    assert not any(name in maps for name in ("numpy/random", "libcrypto"))
     merged = subprocess.run(_command("merge", str(out), "--json"), capture_output=True, text=True, timeout=60)
     assert merged.returncode == 0, merged.stderr
     found = json.loads(merged.stdout)

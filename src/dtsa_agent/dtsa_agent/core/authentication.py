@@ -8,13 +8,16 @@ takes only what is newer. Frames are not secret, and jamming is not prevented.
 
 from __future__ import annotations
 
-import hmac
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 from .abstract_swarm import FRAME_MAX, AbstractSwarm, Bytes, SwarmWrapper
 from .errors import ConfigError, LocalProtocolError
 from .frame import TAG_LENGTH
 from .reference.tag import keyed, tag
+
+if TYPE_CHECKING:
+    from .reference.tag import Keyed
 
 MIN_KEY, MAX_KEY = 16, 32  # bytes
 
@@ -27,7 +30,7 @@ class Authenticator:
     :raises ConfigError: for a key or a session that is not usable.
     """
 
-    __slots__ = ("_key", "_keyed", "forged", "truncated")
+    __slots__ = ("_begun", "_key", "_session", "forged", "truncated")
 
     def __init__(self, key: bytes, session: int = 0) -> None:
         if not MIN_KEY <= len(key) <= MAX_KEY:
@@ -63,7 +66,20 @@ class Authenticator:
         """
         if not 0 <= session < 2**64:
             raise ConfigError("auth_session", session, "0 to 2**64 - 1")
-        self._keyed = keyed(self._key, session)
+        self._begun: Keyed | None = None
+        self._session = session
+
+    @property
+    def _keyed(self) -> Keyed:
+        """What all tags have in common: made with the first one."""
+        if self._begun is None:
+            self._begun = keyed(self._key, self._session)
+        return self._begun
+
+    @property
+    def key_and_session(self) -> tuple[bytes, int]:
+        """The secret and the flight, for compiled code that does the same."""
+        return self._key, self._session
 
     @property
     def rejected(self) -> int:
@@ -93,6 +109,8 @@ class Authenticator:
         if len(data) <= TAG_LENGTH:
             self.truncated += 1
             return None
+        import hmac  # as hashlib
+
         frame, said = data[:-TAG_LENGTH], data[-TAG_LENGTH:]
         for sent in range(slot, max(-1, slot - late - 1), -1):
             if hmac.compare_digest(said, tag(self._keyed, sent, frame + beside)):

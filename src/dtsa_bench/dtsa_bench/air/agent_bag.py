@@ -39,6 +39,7 @@ class AgentBag:
     refused: Counter[str] = field(default_factory=Counter)  # datagrams not taken in, by reason
     summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
     broken_off: bool = False  # the file was not finished
+    unsent_kept: bool = True  # frames that were too late to be sent are in it
 
     @property
     def flight_ns(self) -> int:

@@ -68,6 +68,7 @@ class Judge:
             "two_senders_in_open_turns": ledger.open_collisions,
             "two_senders_in_adopted_turns": ledger.adopted_collisions,
             "two_senders_in_anchors_given_away": ledger.anchor_collisions,
+            "two_senders_in_turns_handed_on": ledger.handed_collisions,
         }  # fmt: skip
         return {
             "slots_judged": self.slots,

@@ -15,7 +15,7 @@ from dtsa_agent.core.errors import ConfigError
 
 from .agent_bag import AgentBag
 from .judge import Judge
-from .merged_flight import fly
+from .merged_flight import ended, fly
 from .replay import Replay
 from .timeline import Crossing, Life, TimeLine, fit, named
 
@@ -29,47 +29,61 @@ class Sent(NamedTuple):
     record: SlotRecord
 
 
-def merge(bags: Sequence[AgentBag], air_ns: int = 0) -> dict[str, Any]:
-    """Lays bags of one flight on one time line and judges the flight.
+class Merge:
+    """Bags of one flight on one time line.
 
     :param bags: one a process, in any order; an agent that came back has several.
-    :param air_ns: ns that a frame is on the air, to tell which overlapped there; 0: only turns are compared.
-    :returns: the results, plain values.
     :raises ConfigError: for bags of different swarms, two of one agent at one time, or none with a slot in it.
     """
-    lives = _lives(bags)
-    sent: dict[tuple[int, int], Sent] = {}
-    for life, bag in lives.items():
-        for record in bag.slots:
-            if record.datagram:
-                sent[(record.slot, life[0])] = Sent(life, record)
-    strange, crossings = _crossings(lives, sent)
-    config, here = bags[0].swarm, {agent for agent, _ in lives}
-    line = fit(crossings, bags[0].flight_ns)
-    turns = _Turns(lives, line, config.slot_ns)
-    replays = {life: Replay(bag) for life, bag in lives.items()}
-    flown = fly(lives, replays, Counter(slot for slot, _ in sent), turns.common_slot)
-    decisions = {
-        "equal": sum(replay.equal for replay in replays.values()),
-        "of": sum(len(bag.slots) for bag in lives.values()),
-        "differences": [one for replay in replays.values() for one in replay.differences],
-    }
-    return {
-        "bags": len(lives),
-        "missing": [agent for agent in range(1, config.agents + 1) if agent not in here],
-        "broken_off": [named(life) for life, bag in lives.items() if bag.broken_off],
-        "not_on_the_time_line": [named(life) for life in lives if life not in line.clocks],
-        "time_line": line.summary(),
-        **turns.summary(),
-        **_air(sent, line, air_ns, turns.common_slot),
-        "frames_unsent": sum(bool(r.frame and not r.datagram) for bag in lives.values() for r in bag.slots),
-        "frames_heard": len(crossings),
-        "frames_heard_not_as_sent": strange,
-        "turns": _judged(lives, sent, turns.common_slot),
-        "decisions_again": decisions,
-        "not_taken_in": {named(life): dict(bag.refused) for life, bag in lives.items() if bag.refused},
-        "flight": flown,
-    }
+
+    def __init__(self, bags: Sequence[AgentBag]) -> None:
+        self.lives = _lives(bags)
+        self.config = bags[0].swarm
+        self.sent = sent_of(self.lives)
+        self.strange, self._crossings = _crossings(self.lives, self.sent)
+        self.line = fit(self._crossings, bags[0].flight_ns)
+        self.turns = _Turns(self.lives, self.line, self.config.slot_ns)
+
+    def judge(self, air_ns: int = 0) -> dict[str, Any]:
+        """Judges the flight; once.
+
+        :param air_ns: ns that a frame is on the air, to tell which overlapped there; 0: only turns are compared.
+        :returns: the results, plain values.
+        """
+        lives, line, common_slot = self.lives, self.line, self.turns.common_slot
+        replays = {life: Replay(bag) for life, bag in lives.items()}
+        on_line = {life: lives[life] for life in line.clocks}
+        flown = ended(fly(on_line, replays, senders_of(lives, self.sent), common_slot))
+        for life in lives.keys() - line.clocks.keys():  # slots of its own, which are nobody else's
+            for record in lives[life].slots:
+                replays[life].fly(record)
+        here = {agent for agent, _ in lives}
+        return {
+            "bags": len(lives),
+            "missing": [agent for agent in range(1, self.config.agents + 1) if agent not in here],
+            "broken_off": [named(life) for life, bag in lives.items() if bag.broken_off],
+            "not_on_the_time_line": [named(life) for life in lives if life not in line.clocks],
+            "time_line": line.summary(),
+            **self.turns.summary(),
+            **_air(self.sent, line, air_ns, common_slot),
+            "frames_unsent": sum(bool(r.frame and not r.datagram) for bag in lives.values() for r in bag.slots),
+            "frames_heard": len(self._crossings),
+            "frames_heard_not_as_sent": self.strange,
+            "turns": judged(lives, self.sent, common_slot),
+            "decisions_again": again(lives, replays),
+            "not_taken_in": {named(life): dict(bag.refused) for life, bag in lives.items() if bag.refused},
+            "flight": flown,
+        }
+
+
+def merge(bags: Sequence[AgentBag], air_ns: int = 0) -> dict[str, Any]:
+    """Lays bags of one flight on one time line and judges the flight; see :class:`Merge`.
+
+    :param bags: one a process, in any order.
+    :param air_ns: ns that a frame is on the air; see :meth:`Merge.judge`.
+    :returns: the results, plain values.
+    """
+    return Merge(bags).judge(air_ns)
 
 
 def verified(summary: Mapping[str, Any]) -> bool:
@@ -90,13 +104,62 @@ def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
     found: dict[Life, AgentBag] = {}
     for bag in sorted(bags, key=lambda bag: (bag.agent, bag.slots[0].slot if bag.slots else -1)):
         if bag.swarm != bags[0].swarm:
-            raise ConfigError("bag", str(bag.path), f"one of the same swarm as {bags[0].path}: other settings")
+            theirs, ours = bag.swarm.to_dict(), bags[0].swarm.to_dict()
+            other = ", ".join(
+                f"{name} {theirs[name]}, there {ours[name]}" for name in ours if theirs[name] != ours[name]
+            )
+            raise ConfigError("bag", str(bag.path), f"one of the same flight as {bags[0].path}: {other}")
         number = sum(agent == bag.agent for agent, _ in found)
         before = found.get((bag.agent, number - 1))
         if before is not None and before.slots and (not bag.slots or bag.slots[0].slot <= before.slots[-1].slot):
             raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
         found[(bag.agent, number)] = bag
     return found
+
+
+def sent_of(lives: Mapping[Life, AgentBag]) -> dict[tuple[int, int], Sent]:
+    """All frames that were sent, by slot and sender.
+
+    :param lives: the bags.
+    """
+    return {
+        (record.slot, life[0]): Sent(life, record)
+        for life, bag in lives.items()
+        for record in bag.slots
+        if record.datagram
+    }
+
+
+def senders_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> Counter[int]:
+    """How many are known to have sent, by slot: by their own bags, or, where these are missing, by those of others.
+
+    :param lives: the bags.
+    :param sent: all frames of their bags.
+    """
+    heard = {(h.slot, h.sender) for bag in lives.values() for r in bag.slots for h in (*r.before, *r.heard)}
+    return Counter(slot for slot, _ in heard | sent.keys())
+
+
+def again(lives: Mapping[Life, AgentBag], replays: Mapping[Life, Replay]) -> dict[str, Any]:
+    """What came of making all decisions again.
+
+    :param lives: the bags.
+    :param replays: of each of them, flown.
+    """
+    return {
+        "equal": sum(replay.equal for replay in replays.values()),
+        "of": sum(len(bag.slots) for bag in lives.values()),
+        "differences": [one for replay in replays.values() for one in replay.differences],
+    }
+
+
+def strange_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> int:
+    """How many frames were heard that their sender's bag does not have, or has otherwise.
+
+    :param lives: the bags.
+    :param sent: all frames of their bags.
+    """
+    return _crossings(lives, sent)[0]
 
 
 def _crossings(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> tuple[int, list[Crossing]]:
@@ -114,10 +177,15 @@ def _crossings(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Se
     return strange, found
 
 
-def _judged(
+def judged(
     lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], common_slot: int | None
 ) -> dict[str, Any]:
-    """What the protocol says of the frames that were sent, or heard, from when on all counted alike."""
+    """What the protocol says of the frames that were sent, or heard, from when on all counted alike.
+
+    :param lives: the bags.
+    :param sent: all frames of their bags.
+    :param common_slot: from which all counted alike; None: never.
+    """
     frames: dict[int, dict[int, bytes]] = {}
     unsent: dict[int, dict[int, bytes]] = {}
     for (agent, _), bag in lives.items():

@@ -27,6 +27,7 @@ class Replay:
         config = dataclasses.replace(bag.swarm, auth=False)
         self._tag = TAG_LENGTH if bag.swarm.auth else 0
         self.agent = bag.agent
+        self._unsent_kept = bag.unsent_kept
         self.swarm = make_swarm(config, make_scenario(config), local=[bag.agent])
         self._group = AgentGroup(self.swarm)
         self.equal = 0  # slots
@@ -76,6 +77,8 @@ class Replay:
             "chosen": int(swarm.chosen[0]), "reason": int(swarm.reason[0]), "digest": int(swarm.digest[0]),
             "frame": swarm.frame(0).hex() if swarm.sends[0] else "",
         }  # fmt: skip
+        if record.sent_ns < 0 and not self._unsent_kept:
+            record.frame, said["frame"] = bytes.fromhex(str(again["frame"])), again["frame"]
         wrong = [name for name, value in said.items() if value != again[name]]
         if not wrong:
             self.equal += 1

@@ -23,10 +23,14 @@ from dtsa_channel_sim.model.airtime import Airtime
 
 from .agent_bag import AgentBag, read
 from .hosts import CABLE, Host, hosts
-from .merge import merge
+from .merge import Merge
+from .merged_run import lay
+from .merged_writer import write
 from .switch import Links, Switch
 
 GROUP = ("239.68.84.83", 7583)
+#: The bag of the whole flight, in its directory.
+WHOLE = "whole"
 _CLOCKS_S = 10**6  # CLOCK_MONOTONIC of the hosts differ by up to this
 _START_S = 120.0  # until all have begun, on a busy machine
 _END_S = 30.0
@@ -223,7 +227,7 @@ def _as_medium() -> Iterator[None]:
 
 
 def fly(trial: Trial, directory: Path, disturb: Callable[[Flight], None] | None = None) -> dict[str, Any]:
-    """Flies a trial and judges it.
+    """Flies a trial and judges it; a flight in which all came to count alike is kept as a bag (``WHOLE``).
 
     :param trial: what is flown.
     :param directory: for bags.
@@ -239,7 +243,10 @@ def fly(trial: Trial, directory: Path, disturb: Callable[[Flight], None] | None 
         flight.carry(trial.seconds * 2 / 3)
         flown = flight.switch.now_ns
         flight.end()
-    found = merge(flight.bags(), flight.config.airtime.on_air_ns(HEADER + trial.swarm.frame_length))
+    merged = Merge(flight.bags())
+    found = merged.judge(flight.config.airtime.on_air_ns(HEADER + trial.swarm.frame_length))
+    if found["common_slot"] is not None:
+        write(directory / WHOLE, lay(merged, found), found)
     return {**found, "switch": seen(flight, begun + round(_AFTER_S * 1e9), flown)}
 
 

@@ -23,6 +23,7 @@ SECOND = 1_000_000_000
 
 # visualization_msgs/Marker
 SPHERE, CYLINDER, TEXT = 2, 3, 9
+DELETE_ALL = 3
 SIZE = 7  # numbers of a pose, which stand before the scale
 # What an agent's radio does in a slot.
 QUIET, WAITING, SENDING, COLLIDED = 0, 1, 2, 3
@@ -121,17 +122,25 @@ class MarkerPacker:
     :param diameter: m, of the spheres.
     :param frame: the frame that positions are given in.
     :param targets: whether each agent's target is drawn too, as a flat disc.
+    :param ids: the agents' ids; None: 1, 2, ...
     """
 
-    def __init__(self, names: Sequence[str], diameter: float = 0.2, frame: str = "map", targets: bool = True) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        diameter: float = 0.2,
+        frame: str = "map",
+        targets: bool = True,
+        ids: Sequence[int] | None = None,
+    ) -> None:
         self._n = len(names)
         message = CdrBuilder()
         kinds = 3 if targets else 2
         message.number("I", kinds * self._n)
         stamps, places, colours = [], [], []
         for kind in range(kinds):
-            for index, name in enumerate(names):
-                stamp, place, colour = self._add(message, kind, index + 1, name, diameter, frame)
+            for number, name in zip(ids or range(1, self._n + 1), names, strict=True):
+                stamp, place, colour = self._add(message, kind, number, name, diameter, frame)
                 stamps.append(stamp)
                 places.append(place)
                 colours.append(colour)
@@ -175,9 +184,20 @@ class MarkerPacker:
         self._f4[self._name_tints] = NAMES[state]
         return bytes(self._data)
 
+    @classmethod
+    def nothing(cls, frame: str = "map") -> bytes:
+        """A message that takes all markers away.
+
+        :param frame: the frame that positions are given in.
+        """
+        message = CdrBuilder()
+        message.number("I", 1)
+        cls._add(message, 0, 0, "", 1.0, frame, DELETE_ALL)
+        return HEADER + bytes(message.data)
+
     @staticmethod
     def _add(
-        message: CdrBuilder, kind: int, number: int, name: str, diameter: float, frame: str
+        message: CdrBuilder, kind: int, number: int, name: str, diameter: float, frame: str, action: int = 0
     ) -> tuple[int, int, int]:
         shape = (SPHERE, TEXT, CYLINDER)[kind]
         scale = ((diameter,) * 3, (0.0, 0.0, 0.6 * diameter), (diameter, diameter, 0.02))[kind]
@@ -185,7 +205,7 @@ class MarkerPacker:
         colour = ((*own, 1.0), (0.45, 0.50, 0.58, 1.0), (*own, 0.35))[kind]
         stamp = message.stamp(frame)
         message.text(("agent", "name", "target")[kind])
-        message.number("i", number, shape, 0)
+        message.number("i", number, shape, action)
         place = message.number("d", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *scale)
         tint = message.number("f", *colour)
         message.number("i", 0, 0)  # lifetime: for ever

@@ -18,6 +18,7 @@ FILE_NAME = "metadata.yaml"
 RECORD_NAME = "rosbag2"  # name of the metadata record inside the .mcap
 RECORD_KEY = "serialized_metadata"
 RUN_ID = "run"  # name of the run's id in custom data, 8 hexadecimal digits
+MERGED_FROM = "merged_from"  # custom data of a bag that was made from the bags of agents on a network, as JSON
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from dtsa_bench.bag.errors import BagError, UnusableBag
 from dtsa_bench.bag.place import find_file
 
 PACKED_MESSAGES = "its messages are compressed one by one; `ros2 bag convert` makes a plain bag of it"
-MERGED = "recorded on a network: `tools/dtsa merge` verifies the bags of all agents of a flight and has its results"
+MERGED = "one agent's, recorded on a network: `tools/dtsa merge` with --out makes one bag of those of all agents"
 _ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.frame import EXTENT_M
 from dtsa_bench.bag.errors import UnusableBag
+from dtsa_bench.bag.merged import MergedFrom, merged_from
 from dtsa_bench.bag.reader import Bag
 
 SLOT, TRANSMISSION, RECEPTION, DECISION = (
@@ -50,7 +51,7 @@ class Decisions:
     """What every agent decided in every slot; arrays are (D, n)."""
 
     slot: NDArray[np.int64]  # (D,)
-    agent: NDArray[np.int64]  # ids
+    agent: NDArray[np.int64]  # ids; 0: nothing is known of who would stand here
     chosen: NDArray[np.int64]  # ids, 0: nobody
     reason: NDArray[np.int64]  # index into `names`
     score: NDArray[np.float64]
@@ -82,6 +83,22 @@ class RecordedRun:
     frames: Frames
     decisions: Decisions
     motion: Motion
+    merged: MergedFrom | None = None  # what the bag was merged from, if it was: its slots count from a common one
+    told: NDArray[np.bool_] | None = None  # (M, N) merged: of whom there is a record in a slot; None: of all
+
+    @property
+    def known_receivers(self) -> NDArray[np.int64]:
+        """(F,) other agents of which is known whether they received a frame."""
+        if self.told is None:
+            return np.full(len(self.frames.slot), max(0, self.agents - 1), np.int64)
+        return np.asarray(self.frames.received.sum(axis=1) + self.frames.lost, np.int64)
+
+    @property
+    def outcome_known(self) -> NDArray[np.bool_]:
+        """(M,) whether a slot's outcome is known: not where nobody is known to have sent, and not all have told."""
+        if self.told is None:
+            return np.ones(len(self.slots), np.bool_)
+        return np.asarray((self.outcome != OUTCOMES.index("idle")) | self.told.all(axis=1), np.bool_)
 
     def time_s(self, slot: NDArray[np.int64]) -> NDArray[np.float64]:
         """Seconds from the start of slot 0 to the start of a slot."""
@@ -107,11 +124,16 @@ def _load(bag: Bag) -> RecordedRun:
     if RECEPTION not in bag.topics and not odometry:
         raise UnusableBag(bag.given, f"it has neither {RECEPTION} nor odometry: no run of a swarm")
     tables = bag.tables(wanted, _FIELDS)
+    merged = merged_from(bag)
+    if merged is not None:
+        tables = {name: _counted_from(merged.first, table) for name, table in tables.items()}
     slot_ns = _slot_ns(config)
     agents = max([_agents(config), *(number for number, _ in odometry)])
     reception, transmission = (tables.get(name, {}) for name in (RECEPTION, TRANSMISSION))
     start_ns = _start_ns(reception, slot_ns)
-    motion = _tracks(transmission, agents, start_ns, slot_ns)
+    motion = _tracks(transmission, agents, start_ns, slot_ns, merged is not None)
+    if motion is None and merged is not None:
+        raise UnusableBag(bag.given, "its transmissions do not fit together")
     if motion is None:
         tables = bag.tables([name for _, name in odometry], _FIELDS)
         motion = _motion([(number, tables[name]) for number, name in odometry])
@@ -127,7 +149,24 @@ def _load(bag: Bag) -> RecordedRun:
         _frames(reception, transmission, agents),
         _decisions(tables.get(DECISION, {})),
         motion,
+        merged,
+        None if merged is None else _told(slots, transmission, agents),
     )
+
+
+def _counted_from(first: int, table: Columns) -> Columns:
+    """Slots counted from a slot."""
+    return {**table, "slot": np.asarray(table["slot"], np.int64) - first}
+
+
+def _told(slots: NDArray[np.int64], transmission: Columns, agents: int) -> NDArray[np.bool_]:
+    """(M, N) of whom there is a record in a slot."""
+    told = np.zeros((len(slots), agents), np.bool_)
+    places = {int(slot): place for place, slot in enumerate(slots)}
+    for slot, ids in zip(*(transmission.get(name, ()) for name in ("slot", "agent")), strict=True):
+        if int(slot) in places:
+            told[places[int(slot)], np.asarray(ids, np.int64) - 1] = True
+    return told
 
 
 def _name(bag: Bag) -> str:
@@ -213,7 +252,8 @@ def _decisions(decision: Columns) -> Decisions:
     for row, (names, index) in enumerate(zip(decision["reason_name"], decision["reason_index"], strict=True)):
         codes = np.array([known.setdefault(str(name), len(known)) for name in names], np.int64)
         if len(codes) and len(index):
-            reason[row, : len(index)] = codes[np.minimum(index, len(codes) - 1)]
+            known_index = np.minimum(index[:width], len(codes) - 1)
+            reason[row, : len(known_index)] = codes[known_index]
     return Decisions(
         np.asarray(decision["slot"], np.int64),
         _plane(decision["agent"], width, np.int64),
@@ -235,10 +275,12 @@ def _plane(rows: NDArray[Any], width: int, dtype: Any) -> NDArray[Any]:
     return plane
 
 
-def _tracks(transmission: Columns, agents: int, start_ns: int, slot_ns: int) -> Motion | None:
+def _tracks(transmission: Columns, agents: int, start_ns: int, slot_ns: int, partly: bool = False) -> Motion | None:
     """True positions at all control instants, as the agents themselves reported them; None if any is missing.
 
     The answer to slot i holds the track of slot i - 1, whose last position is that of the start of slot i.
+
+    :param partly: what is missing is not known, NaN.
     """
     slots = np.asarray(transmission.get("slot", ()), np.int64)
     if not len(slots) or not agents:
@@ -262,7 +304,9 @@ def _tracks(transmission: Columns, agents: int, start_ns: int, slot_ns: int) -> 
     times = start_ns + (first - 1 + np.arange(len(position))[:, None]) * slot_ns
     times = times + (np.arange(steps) + 1) * slot_ns // steps
     flown = np.isfinite(position).all(axis=(2, 3)) & (times >= start_ns)
-    if not flown[times >= start_ns].all():
+    if partly:
+        flown = times >= start_ns
+    elif not flown[times >= start_ns].all():
         return None
     return Motion(np.arange(1, agents + 1), times[flown], position[flown], velocity[flown])
 

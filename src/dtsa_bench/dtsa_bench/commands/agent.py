@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dtsa_agent.air.udp import UdpAgent
     from dtsa_agent.core import SwarmConfig
-    from dtsa_agent.stop import Stop
 
 DESCRIPTION = """\
 Flies one agent, with a simulated vehicle, whose frames go to a multicast group: one process a computer, no channel
@@ -81,44 +77,21 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
 
 def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C, and print what came of it."""
-    from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+    from dtsa_agent.air.udp import AgentSettings, UdpSettings
+    from dtsa_agent.air.udp.prepared import prepare
+    from dtsa_agent.core.joining import check_joinable
     from dtsa_agent.keys import check_key
-    from dtsa_agent.stop import Stop
-    from dtsa_bench.options import given, new_directory
+    from dtsa_bench.air.flying import Order, become, fly
+    from dtsa_bench.options import given
 
     own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
     udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
     config = swarm_of(args)
     check_key(config)  # before anything is made
+    check_joinable(config.policy)
     if args.seal and not config.auth_session:
         print("dtsa: with --auth-session 0 frames of earlier flights with this key are believed", file=sys.stderr)
-    failure = ""
-    with Stop() as stop, UdpAgent(own, config, udp) as agent:
-        directory = None if args.out is None else new_directory(args.out)
-        if directory is None:
-            agent.run(stop)
-        else:
-            failure = _run_recorded(agent, stop, directory)
-    summary = agent.summary()
-    text = json.dumps(summary, indent=2) + "\n"
-    if directory is not None:
-        Path(directory / "summary.json").write_text(text, encoding="utf-8")
-    from dtsa_bench.commands.simulate import describe  # what is needed afterwards only takes no memory in flight
-
-    print(text if args.json else describe(summary), end="")
-    if failure:
-        from dtsa_bench.bag.errors import BagError
-
-        raise BagError(failure)
-    return 0
-
-
-def _run_recorded(agent: UdpAgent, stop: Stop, directory: Path) -> str:
-    """Flies, and records it; why the record is not whole, or an empty text."""
-    from dtsa_bench.air.recorder import AgentRecorder
-
-    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, agent.udp) as recorder:
-        agent.watcher = recorder
-        agent.run(stop)
-        recorder.finish(agent.summary())
-    return recorder.failure
+    order = Order(own, config, udp, prepare(config), args.out, args.json)
+    if args.own_process:
+        become(order)
+    return fly(order)

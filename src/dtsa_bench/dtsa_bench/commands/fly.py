@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dtsa_bench.view.link import ViewLink
 
 INTERRUPTED = 130
+LONGEST_END_S = 60.0  # after a signal; it takes a second
 _LATER = ("respawn",)  # options of a flight that concern real time alone
 
 
@@ -125,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
         late=late_agents(args.late),
         **given(args, FlightOptions, "flight"),
     )
-    with Stop() as stop, viewed(args, stop) as view:
+    with Stop(LONGEST_END_S) as stop, viewed(args, stop) as view:
         flight = fly(config, directory, options, stop, view=view)
         interrupted = bool(stop)
         _tell(args, flight)

@@ -9,7 +9,8 @@ from pathlib import Path
 DESCRIPTION = """\
 Lays the bags that agents on a network have made of their own flights on one time line, by the frames that they share,
 and says what came of the flight: clocks, ages, errors, agreement, the closest pair; whether two spoke in one turn;
-whether all decisions follow from what each agent heard, made again by the core. Exit code 1 if they do not."""
+whether all decisions follow from what each agent heard, made again by the core. Exit code 1 if they do not. --out keeps
+the whole flight as one bag, which report, export, verify, replay and ros2 bag take like any other."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,7 +20,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--air-us", metavar="X", default="0", help="a frame is on the air for so long: count overlaps [0]"
     )
-    parser.add_argument("--out", metavar="FILE", help="write the result there, too, as JSON")
+    parser.add_argument("--out", metavar="DIR", help="keep the whole flight there: bag, and result as summary.json")
     parser.add_argument("--json", action="store_true", help="print the result as JSON instead of lines")
 
 
@@ -27,14 +28,21 @@ def run(args: argparse.Namespace) -> int:
     """Merge, and print what came of it."""
     from dtsa_agent.core.settings import Setting
     from dtsa_bench.air.agent_bag import read
-    from dtsa_bench.air.merge import merge, verified
-    from dtsa_bench.batch.table import write_whole
+    from dtsa_bench.air.merge import Merge, verified
 
+    out = Path(args.out) if args.out else None
+    if out is not None:
+        from dtsa_bench.air.merged_run import lay
+        from dtsa_bench.air.merged_writer import check_free, write
+
+        check_free(out)
     air_us = Setting("air_us", "float", 0.0, "time of a frame on the air", unit="us", minimum=0, maximum=1e6)
-    summary = merge([read(path) for path in args.bags], round(air_us.read(args.air_us) * 1e3))
+    air_ns = round(air_us.read(args.air_us) * 1e3)
+    merged = Merge([read(path) for path in args.bags])
+    summary = merged.judge(air_ns)
+    if out is not None:
+        write(out, lay(merged, summary), summary)
     text = json.dumps(summary, indent=2) + "\n"
-    if args.out:
-        write_whole(Path(args.out), text)
     print(text if args.json else "\n".join(lines(summary)) + "\n", end="")
     return 0 if verified(summary) else 1
 

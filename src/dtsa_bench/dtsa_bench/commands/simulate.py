@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.keys import check_key
     from dtsa_bench.options import new_directory, run_config
     from dtsa_bench.simulate import simulate
+    from dtsa_bench.summary_text import describe
 
     config = run_config(args)
     check_key(config.swarm)  # before anything is made
@@ -51,17 +52,3 @@ def run(args: argparse.Namespace) -> int:
 def _write(directory: Path, summary: str, config: str) -> None:
     (directory / "summary.json").write_text(summary, encoding="utf-8")
     (directory / "config.json").write_text(config, encoding="utf-8")
-
-
-def describe(summary: dict[str, object]) -> str:
-    """A summary in a few lines."""
-    lines = []
-    for key, value in summary.items():
-        if isinstance(value, dict):
-            value = ", ".join(f"{count} {name}" for name, count in value.items())
-        elif isinstance(value, float):
-            value = f"{value:.6g}"
-        elif isinstance(value, list):
-            value = " and ".join(str(item) for item in value)
-        lines.append(f"{key.replace('_', ' '):24}{'-' if value is None else value}\n")
-    return "".join(lines)

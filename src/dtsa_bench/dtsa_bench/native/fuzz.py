@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of libdtsa: clang's libFuzzer with the sanitizers of addresses and of undefined behaviour."""
+"""Coverage-guided fuzzing of the C code: libFuzzer with the sanitizers of addresses and of undefined behaviour."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from dtsa_agent.core.errors import DtsaError
 
 from .library import HERE, LIBRARY, NotHere, compile_program, sources, tool
 
-TARGETS = {"frames": 64, "agents": 1024}  # largest input, bytes
+TARGETS = {"frames": 64, "agents": 1024, "hearing": 1024}  # largest input, bytes
+_HEARING = LIBRARY.parent / "air" / "udp" / "_hearing"  # what agents on a network hear
 _FLAGS = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -40,29 +41,34 @@ def build(target: str, directory: Path, library: Path = LIBRARY) -> Path:
     parts = sources(library)
     if target == "frames":
         parts = [path for path in parts if path.name.startswith("frame")]
-    files = [HERE / f"fuzz_{target}.c", *parts]
+    files, flags = [HERE / f"fuzz_{target}.c", *parts], list(_FLAGS)
+    if target == "hearing":
+        files += [_HEARING / "hearing.c", _HEARING / "socket.c"]
+        flags += ["-D_GNU_SOURCE", f"-I{_HEARING}"]
     try:
-        return compile_program(clang, directory / f"fuzz_{target}", files, _FLAGS, library)
+        return compile_program(clang, directory / f"fuzz_{target}", files, flags, library)
     except DtsaError as error:
         if "libclang_rt" in str(error):
             raise NotHere("missing: clang's runtime; on Debian: sudo apt install libclang-rt-14-dev") from error
         raise
 
 
-def fuzz(program: Path, seconds: float, corpus: Path, seed: int = 0) -> Fuzzed:
+def fuzz(program: Path, seconds: float, corpus: Path, seed: int = 0, most: int = -1) -> Fuzzed:
     """Fuzzes for a while.
 
     :param program: from :func:`build`.
     :param seconds: how long, s.
     :param corpus: folder of inputs that reach something new; read, and added to.
     :param seed: of the fuzzer; 0: another each time.
+    :param most: inputs after which it ends before its time is over; -1: any number.
     :raises Found: with the fuzzer's words; the input is in the corpus' parent.
     """
     target = program.name.removeprefix("fuzz_")
     corpus.mkdir(parents=True, exist_ok=True)
     artifacts = f"-artifact_prefix={corpus.parent}/{target}-"
     options = [f"-max_total_time={max(1, round(seconds))}", f"-max_len={TARGETS[target]}", "-print_final_stats=1"]
-    command = [str(program), str(corpus), *options, artifacts, f"-seed={seed}", "-timeout=10", "-rss_limit_mb=2048"]
+    options += [artifacts, f"-seed={seed}", f"-runs={most}", "-timeout=10", "-rss_limit_mb=2048"]
+    command = [str(program), str(corpus), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds + 120, errors="replace")
     if done.returncode:
         raise Found(f"{target}: {_essence(done.stderr)}")

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from dtsa_agent.core import Scenario
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.run import OUTCOMES, RecordedRun, load_run, swarm_section
-from dtsa_bench.tables.ages import Ages, follow_run
+from dtsa_bench.tables.ages import follow_run
+from dtsa_bench.tables.followed import Ages
 
 BINS = 400  # steps of the charts over time
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
@@ -25,6 +26,7 @@ CRASHES = 50  # most that are shown
 PAIRS = 5  # closest pairs whose distance is drawn
 MISSION_VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
 MISSION_EVENTS = 1000  # most that are shown
+UNKNOWN = -32768  # in the replay: nobody knows where it was
 BLOCK = 512  # moments whose pair distances are computed at once
 
 Array = NDArray[np.float64]
@@ -56,6 +58,8 @@ def run_data(path: str | Path) -> dict[str, Any]:
     followed = follow_run(run)
     scenario, ages = followed.scenario, followed.ages
     notes += followed.notes
+    if unknown := int((~run.outcome_known).sum()):
+        notes.append(f"Of {unknown} slots it is not known whether somebody sent: not all agents have told of them.")
     summary = followed.summary | _counts(run)
     if distances is not None and summary.get("min_distance_m") is None and len(distances.least):
         summary["min_distance_m"] = float(np.nanmin(distances.least))
@@ -198,11 +202,16 @@ def _duration_s(run: RecordedRun) -> float:
 
 
 def _counts(run: RecordedRun) -> dict[str, Any]:
-    counts = np.bincount(run.outcome, minlength=len(OUTCOMES))
+    counts = np.bincount(run.outcome[run.outcome_known], minlength=len(OUTCOMES))
+    unknown = int((~run.outcome_known).sum())
     frames = run.frames
-    offered = len(frames.slot) * max(0, run.agents - 1)
+    offered = int(run.known_receivers.sum())
     return {
-        "slots": {"total": len(run.slots), **dict(zip(OUTCOMES, counts.tolist(), strict=True))},
+        "slots": {
+            "total": len(run.slots),
+            **dict(zip(OUTCOMES, counts.tolist(), strict=True)),
+            **({"unknown": unknown} if unknown else {}),
+        },
         "frames": len(frames.slot),
         "lost_fraction": float(frames.lost.sum()) / offered if offered else 0.0,
     }
@@ -215,10 +224,12 @@ def _scene(run: RecordedRun, scenario: Scenario | None) -> dict[str, Any] | None
     duration = (int(motion.time_ns[-1]) - int(motion.time_ns[0])) / 1e9
     frames = int(min(duration * SCENE_HZ, SCENE_VALUES / (3 * len(motion.ids)))) + 2
     index = np.unique(np.linspace(0, len(motion.time_ns) - 1, min(frames, len(motion.time_ns))).astype(int))
+    known = np.isfinite(motion.position[index]) | (run.told is None)
     place = np.nan_to_num(motion.position[index])
     span = max(1.0, float(np.abs(place).max()))
     scale = span / 32000
     targets = scenario.target if scenario else place[-1]
+    place = np.where(known, place, scale * UNKNOWN)
     return {
         "ids": motion.ids.tolist(),
         "time": pack(((motion.time_ns[index] - run.start_ns) / 1e9).astype("<f4")),
@@ -235,13 +246,14 @@ def _slots(run: RecordedRun) -> dict[str, Any]:
     if len(run.slots):
         place = np.minimum(np.searchsorted(run.slots, frames.slot), len(run.slots) - 1)
         outcome = run.outcome[place].astype(np.uint8)
-    share = frames.received.sum(axis=1) / max(1, run.agents - 1)
+    share = frames.received.sum(axis=1) / np.maximum(1, run.known_receivers)
     return {
         "slot": pack(frames.slot.astype("<u4")),
         "sender": pack(frames.sender.astype("<u2")),
         "outcome": pack(outcome),
         "reason": pack(_sender_reason(run).astype(np.uint8)),
         "received": pack(np.round(255 * np.minimum(share, 1)).astype(np.uint8)),
+        **({} if run.outcome_known.all() else {"unknown": run.slots[~run.outcome_known].tolist()}),
         "first": int(run.slots[0]) if len(run.slots) else 0,
         "count": int(run.slots[-1] - run.slots[0]) + 1 if len(run.slots) else 0,
     }
@@ -280,14 +292,14 @@ def _channel(run: RecordedRun) -> dict[str, Any] | None:
         return None
     bins, count, middle = _bin_of(run, run.slots)
     shares = np.zeros((len(OUTCOMES), count))
-    np.add.at(shares, (run.outcome, bins), 1)
-    shares /= np.maximum(1, shares.sum(axis=0))
+    np.add.at(shares, (run.outcome, bins), run.outcome_known)
+    shares /= np.maximum(1, np.bincount(bins, minlength=count))
     frames = run.frames
     lost, offered = np.zeros(count), np.zeros(count)
     if len(frames.slot):
         place, _, _ = _bin_of(run, frames.slot)
         np.add.at(lost, place, frames.lost)
-        np.add.at(offered, place, max(1, run.agents - 1))
+        np.add.at(offered, place, np.maximum(run.told is None, run.known_receivers))
     return {
         "time": thin(middle),
         "share": {name: thin(shares[index]) for index, name in enumerate(OUTCOMES)},
@@ -301,7 +313,7 @@ def _reasons(run: RecordedRun) -> dict[str, Any] | None:
         return None
     bins, count, middle = _bin_of(run, decisions.slot)
     shares = np.zeros((len(decisions.names), count))
-    np.add.at(shares, (decisions.reason, bins[:, None]), 1)
+    np.add.at(shares, (decisions.reason, bins[:, None]), decisions.agent > 0)
     disagree = np.array([len(np.unique(row[row > 0])) > 1 for row in decisions.chosen])
     return {
         "names": list(decisions.names),
@@ -372,11 +384,11 @@ def _table(
             "id": agent,
             "moving": bool(scenario.moving[agent - 1]) if scenario else None,
             "sent": sent,
-            "heard": round(float(frames.received[mine].sum()) / (sent * max(1, run.agents - 1)), 4) if sent else None,
-            "collided": int((frames.collided[mine] > 0).sum()),
+            "heard": _heard_share(run, mine),
+            "collided": int((frames.collided[mine] > 0).sum()) if run.merged is None else None,
         }
         if ages is not None:
-            column = slice(min(run.agents, len(ages.slot)), None), agent - 1
+            column = ages.results, agent - 1
             for name, values, digits in (("age", ages.age, 2), ("error", ages.error, 4)):
                 known = values[column][np.isfinite(values[column])]
                 row[f"{name}_mean"] = round(float(known.mean()), digits) if len(known) else None
@@ -384,10 +396,20 @@ def _table(
         place = np.flatnonzero(motion.ids == agent)
         if len(place) and len(motion.time_ns) > 1:
             track = motion.position[:, :, place[0]]
-            steps = np.diff(track[np.isfinite(track).all(axis=1)], axis=0)
-            row["path"] = round(float(np.sqrt((steps**2).sum(axis=1)).sum()), 3)
+            known = np.isfinite(track).all(axis=1)
+            steps = np.diff(track[known], axis=0)
+            if known.any():
+                row["path"] = round(float(np.sqrt((steps**2).sum(axis=1)).sum()), 3)
         rows.append(row)
     return rows
+
+
+def _heard_share(run: RecordedRun, mine: NDArray[np.bool_]) -> float | None:
+    """Share of an agent's receivers that received its frames; None without any of which it is known."""
+    offered = int(run.known_receivers[mine].sum())
+    if not mine.any() or (run.told is not None and not offered):
+        return None
+    return round(float(run.frames.received[mine].sum()) / max(1, offered), 4)
 
 
 def reduce_bins(values: NDArray[Any], how: Any) -> Array:

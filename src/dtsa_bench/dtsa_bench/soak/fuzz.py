@@ -12,7 +12,7 @@ from dtsa_bench.native.fuzz import TARGETS, Found, build, fuzz
 from .item import Item, NotMet, Soak
 
 _SHARES = 6
-_SECONDS = {"frames": 120.0, "agents": 480.0}  # of one share: an hour in all
+_SECONDS = {"frames": 120.0, "agents": 420.0, "hearing": 60.0}  # of one share: an hour in all
 _CORPUS = Path("runs") / "fuzz"  # kept: the next soak begins where this one ended
 
 
@@ -45,7 +45,8 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
 
 SOAK = Soak(
     "fuzz",
-    "no input makes decoders or agents of libdtsa touch foreign memory, do what C leaves undefined, or stand still",
+    "no input makes decoders or agents of libdtsa, or what agents on a network make of datagrams, touch foreign "
+    "memory, do what C leaves undefined, or stand still",
     tuple(_items()),
     _run,
     _figures,

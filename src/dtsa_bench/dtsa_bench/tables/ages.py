@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,37 +14,7 @@ from dtsa_bench.bag.run import RecordedRun
 from dtsa_bench.metrics import FlightMetrics, metrics_tables
 from dtsa_bench.run_config import RunConfig
 
-
-@dataclass(frozen=True, slots=True)
-class Ages:
-    """By slot and agent: means over all observers that still have that agent in A_p; NaN without any."""
-
-    slot: NDArray[np.int64]  # (M,)
-    age: NDArray[np.float64]  # slots, (M, N)
-    error: NDArray[np.float64]  # m, (M, N)
-    observers: NDArray[np.int64]  # (M, N)
-
-
-@dataclass(frozen=True, slots=True)
-class Observed:
-    """What each observer knew of each other agent that it had heard, at the end of one slot: P pairs."""
-
-    slot: int
-    observer: NDArray[np.int64]  # (P,) ids
-    agent: NDArray[np.int64]  # (P,) ids
-    age: NDArray[np.int64]  # slots, (P,)
-    error: NDArray[np.float64]  # m, (P,)
-    counted: NDArray[np.bool_]  # (P,) the observer still has it in A_p, and it moves
-
-
-@dataclass(frozen=True, slots=True)
-class Followed:
-    """What a recorded run gives when it is followed slot by slot; nothing where the bag does not hold enough."""
-
-    scenario: Scenario | None
-    ages: Ages | None
-    summary: dict[str, Any]  # as in summary.json
-    notes: list[str]  # what is left out, and why
+from .followed import Ages, Followed, Observed
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +35,8 @@ def _usable(run: RecordedRun) -> _Usable:
         return _Usable(None, None, note)
     complete = len(run.slots) and np.array_equal(run.slots, np.arange(len(run.slots)))
     everyone = np.array_equal(run.motion.ids, np.arange(1, run.agents + 1))
+    if complete and run.merged is not None and run.agents == config.swarm.agents:
+        return _Usable(config, scenario)
     if not complete or not everyone or run.agents != config.swarm.agents:
         note = "Ages, estimates and results are left out: slots or agents are missing in the bag."
         return _Usable(None, scenario, note)
@@ -83,6 +54,10 @@ def follow_run(run: RecordedRun) -> Followed:
     if usable.config is None or usable.scenario is None:
         return Followed(usable.scenario, None, {}, [usable.why_not])
     config, scenario = usable.config, usable.scenario
+    if run.merged is not None:
+        from .merged import follow_merged  # other bags need nothing of it
+
+        return follow_merged(run, config, scenario)
     metrics = FlightMetrics(config, scenario)
     ages = _means(run, _tables(run, config, scenario), metrics, scenario.moving)
     notes = []
@@ -98,6 +73,11 @@ def observed(run: RecordedRun) -> Iterator[Observed]:
     """
     usable = _usable(run)
     if usable.config is None or usable.scenario is None:
+        return
+    if run.merged is not None:
+        from .merged import observed_merged
+
+        yield from observed_merged(run, usable.config)
         return
     tables, moving, agents = _tables(run, usable.config, usable.scenario), usable.scenario.moving, run.agents
     others = ~np.eye(agents, dtype=bool)
@@ -175,4 +155,4 @@ def _means(run: RecordedRun, tables: AbstractSwarm, metrics: FlightMetrics, movi
         age[slot, some] = old[some] / observers[some]
         error[slot, some] = wrong[some] / observers[some]
         watching[slot] = observers * (agents - 1 if shared else 1)
-    return Ages(run.slots, age, error, watching)
+    return Ages(run.slots, age, error, watching, np.arange(count) >= agents)

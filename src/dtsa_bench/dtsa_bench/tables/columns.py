@@ -15,17 +15,17 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
     "slots": [
         ("slot", "1", "number of the slot, from 0"),
         ("time_s", "s", "start of the slot, counted from the start of slot 0"),
-        ("outcome", "", "the channel's verdict: idle, success or collision"),
-        ("senders", "1", "agents that sent"),
-        ("sender", "", "id of the first of them; 0: nobody"),
+        ("outcome", "", "the channel's verdict: idle, success, collision (merged: two or more sent); empty: not known"),
+        ("senders", "1", "agents that sent; empty: not known"),
+        ("sender", "", "id of the first of them; 0: nobody; empty: not known"),
     ],
     "frames": [
         ("slot", "1", "slot in which the frame was sent"),
         ("time_s", "s", "start of that slot"),
         ("sender", "", "id of the agent that sent it"),
         ("received", "1", "agents that received it"),
-        ("lost", "1", "agents that lost it to noise"),
-        ("collided", "1", "agents at which it collided with another frame"),
+        ("lost", "1", "agents that lost it to noise (merged: that did not receive it, for whatever reason)"),
+        ("collided", "1", "agents at which it collided with another frame; empty: not known"),
         ("length", "byte", "length of the frame"),
         ("data", "", "the frame, hexadecimal"),
         ("c_r", "1", "transmission parameter in the frame; 0: arrived; empty if the frame cannot be decoded"),
@@ -37,7 +37,7 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("time_s", "s", "start of that slot"),
         ("sender", "", "id of the agent that sent it"),
         ("receiver", "", "id of another agent"),
-        ("received", "", "whether that one received it"),
+        ("received", "", "whether that one received it; empty: not known"),
     ],
     "decisions": [
         ("slot", "1", "slot that was decided about"),
@@ -68,19 +68,27 @@ COLUMNS: dict[str, list[tuple[str, str, str]]] = {
         ("observer", "", "id of the agent that knows"),
         ("agent", "", "id of the agent that is known; rows begin when the observer first hears it"),
         ("age_slots", "slots", "slots since the state was sent that the observer last heard; 0: in this very slot"),
-        ("error_m", "m", "distance between where the observer takes the agent to be and where it is"),
+        ("error_m", "m", "distance between where the observer takes the agent to be and where it is; empty: not known"),
         ("counted", "", _PAIR),
     ],
 }  # fmt: skip
 
 
+_HEAD = """\
+# Columns of the tables
+
+Of `tools/dtsa export` and of the data frames of `import dtsa`. Ids begin at 1. Times are simulated and count
+from the start of slot 0. Frame `map` has its origin in the room's centre (ENU: x and y level, z up).
+
+Of a bag that `tools/dtsa merge` has made, slot 0 is the first slot that all agents counted alike; the number that the
+agents gave it is in the bag. What no agent's bag says is empty there, or has no row: decisions, states and observers
+of an agent without a bag, what it sent in slots in which nobody heard it, and whether it received.
+"""
+
+
 def describe() -> str:
     """The columns of all tables as Markdown."""
-    parts = [
-        "# Columns of the tables\n\nOf `tools/dtsa export` and of the data frames of `import dtsa`. Ids begin at 1. "
-        "Times are simulated and count\nfrom the start of slot 0. Frame `map` has its origin in the room's centre "
-        "(ENU: x and y level, z up).\n"
-    ]
+    parts = [_HEAD]
     for table, columns in COLUMNS.items():
         parts.append(f"\n## {table}\n\n| column | unit | meaning |\n|---|---|---|\n")
         parts.extend(f"| `{name}` | {unit} | {meaning} |\n" for name, unit, meaning in columns)

@@ -12,13 +12,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
+from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_frame
 from dtsa_bench.bag.errors import BagError
 from dtsa_bench.bag.run import OUTCOMES, RecordedRun, extent_of, load_run
-from dtsa_bench.tables.ages import Followed, follow_run, observed
+from dtsa_bench.tables.ages import follow_run, observed
 from dtsa_bench.tables.columns import AXES, COLUMNS, describe
+from dtsa_bench.tables.followed import Followed
 
 FORMATS = ("parquet", "csv")
 ROWS = 65536  # rows that are in memory as a table at once
@@ -129,13 +131,14 @@ def _slots(run: RecordedRun) -> Iterator[dict[str, Any]]:
     first = np.zeros(len(run.slots), np.int64)
     first[places[known][::-1]] = run.frames.sender[known][::-1]  # the first of several is written last
     names = np.array(OUTCOMES)
+    unknown = ~run.outcome_known
     for piece in _pieces(len(run.slots)):
         yield {
             "slot": run.slots[piece],
             "time_s": run.time_s(run.slots[piece]),
-            "outcome": pa.array(names[run.outcome[piece]].tolist(), pa.string()),
-            "senders": counts[piece],
-            "sender": first[piece],
+            "outcome": pa.array(names[run.outcome[piece]].tolist(), pa.string(), mask=unknown[piece]),
+            "senders": pa.array(counts[piece], mask=unknown[piece]),
+            "sender": pa.array(first[piece], mask=unknown[piece]),
         }
 
 
@@ -149,7 +152,7 @@ def _frames(run: RecordedRun) -> Iterator[dict[str, Any]]:
             "sender": frames.sender[piece],
             "received": frames.received[piece].sum(axis=1),
             "lost": frames.lost[piece],
-            "collided": frames.collided[piece],
+            "collided": pa.array(frames.collided[piece], mask=np.full(len(decoded), run.merged is not None)),
             "length": np.array([len(data) for data in frames.data[piece]], np.int64),
             "data": pa.array([data.hex() for data in frames.data[piece]], pa.string()),
             "c_r": pa.array([values[0] for values in decoded], pa.int64()),
@@ -171,8 +174,17 @@ def _receptions(run: RecordedRun) -> Iterator[dict[str, Any]]:
             "time_s": run.time_s(slots),
             "sender": frames.sender[piece][row],
             "receiver": ids[column],
-            "received": frames.received[piece][row, column],
+            "received": _received(run, piece, row, column),
         }
+
+
+def _received(run: RecordedRun, piece: slice, row: NDArray[np.int64], column: NDArray[np.int64]) -> pa.Array:
+    """Whether agents received frames; empty where there is no record of that."""
+    received = run.frames.received[piece][row, column]
+    if run.told is None:
+        return pa.array(received)
+    told = run.told[np.searchsorted(run.slots, run.frames.slot[piece])[row], column]
+    return pa.array(received, mask=~(received | told))
 
 
 def _decode(data: bytes, extent_m: float) -> tuple[Any, ...]:
@@ -187,15 +199,16 @@ def _decisions(run: RecordedRun) -> Iterator[dict[str, Any]]:
     decisions = run.decisions
     names = np.array(decisions.names or ("",), dtype=object)
     for piece in _pieces(len(decisions.slot), decisions.agent.shape[1]):
-        slots = np.repeat(decisions.slot[piece], decisions.agent.shape[1])
+        known = decisions.agent[piece].ravel() > 0
+        slots = np.repeat(decisions.slot[piece], decisions.agent.shape[1])[known]
         yield {
             "slot": slots,
             "time_s": run.time_s(slots),
-            "agent": decisions.agent[piece].ravel(),
-            "chosen": decisions.chosen[piece].ravel(),
-            "reason": pa.array(names[decisions.reason[piece].ravel()].tolist(), pa.string()),
-            "score": decisions.score[piece].ravel(),
-            "digest": decisions.digest[piece].ravel(),
+            "agent": decisions.agent[piece].ravel()[known],
+            "chosen": decisions.chosen[piece].ravel()[known],
+            "reason": pa.array(names[decisions.reason[piece].ravel()[known]].tolist(), pa.string()),
+            "score": decisions.score[piece].ravel()[known],
+            "digest": decisions.digest[piece].ravel()[known],
         }
 
 
@@ -210,6 +223,9 @@ def _states(run: RecordedRun) -> Iterator[dict[str, Any]]:
         for values, form in ((motion.position, "position_{}_m"), (motion.velocity, "velocity_{}_mps")):
             for index, axis in enumerate(AXES):
                 batch[form.format(axis)] = values[piece, index].ravel()
+        if run.merged is not None:  # no rows for those of whom there is no record
+            known = np.isfinite(motion.position[piece]).all(axis=1).ravel()
+            batch = {name: values[known] for name, values in batch.items()}
         yield batch
 
 
@@ -249,6 +265,7 @@ def _ages_by_observer(run: RecordedRun) -> Iterator[dict[str, Any]]:
 
     def batch() -> dict[str, Any]:
         columns = dict(zip(names, (np.concatenate(parts) for parts in waiting), strict=True))
+        columns["error_m"] = pa.array(columns["error_m"], pa.float64(), from_pandas=True)  # not a number: empty
         return {"slot": columns.pop("slot"), "time_s": run.time_s(np.concatenate(waiting[0]) + 1), **columns}
 
     for seen in observed(run):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.bag.errors import BagError, UnusableBag
+from dtsa_bench.bag.metadata import MERGED_FROM
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.bag.writer import BROKEN_OFF
 
@@ -25,7 +26,7 @@ def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) 
     """
     begin = time.perf_counter()
     with Bag(path) as bag:
-        mode = str(bag.config.get("mode", "lockstep"))
+        mode = "merged" if MERGED_FROM in bag.custom_data else str(bag.config.get("mode", "lockstep"))
         result = Result(str(path), mode, broken_off=BROKEN_OFF in bag.custom_data)
         try:
             _check(bag, mode, result, progress)
@@ -44,6 +45,11 @@ def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) 
 def _check(bag: Bag, mode: str, result: Result, progress: Callable[[int], None] | None) -> None:
     if mode == "lockstep":
         LockstepCheck(bag, result, progress).check()
+        return
+    if mode == "merged":
+        from .merged import MergedCheck
+
+        MergedCheck(bag, result).check()
         return
     from .realtime import RealtimeCheck
 

@@ -66,6 +66,10 @@ class SentFrames:
         """A frame; None if it has not gone out."""
         return self._sent.get((slot, sender))
 
+    def all(self) -> list[Sent]:
+        """All frames that have gone out."""
+        return list(self._sent.values())
+
     @property
     def delivered(self) -> int:
         """Receivers to which frames were delivered, over all frames."""

@@ -26,6 +26,7 @@ from dtsa_bench.bag.reader import Bag, Message
 from dtsa_bench.run_config import RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
+from .carrier_sense import CarrierSense
 from .decisions import Decisions
 from .frames import SentFrames
 from .intake import Intake
@@ -180,7 +181,8 @@ class RealtimeCheck:
                 why = "slots come one after the other"
                 self._fail("transmission.slot", f"more than {last}", slot, why, slot, agent)
             self._slots[agent - 1] = slot
-            if not frames[k]:  # a frame may leave late; the slot starts when it starts
+            handed = int(said.chosen[k]) == agent and self.run.swarm.policy_row.listens
+            if not frames[k] and not handed:  # a frame may leave late; the slot starts when it starts
                 starts[agent] = int(offsets[k])
             decided[agent] = int(said.chosen[k]), int(said.reason[k]), int(said.digest[k]), float(said.score[k])
             self.position[:, agent - 1] = track[-1, :, k]
@@ -217,10 +219,13 @@ class RealtimeCheck:
         intake, untold = Intake(self.frames, self.run.air.link_delay_ns, self.result.slots), 0
         replayable = self._authenticator is not None or not self.run.swarm.auth
         decisions = Decisions(self.run, self.frames) if replayable else None
+        sense = CarrierSense(self.frames) if self.run.swarm.policy_row.listens else None
         for _, said in self.bag.typed([REPORT]):
             intake.report(said)
             if decisions is not None:
                 decisions.report(said)
+            if sense is not None:
+                sense.report(said)
             ids = set(said.agent.tolist())
             untold += sum(len(ids - self._told.get(s, set())) for s in said.slot.tolist() if s < self.result.slots)
         missed = summary.get("missed_reports", untold)
@@ -228,11 +233,20 @@ class RealtimeCheck:
             self._fail("transmission", f"all but {missed} entries of reports", f"all but {untold}",
                        "only who reported too late is missing", None)  # fmt: skip
         self.result.count("frames taken in as they were delivered", intake.checked)
+        if sense is not None:
+            self._carrier_sense(sense)
         if decisions is None:
             self.result.skipped["decisions"] = f"no key in {VARIABLE}"
         else:
             self.result.count("decisions made again", decisions.check(self.result.slots))
         self.result.safety |= intake.summary() | {"stalls": summary.get("stalls", [])}
+
+    def _carrier_sense(self, sense: CarrierSense) -> None:
+        if self.run.air.range_m or self.run.air.capture_db:
+            self.result.skipped["carrier sense"] = "it depends on where all were when each frame began"
+        else:
+            self.result.count("frames that began in free air", sense.check(self._events))
+        self.result.safety["frames_not_begun"] = sense.not_sent
 
     def _frame(self, slot: int, agent: int, data: bytes, *state: NDArray[np.float64]) -> None:
         """One frame: it decodes, names its sender and slot, and says where its sender really was."""

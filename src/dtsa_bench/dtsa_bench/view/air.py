@@ -11,8 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.air.udp import MulticastSocket, UdpSettings
-from dtsa_agent.air.udp.agent import EARLY, OTHER_TIME, REPEATED
-from dtsa_agent.air.udp.datagram import HEADER, NO_FRAME, Said, Wrapping, flight_ns
+from dtsa_agent.air.udp.datagram import (
+    EARLY,
+    HEADER,
+    NO_FRAME,
+    OTHER_TIME,
+    REPEATED,
+    Said,
+    Wrapping,
+    flight_ns,
+)
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_frame

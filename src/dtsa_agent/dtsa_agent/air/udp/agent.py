@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import select
 import time
 from collections import Counter, deque
 from typing import Any
@@ -13,34 +12,31 @@ import numpy as np
 from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
 from dtsa_agent.core.agent import AgentGroup
 from dtsa_agent.core.config import SwarmConfig
-from dtsa_agent.core.errors import ConfigError, LocalProtocolError, RemoteProtocolError
-from dtsa_agent.core.frame import decode_frame
+from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import check_joinable
 from dtsa_agent.core.pacing import BETWEEN, LEAD, MOST_EARLY, latest_send_ns, too_long_ns
 from dtsa_agent.core.plugins import make_swarm
-from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 
-from .clock import OwnClock
-from .datagram import NO_FRAME, Wrapping, flight_ns
-from .delay import Delay
-from .precision import going_first, wake_precisely
+from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, flight_ns
+from .hearing import OF_OWN_NAME, REASONS, STATES, make_hearing
+from .precision import give_back_memory, going_first, wake_precisely
+from .prepared import Prepared
 from .record import Heard, SlotRecord, Watcher
 from .settings import AgentSettings, UdpSettings
-from .slots import SlotTime
-from .sockets import Datagram, MulticastSocket
+from .sockets import MulticastSocket
 from .tally import Tally
 from .vehicle import SimulatedVehicle, Vehicle
 
 _SECOND = 1_000_000_000
 _PATIENCE_S = 0.05  # a signal is noticed after this time at the latest
-_BURST = 16  # datagrams taken in at a time: whatever comes, the own slots go on
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
 _OWN_ID = 3  # frames in the own name after which an agent that is new gives way
 _SAID = 64  # own frames that are remembered
-OTHER_TIME, REPEATED, OWN_ID, EARLY = "other time", "repeated", "own id", "too early"
+
+_Frame = tuple[int, int, bytes, bytes, int]  # sender, slot, frame, datagram, arrival by the own clock
 
 
 class UdpAgent:
@@ -54,6 +50,7 @@ class UdpAgent:
     :param udp: the network.
     :param watcher: is told what happens; None: nobody is.
     :param vehicle: what it flies; None: a simulated one.
+    :param prepared: what follows from ``config``, if it is known already.
     :raises ConfigError: for an id or a policy that cannot fly here, a missing key, or a network that cannot be used.
     """
 
@@ -64,32 +61,31 @@ class UdpAgent:
         udp: UdpSettings,
         watcher: Watcher | None = None,
         vehicle: Vehicle | None = None,
+        prepared: Prepared | None = None,
     ) -> None:
         if own.id > config.agents:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
         check_joinable(config.policy)
         self.own, self.config, self.udp = own, config, udp
-        self._wrapping = Wrapping(config, authenticator(config))
-        self.swarm: AbstractSwarm = make_swarm(config, local=[own.id])
+        scenario, header = (None, b"") if prepared is None else (prepared.scenario, prepared.header)
+        wrapping = Wrapping(config, authenticator(config), header)
+        self.swarm: AbstractSwarm = make_swarm(config, scenario, local=[own.id])
         self._group = AgentGroup(self.swarm)
-        self._clock = OwnClock(own.clock_offset_ns, own.clock_drift_ppb)
-        self.time = SlotTime(config, own.id)
-        self.delay = Delay(own.id, config.slot_ns // 4)
+        self._present, self._chosen = self.swarm.present.data, self.swarm.chosen.data
         self.watcher = watcher
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally()
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
-        self._flight_ns = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
-        self._latest_send_ns = latest_send_ns(self._slot_ns, self._flight_ns)
+        flight = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
+        self._latest_send_ns = latest_send_ns(self._slot_ns, flight)
         self._too_long_ns = too_long_ns(config)
         self._ordinary = ""  # why it has no real-time priority
         self.slot = -1  # the slot that is open
         self._first = 0  # slot with which it began, or began anew
         self._awaits = False  # the slot's sender is another one, and has not been heard yet
         self._waiting = b""  # frame of this slot, ready to be sent
-        self._early: list[tuple[int, int, bytes, Datagram]] = []
-        self._last: dict[int, int] = {}  # slot of the last frame, by sender
+        self._early: list[_Frame] = []
         self._said: deque[bytes] = deque(maxlen=_SAID)  # own datagrams
         self._record: SlotRecord | None = None  # of the open slot
         self._before: list[Heard] = []  # heard after it began anew and before its first slot
@@ -97,6 +93,8 @@ class UdpAgent:
         self._signals = 0
         self._gone = False  # it has said on the air that it leaves
         self._socket = MulticastSocket(udp)
+        self.hearing = make_hearing(config, own, udp, wrapping, self._socket.fileno(), self._socket.address)
+        self._late_ns = self.hearing.late_ns
 
     def __enter__(self) -> UdpAgent:
         return self
@@ -111,6 +109,8 @@ class UdpAgent:
         :raises ConfigError: if another agent of its id is on the air already.
         """
         wake_precisely()
+        gc.collect()
+        give_back_memory()
         gc.freeze()  # nothing made so far is garbage: do not look at it again and again
         with going_first(self.own.priority) as self._ordinary:
             self._run(stop)
@@ -125,38 +125,36 @@ class UdpAgent:
                 return
             time.sleep(_PATIENCE_S)
         self._vehicle.sense(self.swarm)
-        began = time.monotonic_ns()
-        deadline = self._clock.monotonic_ns(self.time.start(self._clock.local_ns(began)))
-        while not self._ended(stop, end):
-            if self.time.state == LISTENING:
-                self._await_frame(deadline)
-                self._take_in()
-                if self.time.wake(self._clock.local_ns(time.monotonic_ns())):
+        hearing = self.hearing
+        deadline = hearing.start()
+        while not ((stop.signal or end is not None) and self._ended(stop, end)):
+            if hearing.listening:
+                hearing.await_frame(deadline)
+                self._take_in(hearing.take())
+                if hearing.wake():
                     self._begin_anew()
             elif self._waiting:
-                if _slept_until(self._due_ns()):
+                if hearing.sleep_until(self.slot, 0):
                     self._send()
-            elif _slept_until(self._due_ns(self._lead_ns)):
+            else:
                 # One wake-up a slot: frames wait in the socket, and the kernel has noted when they arrived.
-                more = self._take_in()
-                due = self._due_ns(self._latest_lead_ns if more or self._awaits else self._lead_ns)
-                if time.monotonic_ns() >= due:
-                    self._step()
-                elif not more:
-                    self._await_frame(due)
+                found = hearing.listen(self.slot + 1, self._lead_ns)
+                if found is not None:
+                    self._go_on(self._take_in(found))
         self._tell(self._close_slot())
         self.tally.ended_ns = time.monotonic_ns()
 
-    def _await_frame(self, until_ns: int) -> None:
-        """Waits for a frame, or until a time; ns, CLOCK_MONOTONIC."""
-        remaining = until_ns - time.monotonic_ns()
-        if remaining > 0:
-            select.select([self._socket], [], [], min(remaining / _SECOND, _PATIENCE_S))
+    def _go_on(self, more: bool) -> None:
+        """The next slot, if all is there that it waits for, or it is high time; else waits for that.
 
-    def _due_ns(self, lead_ns: int = 0) -> int:
-        """When to send the frame that lies ready, or to decide the next slot, this long ahead; ns, CLOCK_MONOTONIC."""
-        slot = self.slot if self._waiting else self.slot + 1
-        return self._clock.monotonic_ns(self.time.slot_start_ns(slot) - lead_ns)
+        :param more: there may be more to take in.
+        """
+        late = self._late_ns(self.slot + 1)
+        lead = self._latest_lead_ns if more or self._awaits else self._lead_ns
+        if late + lead >= 0:
+            self._step(late)
+        elif not more:
+            self.hearing.await_frame(time.monotonic_ns() - late - lead)
 
     def _ended(self, stop: Stop, end: int | None) -> bool:
         """Whether to end now: after a second signal, when it has said that it leaves, or has no time left to."""
@@ -166,7 +164,7 @@ class UdpAgent:
         if not stop and (end is None or now < end):
             return False
         if self._leaves_by is None:
-            if not self.config.policy_row.says_leaving or self.time.state == LISTENING or self.slot < self._first:
+            if not self.config.policy_row.says_leaving or self.hearing.listening or self.slot < self._first:
                 return True
             turns = (self.config.main_every + 1) * self.config.agents * self._slot_ns
             self._leaves_by, self._signals = now + min(_LEAVING_NS, turns), stop.count
@@ -175,58 +173,33 @@ class UdpAgent:
 
     # What is heard.
 
-    def _take_in(self) -> bool:
-        """Takes in what has arrived; whether there may be more."""
-        arrived = self._socket.receive(_BURST)
-        for datagram in arrived:
-            if not datagram.own:
-                reason = self._take(datagram)
-                if reason:
-                    self.tally.refused[reason] += 1
-                    if self.watcher is not None:
-                        self.watcher.other(reason, datagram.data, self._clock.local_ns(datagram.arrival_ns))
-        return len(arrived) == _BURST
+    def _take_in(self, found: tuple[list[_Frame] | None, list[tuple[int, int, bytes, int]] | None, bool, bool]) -> bool:
+        """Takes in what has been heard; whether there may be more.
 
-    def _take(self, datagram: Datagram) -> str:
-        """Takes in a datagram; why not, or an empty text."""
-        fault, sender, slot, late_ns, peers, frame = self._wrapping.read(datagram.data)
-        if fault:
-            return fault
-        if not self._is_frame(frame):
-            return NO_FRAME
-        if sender == self.own.id:
-            return self._own_name(slot, datagram.data)
-        if self._last.get(sender, -1) == slot and self.time.state != LISTENING:
-            return REPEATED
-        began = self._clock.local_ns(datagram.arrival_ns) - self._flight_ns - late_ns
-        before = self.time.slot_start_ns(slot)
-        outcome = self.time.hear(slot, began - self.delay.error_ns)
-        if outcome == FOREIGN:
-            return OTHER_TIME
-        self._last[sender] = slot
-        if outcome == RESTARTED:
-            self.delay.reset()
-            self._begin_anew()
-        else:
-            self.delay.hear(sender, began - before, peers)
-            self.delay.moved(self.time.slot_start_ns(slot) - before)
-        if slot > self.slot:
-            if len(self._early) >= MOST_EARLY:
-                return EARLY
-            self._early.append((sender, slot, frame, datagram))
-        elif slot >= self._first - 1:
-            self._hear(sender, slot, frame, datagram)
-        return ""
+        :param found: see ``_hearing.pyi``.
+        """
+        heard, refused, restarted, more = found
+        if refused is not None:
+            for number, slot, data, arrival in refused:
+                self._refuse(self._own_name(slot, data) if number == OF_OWN_NAME else REASONS[number], data, arrival)
+        if heard is not None:
+            for one in heard:
+                if restarted and one is heard[-1]:
+                    self._begin_anew()
+                slot = one[1]
+                if slot > self.slot:
+                    if len(self._early) < MOST_EARLY:
+                        self._early.append(one)
+                    else:
+                        self._refuse(EARLY, one[3], one[4])
+                elif slot >= self._first - 1:
+                    self._hear(one)
+        return more
 
-    def _is_frame(self, frame: bytes) -> bool:
-        """Whether bytes are a frame: nothing else may say what time it is. What holders of the key seal is one."""
-        if self.config.auth:
-            return True
-        try:
-            decode_frame(frame[: len(frame) - self.config.own_bytes], self.config.extent_m)
-        except RemoteProtocolError:
-            return False
-        return True
+    def _refuse(self, reason: str, data: bytes, arrival_ns: int) -> None:
+        self.tally.refused[reason] += 1
+        if self.watcher is not None:
+            self.watcher.other(reason, data, arrival_ns)
 
     def _own_name(self, slot: int, data: bytes) -> str:
         """Somebody else speaks in the own name, or plays what was said there again.
@@ -235,23 +208,22 @@ class UdpAgent:
         """
         if data in self._said:
             return REPEATED
-        if self.time.state == LISTENING or slot < self.slot - 1:
+        if self.hearing.listening or slot < self.slot - 1:
             return OTHER_TIME
         new_ns = 2 * self.config.anchor_every * self.config.agents * self._slot_ns
         if self.tally.refused[OWN_ID] + 1 >= _OWN_ID and time.monotonic_ns() < self.tally.joined_ns + new_ns:
             raise ConfigError("id", self.own.id, "an id that no other agent on the air has")
         return OWN_ID
 
-    def _hear(self, sender: int, slot: int, frame: bytes, datagram: Datagram) -> None:
+    def _hear(self, one: _Frame) -> None:
+        sender, slot, frame, datagram, arrival = one
         accepted = self.swarm.hear(slot, frame)
         if self._awaits and slot >= self.slot:
             self._awaits = False
         self.tally.heard += accepted
-        if self.watcher is None:
-            return
-        arrival = self._clock.local_ns(datagram.arrival_ns)
-        heard = Heard(sender, slot, arrival, datagram.data, bool(accepted))
-        (self._before if self._record is None else self._record.heard).append(heard)
+        if self.watcher is not None:
+            heard = Heard(sender, slot, arrival, datagram, bool(accepted))
+            (self._before if self._record is None else self._record.heard).append(heard)
 
     # Its own slots.
 
@@ -259,20 +231,21 @@ class UdpAgent:
         """From the next slot on it takes part, knowing nothing."""
         self._tell(self._close_slot())
         self._before.clear()
-        now = self._clock.local_ns(time.monotonic_ns())
-        following = self.time.slot(now + self._lead_ns)
-        if following is None:
+        if self.hearing.listening:
             raise LocalProtocolError("an agent that listens has no slots")
+        following = self.hearing.slot_at(self.hearing.local_ns(time.monotonic_ns()) + self._lead_ns)
         self._first, self.slot = following + 1, following
         self._waiting, self._awaits = b"", False
         self._early.clear()
         self._group.restart(0, self._first)
         self.tally.begun(self._first, time.monotonic_ns())
 
-    def _step(self) -> None:
-        """The next slot, or, after standing still for too long, a new beginning."""
-        late = time.monotonic_ns() - self._clock.monotonic_ns(self.time.slot_start_ns(self.slot + 1))
-        if late > self._too_long_ns:
+    def _step(self, late_ns: int) -> None:
+        """The next slot, or, after standing still for too long, a new beginning.
+
+        :param late_ns: ns, how long ago it has started.
+        """
+        if late_ns > self._too_long_ns:
             self._begin_anew()
         else:
             self._open(self.slot + 1)
@@ -282,33 +255,36 @@ class UdpAgent:
         swarm = self.swarm
         closed = self._close_slot()
         if self._leaves_by is not None and not self._gone:
-            swarm.present[0] = PRESENT_LEAVING
-        present = int(swarm.present[0])
+            self._present[0] = PRESENT_LEAVING
+        present = self._present[0]
         self._vehicle.sense(swarm)
-        sends = bool(self._group.on_slot(slot))
+        sends = self._group.on_slot(slot)
         self.slot = slot
-        self._awaits = int(swarm.chosen[0]) not in (0, self.own.id)
+        self._awaits = self._chosen[0] not in (0, self.own.id)
         frame = swarm.frame(0) if sends else b""
-        self._record = None if self.watcher is None else self._recorded(slot, frame, present)
+        if self.watcher is not None:
+            self._record = self._recorded(slot, frame, present)
         self._waiting = frame
-        if self._waiting and self._due_ns() - time.monotonic_ns() < 0:
+        if frame and self._late_ns(slot) > 0:
             self._send()
         self._vehicle.fly(swarm, slot)
-        early, self._early = self._early, []
-        for sender, sent_in, data, datagram in early:
-            if sent_in > slot:
-                self._early.append((sender, sent_in, data, datagram))
-            else:
-                self._hear(sender, sent_in, data, datagram)
-        self._tell(closed)
+        if self._early:
+            early, self._early = self._early, []
+            for one in early:
+                if one[1] > slot:
+                    self._early.append(one)
+                else:
+                    self._hear(one)
+        if closed is not None:
+            self._tell(closed)
 
     def _recorded(self, slot: int, frame: bytes, present: int) -> SlotRecord:
         swarm = self.swarm
         before, self._before = self._before, []
         return SlotRecord(
             slot,
-            self.time.slot_start_ns(slot),
-            self._clock.local_ns(time.monotonic_ns()),
+            self.hearing.slot_start_ns(slot),
+            self.hearing.local_ns(time.monotonic_ns()),
             slot == self._first,
             present,
             int(swarm.chosen[0]),
@@ -325,18 +301,18 @@ class UdpAgent:
 
     def _send(self) -> None:
         """Sends the frame that lies ready, unless its slot is as good as over."""
-        due, now = self._due_ns(), time.monotonic_ns()
+        late = max(0, self._late_ns(self.slot))
         frame, self._waiting = self._waiting, b""
-        if now - due > self._latest_send_ns:  # it would disturb whoever has the next turn
+        if late > self._latest_send_ns:  # it would disturb whoever has the next turn
             self.swarm.frame_length[0] = 0
             self.tally.unsent += 1
             return
-        datagram = self._wrapping.wrap(frame, self.slot, now - due, self.delay.tell())
+        datagram = self.hearing.wrap(frame, self.slot, late)
         self._socket.send(datagram)
         self._said.append(datagram)
-        self.tally.sent(now - due)
+        self.tally.sent(late)
         if self._record is not None:
-            self._record.sent_ns = self._clock.local_ns(now)
+            self._record.sent_ns = self.hearing.slot_start_ns(self.slot) + late
             self._record.datagram = datagram
         if self._leaves_by is not None and self.config.policy_row.says_leaving:
             self._gone = decode_extended(frame[: len(frame) - self.config.own_bytes], self.config.extent_m).leaving
@@ -358,6 +334,7 @@ class UdpAgent:
 
     def summary(self) -> dict[str, Any]:
         """What came of it, as plain values."""
+        state, restarts, corrected, alignments, error_ns, clock_steps, unreadable = self.hearing.status()
         swarm, away = self.swarm, self.swarm.goal[:, 0] - self.swarm.position[:, 0]
         refused: Counter[str] = Counter(self.tally.refused)
         refused.update({"malformed": self.swarm.malformed, "foreign": self.swarm.foreign})
@@ -369,28 +346,16 @@ class UdpAgent:
             "sealed": self.config.auth,
             "no_priority": self._ordinary,
             **self.tally.summary(),
-            "state": self.time.state,
-            "times_taken_over": self.time.restarts,
-            "times_corrected": self.time.corrected,
-            "alignments": self.time.corrections,
-            "flight_time_error_us": self.delay.error_ns / 1e3,
+            "state": STATES[state],
+            "times_taken_over": restarts,
+            "times_corrected": corrected,
+            "alignments": alignments,
+            "flight_time_error_us": error_ns / 1e3,
             "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
             "not_taken_in": {name: count for name, count in sorted(refused.items()) if count},
             "unsendable": self._socket.unsendable,
-            "unreadable": self._socket.unreadable,
-            "clock_steps": self._socket.clock_steps,
+            "unreadable": unreadable,
+            "clock_steps": clock_steps,
             "position_m": [round(float(x), 4) for x in swarm.position[:, 0]],
             "arrived": bool(np.sqrt((away * away).sum()) <= self.config.r_min and swarm.final[0]),
         }
-
-
-def _slept_until(until_ns: int) -> bool:
-    """Sleeps until a time, or a while, so that signals are noticed; whether it is that time.
-
-    :param until_ns: ns, CLOCK_MONOTONIC.
-    """
-    remaining = until_ns - time.monotonic_ns()
-    if remaining <= 0:
-        return True
-    time.sleep(min(remaining / _SECOND, _PATIENCE_S))
-    return time.monotonic_ns() >= until_ns

@@ -30,6 +30,7 @@ HEADER = 26  # bytes before the frame
 MODE = "udp"
 NOT_OURS, LENGTH, OTHER_SETTINGS = "not ours", "length", "other settings"
 NO_FRAME, UNKNOWN, REJECTED = "no frame", "unknown agent", "rejected"
+OTHER_TIME, REPEATED, OWN_ID, EARLY = "other time", "repeated", "own id", "too early"
 _TIMES = struct.Struct("<H" + PEERS * "Hh")
 _MAGIC = b"DT\x01\x00"
 _AGREED = 8  # bytes of the header that are the same in all datagrams of a swarm
@@ -44,6 +45,15 @@ def flight_ns(config: SwarmConfig, flight_time_ns: int, byte_time_ns: int) -> in
     :param byte_time_ns: likewise.
     """
     return flight_time_ns + byte_time_ns * (HEADER + config.frame_length)
+
+
+def header_of(config: SwarmConfig) -> bytes:
+    """With which all datagrams of a swarm begin.
+
+    :param config: what all agents share.
+    """
+    agreed = settings_hash(agreed_settings(config, MODE)) & 0xFFFFFFFF
+    return _MAGIC + agreed.to_bytes(4, "little")
 
 
 class Said(NamedTuple):
@@ -62,13 +72,18 @@ class Wrapping:
 
     :param config: what all agents share.
     :param authenticator: seals and opens frames; None: they are not sealed.
+    :param header: with which all datagrams of the swarm begin, if it is known already.
     """
 
-    def __init__(self, config: SwarmConfig, authenticator: Authenticator | None) -> None:
-        agreed = settings_hash(agreed_settings(config, MODE)) & 0xFFFFFFFF
-        self._header = _MAGIC + agreed.to_bytes(4, "little")
-        self._length, self._agents = HEADER + config.frame_length, config.agents
-        self._authenticator = authenticator
+    def __init__(self, config: SwarmConfig, authenticator: Authenticator | None, header: bytes = b"") -> None:
+        self.header = header or header_of(config)
+        self.length = HEADER + config.frame_length  # bytes of a datagram
+        self._agents, self._authenticator = config.agents, authenticator
+
+    @property
+    def sealed_with(self) -> tuple[bytes, int]:
+        """Key and session; no key: frames are not sealed."""
+        return (b"", 0) if self._authenticator is None else self._authenticator.key_and_session
 
     def wrap(self, frame: bytes, slot: int, late_ns: int = 0, peers: Sequence[Peer] = ()) -> bytes:
         """The datagram of a frame.
@@ -82,7 +97,7 @@ class Wrapping:
         told += [0] * (2 * PEERS - len(told))
         times = _TIMES.pack(min(max(late_ns, 0) // _UNIT_NS, 0xFFFF), *told)
         sealed = frame if self._authenticator is None else self._authenticator.seal(frame, slot, times)
-        return self._header + times + sealed
+        return self.header + times + sealed
 
     def read(self, data: bytes) -> Said:
         """What a datagram says.
@@ -91,9 +106,9 @@ class Wrapping:
         """
         if data[:3] != _MAGIC[:3]:
             return Said(NOT_OURS)
-        if data[:_AGREED] != self._header:
+        if data[:_AGREED] != self.header:
             return Said(OTHER_SETTINGS if len(data) >= _AGREED else LENGTH)
-        if len(data) != self._length:
+        if len(data) != self.length:
             return Said(LENGTH)
         times, frame = data[_AGREED:HEADER], data[HEADER:]
         named = named_in(frame)

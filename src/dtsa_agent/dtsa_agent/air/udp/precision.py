@@ -1,4 +1,4 @@
-"""How exactly and how soon a waiting thread is woken."""
+"""How exactly and how soon a waiting thread is woken, and what it leaves to others meanwhile."""
 
 from __future__ import annotations
 
@@ -15,6 +15,12 @@ def wake_precisely() -> None:
     """Asks Linux not to delay this thread's timers by its usual 50 us; where that is not possible nothing changes."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, _SLACK_NS, 0, 0, 0)
+
+
+def give_back_memory() -> None:
+    """Gives back to Linux what was needed before a flight only, where the C library can."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager

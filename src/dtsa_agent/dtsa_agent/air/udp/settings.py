@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import socket
 from dataclasses import dataclass
 
@@ -59,12 +58,12 @@ class UdpSettings(Settings):
 def _address(text: object) -> tuple[str, int]:
     host, colon, port = str(text).rpartition(":")
     try:
-        address = ipaddress.IPv4Address(host)
-    except ValueError:
+        first, *_ = socket.inet_pton(socket.AF_INET, host)
+    except (OSError, ValueError):
         raise ConfigError("group", text, _GROUP) from None
-    if not (colon and port.isascii() and port.isdigit() and 0 < int(port) < 65536 and address.is_multicast):
+    if not (colon and port.isascii() and port.isdigit() and 0 < int(port) < 65536 and first >> 4 == 14):
         raise ConfigError("group", text, f"{_GROUP}: 224.0.0.0 to 239.255.255.255, port 1 to 65535")
-    return str(address), int(port)
+    return host, int(port)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ import struct
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dtsa_agent.core.errors import ConfigError
 
@@ -86,8 +86,8 @@ class MulticastSocket:
     """
 
     def __init__(self, settings: UdpSettings) -> None:
-        self._address = settings.address
-        group, port = self._address
+        self._group = settings.address
+        group, port = self._group
         local = interface_address(settings.interface)
         membership = struct.pack("=4s4si", socket.inet_aton(group), b"\0\0\0\0", settings.interface_index())
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -101,7 +101,7 @@ class MulticastSocket:
             self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, settings.ttl)
             self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
             self._in.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._in.bind(self._address)
+            self._in.bind(self._group)
             self._in.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
             self._in.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
             with suppress(OSError):  # arrivals are then as exact as this process is quick
@@ -112,7 +112,7 @@ class MulticastSocket:
             self.close()
             where = f"{settings.interface}, group {group}:{port}"
             raise ConfigError("interface", where, f"one that takes part in the group ({error.strerror})") from None
-        self._self = self._out.getsockname()
+        self.address: tuple[str, int] = self._out.getsockname()  # from which it sends
         self._read = self._in.recvmsg
 
     def fileno(self) -> int:
@@ -125,7 +125,7 @@ class MulticastSocket:
         :param data: the datagram.
         """
         try:
-            self._out.sendto(data, self._address)
+            self._out.sendto(data, self._group)
         except OSError:  # the interface is down for a while, or its queue is full: as good as lost on the air
             self.unsendable += 1
             return False
@@ -136,7 +136,7 @@ class MulticastSocket:
 
         :param most: datagrams at a time.
         """
-        arrived = []
+        arrived: list[tuple[bytes, list[tuple[int, int, bytes]], int, Any]] = []  # as the system gives them
         try:
             while len(arrived) < most:
                 arrived.append(self._read(_LONGEST, _ROOM))
@@ -147,7 +147,7 @@ class MulticastSocket:
         if not arrived:
             return []
         self._stamps.look()  # afterwards: however long this process was kept waiting, all have arrived before
-        when, own = self._stamps.arrival_ns, self._self
+        when, own = self._stamps.arrival_ns, self.address
         return [Datagram(data, when(_stamp(notes)), source == own) for data, notes, _, source in arrived]
 
     @property

@@ -65,7 +65,7 @@ class Tally:
             "heard": self.heard,
             "processor_s": used,
             "processor_us_per_slot": (used - self._joined_s) / self.slots * 1e6 if self.slots else None,
-            "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "memory_mb": _memory_mb(),
         }
 
 
@@ -73,3 +73,12 @@ def _processor_s() -> float:
     """Processor time of this process so far, s."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
+
+
+def _memory_mb() -> float:
+    """The most memory that this process has had since its program began, MB."""
+    try:
+        with open("/proc/self/status", encoding="ascii") as lines:
+            return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Protocol
 
 LENGTH = 4  # bytes of a tag
@@ -28,6 +27,8 @@ def keyed(key: bytes, session: int) -> Keyed:
     :param key: 16 to 32 secret bytes.
     :param session: number of the flight, 8 bytes, little-endian.
     """
+    import hashlib  # brings OpenSSL along: 0.6 MB that an agent in flight does without
+
     return hashlib.blake2s(session.to_bytes(8, "little"), key=key, digest_size=LENGTH, person=_PERSON)
 
 

@@ -14,6 +14,8 @@ class Recording {
     if (scene) {
       this.scale = scene.scale; this.box = null; // the places tell
       this.times = new Float32Array(bytes(scene.time)); this.places = new Int16Array(bytes(scene.position));
+      // Nobody knows where it was: what is not a number is not drawn.
+      if (this.places.includes(-32768)) this.places = Float32Array.from(this.places, place => place === -32768 ? NaN : place);
       this.frames = this.times.length;
     }
     this.first = slots.first; this.count = slots.count;

@@ -125,6 +125,7 @@ section("Slots", "Who sent in which slot, and why. The strip on top says what be
 section("Channel use", "What became of the slots, as shares of a short while, and how much of what was sent was lost to noise.", {
   has: run => run.channel,
   draw: run => el("div", {}, shareBars([["success", "success"], ["collision", "collision"], ["idle", "idle"]].map(([name, color]) => ({name, value: run.summary.slots[name], color: () => theme.color(color)}))
+    .concat(run.summary.slots.unknown ? [{name: "not known", value: run.summary.slots.unknown, color: () => theme.color("line")}] : [])
     .concat(run.summary.lost_fraction > 0 ? [{name: "lost to noise", share: run.summary.lost_fraction, color: () => theme.color("lost")}] : [])), shareChart({
     time: run.channel.time, unit: "share of slots (%)", label: "Channel use over time",
     layers: [{name: "success", values: run.channel.share.success, color: () => theme.color("success")}, {name: "collision", values: run.channel.share.collision, color: () => theme.color("collision")},

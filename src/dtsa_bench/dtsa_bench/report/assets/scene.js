@@ -137,12 +137,21 @@ class Scene {
       return this.project(places[base] * scale, places[base + n] * scale, places[base + 2 * n] * scale);
     };
     c.lineJoin = "round"; c.lineCap = "butt";
+    const trace = (agent, from, to, stride) => { // broken where nobody knows where it was
+      let drawn = false;
+      for (let frame = from; frame <= to; frame += stride) {
+        const p = point(frame, agent);
+        if (Number.isNaN(p[0])) { drawn = false; continue; }
+        drawn ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1]);
+        drawn = true;
+      }
+    };
     for (let agent = 0; agent < n; agent++) {
       if (!this.moves(agent)) continue;
       if (this.shared.paths) {
         const stride = Math.max(1, Math.floor(frames / 220));
         c.beginPath();
-        for (let frame = 0; frame < frames; frame += stride) { const p = point(frame, agent); frame ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1]); }
+        trace(agent, 0, frames - 1, stride);
         c.setLineDash(this.dash(agent)); c.strokeStyle = this.color(agent); c.globalAlpha = n > 30 ? 0.2 : 0.38; c.lineWidth = 1; c.stroke(); c.setLineDash([]);
       }
       let first = row;
@@ -151,7 +160,7 @@ class Scene {
       for (let k = 0; k < parts && length > 0; k++) {
         const from = first + Math.floor(length * k / parts), to = first + Math.floor(length * (k + 1) / parts);
         c.beginPath();
-        for (let frame = from; frame <= to; frame++) { const p = point(frame, agent); frame > from ? c.lineTo(p[0], p[1]) : c.moveTo(p[0], p[1]); }
+        trace(agent, from, to, 1);
         if (k === parts - 1) { const p = this.project(...head); c.lineTo(p[0], p[1]); }
         c.setLineDash(this.dash(agent)); c.strokeStyle = this.color(agent); c.globalAlpha = 0.25 + 0.75 * (k + 1) / parts; c.lineWidth = n > 30 ? 1.5 : 2.2; c.stroke(); c.setLineDash([]);
       }
@@ -189,6 +198,7 @@ class Scene {
       c.beginPath(); c.moveTo(p[0] - size, p[1] - size); c.lineTo(p[0] + size, p[1] + size); c.moveTo(p[0] + size, p[1] - size); c.lineTo(p[0] - size, p[1] + size); c.stroke();
     }
     for (let agent = 0; agent < n; agent++) {
+      if (Number.isNaN(now[agent])) continue;
       const p = this.project(now[agent], now[agent + n], now[agent + 2 * n]), foot = this.project(now[agent], now[agent + n], this.floor);
       c.strokeStyle = theme.color("faint"); c.globalAlpha = 0.28; c.lineWidth = 1;
       c.beginPath(); c.moveTo(p[0], p[1]); c.lineTo(foot[0], foot[1]); c.stroke();

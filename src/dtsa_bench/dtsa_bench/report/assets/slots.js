@@ -50,7 +50,7 @@ class SlotLine {
       rows.push(`agent ${this.record.sender[i]}: ${this.record.outcome[i] === 2 ? "collision, " : ""}received by ${percent(this.record.received[i] / 255, 0)}`);
       if (why) rows.push(`  ${why}${reasonText(why) ? ": " + reasonText(why) : ""}`);
     }
-    if (rows.length === 1) rows.push("nobody sent");
+    if (rows.length === 1) rows.push(this.run.slots?.unknown?.includes(slot) ? "not known whether somebody sent" : "nobody sent");
     return rows.join("\n");
   }
 
@@ -95,6 +95,7 @@ class SlotLine {
     if (row >= 4.5) for (let agent = 0; agent < agents; agent += 2) c.fillRect(LEFT, top + agent * row, inner, row);
     else c.fillRect(LEFT, top, inner, agents * row);
     c.fillStyle = theme.color("idle"); c.fillRect(LEFT, 19, inner, 4);
+    for (const slot of this.run.slots?.unknown ?? []) if (slot >= first && slot < first + count) c.clearRect(LEFT + (slot - first) * wide, 18, Math.max(1, wide), 6);
     const slim = Math.max(1, wide - (wide > 4 ? 1 : 0)), tall = Math.max(1.6, row - (row > 5 ? 1.2 : 0));
     for (let pass = 0; pass < 2; pass++) { // collisions last: a single one must not vanish under its neighbours
       for (let i = this.find(first); i < this.record.sent && this.record.slot[i] < first + count; i++) {

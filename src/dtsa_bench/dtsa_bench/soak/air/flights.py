@@ -12,11 +12,14 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_bench.air.intruder import Intruder
 from dtsa_bench.air.merge import verified
 from dtsa_bench.air.switch import Links
-from dtsa_bench.air.trial import Flight, NotFlown, Trial, fly
+from dtsa_bench.air.trial import WHOLE, Flight, NotFlown, Trial, fly
+from dtsa_bench.bag.run import load_run
 from dtsa_bench.run_config import RunConfig, RunLimits, from_swarm
 from dtsa_bench.simulate import simulate
 from dtsa_bench.soak.checks import met
 from dtsa_bench.soak.item import Item, NotMet
+from dtsa_bench.tables.ages import follow_run
+from dtsa_bench.verify import verify_bag
 from dtsa_channel_sim import ChannelConfig
 
 AGENTS = 12
@@ -106,6 +109,7 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     flown, air = found["flight"], found["switch"]
     if flown is None:
         raise NotMet("they never counted alike")
+    _check_bag(directory / WHOLE, flown)
     met(len(air["heard_at_the_end"]) == AGENTS, f"at the end speak only {air['heard_at_the_end']}")
     again = _simulated(swarm, loss, flown["flight_time_s"], fault)
     figures = {
@@ -129,6 +133,13 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     else:
         _check_cold_start(figures, 0.0 if strict else OVERLAP)
     return figures
+
+
+def _check_bag(bag: Path, flown: dict[str, Any]) -> None:
+    """The merged bag verifies, and who reads it finds the same results."""
+    checked = verify_bag(bag)
+    met(checked.ok, f"the merged bag does not verify: {checked.difference}")
+    met(follow_run(load_run(bag)).summary == flown, "the merged bag has other results than `merge`")
 
 
 def _check_cold_start(figures: dict[str, Any], overlap: float) -> None:

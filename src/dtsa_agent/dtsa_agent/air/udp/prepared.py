@@ -1,0 +1,29 @@
+"""What agents find out before a flight with the help of what they do not need in flight: random numbers, hashes."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from dtsa_agent.core.config import SwarmConfig
+from dtsa_agent.core.scenario import Scenario, make_scenario, policy_key
+
+from .datagram import header_of
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """What follows from the settings that all agents share."""
+
+    scenario: Scenario
+    header: bytes  # with which all datagrams begin
+
+
+def prepare(config: SwarmConfig) -> Prepared:
+    """What follows from the settings that all agents share.
+
+    :param config: these settings.
+    :raises ConfigError: for a scenario that cannot be.
+    """
+    scenario = dataclasses.replace(make_scenario(config), policy_key=policy_key(config.seed))
+    return Prepared(scenario, header_of(config))
