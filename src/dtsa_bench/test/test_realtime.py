@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -17,6 +18,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_agent.core import AgentGroup, SwarmConfig
 from dtsa_agent.core.plugins import make_swarm
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.stamps import ns_of
 from dtsa_bench.bag.reader import Bag
 from dtsa_bench.soak.flights import children, process_with
 from dtsa_bench.verify import verify_bag
@@ -79,6 +81,41 @@ def test_beacons_begin_when_their_own_timers_say_and_overlap_by_time_on_the_air(
             late.append(begin - int(said.slot) * 10_000_000 - due[int(said.slot), int(said.agent)])
     assert len(late) > 30
     assert 0 == min(late) <= max(late) <= 5_000_000  # who is later than half a slot is silent
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_radios_that_listen_begin_in_free_air_and_tell_their_agents(tmp_path: Path) -> None:
+    words = ("--agents", "4", "--policy", "csma", "--processes", "2", "--mode", "realtime", "--seed", "5")
+    more = ("--options", "csma.window_ms=10", "--bitrate", "40000", "--timeout-s", "1.5", "--no-picture")
+    summary = fly(tmp_path / "out", *words, *more)
+    result = verify_bag(tmp_path / "out")
+    assert result.ok, result.difference
+    frames = result.checked["frames that began in free air"]
+    assert frames == result.safety["frames"] > 60  # two of five of them on the air, which beacons lose
+    assert result.safety["frames_collided"] < 0.2 * frames
+    assert 0 <= result.safety["frames_not_begun"] - summary["frames_given_up"] <= 4  # what radios held at the end
+    with Bag(tmp_path / "out" / "bag") as bag:
+        begun = {
+            (int(m.slot), int(m.agent)): m.header.stamp for _, m in bag.typed([f"{names.SWARM}/{names.AIR_FRAME}"])
+        }
+        handed = handed_over(bag)
+    assert sum(ns_of(begun[key]) > at_ns for key, at_ns in handed if key in begun) > 10
+    # A policy hears when its frame began: the next one is half a period later at least.
+    times = sorted((agent, ns_of(stamp) / 1e6) for (_, agent), stamp in begun.items())
+    gaps = [after - before for (one, before), (other, after) in itertools.pairwise(times) if one == other]
+    assert min(gaps) >= 20.0
+
+
+def handed_over(bag: Bag) -> list[tuple[tuple[int, int], int]]:
+    """Slot and agent of each frame that was handed to a radio, and when, ns."""
+    return [
+        ((int(slot), int(agent)), names.slot_time_ns(int(slot), 10_000_000) + int(message.offset_ns[entry]))
+        for _, message in bag.typed([f"{names.SWARM}/{names.REPORT}"])
+        for row, slot in enumerate(message.slot)
+        for entry, agent in enumerate(message.agent, row * len(message.agent))
+        if message.length[entry]
+    ]
 
 
 def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path: Path) -> None:

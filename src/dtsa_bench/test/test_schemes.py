@@ -12,7 +12,7 @@ import pytest
 import dtsa
 from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugins import make_swarm
+from dtsa_agent.core.plugins import make_swarm, plug_ins_of
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.unslotted import check_slotted
 from dtsa_agent.crazyflie.config import StationSettings, SwarmSettings
@@ -21,12 +21,14 @@ from dtsa_bench.fly.crazyflie import fly_crazyflies
 from dtsa_bench.fly.flight import FlightOptions, check_options
 from dtsa_bench.protocol_bench.experiment import Experiment
 from dtsa_bench.run_config import RunConfig
+from dtsa_bench.schemes.knowledge import whittle_index
 from dtsa_bench.schemes.optimum import optimum
 from dtsa_bench.simulate import simulate
 from dtsa_bench.sweep.spec import run_config
 from dtsa_bench.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.airtime import Airtime
+from dtsa_channel_sim.model.verdict import COLLISION
 
 LEAGUE = Path(__file__).resolve().parents[3] / "docs" / "league.md"
 
@@ -67,6 +69,31 @@ def test_greedy_is_almost_optimal_for_three_agents() -> None:
     assert perfect.best == perfect.greedy == perfect.tdma == pytest.approx(1.0)
     lossy = optimum(0.2, cap=6, tolerance=1e-4)
     assert lossy.best <= lossy.greedy < 1.005 * lossy.best < 0.95 * lossy.tdma
+    assert lossy.greedy < lossy.whittle < 1.01 * lossy.best
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.5])
+def test_whittles_index_is_the_price_at_which_waiting_costs_as_much(loss: float) -> None:
+    """One link that sends from an age on, at a price a frame: that age and the next one are then equally good."""
+    arrives = 1.0 - loss
+
+    def cost(first: int, price: float) -> float:
+        lengths = first - 1 + np.arange(1, 400)  # of the time between two frames that arrive; ages run from 1 to it
+        share = arrives * loss ** np.arange(399)
+        return float((share @ (lengths * (lengths + 1) / 2) + price / arrives) / (share @ lengths))
+
+    for age in (1, 2, 5, 12):
+        price = float(whittle_index(np.array(float(age)), loss))
+        assert cost(age, price) == pytest.approx(cost(age + 1, price), rel=1e-12)
+        assert min(cost(other, price) for other in range(1, 20)) == pytest.approx(cost(age, price), rel=1e-12)
+
+
+def test_whittles_index_is_close_to_the_genie_and_needs_a_probability() -> None:
+    genie = steady("genie-age", 12, 6, 0.3).outcome.age
+    assert genie < steady("whittle", 12, 6, 0.3, options={"whittle.loss": 0.3}).outcome.age < 1.05 * genie
+    assert steady("whittle", 12, 6).outcome.age == pytest.approx(2.5)
+    with pytest.raises(ConfigError, match=r"whittle\.loss: got 1\.0; allowed: 0 to below 1"):
+        make_swarm(SwarmConfig(agents=4, policy="whittle", options={"whittle.loss": 1.0}))
 
 
 def test_the_tdma_of_the_dynamic_program_is_that_of_the_simulation() -> None:
@@ -125,6 +152,19 @@ def test_carrier_sense_helps_where_frames_are_longer_than_the_turn_round_of_radi
     assert gain("paper") < 1.05
 
 
+def test_the_radio_of_an_agent_that_is_switched_off_sends_nothing() -> None:
+    options = {"csma.period_ms": 15.0, "csma.window_ms": 60.0}
+    air, _, _ = traffic("csma", 0, frame="extended", options=options)
+    assert air._radios is not None
+    slots = iter(range(2000))
+    while not air._radios.holds(4):
+        air.slot(next(slots))
+    air._swarm.present[3] = 0
+    assert not any(4 in air.slot(next(slots)).senders for _ in range(100))
+    air._swarm.present[3] = 1
+    assert any(4 in air.slot(next(slots)).senders for _ in range(100))
+
+
 def test_beacons_come_at_their_rate_and_two_with_one_phase_collide_for_good() -> None:
     _, carried, _ = traffic("beacons", 1000, options={"beacons.period_ms": 20.0})
     sent = sum(len(slot.lengths) for slot in carried)
@@ -133,11 +173,40 @@ def test_beacons_come_at_their_rate_and_two_with_one_phase_collide_for_good() ->
     assert sum(heard[:500]) == pytest.approx(sum(heard[500:]), abs=20)  # the same ones, period after period
 
 
+def test_the_token_ring_takes_as_long_as_its_packets_and_stops_with_one_agent() -> None:
+    """A turn: 19 frames and acknowledgements, TOKEN, RTS, CTS; each is turned to, sent, and carried to and from it."""
+    air, carried, config = traffic("dtr", 1000)
+    airtime, links_ns = Airtime(), 300_000 + ChannelConfig(agents=20).link_delay_ns
+    frame_ns, short_ns = (airtime.total_ns(5 + length) + links_ns for length in (config.frame_length, 0))
+    turn_ns = 19 * (frame_ns + short_ns) + 3 * short_ns
+    heard = [(frame[1], mask) for slot in carried for frame, mask in slot.heard]
+    assert len(heard) == pytest.approx(19 * 1000 * config.slot_ns / turn_ns, abs=19)
+    assert all(mask.sum() == 1 for _, mask in heard)
+    everybody_else = [mask.argmax() for _, mask in heard[:19]]
+    assert sorted(everybody_else) == list(range(1, 20))
+    assert not any(slot.outcome == COLLISION for slot in carried)
+    air._swarm.present[7] = 0
+    after = [air.slot(slot) for slot in range(1000, 1400)]
+    assert {int(mask.argmax()) for slot in after[200:] for _, mask in slot.heard} == {7}  # sent to it again and again
+    assert sum(len(slot.lengths) for slot in after[200:]) == pytest.approx(20, abs=1)  # one agent, every 20 ms
+
+
+def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
+    config = SwarmConfig(agents=4, policy="dtr", seed=5, slot_ms=2)
+    air = UnslottedTraffic(make_swarm(config), Channel(ChannelConfig(agents=4, slot_ns=2_000_000, seed=5, loss=0.3)))
+    late = [{int(frame[1]) for frame, _ in air.slot(slot).heard} for slot in range(4000)][3000:]
+    assert set().union(*late) == {1, 2, 3, 4}
+    with pytest.raises(ConfigError, match="agents: got 21; allowed: 2 to 20 with policy dtr"):
+        make_swarm(SwarmConfig(agents=21, policy="dtr"))
+
+
 def test_agents_that_open_their_own_slots_send_when_those_of_the_simulator_do(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[tuple[int, int]] = []
     plain = UnslottedTraffic.send
     monkeypatch.setattr(
-        UnslottedTraffic, "send", lambda self, k, now_ns: plain(self, k, now_ns) and not begun.append((now_ns, k))
+        UnslottedTraffic,
+        "send",
+        lambda self, k, now_ns, *more: plain(self, k, now_ns, *more) and not begun.append((now_ns, k)),
     )
     for policy, options in (("beacons", {"beacons.jitter_ms": 3.0}), ("pure-aloha", {})):
         begun.clear()
@@ -158,6 +227,53 @@ def test_agents_that_open_their_own_slots_send_when_those_of_the_simulator_do(mo
         assert len(sent) > 80
 
 
+def test_an_agent_whose_radio_listens_waits_for_what_became_of_its_frame() -> None:
+    told: list[tuple[int, bool]] = []
+
+    class Eager:
+        port = ("send", "sent", "busy")
+
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            pass
+
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            radio.send()
+            return 0  # does not count
+
+        def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> int:
+            return int(busy)
+
+        def sent(self, table: object, now_ns: int, begun: bool) -> int:
+            told.append((now_ns, begun))
+            return now_ns + 3_000_000
+
+    dtsa.register("policy", "eager", Eager)
+    agents = AgentGroup(make_swarm(SwarmConfig(agents=2, policy="eager")))
+    parts = plug_ins_of(agents.swarm)
+    assert parts is not None
+
+    def senders(*slots: int) -> list[tuple[int, ...]]:
+        result = []
+        for slot in slots:
+            result.append(agents.on_slot(slot))
+            agents.on_slot_end()
+        return result
+
+    assert senders(0, 1) == [(0, 1), ()]
+    parts.radio_told(0, 0, 12_000_000)  # began in slot 1: its policy acts 3 ms later, in the next slot that opens
+    parts.radio_told(1, 7, 5)  # of no frame that anybody waits for
+    assert senders(2) == [(0,)]
+    assert told == [(12_000_000, True)]
+    assert agents.swarm.send_offset_ns[0] == 0
+    parts.radio_told(0, 2, None)
+    assert senders(3, 4, 5, 6) == [(0,), (), (), ()]
+    assert told[1:] == [(30_000_000, False)]
+    assert agents.swarm.send_offset_ns[0] == 0
+    # A radio that says nothing has not sent: 50 ms beyond two slots.
+    assert senders(7) == [(1,)]
+    assert told[2:] == [(70_000_000, False)]
+
+
 def test_what_policies_without_slots_do_wrong_in_nodes_is_named() -> None:
     class Rogue:
         port = ("send",)
@@ -168,9 +284,14 @@ def test_what_policies_without_slots_do_wrong_in_nodes_is_named() -> None:
         def wake(self, table: object, now_ns: int, radio: Any) -> int:
             return now_ns + 1 if not (self.listens and radio.busy()) else 0
 
+    class Deaf(Rogue):
+        port = ("send", "busy")
+
     dtsa.register("policy", "rogue", Rogue)
+    with pytest.raises(ConfigError, match=r"deaf\.port.*'busy' with the methods sensed and sent"):
+        dtsa.register("policy", "deaf", Deaf)
     for options, said in (
-        ({"rogue.listens": 1.0}, "without 'busy' in its port"),
+        ({"rogue.listens": 1.0}, "rogue, wake: .*has no attribute 'busy'"),
         ({}, "more than 10000 times in a slot"),
     ):
         with pytest.raises(PluginError, match=said):
@@ -222,14 +343,16 @@ def test_nodes_refuse_what_nodes_cannot_do() -> None:
     for policy, options, mode in (
         ("beacons", FlightOptions(processes=1), "lockstep"),
         ("beacons", FlightOptions(respawn=1.0), "realtime"),
-        ("csma", FlightOptions(), "realtime"),
+        ("csma", FlightOptions(), "lockstep"),
+        ("dtr", FlightOptions(), "realtime"),
         ("genie-age", FlightOptions(processes=2), "lockstep"),
         ("genie-age", FlightOptions(processes=1), "realtime"),
     ):
         with pytest.raises(ConfigError, match="policy"):
             check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode=mode), options)
     check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="genie-age")), FlightOptions(processes=1))
-    check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime"), FlightOptions())
+    for policy in ("beacons", "csma"):
+        check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode="realtime"), FlightOptions())
     with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: a slotted one here"):
         check_slotted("pure-aloha")
     mission = RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime")
@@ -255,6 +378,24 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
         def wake(self, table: object, now_ns: int, radio: object) -> int:
             return now_ns
 
+    class Chatty:
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            self.to = int(config.options.get("chatty.to", 0.0))
+
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            radio.send(bytes(250), self.to)
+            return now_ns + 1
+
+        def received(self, table: object, now_ns: int, sender: int, note: bytes) -> int:
+            return 0
+
+    dtsa.register("policy", "chatty", Chatty)
+    for to, said in (
+        (0.0, "sent 269 bytes; allowed: 1 to 255"),
+        (5.0, r"sent .*, 5\); allowed: bytes, to 0 \(all\) to 4"),
+    ):
+        with pytest.raises(PluginError, match=f"policy chatty, wake: {said}"):
+            simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="chatty", options={"chatty.to": to})))
     dtsa.register("policy", "wrong-genie", Wrong)
     dtsa.register("policy", "stuck", Stuck)
     with pytest.raises(PluginError, match="policy wrong-genie, senders: chose agent 5 in slot 0; allowed: 1 to 4"):

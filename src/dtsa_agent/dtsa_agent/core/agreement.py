@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -25,5 +24,7 @@ def settings_hash(settings: Mapping[str, Any]) -> int:
 
     :param settings: plain values.
     """
+    import hashlib  # brings OpenSSL along: 0.6 MB that an agent in flight does without
+
     text = json.dumps(settings, sort_keys=True, separators=(",", ":"))
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")

@@ -105,7 +105,7 @@ class SwarmConfig(Settings):
         maximum=1000,
     )
     adoption: bool = setting(True, "lease: the turns of the dead are given away by the next agent alive")
-    depth_rate: float = setting(0.1, "lease: turns given away ahead, per round of idleness, c", minimum=0, maximum=15)
+    depth_rate: float = setting(0.2, "lease: turns given away ahead, per round of idleness, c", minimum=0, maximum=15)
     lease_share: float = setting(
         1.0, "lease: no leases when more than this share of the agents has something to say", minimum=0, maximum=1
     )

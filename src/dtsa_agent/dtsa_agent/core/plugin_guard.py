@@ -13,7 +13,19 @@ from numpy.typing import NDArray
 
 from .errors import DtsaError, PluginError
 
-_METHODS = ("choose", "senders", "wake", "say", "heard", "slot_over", "estimate", "command")
+_METHODS = (
+    "choose",
+    "senders",
+    "wake",
+    "sensed",
+    "sent",
+    "received",
+    "say",
+    "heard",
+    "slot_over",
+    "estimate",
+    "command",
+)
 
 
 class Overdue(BaseException):
@@ -50,6 +62,9 @@ class Guarded:
     choose: Callable[..., Any]
     senders: Callable[..., Any]
     wake: Callable[..., Any]
+    sensed: Callable[..., Any]
+    sent: Callable[..., Any]
+    received: Callable[..., Any]
     say: Callable[..., Any]
     heard: Callable[..., Any]
     slot_over: Callable[..., Any]

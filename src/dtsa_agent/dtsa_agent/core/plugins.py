@@ -7,13 +7,13 @@ A package announces them in its metadata::
 
 and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. What is announced is
 a factory; it is called once for every observer, as ``factory(config, agent)`` (agent: its id, 0 for tables
-that hear everything).
+that hear everything). What it makes is one of :mod:`.plugin_kinds`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,6 @@ from .registry import ESTIMATORS, POLICIES, REASONS, Registry
 from .scenario import Scenario
 from .swarm import Swarm
 from .unslotted import SILENT, Wakes
-
-Array = NDArray[np.float64]
 
 _PLUGIN_REASON = REASONS.index("plugin")
 
@@ -74,98 +72,6 @@ class Table:
         self.own_position = _window(swarm.position[:, row]) if here else None  # (3,) own true state
         self.own_velocity = _window(swarm.velocity[:, row]) if here else None
         self.goal = _window(swarm.goal[:, row]) if here else None
-
-
-class Speaks(Protocol):
-    """What policies and estimators may have besides: bytes of their own in frames, and the outcome of each slot.
-
-    All of it may be left out. ``own_bytes``, a class attribute, is the number of bytes, 0 to ``MAX_OWN_BYTES``.
-    """
-
-    own_bytes: ClassVar[int] = 0
-
-    def say(self, table: Table, slot: int) -> bytes:
-        """The bytes for the frame that this agent sends in a slot: exactly ``own_bytes`` of them."""
-
-    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
-        """Takes in what the same part of another agent has said.
-
-        :param table: what this observer knows, with the frame's state in it.
-        :param slot: the slot in which the frame is heard.
-        :param sender: id of who sent it.
-        :param data: its bytes: not to be trusted more than its sender.
-        """
-
-    def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
-        """A slot is over for this observer.
-
-        :param outcome: what it could tell; collisions are silence to receivers that cannot tell.
-        """
-
-
-class Policy(Protocol):
-    """Who sends next. It may have what :class:`Speaks` has.
-
-    ``port``, a class attribute, says what it uses of the air (``dtsa_agent.core.registry.PORT``); ``may_join = True``:
-    agents may come late, because nobody needs a table that all have equal.
-    """
-
-    def choose(self, table: Table, slot: int) -> int:
-        """The id that this observer takes for the sender of a slot, 0: nobody. It sends if that is its own."""
-
-
-class Genie(Protocol):
-    """Who sends next, said by one who looks into all agents: a bound to compare with. Made once, for agent 0."""
-
-    def senders(self, swarm: AbstractSwarm, slot: int) -> Sequence[int]:
-        """The ids that send in a slot.
-
-        :param swarm: all agents: true states and everybody's table, to be read only.
-        """
-
-
-class Radio(Protocol):
-    """The radio of an agent that is not bound to slots."""
-
-    def busy(self) -> bool:
-        """Whether it finds the air in use now, or sends itself."""
-
-    def send(self) -> bool:
-        """Begins to send the agent's frame, with its state at the start of the slot; False: it still sends another."""
-
-
-class Unslotted(Protocol):
-    """A policy that is not bound to slots. Slots only say how often vehicles are steered and ages are counted."""
-
-    def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
-        """Acts at an instant; first called at 0.
-
-        :param table: what this agent knew when the slot began.
-        :param now_ns: ns since the start of slot 0.
-        :param radio: its radio.
-        :returns: when to be called again, ns, later than now.
-        """
-
-
-class Estimator(Protocol):
-    """Where the others are by now. It may have what :class:`Speaks` has.
-
-    ``needs_intent = True`` makes frames carry the commanded velocity.
-    """
-
-    needs_intent: ClassVar[bool] = False
-
-    def estimate(self, table: Table, slot: int, step: int, position: Array, velocity: Array) -> None:
-        """Writes the estimates for control instant ``step`` of a slot into (3, N) arrays, m and m/s."""
-
-
-class Avoider(Protocol):
-    """Where to fly. ``model`` names the built-in flight model whose vehicle and spacing are used."""
-
-    model: ClassVar[str] = "orca"
-
-    def command(self, table: Table, slot: int, step: int) -> Sequence[float]:
-        """Commanded velocity, (3,), m/s, frame map; the estimates in ``table`` are those of this instant."""
 
 
 _REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
@@ -222,8 +128,8 @@ class PluginSwarm(SwarmWrapper):
         everybody = self.config.policy_row.needs_everybody and bool(self.ids)
         self._genie = self._guarded(POLICIES, 0) if everybody else None
         self._policies, self._estimators, self._avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
-        unslotted = self.config.policy_row.unslotted
-        self._wakes = Wakes(self._policies, self._tables, self.config.slot_ns) if unslotted else None
+        row = self.config.policy_row
+        self._wakes = Wakes(self._policies, self._tables, self.config.slot_ns, row.listens) if row.unslotted else None
         self._list_speakers()
 
     def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
@@ -285,6 +191,16 @@ class PluginSwarm(SwarmWrapper):
             self.send_offset_ns[index] = max(0, offset)
             self.chosen[index] = self.ids[index] if self.sends[index] else 0
         self._note_decision()
+
+    def radio_told(self, local_index: int, slot: int, delay_ns: int | None) -> None:
+        """An agent's radio, which listens before it sends, has said what became of a frame.
+
+        :param local_index: position in ``ids``.
+        :param slot: the slot in which the frame was handed over.
+        :param delay_ns: ns, how much later than handed over it began; None: it did not.
+        """
+        if self._wakes is not None:
+            self._wakes.told(local_index, slot, delay_ns)
 
     def _note_decision(self) -> None:
         self.reason[:] = _PLUGIN_REASON
@@ -381,6 +297,16 @@ class PluginSwarm(SwarmWrapper):
         for step in range(self.config.steps):
             self.steer(slot, step)
             self.inner.move(step)
+
+
+def plug_ins_of(swarm: AbstractSwarm) -> PluginSwarm | None:
+    """The part of a swarm that calls plug-ins; None: all of it is built in.
+
+    :param swarm: the swarm, however often wrapped.
+    """
+    while isinstance(swarm, SwarmWrapper) and not isinstance(swarm, PluginSwarm):
+        swarm = swarm.inner
+    return swarm if isinstance(swarm, PluginSwarm) else None
 
 
 def _window(array: NDArray[Any]) -> NDArray[Any]:

@@ -50,6 +50,7 @@ class PolicyRow:
     :param own_bytes: bytes of its own that a plug-in appends to frames.
     :param needs_everybody: it looks into all agents: they must be in one process. For comparison only.
     :param unslotted: it sends at any instant; slots only say how often vehicles are steered and ages are counted.
+    :param reacts: unslotted, and it acts on each packet as it arrives. For comparison only.
     """
 
     name: str
@@ -68,6 +69,12 @@ class PolicyRow:
     own_bytes: int = 0
     needs_everybody: bool = False
     unslotted: bool = False
+    reacts: bool = False
+
+    @property
+    def listens(self) -> bool:
+        """Whether an agent's radio listens before it sends, and so decides itself when it begins."""
+        return self.unslotted and "busy" in self.port
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +198,12 @@ def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
     needs_everybody = callable(getattr(factory, "senders", None))
     if needs_everybody and _own_bytes(name, factory):
         raise ConfigError(f"{name}.own_bytes", factory.own_bytes, "0 for a policy that looks into all agents")
+    unslotted = callable(getattr(factory, "wake", None))
+    if unslotted and "busy" in port and not all(callable(getattr(factory, part, None)) for part in ("sensed", "sent")):
+        raise ConfigError(f"{name}.port", port, "'busy' with the methods sensed and sent beside wake")
+    reacts = unslotted and callable(getattr(factory, "received", None))
+    if reacts and "busy" in port:
+        raise ConfigError(f"{name}.port", port, "no 'busy' where a method received answers packets")
     return PolicyRow(
         name,
         name,
@@ -200,7 +213,8 @@ def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
         port=port,
         own_bytes=_own_bytes(name, factory),
         needs_everybody=needs_everybody,
-        unslotted=callable(getattr(factory, "wake", None)),
+        unslotted=unslotted,
+        reacts=reacts,
     )
 
 

@@ -17,7 +17,7 @@ from .flight_models import flight_model
 Array = NDArray[np.float64]
 
 # Streams of random numbers, one a purpose: adding a purpose changes none of the others.
-STREAM_SCENARIO, STREAM_POLICY, STREAM_CHANNEL, STREAM_CLOCKS = 1, 2, 3, 4
+STREAM_SCENARIO, STREAM_POLICY, STREAM_CHANNEL, STREAM_CLOCKS, STREAM_RADIOS = 1, 2, 3, 4, 5
 
 
 def generator(seed: int, stream: int, *more: int) -> np.random.Generator:
@@ -28,6 +28,14 @@ def generator(seed: int, stream: int, *more: int) -> np.random.Generator:
     :param more: further indices, e.g. an agent's id.
     """
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, *more])))
+
+
+def policy_key(seed: int) -> int:
+    """By which policies draw lots, 63 bits.
+
+    :param seed: the run's seed.
+    """
+    return int(generator(seed, STREAM_POLICY).integers(0, 2**63))
 
 
 class Pilots(Protocol):
@@ -59,6 +67,7 @@ class Scenario:
     moving: NDArray[np.bool_]
     plan: Plan | None = None
     goals_known: bool = True  # all know where everybody wants to be in each slot
+    policy_key: int | None = None  # by which policies draw lots; None: it is made when it is needed
 
     def course(self, local: NDArray[np.int32]) -> Course | None:
         """The state of a flight along the plan; None without a plan.

@@ -17,7 +17,7 @@ from .flight_models import flight_model
 from .frame import PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, position_step
 from .reference.estimators import decay_table
 from .registry import ESTIMATORS, POLICIES, REASONS, SELECTIONS
-from .scenario import STREAM_POLICY, Scenario, generator
+from .scenario import Scenario, policy_key
 
 LEASE_STATUS = ("probation", "deaf", "woke", "alive", "absent", "silent_slots")
 
@@ -74,7 +74,8 @@ class Swarm(AbstractSwarm):
 
     def _parameters(self, count: int) -> dict[str, Any]:
         config, model = self.config, flight_model(self.config.avoider, self.config.options)
-        key = int(generator(config.seed, STREAM_POLICY).integers(0, 2**63))
+        given = self.scenario.policy_key
+        key = policy_key(config.seed) if given is None else given
         profile = PROFILE_PAPER_INTENT if config.estimator_row.needs_intent else PROFILE_PAPER
         self._decay = np.array(decay_table(model.vehicle.tau, config.slot_s / config.steps))
         return {

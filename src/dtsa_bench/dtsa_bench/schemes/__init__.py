@@ -5,13 +5,14 @@ Each is announced by entry point in the group ``dtsa.policies``, so ``--policy g
 """
 
 from .contention import Dominance, ThresholdAloha
+from .dtr import Dtr
 from .event_tdma import EventTdma
-from .genie import GenieAge, GenieError
+from .genie import GenieAge, GenieError, Whittle
 from .sense import Sense
 from .sotdma import Sotdma
 from .unslotted import Beacons, Csma, PureAloha
 
 __all__ = [
-    "Beacons", "Csma", "Dominance", "EventTdma", "GenieAge", "GenieError", "PureAloha", "Sense", "Sotdma",
-    "ThresholdAloha",
+    "Beacons", "Csma", "Dominance", "Dtr", "EventTdma", "GenieAge", "GenieError", "PureAloha", "Sense",
+    "Sotdma", "ThresholdAloha", "Whittle",
 ]  # fmt: skip

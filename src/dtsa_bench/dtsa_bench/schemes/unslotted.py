@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.plugins import Radio, Table
+from dtsa_agent.core.plugin_kinds import Radio
+from dtsa_agent.core.plugins import Table
 from dtsa_channel_sim.model.airtime import Airtime
 
 from .knowledge import has_arrived
@@ -80,26 +81,34 @@ class Csma:
     """
 
     may_join = True
-    port = ("send", "received", "busy")
+    port = ("send", "sent", "received", "busy")
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         self._period_ns = max(1.0, config.options.get("csma.period_ms", config.agents * config.slot_ms) * _MS)
         self._window_ns = max(1.0, config.options.get("csma.window_ms", 0.25 * config.agents) * _MS)
         self._random = _random(config, agent, 1975)
         self._agent, self._r_min = agent, config.r_min
-        self._sent_ns = 0
-        self._begun = False
+        self._begun = self._rests = False
 
     def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
-        """Sends if the air is free."""
-        if not self._begun:
-            self._begun = True
-            return now_ns + 1 + int(self._random.random() * self._period_ns)
-        if radio.busy():
-            periods_old = max(0.1, (now_ns - self._sent_ns) / self._period_ns)
-            return now_ns + 1 + int(self._random.random() * self._window_ns / periods_old)
-        radio.send()
-        self._sent_ns = now_ns
-        moves = not has_arrived(table, self._r_min) or bool(table.in_ap[self._agent - 1])
-        rest = 1.0 if moves else 10.0
+        """Hands a frame over to the radio, which listens first."""
+        if self._begun:
+            radio.send()
+            self._rests = has_arrived(table, self._r_min) and not table.in_ap[self._agent - 1]
+            return now_ns + 1  # does not count: the radio says when
+        self._begun = True
+        return now_ns + 1 + int(self._random.random() * self._period_ns)
+
+    def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> int:
+        """Begins if the air is free, else waits."""
+        if not busy:
+            return 0
+        periods_old = max(0.1, (now_ns - sent_ns) / self._period_ns)
+        return 1 + int(self._random.random() * self._window_ns / periods_old)
+
+    def sent(self, table: Table, now_ns: int, begun: bool) -> int:
+        """Waits for a period, or tries again."""
+        if not begun:
+            return now_ns + 1
+        rest = 10.0 if self._rests else 1.0
         return now_ns + 1 + int(self._random.uniform(0.5, 1.5) * self._period_ns * rest)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
+from array import array
 from collections.abc import Callable
 from functools import partial
-from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,15 @@ from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.report_fields import ReportFields, read_report
 from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of, ns_of, time_of
-from dtsa_channel_sim.model.air import Air, FrameVerdict
+from dtsa_agent.ros.common.waiting import Patience
+from dtsa_channel_sim.model.air import FrameVerdict
 from dtsa_channel_sim.model.airtime import LONGEST_FRAME
 from dtsa_channel_sim.model.channel import Channel
-from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
+from dtsa_channel_sim.model.verdict import Verdict
 
 from .accounts import Accounts, Delivered
 from .answers import Answers, named
+from .live_air import Begun, LiveAir, Sent, slot_verdict
 from .pace import Pace
 from .roll_call import RollCall
 from .ros_channel import RosChannel, put_frames
@@ -38,8 +40,6 @@ _TICK_NS = 2_000_000  # longest wait for a frame
 _REPEAT_S = 0.1
 _TELL_S = 1.0  # the start is told again so often, for processes that come later
 _LEAD_NS = 300_000_000  # from the start message to slot 0
-_GRACE = 0.05  # of a slot: frames are handed over ahead of their start; who is late by less than this still collides
-_WINDOW = 0.5  # of a slot: a frame that reaches the channel later than this after its start is dropped
 _PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports at least so long
 # After a stall the middleware repeats some messages only when its writers ask for acknowledgements, every 3 s.
 _RECOVERY_NS = 4 * _NS
@@ -50,8 +50,6 @@ _KEEP_NS = 10 * _NS  # an agent may tell so late that it took in a frame
 # What one pass of the loop does at most: frames, reports. Then it looks at the clock and at signals again.
 _FRAMES, _REPORTS = 64, 2
 _TIGHT = 0.6  # of a slot: a round of messages that takes longer leaves too little for the rest
-
-_Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
 
 _read_frame = partial(deserialize_message, message_type=Frame)
 
@@ -91,28 +89,27 @@ class RealtimeChannel(RosChannel):
         qos = names.lockstep_qos(names.REALTIME_WAITING * self.agents)
         self._reports = Feed(node, Report, f"{swarm_namespace}/{names.REPORT}", qos, raw=True)
         self.accounts = Accounts(self.agents, steps, max(100, _KEEP_NS // self.slot_ns))
-        self.air: Air[_Sent] = Air(channel)
+        self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)
-        self.late_frames = 0  # came when the air had been settled past their start, and were dropped
         self.round_ms: float | None = None  # of a round of messages before slot 0, median
         self.returned: set[int] = set()  # ids of those that were, and report again
         self._steps, self._slotted = steps, slotted
         self._zero = 0
         self._told = 0.0  # time.monotonic() of the last start message
         self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
-        self._frames: dict[_Sent, bytes] = {}
-        self._ends: list[int] = []  # ns, when frames that have no verdict yet leave the air: a heap
-        self._settled_ns = -(2**63)
         self._leisure_ns = -(2**63)  # when there was time for all that is not the air
-        self._settled: dict[int, list[FrameVerdict[_Sent]]] = {}
+        self._settled: dict[int, list[FrameVerdict[Sent]]] = {}
         self._heard_ns = np.zeros(self.agents, dtype=np.int64)
         self._recovered_ns = 0  # when all that was sent during the last stall should have come
         self._newest = -1  # slot: last one reported by anybody
         self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
-        self._hold_ns = max(round(_GRACE * self.slot_ns), channel.config.link_delay_ns)
-        self._window_ns = round(_WINDOW * self.slot_ns)
-        self._close_ns = self._hold_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
+        self._close_ns = self.air.hold_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
         self._patience_ns = max(_PATIENCE_SLOTS * self.slot_ns, _PATIENCE_NS)
+
+    @property
+    def late_frames(self) -> int:
+        """Number of frames that came when the air had been settled past their start, and were dropped."""
+        return self.air.late
 
     @property
     def missed(self) -> int:
@@ -127,7 +124,9 @@ class RealtimeChannel(RosChannel):
         """
         try:
             if self._prepare(stop):
-                self._fly(stop)
+                with self.air.radios(self.roster.agreed):
+                    self._close_ns += self.air.patience_ns
+                    self._fly(stop)
         finally:
             self._publish_end()
 
@@ -178,7 +177,7 @@ class RealtimeChannel(RosChannel):
         if not self._call(stop, self.lost):
             return False
         roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling)
-        begin, repeat = time.monotonic(), 0.0
+        patience, repeat = Patience(), 0.0
         everybody = set(range(1, self.agents + 1))
         awaited = set(everybody)
         while awaited - self.lost:
@@ -193,7 +192,7 @@ class RealtimeChannel(RosChannel):
             self.answers.missing = len(awaited)
             self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
             self._housekeeping()
-            if now - begin > self._startup_s:
+            if patience.look() > self._startup_s:
                 missing = named(awaited - self.lost)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
         self.round_ms = roll_call.round_ms(everybody - self.lost)
@@ -224,7 +223,7 @@ class RealtimeChannel(RosChannel):
         self.pace.passed(self._now())
         more = False
         while not stop:
-            data = self.loop.wait(0 if more else self._spare_ns(self._now()))
+            data = self.loop.wait(0 if more else self.air.spare_ns(self._now(), _TICK_NS))
             if self.pace.passed(self._now()):
                 self._resume(self._now())
             for _ in range(_FRAMES):
@@ -250,7 +249,7 @@ class RealtimeChannel(RosChannel):
 
     def _at_leisure(self, now: int) -> bool:
         """Whether there is time for the rest: no frame waits for its delivery, or the rest has waited for a slot."""
-        waits = bool(self._ends) and (self._slotted or self._spare_ns(now) < _TICK_NS)
+        waits = self.air.waits if self._slotted else self.air.spare_ns(now, _TICK_NS) < _TICK_NS
         if waits and now - self._leisure_ns < self.slot_ns:
             return False
         self._leisure_ns = now
@@ -263,10 +262,6 @@ class RealtimeChannel(RosChannel):
         self._recovered_ns = ended + (_RECOVERY_NS if ended - begun > self._patience_ns else self._patience_ns)
         self._heard_ns[:] = np.maximum(self._heard_ns + ended - begun, self._recovered_ns)
         self._observers.stalled(begun, ended)
-
-    def _spare_ns(self, now: int) -> int:
-        """For how long there is nothing to deliver, ns."""
-        return min(max(0, self._ends[0] + self._hold_ns - now), _TICK_NS) if self._ends else _TICK_NS
 
     def _falls_behind(self, now: int) -> bool:
         """Whether the run cannot keep up, by its accounts or by the agents' reports."""
@@ -314,44 +309,55 @@ class RealtimeChannel(RosChannel):
         check_start(start_ns, now, early_ns=_AHEAD * self.slot_ns)
         check_start(slot * self.slot_ns, now, early_ns=_AHEAD * self.slot_ns)
         key = (slot, agent)
-        if key in self._frames:
+        if self.air.holds(key):
             return
-        if not self.air.begin(key, agent, start_ns, length):  # nobody hears it
-            self.late_frames += 1
-            return
-        frame = self._frames[key] = bytes(message.data)
-        heappush(self._ends, start_ns + self.model.config.airtime.total_ns(length))
+        begun = self.air.hand_over(key, start_ns, bytes(message.data))
+        if begun is not None:
+            self._note(begun, data)
+        elif not self.air.listens:
+            return  # too late: nobody hears it
         self._heard_ns[agent - 1] = max(now, self._heard_ns[agent - 1])
+
+    def _note(self, begun: Begun, data: bytes) -> None:
+        """Takes note of a frame that goes on the air.
+
+        :param begun: the frame.
+        :param data: as a message, with the start of its transmission.
+        """
+        slot, agent = begun.key
         if slot > self.slot:
-            self.accounts[slot].frames[agent] = frame
-        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns))
+            if self.air.listens:
+                self.accounts[slot].begin(agent, begun.data, begun.start_ns - slot * self.slot_ns)
+            else:
+                self.accounts[slot].frames[agent] = begun.data
+        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, begun.start_ns))
 
     def _settle(self, now: int) -> None:
-        """Delivers all frames whose time has come."""
-        until = now - max(self._hold_ns, self._window_ns)
-        ripe = now - self._hold_ns
-        while self._ends and self._ends[0] <= ripe:
-            until = max(until, heappop(self._ends))
-        if until <= self._settled_ns:
-            return
-        self._settled_ns = until
-        for verdict in self.air.settle(until, self.answers.position):
+        """Lets radios listen, and delivers all frames whose time has come."""
+        for begun in self.air.listen(now, self.answers.position):
+            slot, agent = begun.key
+            header, data = header_of(names.TIME_ZERO_NS + begun.start_ns), array("B", begun.data)
+            message = Frame(header=header, run=self.run_id, slot=slot, agent=agent, data=data)
+            self._note(begun, bytes(serialize_message(message)))
+        for verdict in self.air.settle(now, self.answers.position):
             self._deliver(verdict)
 
-    def _deliver(self, verdict: FrameVerdict[_Sent]) -> None:
+    def _deliver(self, verdict: FrameVerdict[Sent]) -> None:
         """Sends a frame that has left the air to those that received it."""
         slot, sender = verdict.frame_id
         self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
-        self.pace.lag.add(self._now() - verdict.end_ns - self._hold_ns)
-        if not verdict.received.any():
+        self.pace.lag.add(self._now() - verdict.end_ns - self.air.hold_ns)
+        heard = bool(verdict.received.any())
+        if not heard and not self.air.listens:  # else its sender learns from the message when it began
             return
-        frame = self._frames[slot, sender]
+        frame = self.air.frame(verdict.frame_id)
         time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
         message = Slot(header=header_of(time_ns), run=self.run_id, slot=slot, phase=Slot.RUN, heard_slot=slot)
         put_frames(message, [sender], [frame], verdict.received[None])
         data = bytes(serialize_message(message))
         self._publisher.publish(data)
-        self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
+        if heard:
+            self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
         self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     # The accounts.
@@ -429,17 +435,4 @@ class RealtimeChannel(RosChannel):
     def _verdict(self, slot: int) -> tuple[dict[int, bytes], Verdict]:
         """What the air did in one slot, frame by frame."""
         settled = self._settled.pop(slot, [])
-        frames = {}
-        for verdict in settled:
-            key = verdict.frame_id
-            frames[verdict.sender] = self._frames.pop(key)
-        if not settled:
-            return frames, Verdict(IDLE, (), None, None, None)
-        outcome = COLLISION if any(verdict.collided for verdict in settled) else SUCCESS
-        return frames, Verdict(
-            outcome,
-            tuple(verdict.sender for verdict in settled),
-            np.array([verdict.received for verdict in settled]),
-            tuple(verdict.lost for verdict in settled),
-            tuple(verdict.collided for verdict in settled),
-        )
+        return {verdict.sender: self.air.forget(verdict.frame_id) for verdict in settled}, slot_verdict(settled)
