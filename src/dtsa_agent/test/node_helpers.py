@@ -17,7 +17,10 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from waiting import wait_for
 
+from dtsa_agent.ros.common.dds import limit_to_machine
+from dtsa_agent.ros.common.serving import Serving
 from dtsa_bench.fly.domain import ros_domain
 from dtsa_bench.soak.nodes import node_command, node_environment
 
@@ -69,6 +72,43 @@ class Graph:
         return next(answer.result() for answer in answers if answer.done())
 
 
+class ServedNode:
+    """A node of a test that a thread serves until it is closed.
+
+    :param domain: ROS domain.
+    :param name: of the node.
+    """
+
+    def __init__(self, domain: int, name: str) -> None:
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.node = _made(domain, name)
+        self._clients: dict[str, Client] = {}
+        self._serving = Serving(self.node.context, name, self.node)
+        self._serving.start()
+
+    def client(self, kind: Any, name: str) -> Client:
+        """A client whose service has been found."""
+        if name not in self._clients:
+            began = time.monotonic()
+            client = self.node.create_client(kind, name)
+            assert client.wait_for_service(PATIENCE_S), name
+            # The answer to a client that the server has not found yet is dropped; that takes about as long again.
+            time.sleep(0.1 + 2 * (time.monotonic() - began))
+            self._clients[name] = client
+        return self._clients[name]
+
+    def call(self, kind: Any, name: str, **fields: Any) -> Any:
+        """Answer of a service."""
+        future = self.client(kind, name).call_async(kind.Request(**fields))
+        wait_for(future.done, what=f"{name} does not answer")
+        return future.result()
+
+    def close(self) -> None:
+        """Ends it."""
+        self._serving.close()
+        _ended(self.node)
+
+
 @contextmanager
 def ros_graph(logs: Path) -> Iterator[Graph]:
     """A free domain with a node in it; all processes started in it end with it."""
@@ -81,10 +121,8 @@ def graph_in(domain: int, logs: Path) -> Iterator[Graph]:
     """A node in a domain in which there may be others; all processes started in it end with it."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     environment = node_environment(domain, logs)
-    context = Context()
-    rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("test", context=context, enable_rosout=False, start_parameter_services=False)
-    executor = SingleThreadedExecutor(context=context)
+    node = _made(domain, "test")
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     graph = Graph(node, executor, environment)
     try:
@@ -95,8 +133,23 @@ def graph_in(domain: int, logs: Path) -> Iterator[Graph]:
                 process.kill()
             process.communicate()
         executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()
+        _ended(node)
+
+
+def _made(domain: int, name: str) -> Node:
+    """A node in a context of its own.
+
+    Without shared memory: to end it beside what was killed may crash the middleware.
+    """
+    limit_to_machine(os.environ, shared_memory=False)
+    context = Context()
+    rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    return Node(name, context=context, enable_rosout=False, start_parameter_services=False)
+
+
+def _ended(node: Node) -> None:
+    node.destroy_node()
+    node.context.try_shutdown()
 
 
 def end_of(process: subprocess.Popen[str], number: int | None = None) -> tuple[int, str]:

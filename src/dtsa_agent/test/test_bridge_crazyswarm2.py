@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,9 +23,9 @@ from bridge_helpers import end_process, fake_fleet, settings  # noqa: E402
 from builtin_interfaces.msg import Duration  # noqa: E402
 from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
 from metronome import flown_again_when_overloaded  # noqa: E402
+from node_helpers import ServedNode  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Empty  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
@@ -105,24 +104,11 @@ def test_without_its_messages_the_bridge_says_so_and_ends(
         assert words in errors[0]
 
 
-class Program:
+class Program(ServedNode):
     """What a program of Crazyswarm2's does on the graph."""
 
     def __init__(self, domain: int) -> None:
-        self.context = rclpy.Context()
-        self.context.init(domain_id=domain)
-        self.node = rclpy.create_node("program", context=self.context, enable_rosout=False)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
-        self.thread.start()
-
-    def call(self, kind: Any, name: str, **fields: Any) -> Any:
-        client = self.node.create_client(kind, name)
-        assert client.wait_for_service(20), name
-        future = client.call_async(kind.Request(**fields))
-        wait_for(future.done)
-        return future.result()
+        super().__init__(domain, "program")
 
     def listen(self, kind: Any, topic: str) -> list[Any]:
         heard: list[Any] = []
@@ -138,12 +124,6 @@ class Program:
         parameters = [Parameter(name=name, value=value)]
         (result,) = self.call(SetParameters, "/crazyflie_server/set_parameters", parameters=parameters).results
         return bool(result.successful)
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.thread.join(5)
-        self.node.destroy_node()
-        self.context.try_shutdown()
 
 
 def heard(messages: list[Any], number: int = 3) -> Any:
@@ -182,7 +162,7 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         program = Program(domain)
         try:
-            assert program.node.create_client(Empty, "/all/emergency").wait_for_service(20)
+            program.client(Empty, "/all/emergency")
             poses, status = program.listen(PoseStamped, "/cf1/pose"), program.listen(Status, "/cf1/status")
             # Parameters: of one, of all, of the robots; what cannot be is refused.
             assert list(program.get("robots.cf1.initial_position").double_array_value) == [1.2, 0.0, 0.0]

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,7 +30,7 @@ from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff  # noqa: E402
 from geometry_msgs.msg import Point, PoseStamped, TwistStamped  # noqa: E402
 from metronome import flown_again_when_overloaded  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from node_helpers import ServedNode  # noqa: E402
 from std_srvs.srv import Empty, Trigger  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
@@ -44,15 +43,12 @@ COUNT = 3
 PATIENT = {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}}  # not what is tested here
 
 
-class Graph:
+class Graph(ServedNode):
     """A node of the test that listens, calls and commands."""
 
     def __init__(self, domain: int) -> None:
-        self.context = rclpy.Context()
-        self.context.init(domain_id=domain)
-        self.node = rclpy.create_node("test", context=self.context, enable_rosout=False)
+        super().__init__(domain, "test")
         self.last: dict[str, Any] = {}
-        self.clients: dict[str, Any] = {}
         for k in range(1, COUNT + 1):
             self._listen(Odometry, f"/cf{k}/odom")
             self._listen(PoseStamped, f"/cf{k}/pose")
@@ -62,22 +58,9 @@ class Graph:
             k: self.node.create_publisher(VelocityWorld, f"/cf{k}/cmd_velocity_world", 1) for k in (1, 2, 3)
         }
         self.position = self.node.create_publisher(Position, "/cf1/cmd_position", 1)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
-        self.thread.start()
 
     def _listen(self, kind: type, topic: str) -> None:
         self.node.create_subscription(kind, topic, lambda message: self.last.__setitem__(topic, message), 10)
-
-    def call(self, kind: Any, name: str, **fields: Any) -> Any:
-        if name not in self.clients:
-            self.clients[name] = self.node.create_client(kind, name)
-        client = self.clients[name]
-        assert client.wait_for_service(15), name
-        future = client.call_async(kind.Request(**fields))
-        wait_for(future.done)
-        return future.result()
 
     def state(self, k: int) -> str:
         status = self.last.get(f"/cf{k}/status")
@@ -89,12 +72,6 @@ class Graph:
             return math.inf, math.inf, math.inf
         p = odometry.pose.pose.position
         return p.x, p.y, p.z
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.thread.join(5)
-        self.node.destroy_node()
-        self.context.try_shutdown()
 
 
 @contextmanager
@@ -121,8 +98,7 @@ def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Gr
 
 def up(graph: Graph) -> None:
     # all/emergency is the last service to come: everything else is there.
-    client = graph.node.create_client(Empty, "/all/emergency")
-    assert client.wait_for_service(20)
+    graph.client(Empty, "/all/emergency")
     names = {name for name, _ in graph.node.get_service_names_and_types()}
     for prefix in ("/all", "/cf1", "/cf2", "/cf3"):
         for service in ("takeoff", "land", "go_to", "arm", "emergency", "notify_setpoints_stop"):

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import signal
+import subprocess
 from array import array
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -139,6 +143,24 @@ def test_only_the_channel_can_end_its_run() -> None:
     assert not call.channel.gone
     assert not ProcessName(call.channel.node, "elsewhere", 1, 1).gone
     assert ProcessName(call.channel.node, call.channel.machine, call.channel.pid, call.channel.started + 1).gone
+
+
+def test_a_stopped_process_is_paused_and_not_gone() -> None:
+    with subprocess.Popen(["sleep", "60"]) as process:
+        fields = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").split()
+        name = ProcessName("/swarm/channel", ProcessName.own("").machine, process.pid, int(fields[21]))
+        try:
+            assert not name.paused
+            assert not name.gone
+            process.send_signal(signal.SIGSTOP)
+            wait_for(lambda: name.paused)
+            assert not name.gone
+            assert not ProcessName(name.node, name.machine, name.pid, name.started + 1).paused
+        finally:
+            process.kill()
+        wait_for(lambda: name.gone)
+        assert not name.paused
+    assert not ProcessName(name.node, "elsewhere", name.pid, name.started).paused
 
 
 @given(

@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 from node_helpers import ros_graph
 from process_helpers import addresses, segments_of
+from rclpy.node import Node
 
+from dtsa_agent.core.errors import DtsaError, LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common.dds import (
     PEERS,
     PROFILE,
@@ -22,7 +24,7 @@ from dtsa_agent.ros.common.dds import (
     clean_shared_memory,
     limit_to_machine,
 )
-from dtsa_agent.ros.common.process import in_real_time
+from dtsa_agent.ros.common.process import ending, in_real_time
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -46,6 +48,22 @@ def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
     assert plain == {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(PUNCTUAL), PROFILES[1]: str(PUNCTUAL)}
     limit_to_machine(plain)
     assert plain[PROFILES[0]] == str(PROFILE)
+
+
+@pytest.mark.parametrize(("error", "lasts"), [(LocalProtocolError, True), (RemoteProtocolError, False)])
+def test_a_node_lasts_as_long_as_its_process_where_others_are_dead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[DtsaError], lasts: bool
+) -> None:
+    kept: list[Node] = []
+    monkeypatch.setattr("dtsa_agent.ros.common.process._KEPT", kept)
+    with ros_graph(tmp_path) as graph:
+        node = Node("ending", context=graph.node.context)
+        with pytest.raises(error), ending(node):
+            raise error("cf1 is dead")
+        assert kept == ([node] if lasts else [])
+        names = graph.node.get_node_names
+        graph.until(lambda: ("ending" in names()) == lasts)
+        node.destroy_node()
 
 
 def test_real_time_is_seen_in_the_command_line(tmp_path: Path) -> None:

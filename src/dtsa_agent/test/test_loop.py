@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -29,3 +31,17 @@ def test_a_signal_ends_what_looks_at_no_flag_and_is_a_flag_elsewhere() -> None:
         with pytest.raises(KeyboardInterrupt):  # there was a signal before
             _signalled(stop)
         assert stop.count == 2
+
+
+def test_what_does_not_end_after_a_signal_says_where_it_stands_and_is_ended() -> None:
+    program = (
+        "import os, signal, time\nfrom dtsa_agent.stop import Stop\n"
+        "def stands_still():\n    time.sleep(60)\n"
+        "with Stop(0.3) as stop:\n    os.kill(os.getpid(), signal.SIGINT)\n{}"
+    )
+    for then, code, said in (("    stands_still()", 1, "in stands_still"), ("time.sleep(0.6)", 0, "")):
+        words = [sys.executable, "-c", program.format(then)]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=50, check=False)
+        assert done.returncode == code
+        assert said in done.stderr
+        assert bool(done.stderr) == bool(said)

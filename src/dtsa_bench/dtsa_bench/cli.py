@@ -126,6 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args, unknown = parser.parse_known_args(words)
         if unknown:
             parser.error(_unknown(unknown, command_parser(parser, command)))
+        args.own_process = arguments is None
         return int(chosen.run(args) or 0)  # type: ignore[union-attr, attr-defined]
     except KeyboardInterrupt:
         return INTERRUPTED

@@ -39,7 +39,11 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     ),
     "verify": (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON")),
     "sniff": (("--interface eth0 --out runs/sniffed", "twelve agents; until Ctrl-C"),),
-    "merge": (("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"), ("runs/cf* --json", "all of them, as JSON")),
+    "merge": (
+        ("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"),
+        ("runs/cf* --json", "all of them, as JSON"),
+        ("runs/cf* --out flight_1", "kept as one bag, for report, export and verify"),
+    ),
     "recover": (("runs/a", "into runs/a/bag_recovered"),),
     "view": (
         ("runs/a", "a recorded run, played; one that is being recorded is followed"),

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import subprocess
+import threading
 import time
 from array import array
 from pathlib import Path
@@ -123,6 +124,18 @@ class Stranger:
             return agents and all(p.get_subscription_count() >= found[t] for t, p in self.publishers.items())
 
         self.graph.until(lambda: (self.last.run and self.slot >= slot and heard()) or process.poll() is not None)
+
+
+def two_in_flight(graph: Graph, *parameters: str) -> tuple[Stranger, subprocess.Popen[str], subprocess.Popen[str]]:
+    """Somebody who hears two agents fly in lockstep, their process, and their channel's.
+
+    :param parameters: of the channel, beside the number of agents.
+    """
+    stranger = Stranger(graph)
+    host = graph.start(HOST, "-p", "agents:=2")
+    channel = graph.start(CHANNEL, *(word for given in ("agents:=2", *parameters) for word in ("-p", given)))
+    stranger.listen(5, channel)
+    return stranger, host, channel
 
 
 @pytest.fixture(scope="module")
@@ -337,10 +350,7 @@ def test_two_processes_with_the_same_agent_are_refused_before_slot_0(tmp_path: P
 
 def test_a_second_channel_is_refused_and_the_first_flies_on(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
-        stranger = Stranger(graph)
-        host = graph.start(HOST, "-p", "agents:=2")
-        first = graph.start(CHANNEL, "-p", "agents:=2")
-        stranger.listen(5, first)
+        stranger, host, first = two_in_flight(graph)
         run, slot = stranger.last.run, stranger.slot
         code, said = end_of(graph.start(CHANNEL, "-r", "__node:=second", "-p", "agents:=2"))
         graph.processes.pop()
@@ -357,10 +367,7 @@ def test_a_second_channel_is_refused_and_the_first_flies_on(tmp_path: Path) -> N
 
 def test_processes_of_another_run_are_refused_and_fly_on_in_their_own(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
-        stranger = Stranger(graph)
-        host = graph.start(HOST, "-p", "agents:=2")
-        channel = graph.start(CHANNEL, "-p", "agents:=2")
-        stranger.listen(5, channel)
+        stranger, host, channel = two_in_flight(graph)
         channel.send_signal(signal.SIGSTOP)
         code, said = end_of(graph.start(CHANNEL, "-r", "__node:=second", "-p", "agents:=2"))
         graph.processes.pop()
@@ -372,15 +379,50 @@ def test_processes_of_another_run_are_refused_and_fly_on_in_their_own(tmp_path: 
         assert host.poll() is channel.poll() is None
 
 
+def test_a_channel_that_stood_still_waits_for_answers_that_it_has_not_read_yet(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        stranger, host, channel = two_in_flight(graph, "answer_s:=0.5")
+        for _ in range(3):
+            host.send_signal(signal.SIGSTOP)
+            time.sleep(0.2)  # the channel waits for its answer now
+            channel.send_signal(signal.SIGSTOP)
+            host.send_signal(signal.SIGCONT)
+            time.sleep(0.6)
+            channel.send_signal(signal.SIGCONT)
+            slot = stranger.slot + 20
+            graph.until(lambda slot=slot: stranger.slot > slot)
+        assert host.poll() is channel.poll() is None
+
+
+def test_a_channel_whose_agents_hang_ends_however_much_others_say(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        stranger, host, channel = two_in_flight(graph, "answer_s:=0.5")
+        host.send_signal(signal.SIGSTOP)
+        graph.processes.remove(channel)
+        answer = Transmission(run=stranger.last.run + 1)
+        heard = threading.Event()
+
+        def talk() -> None:  # without a pause as long as the channel waits for a message
+            while not heard.wait(0.005):
+                stranger.publishers[names.TRANSMISSION].publish(answer)
+
+        talking = threading.Thread(target=talk, daemon=True)
+        talking.start()
+        try:
+            code, said = end_of(channel)
+        finally:
+            heard.set()
+            talking.join()
+        assert code == 1
+        assert "did not answer slot" in said
+
+
 @pytest.mark.parametrize("restarted", [False, True])
 def test_agents_end_when_their_channel_is_killed_whoever_comes_after_it(tmp_path: Path, restarted: bool) -> None:
     with ros_graph(tmp_path) as graph:
-        stranger = Stranger(graph)
-        host = graph.start(HOST, "-p", "agents:=2")
-        channel = graph.start(CHANNEL, "-p", "agents:=2")
-        stranger.listen(5, channel)
+        _, host, channel = two_in_flight(graph)
         channel.kill()
-        channel.wait()
+        channel.communicate()
         killed = time.monotonic()
         graph.processes.remove(channel)
         if restarted:

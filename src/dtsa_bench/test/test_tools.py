@@ -42,7 +42,9 @@ def pretend_built(package: str) -> None:
     (share / "package.sh").touch()
     (packages / f"{package}.egg-link").touch()
     if package == "dtsa_agent":
-        workspace.kernel().touch()
+        for path in workspace.compiled():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
     workspace.stamp(package)
 
 
@@ -81,7 +83,7 @@ def test_missing_products_need_a_build(checkout: Path) -> None:
     for_one_python = workspace.kernel().with_name("_kernel.cpython-311-x86_64-linux-gnu.so")
     for_one_python.touch()
     workspace.remove_kernel()
-    assert not for_one_python.exists()
+    assert not any(path.exists() for path in (for_one_python, *workspace.compiled()))
     shutil.rmtree(layout.BUILD / "dtsa_bench")
     # A plain `colcon build` copies instead of linking.
     next((layout.INSTALL / "dtsa_channel_sim").rglob("*.egg-link")).unlink()
@@ -225,17 +227,25 @@ def test_a_failed_step_is_named_with_its_reason_and_log(checkout: Path) -> None:
         step.run(["sh", "-c", script], dict(os.environ))
 
 
-def test_an_interrupted_step_ends_what_it_started(checkout: Path) -> None:
+@pytest.mark.parametrize("while_it_starts", [False, True])
+def test_an_interrupted_step_ends_what_it_started(checkout: Path, while_it_starts: bool) -> None:
     began = checkout / "began"
     program = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "from machine import layout, prepare, progress\nfrom pathlib import Path\nimport os, signal\n"
+        "from machine import layout, prepare, progress\nfrom pathlib import Path\nimport os, signal, subprocess\n"
         "layout.STEP_LOGS = Path(sys.argv[2])\n"
         "signal.signal(signal.SIGTERM, prepare.interrupt)\n"
+        "start = subprocess.Popen\n"
+        "def start_late(*arguments, **options):\n"  # returns when the command has run for a while, as on a busy machine
+        "    process = start(*arguments, **options)\n"
+        "    while not layout.read(Path(sys.argv[3])).strip(): pass\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    return process\n"
+        "subprocess.Popen = start_late if sys.argv[4] == 'True' else start\n"
         "with progress.step('build', 'workspace') as step:\n"
         "    step.run(['sh', '-c', 'sleep 60 & echo $! > ' + sys.argv[3] + '; wait'], os.environ)\n"
     )
-    arguments = [str(DTSA.parent), str(checkout / "log"), str(began)]
+    arguments = [str(DTSA.parent), str(checkout / "log"), str(began), str(while_it_starts)]
     process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 30
     while not layout.read(began).strip() and time.monotonic() < deadline:
@@ -319,7 +329,8 @@ def test_all_tests_run_side_by_side_and_chosen_ones_as_pytest_is_told(monkeypatc
     for cores, workers in ((1, "2"), (2, "3"), (64, "4")):
         monkeypatch.setattr(os, "sched_getaffinity", lambda process, cores=cores: set(range(cores)))
         assert main.main(["test"]) == 0
-        assert started.pop() == ["-m", "pytest", "-n", workers, "--dist", "loadfile", "--no-loadscope-reorder"]
+        side_by_side = ["--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0"]
+        assert started.pop() == ["-m", "pytest", "-n", workers, *side_by_side]
     assert main.main(["test", "-k", "frame", "-x"]) == 0
     assert started == [["-m", "pytest", "-k", "frame", "-x"]]
 

@@ -19,6 +19,7 @@ from view_helpers import AGENTS, PATIENCE_S, SLOTS, lossy_bag, numbers, track_of
 pytest.importorskip("aiohttp")
 
 import aiohttp
+from metronome import flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
@@ -31,7 +32,7 @@ from dtsa_bench.view.link import BEGIN, ViewLink, record
 from dtsa_bench.view.moments import UNKNOWN, Moment, belief
 from dtsa_bench.view.orders import Order, read_order
 from dtsa_bench.view.recording import BagSource
-from dtsa_bench.view.server import ViewServer
+from dtsa_bench.view.server import ViewServer, _Reader
 from dtsa_bench.view.track import MOST_BYTES, MOST_MOMENTS, Track
 
 
@@ -212,6 +213,36 @@ def test_a_page_that_does_not_read_costs_nothing_and_garbage_is_let_go() -> None
         assert asyncio.run(session(url)) == 40
 
 
+class Page:
+    """A connection whose other side takes everything."""
+
+    closed = False
+
+    async def send_str(self, _: str) -> None:
+        await asyncio.sleep(0)
+
+    async def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize("steps", range(25))
+def test_a_page_is_let_go_wherever_sending_stands(steps: int) -> None:
+    found = Track("fast")
+    found.begin({"agents": 1})
+    for _ in range(500):
+        found.add(Moment(0, "{}", b"", b""))
+
+    async def session() -> bool:
+        reader = _Reader(page := Page(), [found])  # type: ignore[arg-type]
+        running = asyncio.create_task(reader.run())
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        await reader.end(running)
+        return running.done() and (page.closed or not steps)
+
+    assert asyncio.run(session())
+
+
 NO_ORDERS = [
     *(None, [], {}, {"kind": "reboot"}, {"kind": "kill"}, {"kind": "kill", "agent": True}),
     *({"kind": "loss", "value": value} for value in (2, "1", True, float("nan"))),
@@ -236,6 +267,7 @@ def test_usable_orders_are_read() -> None:
     assert read_order({"kind": "partition", "value": ""}) == Order("partition", value="")
 
 
+@flown_again_when_overloaded
 def test_a_link_to_a_server_that_stands_still_never_waits() -> None:
     """What it cannot take is dropped; that a process stands still is what SIGSTOP makes of it."""
     link = ViewLink()

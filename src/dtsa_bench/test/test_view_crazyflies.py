@@ -17,15 +17,11 @@ pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 pytest.importorskip("aiohttp")
 
-import rclpy
 from bridge_helpers import end_process, fake_fleet, settings
 from builtin_interfaces.msg import Duration
 from dtsa_msgs.srv import Arm, Takeoff
 from metronome import flown_again_when_overloaded
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
+from node_helpers import ServedNode
 from waiting import wait_for
 
 from dtsa_bench.fly.domain import ros_domain
@@ -59,7 +55,7 @@ def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Pa
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         command = [sys.executable, "-m", "dtsa_agent.crazyflie.bridge_node", "--ros-args", "-p", f"config:={config}"]
         bridge = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, text=True)
-        track, pilot = Track("/swarm"), Pilot(domain)
+        track, pilot = Track("/swarm"), ServedNode(domain, "pilot")
         source = GraphSource(track, domain, control=True)
         listening = threading.Thread(target=source.run)
         listening.start()
@@ -67,9 +63,9 @@ def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Pa
             with serving(ViewServer([track], "some-token", source.order)) as url:
                 browser.open(url)
                 browser.wait_for(all_are("ready"))
-                pilot.call(Arm, "/all/arm", arm=True)
+                assert pilot.call(Arm, "/all/arm", arm=True).success
                 browser.wait_for(all_are("armed"))
-                pilot.call(Takeoff, "/all/takeoff", height=0.6, duration=Duration(sec=2))
+                assert pilot.call(Takeoff, "/all/takeoff", height=0.6, duration=Duration(sec=2)).success
                 browser.wait_for(all_are("flying"))
                 assert browser.run("parseFloat(document.querySelector('.vehicles td:nth-child(3)').textContent)") > 3.0
                 browser.run(CLICK.format("land"))
@@ -90,29 +86,3 @@ def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Pa
             listening.join()
             pilot.close()
             end_process(bridge)
-
-
-class Pilot:
-    """Another node that orders something.
-
-    :param domain: ROS domain.
-    """
-
-    def __init__(self, domain: int) -> None:
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node("pilot", context=self._context, enable_rosout=False, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-
-    def call(self, kind: Any, name: str, **fields: Any) -> None:
-        client = self._node.create_client(kind, name)
-        assert client.wait_for_service(30)
-        answer = client.call_async(kind.Request(**fields))
-        self._executor.spin_until_future_complete(answer, 30)
-        assert answer.result().success, answer.result()
-
-    def close(self) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()

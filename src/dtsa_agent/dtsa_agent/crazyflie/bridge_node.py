@@ -19,7 +19,6 @@ from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -39,6 +38,7 @@ from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.priority import stay_on_one_processor, take_priority
 from dtsa_agent.ros.common.process import follow_supervisor
+from dtsa_agent.ros.common.serving import Serving
 
 DTSA, CRAZYSWARM2 = "dtsa", "crazyswarm2"
 NODES = {DTSA: "crazyflie_bridge", CRAZYSWARM2: "crazyflie_server"}  # by the interfaces that are offered
@@ -216,15 +216,12 @@ def run_node(node: BridgeNode) -> int:
         node.say("error", problem)
         node.bridge.close()
         return 1
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    spinner = threading.Thread(target=executor.spin, name="executor", daemon=True)
-    spinner.start()
+    serving = Serving(node.context, "executor", node)
+    serving.start()
     node.say("info", "ready; Ctrl-C lands all, a second one stops all motors")
     interrupts.event.wait()
     code = _end(node, interrupts)
-    executor.shutdown()
-    spinner.join(2.0)
+    serving.close()
     return code
 
 

@@ -15,7 +15,7 @@ from .common import names
 from .common.loop import Stop
 from .common.namespaces import declare_swarm_namespace
 from .common.parameters import declare_setting
-from .common.process import node_options, run_node
+from .common.process import ending, node_options, run_node
 from .hosting import declare_swarm, host_agents
 
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
@@ -49,7 +49,7 @@ def _own_id(node: Node, default: int) -> int:
 
 def _body(stop: Stop, supervised: bool) -> int | None:
     node, agent, space = _make_node(supervised)
-    try:
+    with ending(node):
         if _AIR.check(declare_setting(node, _AIR)) == UDP:
             from .udp_node import fly_over_udp  # other agents need no sockets
 
@@ -59,8 +59,6 @@ def _body(stop: Stop, supervised: bool) -> int | None:
             raise ConfigError("id", agent, f"1 to {config.agents}, the number of agents")
         host_agents(node, [agent], config, stop, space, spaces=[node.get_namespace()])
         return None
-    finally:
-        node.destroy_node()
 
 
 def main(args: Sequence[str] | None = None) -> int:

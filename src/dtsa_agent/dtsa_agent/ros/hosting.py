@@ -14,7 +14,7 @@ from dtsa_agent.core import AbstractSwarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins import make_swarm, shareable
 from dtsa_agent.core.settings import Settings, setting
-from dtsa_agent.core.unslotted import check_slotted
+from dtsa_agent.core.unslotted import check_carried, check_slotted
 from dtsa_agent.keys import with_key
 from dtsa_agent.plugin_watch import watched
 
@@ -106,6 +106,7 @@ def _run_agents(
     priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
     if host.mode == "lockstep":
         check_slotted(config.policy)
+    check_carried(config.policy)
     swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared and host.mode == "lockstep"))
     if host.mode == "lockstep":
         agents: SwarmNode = SwarmNode(node, swarm, space)

@@ -31,8 +31,9 @@ from .common.checks import (
 from .common.intake import Intake, add_counts
 from .common.runs import Call, run_text
 from .common.slot_fields import SlotFields
+from .common.waiting import Patience
 
-_GONE_S = 2.0  # a channel that nobody has seen for so long will not come back
+_GONE_S = 6.0  # a channel that nobody has seen for so long will not come back; it announces itself every 3 s
 _TELL_S = 0.5  # counts are told that often at most
 _REFUSED_S = 10.0  # who has taken part for so long is not sent away any more
 _MOST_CALLERS = 16
@@ -74,7 +75,8 @@ class Membership:
         self.intake = Intake(node.get_logger())
         self._agents, self._dropped_frames, self._plausible = int(settings["agents"]), dropped_frames, plausible
         self._callers: dict[int, _Caller] = {}  # by run
-        self._began_s = self._told_s = self._seen_s = 0.0  # monotonic
+        self._began_s = self._told_s = 0.0  # monotonic
+        self._unseen = Patience()  # with a channel that is not on the graph
         self._told: dict[str, int] = {}
         self._following = 0  # another run that calls while this one lasts
         self._settings = json.dumps(settings, sort_keys=True, separators=(",", ":"))
@@ -154,7 +156,7 @@ class Membership:
         :param run: its id.
         """
         self.run = run
-        self._began_s = self._seen_s = time.monotonic()
+        self._began_s, self._unseen = time.monotonic(), Patience()
 
     @property
     def session(self) -> int:
@@ -230,9 +232,9 @@ class Membership:
         if not self.run:
             return
         self._tell()
-        caller, now = self._callers[self.run], time.monotonic()
-        if publishers:
-            self._seen_s = now
-        if now - self._seen_s > _GONE_S or caller.call.channel.gone:
+        channel = self._callers[self.run].call.channel
+        if publishers or channel.paused:  # who is stopped for long leaves the graph, too, and comes back
+            self._unseen = Patience()
+        if self._unseen.look() > _GONE_S or channel.gone:
             following = f"; run {run_text(self._following)} calls now" if self._following else ""
             raise LocalProtocolError(f"the channel has gone after slot {slot} without ending the run{following}")

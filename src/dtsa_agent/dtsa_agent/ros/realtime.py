@@ -20,6 +20,7 @@ from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.joining import Listeners, check_joinable
 from dtsa_agent.core.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
+from dtsa_agent.core.plugins import plug_ins_of
 from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 
@@ -29,6 +30,7 @@ from .common.loop import Stop
 from .common.slot_fields import SlotFields
 from .common.stamps import header_of, time_of
 from .common.wire import split_frames, unpack_received
+from .handed_over import HandedOver
 from .reporter import Reporter
 from .swarm_node import SwarmNode
 
@@ -106,6 +108,8 @@ class RealtimeNode(SwarmNode):
         self._starts: tuple[int | None, NDArray[np.int64]] = None, self._shift  # of the slot asked for last
         self._ideal = not (self._offset.any() or self._drift.any())  # all clocks show the channel's time
         self._slotted = not self.config.policy_row.unslotted
+        parts = plug_ins_of(self.swarm) if self.config.policy_row.listens else None
+        self._handed = None if parts is None else HandedOver(parts)
         self._aligners = [ClockAligner() for _ in range(count)] if align and self._slotted else []
         self._free_ns = [0] * count  # when each radio has done with its last frame; of policies without slots
         self._jitter_ns = jitter_ns
@@ -314,7 +318,10 @@ class RealtimeNode(SwarmNode):
         if masks is not None:
             now = time.monotonic_ns() - self._zero
             for sender, mask in zip(message.sender, masks, strict=True):
-                if mask.any():
+                own = self._handed is not None and self._handed.heard(
+                    sender, message.heard_slot, self._began_ns(message)
+                )
+                if own or mask.any():
                     self._reporter.add_heard(sender, message.heard_slot, self.slot, now, mask)
         if masks is None or not (self._aligners or self._timeless.any()):
             return
@@ -383,8 +390,11 @@ class RealtimeNode(SwarmNode):
             self._reporter.publish(self.run_id)
 
     def _still_sends(self, index: int, begin_ns: int) -> bool:
-        """Whether a radio is still busy with its last frame; it takes the next one if not. With slots it never is."""
-        if self._slotted:
+        """Whether a radio is still busy with its last frame; it takes the next one if not.
+
+        With slots it never is, and a radio that listens knows by itself.
+        """
+        if self._slotted or self._handed is not None:
             return False
         if begin_ns < self._free_ns[index]:
             return True
@@ -410,8 +420,12 @@ class RealtimeNode(SwarmNode):
                 # The turn is as good as over: speaking now would disturb whoever has the next one.
                 swarm.frame_length[index] = 0
                 self.unsent += 1
+                if self._handed is not None:
+                    self._handed.not_sent(index, slot)
                 continue
             offsets[index] = offset
+            if self._handed is not None:
+                self._handed.note(index, slot, slot * self.slot_ns + offset)
             data = swarm.frames[index, : swarm.frame_length[index]].tobytes()
             header = header_of(names.slot_time_ns(slot, self.slot_ns) + offset)
             self._air.publish(

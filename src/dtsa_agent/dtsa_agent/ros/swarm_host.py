@@ -12,7 +12,7 @@ from dtsa_agent.core.settings import Setting
 from .common.loop import Stop
 from .common.namespaces import swarm_wide_node
 from .common.parameters import declare_setting
-from .common.process import node_options, run_node
+from .common.process import ending, node_options, run_node
 from .hosting import declare_swarm, host_agents
 from .swarm_node import parse_ids
 
@@ -27,7 +27,7 @@ SHARED = Setting(
 
 def _body(stop: Stop, supervised: bool) -> None:
     node, space = swarm_wide_node("swarm_host", node_options(supervised))
-    try:
+    with ending(node):
         config = declare_swarm(node)
         listed = ParameterDescriptor(
             description="ids of the agents in this process; [0]: all",
@@ -37,8 +37,6 @@ def _body(stop: Stop, supervised: bool) -> None:
         ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
         shared = declare_setting(node, SHARED)
         host_agents(node, parse_ids(ids, config.agents), config, stop, space, shared)
-    finally:
-        node.destroy_node()
 
 
 def main(args: Sequence[str] | None = None) -> int:

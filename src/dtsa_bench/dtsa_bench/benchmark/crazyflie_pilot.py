@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Empty
 
+from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common.dds import limit_to_machine
 
 from .stamped_fleet import STEP_MPS
@@ -49,7 +50,9 @@ class Pilot:
             # Only what somebody listens to is sent; what comes is not of interest here.
             self._odometry.append(self._node.create_subscription(Odometry, f"/cf{k + 1}/odom", lambda _: None, 1))
             self._outputs.append(self._node.create_publisher(VelocityWorld, f"/cf{k + 1}/cmd_velocity_world", 1))
-        self._emergency = self._node.create_client(Empty, "/all/emergency")
+        # Made long before they are used: a server drops answers to a client that it has not found yet.
+        services = {"emergency": Empty, "arm": Arm, "takeoff": Takeoff, "land": Land}
+        self._clients = {name: self._node.create_client(kind, f"/all/{name}") for name, kind in services.items()}
         self.first = 1  # number of the first command of the latest stream; 0 is nobody's
         self._sent = 0  # commands in it
 
@@ -71,16 +74,14 @@ class Pilot:
 
     def ready(self) -> bool:
         """Whether all services are there and everybody is ready."""
-        return self._emergency.service_is_ready() and self._all(Status.STATE_READY)
+        return all(client.service_is_ready() for client in self._clients.values()) and self._all(Status.STATE_READY)
 
     def _all(self, state: int) -> bool:
         return all(status is not None and status.state == state for status in self._status)
 
-    def _call(self, step: Step, kind: Any, name: str, **fields: Any) -> None:
-        client = self._node.create_client(kind, name)
-        step(name, client.service_is_ready)
-        future = client.call_async(kind.Request(**fields))
-        step(name, future.done)
+    def _call(self, step: Step, name: str, **fields: Any) -> None:
+        client = self._clients[name]
+        step(name, client.call_async(client.srv_type.Request(**fields)).done)
 
     def take_off(self, step: Step, height: float, seconds: float) -> None:
         """Arm all and climb.
@@ -89,15 +90,15 @@ class Pilot:
         :param height: m above the floor.
         :param seconds: duration.
         """
-        self._call(step, Arm, "/all/arm", arm=True)
+        self._call(step, "arm", arm=True)
         step("arming", lambda: self._all(Status.STATE_ARMED))
-        self._call(step, Takeoff, "/all/takeoff", height=height, duration=_duration(seconds))
+        self._call(step, "takeoff", height=height, duration=_duration(seconds))
         climbed = time.monotonic() + seconds + 0.5
         step("the take-off", lambda: self._all(Status.STATE_FLYING) and time.monotonic() > climbed)
 
     def land(self, step: Step, seconds: float) -> None:
         """Land all and wait until the motors are locked."""
-        self._call(step, Land, "/all/land", duration=_duration(seconds))
+        self._call(step, "land", duration=_duration(seconds))
         step("the landing", lambda: self._all(Status.STATE_READY))
 
     def stream(self, rate_hz: float, seconds: float) -> NDArray[np.float64]:
@@ -135,8 +136,12 @@ class Pilot:
         """Log packets a second that reached the bridge since then, for each.
 
         :param before: what `received` said.
+        :raises DtsaError: nothing was heard of one.
         """
-        return [(n1 - n0) / (t1 - t0) for (t0, n0), (t1, n1) in zip(before, self.received(), strict=True)]
+        pairs = list(zip(before, self.received(), strict=True))
+        if any(t1 <= t0 for (t0, _), (t1, _) in pairs):
+            raise DtsaError("no status of a Crazyflie came while its log packets were counted")
+        return [(n1 - n0) / (t1 - t0) for (t0, n0), (t1, n1) in pairs]
 
 
 def _duration(seconds: float) -> Duration:

@@ -96,8 +96,8 @@ def _lost(flights: Flights) -> str:
     return (
         f"DTSA works as long as all know the same. After the first lost message they do not: all agree in "
         f"{agreement(dtsa)} of the slots, {_at_once(dtsa)} or nobody does, positions are wrong by {error(dtsa)}. With "
-        f"lease only a turn's owner gives it away, in its own message: {_at_once(lease)}, {error(lease)}. Round robin "
-        f"does not mind losses, but is slow: {error(flights['loss-tdma'])}."
+        f"lease only whose turn it is gives it away, in its own message: {_at_once(lease)}, {error(lease)}. Round "
+        f"robin does not mind losses, but is slow: {error(flights['loss-tdma'])}."
     )
 
 

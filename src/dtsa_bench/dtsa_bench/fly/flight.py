@@ -21,12 +21,14 @@ from rclpy.signals import SignalHandlerOptions
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.joining import check_joinable
+from dtsa_agent.core.unslotted import check_carried
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.common.priority import give_way_by, take_place, take_priority
+from dtsa_agent.ros.common.process import keep_node
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
@@ -121,9 +123,7 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
 def _check_policy(run: RunConfig, options: FlightOptions) -> None:
     """What the policy asks of a flight of nodes."""
     row = run.swarm.policy_row
-    if row.unslotted and "busy" in row.port:
-        why = "one that does not listen before it sends: messages between processes take longer than a frame"
-        raise ConfigError("policy", row.name, f"{why}; simulate and sweep can")
+    check_carried(row.name)
     if row.unslotted and run.mode == LOCKSTEP:
         raise ConfigError("policy", row.name, "with --mode realtime: in lockstep all frames begin with their slot")
     if row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or run.swarm.agents) > 1):
@@ -200,6 +200,7 @@ def _fly(
     observers: Sequence[ChannelObserver],
     view: ViewLink | None,
 ) -> Flight:
+    failure: DtsaError | None = None
     try:
         channel, measurement = flight.channel, flight.measurement
         shown = FlightProgress(progress, measurement, channel)
@@ -213,15 +214,16 @@ def _fly(
             show_flight(view, flight, supervisor)
         limit_s = wall_limit_s(options.wall_timeout_s, flight.run_config.limits.timeout_s)
         ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
-        failure: DtsaError | None = None
         try:
             _run(channel, ended, shown, options.priority)
         except DtsaError as error:
             failure = error
         progress.end()
-        if stop:
+        if failure is None:
             # Before the others are killed: the middleware may wait for seconds for locks of those that died with them.
             node.destroy_node()
+        else:
+            keep_node(node)  # some may have been killed already
         children.stop(hurry=bool(stop))
         try:
             pictures = options.pictures and not ended and failure is None
@@ -233,7 +235,8 @@ def _fly(
             raise failure
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
-        node.destroy_node()
+        if failure is None:
+            node.destroy_node()
 
 
 def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress, priority: int) -> None:

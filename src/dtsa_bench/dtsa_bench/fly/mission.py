@@ -18,7 +18,6 @@ from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
@@ -29,6 +28,7 @@ from dtsa_agent.crazyflie.bridge_outputs import EVENTS, EVENTS_QOS
 from dtsa_agent.crazyflie.config import SwarmSettings
 from dtsa_agent.crazyflie.paths import shortest_s
 from dtsa_agent.ros.common.loop import Stop
+from dtsa_agent.ros.common.serving import Serving
 
 from .bringing import plan_moves
 from .mission_log import MissionLog
@@ -102,9 +102,7 @@ class Mission:
                 *((GoTo, f"/{robot.name}/go_to") for robot in settings.robots),
             )
         }
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(node)
-        self._spinner = threading.Thread(target=self._executor.spin, name="mission", daemon=True)
+        self._serving = Serving(node.context, "mission", node)
         self._pulse = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
     def _keep_status(self, name: str) -> Callable[[Status], None]:
@@ -147,14 +145,13 @@ class Mission:
 
     def start(self) -> None:
         """Begin to listen."""
-        self._spinner.start()
+        self._serving.start()
         self._pulse.start()
 
     def close(self) -> None:
         """End of all threads."""
         self._over.set()
-        self._executor.shutdown()
-        self._spinner.join(2.0)
+        self._serving.close()
         self._pulse.join(2.0)
 
     def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
@@ -246,7 +243,7 @@ class Mission:
         self.wait("the way to the start", self._at_start, seconds + 15.0)
         time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count
         # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
-        self._executor.create_task(self._forget_odometry)
+        self._serving.executor.create_task(self._forget_odometry)
         self.exchanging = True
 
     def _bring(self) -> None:

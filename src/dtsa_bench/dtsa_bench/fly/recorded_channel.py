@@ -20,7 +20,7 @@ from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_setting, declare_settings
 from dtsa_agent.ros.common.priority import PrioritySettings, take_priority
-from dtsa_agent.ros.common.process import run_node
+from dtsa_agent.ros.common.process import ending, run_node
 from dtsa_agent.ros.common.runs import Run
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
@@ -152,7 +152,7 @@ def declare_run(node: Node) -> RunConfig:
 
 def _body(stop: Stop, supervised: bool) -> None:
     node, space = swarm_wide_node("channel")
-    try:
+    with ending(node):
         run = declare_run(node)
         check_key(run.swarm)
         directory = new_directory(declare_setting(node, Setting("out", "text", "flight", "directory for the results")))
@@ -166,8 +166,6 @@ def _body(stop: Stop, supervised: bool) -> None:
         finally:
             flight.channel.close()
         node.get_logger().info(f"flight {flight.write_results()['end']}; results in {directory}")
-    finally:
-        node.destroy_node()
 
 
 def main(args: Sequence[str] | None = None) -> int:

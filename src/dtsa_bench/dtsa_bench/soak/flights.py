@@ -140,12 +140,16 @@ class Running:
         """Waits for the flight to end by itself; its exit code.
 
         :param patience_s: s, how long.
-        :raises NotMet: if it does not.
+        :raises NotMet: if it does not, or stood still after a signal.
         """
         try:
-            return self.process.wait(patience_s)
+            code = self.process.wait(patience_s)
         except subprocess.TimeoutExpired:
             raise NotMet(f"the flight did not end within {patience_s:g} s") from None
+        _, stood, where = self.said().partition("Timeout (")
+        if stood:
+            raise NotMet(f"the flight stood still after a signal: {where[-1500:]}")
+        return code
 
     def nobody_left(self) -> None:
         """Waits until no process of the flight is left.

@@ -59,7 +59,7 @@ class GraphSource:
         self, track: Track, domain: int | None = None, space: str = names.SWARM, control: bool = False
     ) -> None:
         self._track, self._space = track, space
-        limit_to_machine(os.environ)
+        limit_to_machine(os.environ, shared_memory=False)  # who is killed beside it does not take it along
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node(

@@ -29,6 +29,7 @@ MOST_PAGES = 16
 _LONGEST_ORDER = 4096  # bytes
 _PATIENCE_S = 60.0  # a page that reads nothing for so long is let go
 _ORDERS_PER_S = 20.0
+_GOODBYE_S = 2.0  # for one page to be let go
 _POLICY = "Content-Security-Policy"
 _HEADERS = {
     _POLICY: "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -95,7 +96,7 @@ class ViewServer:
             await asyncio.sleep(0.02)
         for page in list(self._pages):
             with suppress(Exception):
-                await asyncio.wait_for(page.close(code=WSCloseCode.GOING_AWAY, message=b"the end"), 1.0)
+                await asyncio.wait_for(page.close(code=WSCloseCode.GOING_AWAY, message=b"the end"), _GOODBYE_S / 2)
         await self._runner.cleanup()
 
     @web.middleware
@@ -136,9 +137,7 @@ class ViewServer:
         try:
             await self._listen(page, reader)
         finally:
-            sending.cancel()
-            with suppress(asyncio.CancelledError, Exception):
-                await sending
+            await reader.end(sending)
             self._pages.pop(page, None)
         return page
 
@@ -182,6 +181,7 @@ class _Reader:
         self._chosen = [0] * len(tracks)  # agent whose beliefs it wants
         self._next_belief = [0] * len(tracks)
         self.answer = ""  # to its last order
+        self._ended = False
 
     def choose(self, run: int, agent: int) -> None:
         """The page wants to see what an agent believes; others are ignored.
@@ -198,12 +198,24 @@ class _Reader:
     async def run(self) -> None:
         """Sends what is new until the page goes."""
         try:
-            while not self._page.closed:
+            while not self._page.closed and not self._ended:
                 await self._send_news()
                 await asyncio.sleep(1 / RATE_HZ if not self.behind else 0.0)
         finally:  # the page may connect again
             with suppress(Exception):
-                await asyncio.wait_for(self._page.close(), 1.0)
+                await asyncio.wait_for(self._page.close(), _GOODBYE_S / 2)
+
+    async def end(self, running: asyncio.Task[None]) -> None:
+        """Ends `run`, which may be anywhere.
+
+        :param running: the task that it is.
+        """
+        self._ended = True  # before Python 3.12, wait_for drops a cancellation when what it waits for is just done
+        running.cancel()
+        ended, _ = await asyncio.wait({running}, timeout=_GOODBYE_S)
+        for task in ended:
+            if not task.cancelled():
+                task.exception()  # a page that has gone is no error
 
     async def _send_news(self) -> None:
         for index in range(len(self._tracks)):

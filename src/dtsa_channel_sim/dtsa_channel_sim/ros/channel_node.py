@@ -22,7 +22,7 @@ from dtsa_agent.ros.common.names import MODES
 from dtsa_agent.ros.common.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.parameters import declare_settings, from_parameter
 from dtsa_agent.ros.common.priority import PrioritySettings, take_priority
-from dtsa_agent.ros.common.process import run_node
+from dtsa_agent.ros.common.process import ending, run_node
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, ChannelConfig
 from dtsa_channel_sim.model.schedule import Change
@@ -107,7 +107,7 @@ def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: s
 
 def _body(stop: Stop, supervised: bool) -> None:
     node, space = swarm_wide_node("channel")
-    try:
+    with ending(node):
         values = declare_channel(node, ChannelConfig(agents=12))
         run = ChannelNodeSettings(**declare_settings(node, ChannelNodeSettings))
         config = ChannelConfig.from_dict(values)
@@ -125,8 +125,6 @@ def _body(stop: Stop, supervised: bool) -> None:
             channel.run(stop)
         finally:
             channel.close()
-    finally:
-        node.destroy_node()
 
 
 def main(args: Sequence[str] | None = None) -> int:

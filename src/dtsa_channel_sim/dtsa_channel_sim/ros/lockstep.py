@@ -16,6 +16,7 @@ from dtsa_agent.ros.common.checks import OTHER_RUN, OTHER_SENDER, SLOT, UNREADAB
 from dtsa_agent.ros.common.runs import run_text
 from dtsa_agent.ros.common.stamps import header_of
 from dtsa_agent.ros.common.transmission_fields import TransmissionFields, read_transmission
+from dtsa_agent.ros.common.waiting import Patience
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
@@ -96,26 +97,23 @@ class LockstepChannel(RosChannel):
     def _collect(self, slot: int, stop: object) -> bool:
         """Takes in answers until all agents have given theirs; False when stopped."""
         loop, answers = self.loop, self.answers
-        begin = repeat = time.monotonic()
+        patience, repeat = Patience(), time.monotonic()
         while answers.missing:
             data = loop.wait()
-            if data is None:
+            if data is None or not self._take(slot, data):
                 if stop:
                     return False
-                repeat = self._wait(slot, begin, repeat)
-            else:
-                self._take(slot, data)
+                repeat = self._wait(slot, patience.look(), repeat)
             self._housekeeping()
         return not stop
 
-    def _wait(self, slot: int, begin: float, repeat: float) -> float:
-        """Nothing has come for a while: complain if that takes too long; says when slot 0 was last sent."""
-        self._idle()
+    def _wait(self, slot: int, waited_s: float, repeat: float) -> float:
+        """No answer has come: complain if that takes too long; says when the slot was last sent."""
         now = time.monotonic()
         if self._complaint and now > self._complaint_time + _GARBAGE_PATIENCE_S:
             raise RemoteProtocolError(f"{named(self.answers.silent)} sent garbage in slot {slot}: {self._complaint}")
         limit = self._answer_s if slot else self._startup_s
-        if now - begin > limit:
+        if waited_s > limit:
             raise LocalProtocolError(
                 f"{named(self.answers.silent)} did not answer slot {slot} within {limit:g} s: dead or hung?"
             )
@@ -124,11 +122,12 @@ class LockstepChannel(RosChannel):
             return now
         return repeat
 
-    def _take(self, slot: int, data: bytes) -> None:
+    def _take(self, slot: int, data: bytes) -> bool:
+        """Takes in one message; whether it is an answer that was missing."""
         try:
             message = self._decoded(data)
             if message.slot < slot:
-                return  # an answer that was asked for twice
+                return False  # an answer that was asked for twice
             if message.slot > slot:
                 raise Unusable(SLOT, f"{named(message.agent)} answered slot {message.slot}, which has not begun")
             fresh = self.answers.add(message)
@@ -136,9 +135,10 @@ class LockstepChannel(RosChannel):
             self.intake.drop(error.reason, str(error))
             if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent is to blame
                 self._complaint, self._complaint_time = str(error), time.monotonic()
-            return
+            return False
         if fresh:
             self._observers.answer_received(slot, message.agent.tobytes(), data)
+        return fresh
 
     def _decoded(self, data: bytes) -> TransmissionFields | Transmission:
         """A transmission message of one of this run's processes; where it is laid out as usual, its fields.

@@ -21,6 +21,7 @@ from dtsa_agent.ros.common.checks import OTHER_SENDER, check_slot
 from dtsa_agent.ros.common.intake import Intake, add_counts
 from dtsa_agent.ros.common.loop import Feed, Loop
 from dtsa_agent.ros.common.runs import Run
+from dtsa_agent.ros.common.waiting import Patience
 from dtsa_agent.ros.common.wire import pack_received
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
@@ -151,7 +152,7 @@ class RosChannel:
             return self._introduce_all(stop, absent, look_for_others)
 
     def _introduce_all(self, stop: object, absent: Set[int], look_for_others: Callable[[], None]) -> bool:
-        begin, repeat = time.monotonic(), 0.0
+        patience, repeat = Patience(), 0.0
         while not self.roster.complete(time.monotonic(), absent):
             if stop:
                 return False
@@ -165,7 +166,7 @@ class RosChannel:
             self._hear_processes()
             look_for_others()
             self._housekeeping()
-            if now - begin > self._startup_s:
+            if patience.look() > self._startup_s:
                 missing = named(set(self.roster.missing) - absent)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
         self.roster.close()

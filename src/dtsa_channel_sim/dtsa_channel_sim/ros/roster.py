@@ -72,6 +72,11 @@ class Roster:
         self.closed = False
 
     @property
+    def agreed(self) -> Mapping[str, Any]:
+        """The settings that all share, as plain values; those of the agents are known once they have told them."""
+        return self._agreed
+
+    @property
     def missing(self) -> list[int]:
         """Ids of the agents whose processes have not told about themselves."""
         return [agent for agent in range(1, self._agents + 1) if agent not in self._of]

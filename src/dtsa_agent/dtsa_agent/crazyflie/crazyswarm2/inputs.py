@@ -8,13 +8,11 @@ radians.
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from dtsa_agent.crazyflie import units
@@ -27,6 +25,7 @@ from dtsa_agent.crazyflie.pump import CommandPump
 from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.crazyflie.trajectories import Piece, Trajectory, meeting
 from dtsa_agent.crazyflie.vehicle import Vehicle
+from dtsa_agent.ros.common.serving import Serving
 
 
 @dataclass(slots=True)
@@ -61,8 +60,7 @@ class Crazyswarm2Inputs(Inputs):
         self._masks = {name: vehicle.robot.group_mask for name, vehicle in bridge.vehicles.items()}
         # An upload takes up to seconds: it must not keep an emergency stop waiting.
         self._uploads = helper_node(node, "uploads")
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._thread = threading.Thread(target=self._executor.spin, name="uploads", daemon=True)
+        self._serving = Serving(node.context, "uploads", self._uploads)
 
     def offer(self) -> None:
         """Create everything; `/all/emergency` is last."""
@@ -71,15 +69,12 @@ class Crazyswarm2Inputs(Inputs):
         for name, vehicle in self._bridge.vehicles.items():
             kind, service = self._interfaces.srv.UploadTrajectory, f"{name}/upload_trajectory"
             self._uploads.create_service(kind, service, partial(self._upload, vehicle))
-        self._executor.add_node(self._uploads)
-        self._thread.start()
+        self._serving.start()
         super().offer()
 
     def close(self) -> None:
         """No more uploads."""
-        self._executor.shutdown()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
+        self._serving.close()
         self._uploads.destroy_node()
 
     def _services(self) -> list[tuple[Any, str, Callable[[list[str], Any, Any], Any]]]:

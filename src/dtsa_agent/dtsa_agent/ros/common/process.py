@@ -7,18 +7,19 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
 
 from . import names
 from .dds import clean_shared_memory, limit_to_machine
@@ -27,6 +28,7 @@ from .loop import Stop
 _PR_SET_PDEATHSIG = 1
 _REALTIME = re.compile(rf"""^\s*["']?mode["']?\s*:\s*["']?{names.MODES[1]}\b""", re.MULTILINE)
 SUPERVISOR = "DTSA_SUPERVISOR"  # process id of the supervisor that started this node, if one did
+_KEPT: list[Node] = []  # nodes that last as long as their process
 
 
 def follow_supervisor() -> bool:
@@ -69,6 +71,34 @@ def in_real_time(words: Sequence[str]) -> bool:
     return False
 
 
+def keep_node(node: Node) -> None:
+    """Lets a node last as long as its process, in place of destroying it: where one that it talked with may be dead.
+
+    Who is killed may hold a lock in the shared memory of others. Fast DDS 2.14 gives such memory up in the thread that
+    receives; a thread that destroys the node waits for the lock meanwhile, and the process crashes.
+
+    :param node: the node.
+    """
+    _KEPT.append(node)
+
+
+@contextmanager
+def ending(node: Node) -> Iterator[None]:
+    """Destroys a node at the end of the context; keeps it when that ends because others are dead or hang.
+
+    :param node: the node.
+    """
+    try:
+        yield
+    except LocalProtocolError:
+        keep_node(node)
+        raise
+    except BaseException:
+        node.destroy_node()
+        raise
+    node.destroy_node()
+
+
 def run_node(
     name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None, real_time: bool = False
 ) -> int:
@@ -85,20 +115,32 @@ def run_node(
     if not supervised:  # a supervisor does that for all of them
         clean_shared_memory()  # of the process, killed, whose place this one may take
     with Stop() as stop:
-        try:
-            rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # rclpy's errors for a wrong command line have no common base
-            print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
-            return 2
-        try:
-            return body(stop, supervised) or 0
-        except ConfigError as error:
-            print(f"{name}: error: {error}", file=sys.stderr)
-            return 2
-        except DtsaError as error:
-            print(f"{name}: error: {error}", file=sys.stderr)
-            return 1
-        except ExternalShutdownException:
-            return 0
-        finally:
-            rclpy.try_shutdown()
+        code = _run(name, body, args, stop, supervised)
+    if _KEPT:  # nor is the interpreter taken apart with them
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _run(
+    name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None, stop: Stop, supervised: bool
+) -> int:
+    """The node itself; its exit code."""
+    try:
+        rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy's errors for a wrong command line have no common base
+        print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 2
+    try:
+        return body(stop, supervised) or 0
+    except ConfigError as error:
+        print(f"{name}: error: {error}", file=sys.stderr)
+        return 2
+    except DtsaError as error:
+        print(f"{name}: error: {error}", file=sys.stderr)
+        return 1
+    except ExternalShutdownException:
+        return 0
+    finally:
+        rclpy.try_shutdown()

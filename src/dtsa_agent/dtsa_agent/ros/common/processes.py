@@ -31,9 +31,17 @@ class ProcessName:
     @property
     def gone(self) -> bool:
         """Whether the process has ended for sure. A stopped one has not; of other machines nothing is known."""
-        if not self.started or self.machine != _machine() or self.pid <= 0:
-            return False
-        return _started(self.pid) != self.started
+        return self._of_here and _started(self.pid) != self.started
+
+    @property
+    def paused(self) -> bool:
+        """Whether the process is there but stopped, by a signal or a debugger; of other machines nothing is known."""
+        fields = _fields(self.pid) if self._of_here else []
+        return bool(fields) and fields[0] in (b"T", b"t") and int(fields[19]) == self.started
+
+    @property
+    def _of_here(self) -> bool:
+        return bool(self.started) and self.machine == _machine() and self.pid > 0
 
 
 @cache
@@ -47,9 +55,13 @@ def _machine() -> str:
 
 def _started(pid: int) -> int:
     """When a process started, in clock ticks after the boot; 0: there is none, or it is a zombie."""
+    fields = _fields(pid)
+    return int(fields[19]) if fields and fields[0] not in (b"Z", b"X") else 0
+
+
+def _fields(pid: int) -> list[bytes]:
+    """What the kernel says about a process, from its state on; nothing if there is none."""
     try:
-        stat = Path(f"/proc/{pid}/stat").read_bytes()
+        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
     except OSError:
-        return 0
-    fields = stat.rpartition(b")")[2].split()
-    return 0 if fields[0] in (b"Z", b"X") else int(fields[19])
+        return []

@@ -1,4 +1,4 @@
-"""Lines on a node's logger that come again and again, but ever more seldom."""
+"""Waiting for other processes: for how long, and lines on a node's logger that say so ever more seldom."""
 
 from __future__ import annotations
 
@@ -7,6 +7,26 @@ from typing import Any
 
 _FIRST_S = 2.0
 _LONGEST_S = 60.0
+_LONGEST_LOOK_S = 0.25
+
+
+class Patience:
+    """How long this process has looked for something in vain.
+
+    Time in which it did not run (Ctrl-Z, a debugger, a frozen container) does not count: what the others have said
+    meanwhile has not reached it yet.
+    """
+
+    def __init__(self) -> None:
+        self._looked_s = time.monotonic()
+        self._spent_s = 0.0
+
+    def look(self) -> float:
+        """Called at every look, several times a second; gives the s of wall time spent so far."""
+        now = time.monotonic()
+        self._spent_s += min(now - self._looked_s, _LONGEST_LOOK_S)
+        self._looked_s = now
+        return self._spent_s
 
 
 class Waiting:

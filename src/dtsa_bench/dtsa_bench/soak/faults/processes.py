@@ -14,6 +14,8 @@ from dtsa_bench.soak.flights import ENDLESS, PATIENCE_S, Running, children, flyi
 from .fault import LOCKSTEP, REALTIME, Fault
 
 _STOPPED_S = 1.0
+_SUSPENDED_S = 30.0  # by then the middleware has given up who is stopped
+_FOUND_S = 10.0  # by then an agent that does not find the channel again has ended
 # The vehicle of an agent that is dead or hangs hovers in the way; what the others then do is not what a row is about.
 _IN_THE_WAY = (*REALTIME, "--no-stop-on-crash")
 
@@ -88,6 +90,22 @@ def _channel_paused(directory: Path) -> None:
         flight.process.send_signal(signal.SIGSTOP)
         time.sleep(_STOPPED_S)
         flight.process.send_signal(signal.SIGCONT)
+        flies_on(flight)
+        interrupted_well(flight)
+
+    _flight(directory, LOCKSTEP, act)
+
+
+def _suspended(directory: Path) -> None:
+    def act(flight: Running) -> None:
+        everybody = (flight.process.pid, *flight.known)
+        for pid in everybody:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(_SUSPENDED_S)
+        for pid in everybody:
+            os.kill(pid, signal.SIGCONT)
+        flies_on(flight)
+        time.sleep(_FOUND_S)
         flies_on(flight)
         interrupted_well(flight)
 
@@ -206,6 +224,8 @@ FAULTS = (
           "all wait, then fly on; the bag verifies", _agent_paused, True),
     Fault("channel paused, lockstep", "SIGSTOP and, 1 s later, SIGCONT to the channel, lockstep",
           "all wait, then fly on; the bag verifies", _channel_paused),
+    Fault("flight suspended, lockstep", "SIGSTOP and, 30 s later, SIGCONT to all processes of a flight, lockstep",
+          "it flies on; the bag verifies", _suspended),
     Fault("channel paused, real time", "SIGSTOP and, 1 s later, SIGCONT to the channel, real time",
           "the flight goes on; nobody is taken for lost; the bag verifies", _channel_paused_in_real_time),
     Fault("recorder killed, lockstep", "SIGKILL to channel and recorder, lockstep", _RECOVERS,
