@@ -8,6 +8,7 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
@@ -52,6 +53,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
         return (yield)
 
 
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Names a test that failed at once; a run that is ended from outside never comes to its list of failures."""
+    if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
+        crash = getattr(report.longrepr, "reprcrash", None)
+        why = str(report.longrepr if crash is None else crash.message).splitlines()
+        print(f"\n{report.nodeid}: {why[0] if why else 'failed'}", file=sys.__stderr__, flush=True)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:
     """Tells a worker of pytest-xdist where the locks are."""
@@ -73,17 +82,16 @@ def pytest_keyboard_interrupt(excinfo: pytest.ExceptionInfo[BaseException]) -> N
 def machine(locks: Path, alone: bool) -> Iterator[None]:
     """The machine for one test alone, or together with those of other workers that do not mind.
 
+    The locks are POSIX's, which belong to one process: what a worker has forked does not hold them when it has died.
+
     :param locks: directory of the workers' locks. Who waits at the door lets nobody past, so that each gets its turn.
     :param alone: whether no other test may run meanwhile.
     """
-    with (locks / "room").open("w") as room:
-        with (locks / "door").open("w") as door:
-            fcntl.flock(door, fcntl.LOCK_EX)
-            fcntl.flock(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
-        try:
-            yield
-        finally:
-            fcntl.flock(room, fcntl.LOCK_UN)  # also for processes that were forked meanwhile
+    with (locks / "room").open("a+") as room:
+        with (locks / "door").open("a+") as door:
+            fcntl.lockf(door, fcntl.LOCK_EX)
+            fcntl.lockf(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+        yield
 
 
 def _is_alone(item: pytest.Item) -> bool:

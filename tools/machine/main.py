@@ -36,7 +36,8 @@ Removes what the build made for this kind of machine and this Python; what proce
   --all   the virtual environment, too""",
 }
 # A file's tests share what it flies.
-SIDE_BY_SIDE = ("--dist", "loadfile", "--no-loadscope-reorder")
+# When a worker dies, pytest-xdist would give its files to a new one, lose some of them, and wait for those for ever.
+SIDE_BY_SIDE = ("--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0")
 MOST_WORKERS = 4
 TEST_EXTRAS = {"test", "dev", "cflib", "benchmark", "cluster"}
 BENCH = layout.SOURCES / "dtsa_bench"

@@ -54,7 +54,7 @@ class Step:
 
         :raises SetupError: naming the step, the reason and the log, when it fails.
         """
-        with self.log.open("ab") as log:
+        with self.log.open("ab") as log, noted_signals() as signals:
             log.write(f"$ {' '.join(str(word) for word in command)}\n".encode())
             log.flush()
             start = log.tell()
@@ -68,14 +68,35 @@ class Step:
                 start_new_session=True,
             )
             try:
-                while process.poll() is None:
+                while process.poll() is None and not signals:
                     with suppress(subprocess.TimeoutExpired):
-                        process.wait(timeout=0.5)
+                        process.wait(timeout=0.2)
                     self.show()
             finally:
                 stop(process)
+        if signals:
+            raise KeyboardInterrupt
         if process.returncode != 0:
             raise SetupError(f"{reason(self.log, start)}")
+
+
+@contextmanager
+def noted_signals() -> Iterator[list[int]]:
+    """Notes SIGINT and SIGTERM in a list until the end of the context.
+
+    An exception raised by a signal while a command is being started, or ended, would leave it running.
+    """
+    noted: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda number, frame: noted.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
+    try:
+        yield noted
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:

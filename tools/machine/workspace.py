@@ -80,7 +80,7 @@ def products(package: str) -> bool:
         return False
     if package == "dtsa_msgs":
         return True
-    if package == "dtsa_agent" and not kernel().exists():
+    if package == "dtsa_agent" and not all(made.exists() for made in compiled()):
         return False
     return any((installed / "lib").glob("python*/site-packages/*.egg-link"))
 
@@ -146,7 +146,7 @@ def build(packages: list[str]) -> None:
                 shutil.rmtree(layout.INSTALL / package, ignore_errors=True)
                 if package == "dtsa_agent":
                     remove_kernel()
-        remove_kernel("_kernel.cpython-*.so")  # made for one Python: Python looks for these first
+        remove_kernel("cpython-*.so")  # made for one Python: Python looks for these first
         (layout.INSTALL / ".dtsa-environment.json").unlink(missing_ok=True)
         arguments = ["--base-paths", str(layout.SOURCES), "--symlink-install", "--packages-select", *packages]
         arguments += ["--build-base", str(layout.BUILD), "--install-base", str(layout.INSTALL)]
@@ -164,13 +164,19 @@ def kernel() -> Path:
     return layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "core" / "_kernel.abi3.so"
 
 
-def remove_kernel(pattern: str = "_kernel.*.so") -> None:
-    """Remove compiled kernels from the source tree.
+def compiled() -> list[Path]:
+    """All that is compiled: the kernel, and what agents on a network hear."""
+    return [kernel(), layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "air" / "udp" / "_hearing.abi3.so"]
 
-    :param pattern: of their names.
+
+def remove_kernel(ending: str = "*.so") -> None:
+    """Remove what is compiled from the source tree.
+
+    :param ending: pattern of what follows the modules' names.
     """
-    for made in kernel().parent.glob(pattern):
-        made.unlink(missing_ok=True)
+    for path in compiled():
+        for made in path.parent.glob(f"{path.name.partition('.')[0]}.{ending}"):
+            made.unlink(missing_ok=True)
 
 
 def environment() -> dict[str, str]:
