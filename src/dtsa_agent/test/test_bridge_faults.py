@@ -281,6 +281,14 @@ def test_min_connected(tmp_path: Path) -> None:
             assert "min_connected is 2" in pilot.bridge.enough()
 
 
+def test_simulated_ones_that_begin_to_listen_later_are_waited_for(tmp_path: Path) -> None:
+    """A launch starts them beside the bridge, whose three attempts were over within 40 ms."""
+    with fake_fleet(tmp_path, 1) as fleet:
+        fleet.fault("close", 1, seconds=2.0)
+        with flight(settings(fleet, connect_attempts=1, connect_timeout_s=20.0)) as pilot:
+            assert pilot.bridge.connect() == []
+
+
 PILOT = """
 import sys, time, json
 sys.path.insert(0, {helpers!r})

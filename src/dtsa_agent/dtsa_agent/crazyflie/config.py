@@ -92,7 +92,12 @@ class RobotSettings(Settings):
         minimum=0.2,
         maximum=300,
     )
-    connect_attempts: int = setting(3, "attempts to connect", minimum=1, maximum=100)
+    connect_attempts: int = setting(
+        3,
+        "attempts to connect; before the first one counts, a closed UDP port is asked for up to 10 s",
+        minimum=1,
+        maximum=100,
+    )
     estimator_timeout_s: float = setting(10.0, "time for the estimator to settle", unit="s", minimum=0.1, maximum=300)
     estimator_variance_m2: float = setting(
         0.01,

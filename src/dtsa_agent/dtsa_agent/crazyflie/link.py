@@ -8,6 +8,7 @@ again and again, until it is closed.
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.util
 import logging
 import math
@@ -34,8 +35,10 @@ FIRST_ANSWER_S = 2.0  # over the air nothing else tells that nobody is there: th
 STUCK_S = 0.25  # nothing acknowledged for that long, though cflib asks all the time
 REOPEN_S = (0.1, 2.0)  # first and longest pause before a link that ended is opened again
 REOPEN_TIMEOUT_S = 3.0  # for one such attempt
+NOBODY_S = 10.0  # simulated Crazyflies that are started at the same time take so long to listen
 LOG_ORDER_S = 0.4  # nothing logged for that long, though it can be heard: the log is ordered anew
 IDLE_S = 0.01
+REFUSED = f"[Errno {errno.ECONNREFUSED}]"  # in the words of a driver: nobody listens there
 
 
 def require_cflib() -> None:
@@ -208,15 +211,23 @@ class Link:
         """Connect in the worker; `done` is called with an empty text, or with why it failed."""
 
         def run() -> None:
-            reason = ""
-            for attempt in range(1, self.robot.connect_attempts + 1):
+            attempts, attempt, reason = self.robot.connect_attempts, 1, "the link has been closed"
+            pause, longest = REOPEN_S
+            patience = time.monotonic() + min(NOBODY_S, self.robot.connect_timeout_s)
+            while attempt <= attempts and not self.mailbox.closed:
                 try:
                     self._connect()
                     reason = ""
                     break
                 except LinkError as error:
-                    reason = f"attempt {attempt} of {self.robot.connect_attempts}: {error}"
+                    reason = f"attempt {attempt} of {attempts}: {error}"
                     self._drop()
+                    # A closed port says so at once: that is no attempt as long as it may be about to be opened.
+                    nobody = REFUSED in reason and time.monotonic() < patience
+                    attempt += not nobody
+                    if nobody:
+                        time.sleep(pause)
+                        pause = min(2 * pause, longest / 4)
             done(reason)
 
         self._reopen = False
