@@ -239,6 +239,37 @@ def test_an_answer_to_a_call_that_comes_late_is_not_taken_for_what_was_done_in_a
     assert late.places == {0.0}
 
 
+class SilentAtFirst(LateSender):
+    """Answers calls, and reports nothing of the first slots."""
+
+    def __init__(self, node: Node, channel: RealtimeChannel) -> None:
+        super().__init__(node, channel)
+        self.places: list[list[float]] = []
+
+    def _report(self, slot: int, place: float = 3.0) -> None:
+        if slot >= names.FIRST_CALL or slot > 100:
+            super()._report(slot, place)
+
+    def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        self.places.append(answers.position.ravel().tolist())
+
+
+@pytest.mark.ros
+def test_who_is_late_with_its_first_report_is_where_it_was_when_it_was_called(tmp_path: Path) -> None:
+    """Taken for the field's origin, two who were late were taken for crashed."""
+    with ros_graph(tmp_path) as graph:
+        node = Node("channel", context=graph.node.context, enable_rosout=False)
+        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, referee=SlotLimit(20))
+        silent = SilentAtFirst(graph.node, channel)
+        channel.observe(silent)
+        try:
+            channel.run(stop=False)
+        finally:
+            channel.close()
+            node.destroy_node()
+    assert silent.places == [[3.0] * 6] * 20
+
+
 @pytest.mark.ros
 @flown_again_when_overloaded
 def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_path: Path) -> None:

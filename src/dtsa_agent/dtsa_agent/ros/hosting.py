@@ -21,7 +21,7 @@ from dtsa_agent.plugin_watch import watched
 from .common import names
 from .common.loop import Stop
 from .common.parameters import declare_settings
-from .common.priority import PrioritySettings, take_place
+from .common.priority import PrioritySettings, give_way_by
 from .swarm_node import SwarmNode
 
 
@@ -149,7 +149,7 @@ def _realtime(node: Node, swarm: AbstractSwarm, space: str, priority: int) -> Sw
     nice = _declare(node, "nice", 0, text, ParameterType.PARAMETER_INTEGER)
     if not 0 <= nice <= 19:
         raise ConfigError("nice", nice, "0 to 19")
-    take_place(priority, nice)
+    give_way_by(nice)
     text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
     places = list(_declare(node, "resume_at", [0.0], text, ParameterType.PARAMETER_DOUBLE_ARRAY))
     if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):
@@ -163,6 +163,7 @@ def _realtime(node: Node, swarm: AbstractSwarm, space: str, priority: int) -> Sw
         jitter_ns=clocks.clock_jitter_ns,
         align=clocks.align,
         flight_time_ns=(fixed, per_byte),
+        priority=priority,
         resume_at=places if len(places) > 1 else (),
     )
 

@@ -27,6 +27,7 @@ from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
 from .common import names
 from .common.checks import SIZES, SLOT, Unusable, check_start
 from .common.loop import Stop
+from .common.priority import take_priority
 from .common.slot_fields import SlotFields
 from .common.stamps import header_of, time_of
 from .common.wire import split_frames, unpack_received
@@ -76,6 +77,7 @@ class RealtimeNode(SwarmNode):
     :param align: whether agents move their slots towards what they hear.
     :param flight_time_ns: ns from the order to send a frame until the receivers' flight processors have it: for any
         frame, and for each of its bytes.
+    :param priority: real-time priority of the process, where allowed, once all have found each other; 0: none.
     :param resume_at: m, x, y, z of each agent in turn: where its vehicle hovers when it comes into a flight under way;
         none: at its start in the scenario.
     """
@@ -90,6 +92,7 @@ class RealtimeNode(SwarmNode):
         jitter_ns: float = 0.0,
         align: bool = True,
         flight_time_ns: tuple[int, int] = (0, 0),
+        priority: int = 0,
         resume_at: Sequence[float] = (),
         **kwargs: Any,
     ) -> None:
@@ -115,6 +118,7 @@ class RealtimeNode(SwarmNode):
         self._jitter_ns = jitter_ns
         self._random = [generator(self.config.seed, STREAM_CLOCKS, agent) for agent in self.swarm.ids]
         self._fixed_ns, self._per_byte_ns = flight_time_ns
+        self._priority = priority  # still to be taken
         self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3).T
         self._called = False  # was there when the channel asked who is
         self._listeners: Listeners | None = None
@@ -220,9 +224,12 @@ class RealtimeNode(SwarmNode):
         """Answers the channel's call, or takes the start time; False when the run is over."""
         if message.phase == Slot.PREPARE:
             self._called = True
+            if message.slot > names.FIRST_CALL:
+                self._go_first()
             self._reporter.add_slot(message.slot, self.starts(0))
             self._reporter.publish(message.run)
         elif message.phase == Slot.START and (self._called or self._may_join()):
+            self._go_first()
             self._begin(message.run)
             self._zero = message.time_ns
             if not self._called:
@@ -233,6 +240,16 @@ class RealtimeNode(SwarmNode):
                     self.swarm.position[:] = self._resume_at
                     self.swarm.track[:] = self._resume_at
         return message.phase != Slot.END
+
+    def _go_first(self) -> None:
+        """Real-time priority, where it may be had.
+
+        Not earlier: many processes that look for each other keep all processors busy for seconds, and by turns of
+        0.1 s, as real-time priority has them, for minutes.
+        """
+        if self._priority:
+            take_priority(self._priority)
+            self._priority = 0
 
     def _may_join(self) -> bool:
         """Whether the channel has found all that this process sends; who comes late waits for that.

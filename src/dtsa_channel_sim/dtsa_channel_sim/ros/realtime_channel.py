@@ -176,7 +176,8 @@ class RealtimeChannel(RosChannel):
         """Waits until all agents have reported, and tells them when slot 0 starts."""
         if not self._call(stop, self.lost):
             return False
-        roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling)
+        accounts = Accounts(self.agents, self._steps, 1)
+        roll_call = RollCall(self._publisher, self._reports, self.run_id, self._calling, accounts)
         patience, repeat = Patience(), 0.0
         everybody = set(range(1, self.agents + 1))
         awaited = set(everybody)
@@ -195,6 +196,10 @@ class RealtimeChannel(RosChannel):
             if patience.look() > self._startup_s:
                 missing = named(awaited - self.lost)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
+        # Nobody who is late with its first report has been anywhere else.
+        places = roll_call.answers(0)
+        places.carry(self.answers)
+        self.answers = places
         self.round_ms = roll_call.round_ms(everybody - self.lost)
         self._zero = time.monotonic_ns() + _LEAD_NS
         self._tell_start()

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import time
 from array import array
+from contextlib import suppress
 
 import numpy as np
 from dtsa_msgs.msg import Slot
 from rclpy.publisher import Publisher
 
 from dtsa_agent.ros.common import names
+from dtsa_agent.ros.common.checks import Unusable
 from dtsa_agent.ros.common.loop import Feed
 from dtsa_agent.ros.common.report_fields import read_report
+
+from .accounts import Accounts
+from .answers import Answers
 
 _ROUNDS, _LONGEST_S = 20, 0.5
 _PAUSE_S = 0.0001
@@ -24,10 +29,21 @@ class RollCall:
     :param reports: what they answer.
     :param run_id: the run's id.
     :param calling: what the channel's calls carry.
+    :param accounts: those of the calls, a slot each; what agents answer is checked as all that they report.
     """
 
-    def __init__(self, publisher: Publisher, reports: Feed, run_id: int, calling: array[int]) -> None:
+    def __init__(
+        self, publisher: Publisher, reports: Feed, run_id: int, calling: array[int], accounts: Accounts
+    ) -> None:
         self._publisher, self._reports, self._run_id, self._calling = publisher, reports, run_id, calling
+        self._accounts = accounts
+
+    def answers(self, number: int) -> Answers:
+        """What has been answered to a call: where all are, above all.
+
+        :param number: of the call.
+        """
+        return self._accounts[names.FIRST_CALL + number]
 
     def call(self, number: int) -> None:
         """Asks who is there.
@@ -48,8 +64,11 @@ class RollCall:
                 message = read_report(data)
             except Exception:  # rclpy has no common base for what a message can do to it
                 continue
-            if message.run == self._run_id and message.slot.tolist() == [names.FIRST_CALL + number]:
-                found.update(message.agent)
+            asked = names.FIRST_CALL + number
+            if message.run == self._run_id and message.slot.tolist() == [asked]:
+                with suppress(Unusable):
+                    self._accounts.add(message, asked)
+                    found.update(message.agent)
         return found
 
     def round_ms(self, agents: set[int]) -> float:
