@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from fly_helpers import command
 from metronome import flown_again_when_overloaded
+from node_helpers import ros_graph
 from process_helpers import addresses, may_be_real_time, real_time, segments_of
 from waiting import wait_for
 
@@ -207,3 +208,15 @@ def test_an_end_has_one_reason() -> None:
     by_hand = EarlyEnd(stop, 1.0, lambda: 1.5)
     assert by_hand
     assert by_hand.reason == ""  # the user knows why
+
+
+@pytest.mark.skipif(not may_be_real_time(), reason="this user may not have real-time priority")
+def test_agents_go_first_once_all_have_found_each_other(tmp_path: Path) -> None:
+    """Many that look for each other by turns of real-time priority need minutes for it."""
+    words = ("-p", "agents:=2", "-p", "mode:=realtime")
+    with ros_graph(tmp_path) as graph:
+        host = graph.start("dtsa_agent.ros.swarm_host", *words, "-p", "policy:=lease", "-p", "priority:=10")
+        graph.until(lambda: graph.node.count_publishers("/swarm/process"))
+        assert not real_time(host.pid)
+        graph.start("dtsa_channel_sim.ros.channel_node", *words)
+        graph.until(lambda: real_time(host.pid))
