@@ -187,9 +187,9 @@ class RealtimeChannel(RosChannel):
             now = time.monotonic()
             if now - repeat > _REPEAT_S:
                 repeat = now
-                roll_call.call(0)
+                roll_call.call()
             self.loop.wait(_TICK_NS)
-            awaited -= roll_call.answered(0)
+            awaited -= roll_call.present()
             self.answers.missing = len(awaited)
             self.answers.answered[:] = [agent not in awaited for agent in range(1, self.agents + 1)]
             self._housekeeping()
@@ -197,10 +197,18 @@ class RealtimeChannel(RosChannel):
                 missing = named(awaited - self.lost)
                 raise LocalProtocolError(f"{missing} did not report within {self._startup_s:g} s: dead or hung?")
         # Nobody who is late with its first report has been anywhere else.
-        places = roll_call.answers(0)
-        places.carry(self.answers)
-        self.answers = places
-        self.round_ms = roll_call.round_ms(everybody - self.lost)
+        told = roll_call.told
+        told.carry(self.answers)
+        self.answers = told
+        absent = set(self.lost)
+
+        def disturbed() -> bool:
+            self._housekeeping()
+            return bool(stop) or self.lost != absent
+
+        self.round_ms = roll_call.round_ms(everybody - absent, _TIGHT * self.slot_ns / 1e6, disturbed)
+        if stop:
+            return False
         self._zero = time.monotonic_ns() + _LEAD_NS
         self._tell_start()
         self._observers.begun(self._zero / _NS)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from array import array
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -13,12 +15,14 @@ from rclpy.publisher import Publisher
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.checks import Unusable
 from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.report_fields import read_report
+from dtsa_agent.ros.common.report_fields import ReportFields, read_report
 
 from .accounts import Accounts
 from .answers import Answers
 
-_ROUNDS, _LONGEST_S = 20, 0.5
+_ROUNDS, _LONGEST_S = 20, 0.5  # of one measurement
+_SHORTER = 0.8  # rounds that take so much of what those before took become shorter
+_SETTLED_S = 10.0  # after that a measurement counts however long rounds take
 _PAUSE_S = 0.0001
 
 
@@ -29,7 +33,7 @@ class RollCall:
     :param reports: what they answer.
     :param run_id: the run's id.
     :param calling: what the channel's calls carry.
-    :param accounts: those of the calls, a slot each; what agents answer is checked as all that they report.
+    :param accounts: an empty one, for the answers to the first call.
     """
 
     def __init__(
@@ -37,53 +41,67 @@ class RollCall:
     ) -> None:
         self._publisher, self._reports, self._run_id, self._calling = publisher, reports, run_id, calling
         self._accounts = accounts
+        self._number = names.FIRST_CALL
 
-    def answers(self, number: int) -> Answers:
-        """What has been answered to a call: where all are, above all.
+    def call(self) -> None:
+        """Asks who is there, with the same number until a round is measured."""
+        data = self._calling
+        self._publisher.publish(Slot(run=self._run_id, phase=Slot.PREPARE, slot=self._number, data=data))
 
-        :param number: of the call.
-        """
-        return self._accounts[names.FIRST_CALL + number]
-
-    def call(self, number: int) -> None:
-        """Asks who is there.
-
-        :param number: the answers name it.
-        """
-        number += names.FIRST_CALL
-        self._publisher.publish(Slot(run=self._run_id, phase=Slot.PREPARE, slot=number, data=self._calling))
-
-    def answered(self, number: int) -> set[int]:
-        """Ids of agents that have answered a call, among the answers that have come in since this was asked last.
-
-        :param number: of the call.
-        """
+    def present(self) -> set[int]:
+        """Ids of agents that have answered the first call, among the answers that have come since this was asked."""
         found: set[int] = set()
+        for message in self._answers():
+            with suppress(Unusable):
+                self._accounts.add(message, self._number)
+                found.update(message.agent)
+        return found
+
+    @property
+    def told(self) -> Answers:
+        """What all have answered to the first call: where they are, above all."""
+        return self._accounts[names.FIRST_CALL]
+
+    def _answers(self) -> Iterator[ReportFields]:
+        """Answers to the last call that have come in."""
         while (data := self._reports.take()) is not None:
             try:
                 message = read_report(data)
             except Exception:  # rclpy has no common base for what a message can do to it
                 continue
-            asked = names.FIRST_CALL + number
-            if message.run == self._run_id and message.slot.tolist() == [asked]:
-                with suppress(Unusable):
-                    self._accounts.add(message, asked)
-                    found.update(message.agent)
-        return found
+            if message.run == self._run_id and message.slot.tolist() == [self._number]:
+                yield message
 
-    def round_ms(self, agents: set[int]) -> float:
+    def round_ms(self, agents: set[int], enough_ms: float, give_up: Callable[[], object]) -> float:
         """How long a round of messages takes, from a call to the last answer: ms, median over some rounds.
 
+        Many processes may have found the channel and still look for each other. So a measurement is repeated for some
+        seconds while only some answer in time, or rounds that take too long become shorter.
+
         :param agents: ids of those that answer.
+        :param enough_ms: ms, what is short enough.
+        :param give_up: asked twice a second; whether to end with what is known.
         """
+        end, before = time.monotonic() + _SETTLED_S, math.inf
+        while True:
+            took, silent = self._series(agents)
+            settled = silent == agents or (not silent and (took <= enough_ms or took > _SHORTER * before))
+            if settled or time.monotonic() > end or give_up():
+                return took
+            before = math.inf if silent else took
+
+    def _series(self, agents: set[int]) -> tuple[float, set[int]]:
+        """Median of some rounds, ms, and who did not answer in time in the last of them."""
         end, rounds = time.monotonic() + _LONGEST_S, []
-        for number in range(1, _ROUNDS + 1):
+        for _ in range(_ROUNDS):
             begin, awaited = time.monotonic(), set(agents)
-            self.call(number)
+            self._number += 1
+            self.call()
             while awaited and time.monotonic() < end:
                 time.sleep(_PAUSE_S)
-                awaited -= self.answered(number)
+                for message in self._answers():
+                    awaited.difference_update(message.agent)
             rounds.append(time.monotonic() - begin)
             if time.monotonic() >= end:
                 break
-        return float(np.median(rounds)) * 1e3
+        return float(np.median(rounds)) * 1e3, awaited
