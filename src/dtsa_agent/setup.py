@@ -53,8 +53,9 @@ setup(
             extra_compile_args=COMPILE_FLAGS,
             py_limited_api=True,
         ),
+        Extension("dtsa_agent.ros.common._endless", sources=["dtsa_agent/ros/common/_endless.c"], py_limited_api=True),
     ],
-    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml", "libdtsa*/**/*.[ch]", "air/**/*.[ch]"]},
+    package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml", "**/*.[ch]"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -165,8 +165,9 @@ def kernel() -> Path:
 
 
 def compiled() -> list[Path]:
-    """All that is compiled: the kernel, and what agents on a network hear."""
-    return [kernel(), layout.SOURCES / "dtsa_agent" / "dtsa_agent" / "air" / "udp" / "_hearing.abi3.so"]
+    """All that is compiled: the kernel, what agents on a network hear, what the middleware's waits need."""
+    package = layout.SOURCES / "dtsa_agent" / "dtsa_agent"
+    return [kernel(), package / "air" / "udp" / "_hearing.abi3.so", package / "ros" / "common" / "_endless.abi3.so"]
 
 
 def remove_kernel(ending: str = "*.so") -> None:

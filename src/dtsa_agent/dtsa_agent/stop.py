@@ -6,9 +6,26 @@ import faulthandler
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any
+
+
+@contextmanager
+def in_time(limit_s: float) -> Iterator[None]:
+    """What is done within takes no longer; otherwise this process says where its threads stand, and ends with code 1.
+
+    For calls into libraries that may stand still with the interpreter's lock, so that nobody sees a signal either.
+
+    :param limit_s: s; 0: as long as it takes.
+    """
+    if limit_s and sys.__stderr__ is not None:
+        faulthandler.dump_traceback_later(limit_s, exit=True, file=sys.__stderr__)
+    try:
+        yield
+    finally:
+        if limit_s:
+            faulthandler.cancel_dump_traceback_later()
 
 
 class Stop:
@@ -40,6 +57,10 @@ class Stop:
 
     def __bool__(self) -> bool:
         return self.signal != 0
+
+    def in_time(self) -> AbstractContextManager[None]:
+        """What is done within has as long as the process has after a signal, whether there was one or not."""
+        return in_time(self._patience_s)
 
     @contextmanager
     def at_once(self) -> Iterator[None]:

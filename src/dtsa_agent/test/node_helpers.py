@@ -11,15 +11,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from waiting import wait_for
 
 from dtsa_agent.ros.common.dds import limit_to_machine
+from dtsa_agent.ros.common.process import init_ros
 from dtsa_agent.ros.common.serving import Serving
 from dtsa_bench.fly.domain import ros_domain
 from dtsa_bench.soak.nodes import node_command, node_environment
@@ -143,7 +142,7 @@ def _made(domain: int, name: str) -> Node:
     """
     limit_to_machine(os.environ, shared_memory=False)
     context = Context()
-    rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    init_ros([], context, domain)
     return Node(name, context=context, enable_rosout=False, start_parameter_services=False)
 
 

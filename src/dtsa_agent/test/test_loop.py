@@ -45,3 +45,18 @@ def test_what_does_not_end_after_a_signal_says_where_it_stands_and_is_ended() ->
         assert done.returncode == code
         assert said in done.stderr
         assert bool(done.stderr) == bool(said)
+
+
+def test_a_call_that_stands_still_with_the_interpreters_lock_ends_the_process() -> None:
+    """Nobody sees a signal then, and no other thread runs."""
+    program = (
+        "import ctypes\nfrom dtsa_agent.stop import Stop\n"
+        "def stands_still(seconds):\n    ctypes.PyDLL(None).usleep(int(1e6 * seconds))\n"
+        "with Stop({limit}) as stop, stop.in_time():\n    stands_still({seconds})\n"
+    )
+    for limit, seconds, code, said in ((0.3, 50, 1, "in stands_still"), (30, 0.1, 0, ""), (0.0, 0.5, 0, "")):
+        words = [sys.executable, "-c", program.format(limit=limit, seconds=seconds)]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=40, check=False)
+        assert done.returncode == code
+        assert said in done.stderr
+        assert bool(done.stderr) == bool(said)

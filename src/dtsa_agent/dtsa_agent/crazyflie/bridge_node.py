@@ -20,7 +20,6 @@ from typing import Any
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings import named
@@ -37,7 +36,7 @@ from dtsa_agent.crazyflie.state_machine import State
 from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.parameters import declare_settings
 from dtsa_agent.ros.common.priority import stay_on_one_processor, take_priority
-from dtsa_agent.ros.common.process import follow_supervisor
+from dtsa_agent.ros.common.process import follow_supervisor, init_ros
 from dtsa_agent.ros.common.serving import Serving
 
 DTSA, CRAZYSWARM2 = "dtsa", "crazyswarm2"
@@ -274,7 +273,7 @@ def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = r
     follow_supervisor()
     limit_to_machine(os.environ, shared_memory=False)
     try:
-        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+        init_ros(argv)
     except Exception as error:  # rclpy's errors for a wrong command line have no common base
         print(f"crazyflie_bridge: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2

@@ -14,16 +14,14 @@ import tempfile
 import time
 from pathlib import Path
 
-import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt32
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Loop, Stop
-from dtsa_agent.ros.common.process import node_options, run_node
+from dtsa_agent.ros.common.process import init_ros, node_options, run_node
 
 from ..fly.children import Children
 from ..fly.domain import ros_domain
@@ -47,7 +45,7 @@ def rounds_per_s(processes: int, rounds: int, repeats: int) -> list[float]:
         try:
             for number in range(1, processes + 1):
                 children.start(f"process {number}", [], __name__, [])
-            rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            init_ros([], context, domain)
             return _Asker(context, children, processes).measure(rounds, repeats)
         finally:
             context.try_shutdown()

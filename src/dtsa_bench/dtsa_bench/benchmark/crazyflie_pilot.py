@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import rclpy
 from builtin_interfaces.msg import Duration
 from dtsa_msgs.msg import Status, VelocityWorld
 from dtsa_msgs.srv import Arm, Land, Takeoff
@@ -17,11 +16,11 @@ from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Empty
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common.dds import limit_to_machine
+from dtsa_agent.ros.common.process import init_ros
 
 from .stamped_fleet import STEP_MPS
 
@@ -38,7 +37,7 @@ class Pilot:
     def __init__(self, domain: int, count: int) -> None:
         self._context = Context()
         limit_to_machine(os.environ, shared_memory=False)
-        rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        init_ros([], self._context, domain)
         self._node = Node("benchmark", context=self._context, enable_rosout=False, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dtsa_bench.view.link import ViewLink
 
 INTERRUPTED = 130
-LONGEST_END_S = 60.0  # after a signal; it takes a second
+LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
 _LATER = ("respawn",)  # options of a flight that concern real time alone
 
 

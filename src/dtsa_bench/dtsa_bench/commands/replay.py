@@ -60,14 +60,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _play(args: argparse.Namespace, bag: Bag) -> int:
     import rclpy
-    from rclpy.signals import SignalHandlerOptions
 
     from dtsa_agent.ros.common.dds import limit_to_machine
+    from dtsa_agent.ros.common.process import init_ros
     from dtsa_bench.bag.replay import Player, RosOutput, steady_timing
 
     topics = [bag.topic(name) for name in args.topics] if args.topics else list(bag.topics.values())
     limit_to_machine(os.environ)
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    init_ros(None)
     try:
         node = rclpy.create_node("replay", enable_rosout=False, start_parameter_services=False)
         output = RosOutput(node, topics)

@@ -12,11 +12,10 @@ from typing import Any
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
-from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.priority import take_priority
-from dtsa_agent.ros.common.process import follow_supervisor
+from dtsa_agent.ros.common.process import follow_supervisor, init_ros
 from dtsa_bench.fake_crazyflie.cameras import DATAGRAM, half_turn, read_picture
 
 QUIET = ["--ros-args", "--disable-rosout-logs"]
@@ -45,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
         sock.bind(("127.0.0.1", args.port))
         take_priority(args.priority)  # in a laboratory this is a machine of its own
         limit_to_machine(os.environ, shared_memory=False)
-        rclpy.init(args=QUIET, signal_handler_options=SignalHandlerOptions.NO)
+        init_ros(QUIET)
         node = rclpy.create_node("motion_capture", enable_rosout=False, start_parameter_services=False)
         publishers: dict[int, Any] = {}
         message = PoseStamped()

@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
 import yaml
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
@@ -28,6 +26,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.common.priority import give_way, take_priority
+from dtsa_agent.ros.common.process import init_ros
 from dtsa_bench.metrics import FlightMetrics
 from dtsa_bench.options import new_directory, whole_number
 from dtsa_bench.processes import end_process
@@ -169,7 +168,7 @@ def fly_crazyflies(
         ended = Ended(stop)
         mission: Mission | None = None
         try:
-            rclpy.init(args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            init_ros(QUIET, context, domain)
             node = Node("mission", context=context, enable_rosout=False, start_parameter_services=False)
             mission = Mission(node, settings, scenario, ended, progress.show)
             mission.bridge_alive = mission.check_bridge if attach else bridge.check

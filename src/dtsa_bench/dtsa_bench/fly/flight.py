@@ -11,12 +11,10 @@ from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import rclpy
 import yaml
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError, DtsaError
@@ -28,7 +26,7 @@ from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.loop import Stop
 from dtsa_agent.ros.common.parameters import to_parameters
 from dtsa_agent.ros.common.priority import give_way_by, take_place, take_priority
-from dtsa_agent.ros.common.process import keep_node
+from dtsa_agent.ros.common.process import init_ros, keep_node
 from dtsa_bench.options import new_directory
 from dtsa_bench.run_config import LOCKSTEP, RunConfig
 from dtsa_bench.simulate import may_share
@@ -171,9 +169,7 @@ def fly(
             late = _start_agents(children, run, options, directory, stop)
             try:
                 with stop.at_once():
-                    rclpy.init(
-                        args=QUIET, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
-                    )
+                    init_ros(QUIET, context, domain)
                     if started:
                         started(children)
                     node = Node("channel", namespace=names.SWARM, context=context)
@@ -185,7 +181,8 @@ def fly(
             return _fly(flight, node, directory, children, progress, options, stop, late, observers, view)
         finally:
             children.stop(hurry=bool(stop))
-            context.try_shutdown()
+            with stop.in_time():
+                context.try_shutdown()
 
 
 def _fly(
@@ -201,6 +198,7 @@ def _fly(
     view: ViewLink | None,
 ) -> Flight:
     failure: DtsaError | None = None
+    helped: list[str] = []  # processes that did not end by themselves
     try:
         channel, measurement = flight.channel, flight.measurement
         shown = FlightProgress(progress, measurement, channel)
@@ -219,12 +217,7 @@ def _fly(
         except DtsaError as error:
             failure = error
         progress.end()
-        if failure is None:
-            # Before the others are killed: the middleware may wait for seconds for locks of those that died with them.
-            node.destroy_node()
-        else:
-            keep_node(node)  # some may have been killed already
-        children.stop(hurry=bool(stop))
+        helped = children.stop(hurry=bool(stop))
         try:
             pictures = options.pictures and not ended and failure is None
             summary = flight.write_results(pictures, **_cut_short(channel, ended, failure))
@@ -235,8 +228,12 @@ def _fly(
             raise failure
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
-        if failure is None:
-            node.destroy_node()
+        # Last of all: the middleware may stand still for ever if others leave in the same moment.
+        if failure is None and not helped:
+            with stop.in_time():
+                node.destroy_node()
+        else:
+            keep_node(node)  # some may have been killed
 
 
 def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress, priority: int) -> None:

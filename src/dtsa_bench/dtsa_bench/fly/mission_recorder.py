@@ -22,12 +22,11 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.crazyflie.bridge_outputs import EVENTS, EVENTS_QOS
 from dtsa_agent.ros.common.priority import give_way_by
-from dtsa_agent.ros.common.process import follow_supervisor
+from dtsa_agent.ros.common.process import follow_supervisor, init_ros
 from dtsa_bench.bag.writer import BagWriter
 
 QUIET = ["--ros-args", "--disable-rosout-logs"]
@@ -96,7 +95,7 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(number, lambda *_: over.set())
     follow_supervisor()
     give_way_by(NICE)
-    rclpy.init(args=QUIET, signal_handler_options=SignalHandlerOptions.NO)
+    init_ros(QUIET)
     node = rclpy.create_node("mission_recorder", enable_rosout=False, start_parameter_services=False)
     try:
         with BagWriter(args.bag, None, custom_data={"mission": "the station's clock"}) as bag:

@@ -7,7 +7,6 @@ import time
 from collections import deque
 from typing import Any
 
-import rclpy
 from builtin_interfaces.msg import Duration
 from dtsa_msgs.msg import Configuration, Decision, Reception, RunStatus, Slot
 from dtsa_msgs.srv import Land
@@ -18,7 +17,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_srvs.srv import Empty
 
@@ -27,6 +25,7 @@ from dtsa_agent.ros.common import names
 from dtsa_agent.ros.common.dds import limit_to_machine
 from dtsa_agent.ros.common.intake import Intake
 from dtsa_agent.ros.common.loop import Feed
+from dtsa_agent.ros.common.process import init_ros
 
 from .follower import Follower
 from .orders import Order
@@ -61,7 +60,7 @@ class GraphSource:
         self._track, self._space = track, space
         limit_to_machine(os.environ, shared_memory=False)  # who is killed beside it does not take it along
         self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        init_ros(None, self._context, domain)
         self._node = Node(
             "view", namespace=space, context=self._context, enable_rosout=False, start_parameter_services=False
         )

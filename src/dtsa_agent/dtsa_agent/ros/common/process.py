@@ -14,20 +14,25 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
+from dtsa_agent.stop import in_time
 
 from . import names
+from ._endless import mend
 from .dds import clean_shared_memory, limit_to_machine
 from .loop import Stop
 
 _PR_SET_PDEATHSIG = 1
 _REALTIME = re.compile(rf"""^\s*["']?mode["']?\s*:\s*["']?{names.MODES[1]}\b""", re.MULTILINE)
 SUPERVISOR = "DTSA_SUPERVISOR"  # process id of the supervisor that started this node, if one did
+_LONGEST_END_S = 20.0  # of a node; the middleware was seen to stand still when others left in the same moment
+_MIDDLEWARE = "libfastrtps"  # Fast DDS 2
 _KEPT: list[Node] = []  # nodes that last as long as their process
 
 
@@ -71,6 +76,17 @@ def in_real_time(words: Sequence[str]) -> bool:
     return False
 
 
+def init_ros(args: list[str] | None, context: Context | None = None, domain_id: int | None = None) -> None:
+    """``rclpy.init`` without signal handlers of its own, and with a middleware that lets nodes be destroyed.
+
+    :param args: command line; None: ``sys.argv``.
+    :param context: what is initialized; None: the process's own.
+    :param domain_id: ROS domain; None: the environment's.
+    """
+    rclpy.init(args=args, context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
+    mend(_MIDDLEWARE)
+
+
 def keep_node(node: Node) -> None:
     """Lets a node last as long as its process, in place of destroying it: where one that it talked with may be dead.
 
@@ -94,9 +110,14 @@ def ending(node: Node) -> Iterator[None]:
         keep_node(node)
         raise
     except BaseException:
-        node.destroy_node()
+        _destroy(node)
         raise
-    node.destroy_node()
+    _destroy(node)
+
+
+def _destroy(node: Node) -> None:
+    with in_time(_LONGEST_END_S):
+        node.destroy_node()
 
 
 def run_node(
@@ -128,7 +149,7 @@ def _run(
 ) -> int:
     """The node itself; its exit code."""
     try:
-        rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+        init_ros(list(args) if args is not None else None)
     except Exception as error:  # rclpy's errors for a wrong command line have no common base
         print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
