@@ -24,7 +24,7 @@ from dtsa_agent.ros.common.dds import (
     clean_shared_memory,
     limit_to_machine,
 )
-from dtsa_agent.ros.common.process import ending, in_real_time
+from dtsa_agent.ros.common.process import SUPERVISOR, ending, in_real_time
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -104,6 +104,17 @@ def test_a_node_in_real_time_has_no_port_in_shared_memory(tmp_path: Path) -> Non
         graph.until(lambda: ("channel", "/swarm") in names())
         assert addresses(node.pid) == {"127.0.0.1"}
         assert segments_of(node.pid) == set()
+
+
+def test_a_node_shares_memory_only_if_its_supervisor_does(tmp_path: Path) -> None:
+    """Where many processes do, they wait for each other's ports for minutes."""
+    with ros_graph(tmp_path) as graph:
+        graph.environment |= {SUPERVISOR: str(os.getpid()), RANGE: "SYSTEM_DEFAULT"}
+        for profile in (PROFILE, PUNCTUAL):
+            graph.environment |= dict.fromkeys(PROFILES, str(profile))
+            node = graph.start("dtsa_agent.ros.swarm_host", "-r", f"__node:={profile.stem}", "-p", "agents:=2")
+            graph.until(lambda profile=profile: profile.stem in graph.node.get_node_names())
+            assert bool(segments_of(node.pid)) == (profile == PROFILE)
 
 
 def test_only_what_nobody_has_locked_and_is_not_young_is_removed(tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ from dtsa_agent.ros.common.process import SUPERVISOR
 
 # A process group of its own; Python 3.10 cannot say so without a function that runs in the child.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
-_LEAVE_S = 1.0  # to end by themselves once the run is over, and then after SIGTERM
-_HURRY_S = 0.3  # likewise, when the user has ended it
+_LEAVE_S = 3.0  # to end by themselves once the run is over; many on few cores take their time
+_TERM_S = 1.0  # and then after SIGTERM
+_HURRY_S = 0.3  # both, when the user has ended it
 
 
 class NodeError(DtsaError):
@@ -104,8 +105,8 @@ class Children:
         :returns: names of those that had to be helped.
         """
         helped: dict[str, None] = {}
-        patience_s = _HURRY_S if hurry else _LEAVE_S
-        for number, patience in ((None, patience_s), (signal.SIGTERM, patience_s), (signal.SIGKILL, 10.0)):
+        leave_s, term_s = (_HURRY_S, _HURRY_S) if hurry else (_LEAVE_S, _TERM_S)
+        for number, patience in ((None, leave_s), (signal.SIGTERM, term_s), (signal.SIGKILL, 10.0)):
             alive = [child for child in self.all if child.process.poll() is None]
             if number is not None:
                 for child in alive:

@@ -57,6 +57,7 @@ ENVIRONMENT = {
 
 # The log of this process's nodes goes to /rosout alone: the progress line tells the same here.
 QUIET = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
+MOST_SHARED = 32  # processes; where 70 share memory, they wait for each other's ports for minutes
 
 END_S = 1.0  # wall time in which the nodes are to hear of the end; those that have not are ended then
 
@@ -66,7 +67,7 @@ def run_environment(domain: int, logs: Path, shared_memory: bool = True) -> dict
 
     :param domain: ROS domain.
     :param logs: directory for ROS's logs.
-    :param shared_memory: whether nodes of this process use it: not in real time.
+    :param shared_memory: whether this process and those that it starts use it: not in real time, nor if they are many.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -161,7 +162,8 @@ def fly(
         directory = new_directory(out)
         (directory / "log").mkdir()
         context = Context()
-        environment = run_environment(domain, directory / "log", shared_memory=run.mode == LOCKSTEP)
+        few = (options.processes or run.swarm.agents) <= MOST_SHARED
+        environment = run_environment(domain, directory / "log", shared_memory=few and run.mode == LOCKSTEP)
         children = Children(directory / "log", environment)
         progress = progress or ProgressLine(label)
         try:

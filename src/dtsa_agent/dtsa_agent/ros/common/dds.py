@@ -7,7 +7,7 @@ import os
 import re
 import struct
 import time
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -51,6 +51,14 @@ def limit_to_machine(environment: MutableMapping[str, str], shared_memory: bool 
     environment[RANGE] = "SYSTEM_DEFAULT"
     for name in PROFILES:
         environment[name] = str(PROFILE if shared_memory else PUNCTUAL)
+
+
+def by_udp(environment: Mapping[str, str]) -> bool:
+    """Whether a process does without shared memory, or whoever has started it does.
+
+    :param environment: its variables.
+    """
+    return all(environment.get(name) == str(PUNCTUAL) for name in PROFILES)
 
 
 def clean_shared_memory(directory: Path = _SHARED_MEMORY) -> list[str]:

@@ -25,7 +25,7 @@ from dtsa_agent.stop import in_time
 
 from . import names
 from ._endless import mend
-from .dds import clean_shared_memory, limit_to_machine
+from .dds import by_udp, clean_shared_memory, limit_to_machine
 from .loop import Stop
 
 _PR_SET_PDEATHSIG = 1
@@ -132,7 +132,8 @@ def run_node(
     :returns: exit code: 0 for a clean end (by a signal, too), 2 for settings that are not usable, 1 for other errors.
     """
     supervised = follow_supervisor()
-    limit_to_machine(os.environ, shared_memory=not (real_time or in_real_time(sys.argv if args is None else args)))
+    real_time = real_time or in_real_time(sys.argv if args is None else args)
+    limit_to_machine(os.environ, shared_memory=not (real_time or (supervised and by_udp(os.environ))))
     if not supervised:  # a supervisor does that for all of them
         clean_shared_memory()  # of the process, killed, whose place this one may take
     with Stop() as stop:
