@@ -149,7 +149,8 @@ def _realtime(node: Node, swarm: AbstractSwarm, space: str, priority: int) -> Sw
     nice = _declare(node, "nice", 0, text, ParameterType.PARAMETER_INTEGER)
     if not 0 <= nice <= 19:
         raise ConfigError("nice", nice, "0 to 19")
-    give_way_by(nice)
+    if nice:
+        give_way_by(nice)
     text = "x, y, z an agent: where it hovers when it comes into a flight under way; [0.0]: at its start (m)"
     places = list(_declare(node, "resume_at", [0.0], text, ParameterType.PARAMETER_DOUBLE_ARRAY))
     if len(places) not in (1, 3 * count) or not all(map(math.isfinite, places)):

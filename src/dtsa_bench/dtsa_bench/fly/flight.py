@@ -200,7 +200,6 @@ def _fly(
     view: ViewLink | None,
 ) -> Flight:
     failure: DtsaError | None = None
-    helped: list[str] = []  # processes that did not end by themselves
     try:
         channel, measurement = flight.channel, flight.measurement
         shown = FlightProgress(progress, measurement, channel)
@@ -219,7 +218,7 @@ def _fly(
         except DtsaError as error:
             failure = error
         progress.end()
-        helped = children.stop(hurry=bool(stop))
+        children.stop(hurry=bool(stop))
         try:
             pictures = options.pictures and not ended and failure is None
             summary = flight.write_results(pictures, **_cut_short(channel, ended, failure))
@@ -231,11 +230,11 @@ def _fly(
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         # Last of all: the middleware may stand still for ever if others leave in the same moment.
-        if failure is None and not helped:
+        if failure is None and not children.killed:
             with stop.in_time():
                 node.destroy_node()
         else:
-            keep_node(node)  # some may have been killed
+            keep_node(node)  # who was killed may have left locks behind
 
 
 def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress, priority: int) -> None:
