@@ -19,13 +19,17 @@ def in_time(limit_s: float) -> Iterator[None]:
 
     :param limit_s: s; 0: as long as it takes.
     """
-    if limit_s and sys.__stderr__ is not None:
-        faulthandler.dump_traceback_later(limit_s, exit=True, file=sys.__stderr__)
+    _end_after(limit_s)
     try:
         yield
     finally:
         if limit_s:
             faulthandler.cancel_dump_traceback_later()
+
+
+def _end_after(limit_s: float) -> None:
+    if limit_s and sys.__stderr__ is not None:
+        faulthandler.dump_traceback_later(limit_s, exit=True, file=sys.__stderr__)
 
 
 class Stop:
@@ -77,8 +81,8 @@ class Stop:
             self._raises = False
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if not self and self._patience_s and sys.__stderr__ is not None:
-            faulthandler.dump_traceback_later(self._patience_s, exit=True, file=sys.__stderr__)
+        if not self:
+            _end_after(self._patience_s)
         self.signal = self.signal or number
         self.count += 1
         if self._raises:

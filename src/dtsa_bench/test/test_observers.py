@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 from fly_helpers import readable
@@ -33,6 +34,8 @@ from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus, ObserverError, Observers, SlotLimit
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+
+Sender = TypeVar("Sender", bound="LateSender")
 
 
 class Diary(ChannelObserver):
@@ -201,6 +204,21 @@ class LateSender(ChannelObserver):
             self.frames.append((sender, verdict.received[row].tolist(), verdict.collided[row]))
 
 
+def flown_with(kind: type[Sender], folder: Path, slots: int) -> tuple[RealtimeChannel, Sender]:
+    """The channel of a flight in real time of two agents for whom an observer answers, and that observer."""
+    with ros_graph(folder) as graph:
+        node = Node("channel", context=graph.node.context, enable_rosout=False)
+        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, referee=SlotLimit(slots))
+        observer = kind(graph.node, channel)
+        channel.observe(observer)
+        try:
+            channel.run(stop=False)
+        finally:
+            channel.close()
+            node.destroy_node()
+    return channel, observer
+
+
 class LateAnswers(LateSender):
     """Answers all calls but the first one when the run has begun, and says then that everybody is somewhere else."""
 
@@ -221,20 +239,13 @@ class LateAnswers(LateSender):
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         self.places.update(answers.position.ravel().tolist())
 
+    def close(self) -> None:
+        self.slots.close()
+
 
 @pytest.mark.ros
 def test_an_answer_to_a_call_that_comes_late_is_not_taken_for_what_was_done_in_a_slot(tmp_path: Path) -> None:
-    with ros_graph(tmp_path) as graph:
-        node = Node("channel", context=graph.node.context, enable_rosout=False)
-        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, referee=SlotLimit(40))
-        late = LateAnswers(graph.node, channel)
-        channel.observe(late)
-        try:
-            channel.run(stop=False)
-        finally:
-            late.slots.close()
-            channel.close()
-            node.destroy_node()
+    _, late = flown_with(LateAnswers, tmp_path, slots=40)
     assert late.late
     assert late.places == {0.0}
 
@@ -257,33 +268,14 @@ class SilentAtFirst(LateSender):
 @pytest.mark.ros
 def test_who_is_late_with_its_first_report_is_where_it_was_when_it_was_called(tmp_path: Path) -> None:
     """Taken for the field's origin, two who were late were taken for crashed."""
-    with ros_graph(tmp_path) as graph:
-        node = Node("channel", context=graph.node.context, enable_rosout=False)
-        channel = RealtimeChannel(node, Channel(ChannelConfig(agents=2)), 1, referee=SlotLimit(20))
-        silent = SilentAtFirst(graph.node, channel)
-        channel.observe(silent)
-        try:
-            channel.run(stop=False)
-        finally:
-            channel.close()
-            node.destroy_node()
+    _, silent = flown_with(SilentAtFirst, tmp_path, slots=20)
     assert silent.places == [[3.0] * 6] * 20
 
 
 @pytest.mark.ros
 @flown_again_when_overloaded
 def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_path: Path) -> None:
-    with ros_graph(tmp_path) as graph:
-        node = Node("channel", context=graph.node.context, enable_rosout=False)
-        model = Channel(ChannelConfig(agents=2))
-        channel = RealtimeChannel(node, model, 1, referee=SlotLimit(150))
-        sender = LateSender(graph.node, channel)
-        channel.observe(sender)
-        try:
-            channel.run(stop=False)
-        finally:
-            channel.close()
-            node.destroy_node()
+    channel, sender = flown_with(LateSender, tmp_path, slots=150)
     assert channel.air.late == channel.late_frames == 1
     # That of agent 1 disturbed nobody; agent 2 was heard by the one other agent.
     assert sender.frames == [(2, [True, False], 0)]
