@@ -31,6 +31,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a script; what tests start would ignore Ctrl-C, too.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+_TOOLS = str(Path(__file__).parent / "tools")
+if _TOOLS not in os.environ.get("PYTHONPATH", "").split(os.pathsep):  # what tests start imports `dtsa_dev`, too
+    os.environ["PYTHONPATH"] = os.pathsep.join([_TOOLS, *filter(None, [os.environ.get("PYTHONPATH", "")])])
+
 _LOCKS = "dtsa_locks"  # what workers are told about: the directory of their locks
 
 

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "src" / "dtsa_bench"))
 
-from dtsa_bench.figures.palette import AGENT_COLOURS, COLLIDED, SERIES, agent_colour, rgb  # noqa: E402
+from dtsa_bench.drawing.palette import AGENT_COLOURS, COLLIDED, SERIES, agent_colour, rgb  # noqa: E402
 
 AGENTS = 12
 PAIRS = 5  # PlotJuggler: distances from cf1 to so many others

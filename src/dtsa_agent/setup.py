@@ -22,11 +22,12 @@ COMPILE_FLAGS = [
 
 LIBRARY, SIMULATOR, BINDING = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/core/_kernel"
 HEARING = "dtsa_agent/air/udp/_hearing"
+WORKAROUNDS = "dtsa_agent/ros/common/workarounds"
 OF_THE_LIBRARY = ("draw", "frame", "tag", "timebase")  # what an agent on a network uses without Python between
 
 
 def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR, BINDING)) -> list[str]:
-    """Sources of the compiled core with a suffix: one agent, many agents, Python's door."""
+    """Sources of the compiled core with a suffix: one agent, many agents, the binding to Python."""
     return [path for folder in folders for path in sorted(glob(f"{folder}/**/*{suffix}", recursive=True))]
 
 
@@ -53,7 +54,11 @@ setup(
             extra_compile_args=COMPILE_FLAGS,
             py_limited_api=True,
         ),
-        Extension("dtsa_agent.ros.common._endless", sources=["dtsa_agent/ros/common/_endless.c"], py_limited_api=True),
+        Extension(
+            "dtsa_agent.ros.common.workarounds._endless",
+            sources=["dtsa_agent/ros/common/workarounds/_endless.c"],
+            py_limited_api=True,
+        ),
     ],
     package_data={NAME: ["py.typed", "**/*.pyi", "**/*.yaml", "**/*.xml", "**/*.[ch]"]},
     data_files=[
@@ -74,8 +79,8 @@ setup(
         "console_scripts": [
             "agent = dtsa_agent.ros.agent_node:main",
             "swarm_host = dtsa_agent.ros.swarm_host:main",
-            "crazyflie_bridge = dtsa_agent.crazyflie.bridge_node:main",
-            "crazyflie_agents = dtsa_agent.crazyflie.agents_node:main",
+            "crazyflie_bridge = dtsa_agent.crazyflie.node.bridge_node:main",
+            "crazyflie_agents = dtsa_agent.crazyflie.node.agents_node:main",
         ],
     },
 )

@@ -8,7 +8,9 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from machine import layout, prepare, processes, workspace
+from dtsa_dev.registry import COMMANDS as DEVELOPERS
+
+from machine import layout, prepare, processes, wheels, workspace
 from machine.layout import SetupError
 
 OWN_COMMANDS = {
@@ -28,7 +30,7 @@ Opens a shell in which the workspace is sourced; `tools/dtsa shell -c COMMAND` r
 Installs what the tests need and runs them: all of them on several cores, or what pytest's arguments say.
   tools/dtsa test -k frame -x                        tests with `frame` in their names, until one fails
   tools/dtsa test -n 0                               all, one after the other
-  tools/dtsa test src/dtsa_agent/test/test_frame.py  one file
+  tools/dtsa test src/dtsa_agent/test/core/test_frame.py  one file
   tools/dtsa shell -c 'python3 -m pytest --help'     pytest's own help""",
     "clean": """usage: tools/dtsa clean [--all]
 
@@ -68,7 +70,7 @@ def main(arguments: list[str]) -> int:
             words = [*known, *OWN_COMMANDS]
             raise SetupError(f"command: got {command!r}; allowed: {', '.join(words)}{_hint(command, words)}", code=2)
         prepare.prepare(set())
-        return start(python(), ["-m", "dtsa_bench", command, *rest])
+        return start(python(), ["-m", module_of(command), command, *rest])
     except SetupError as error:
         print(f"dtsa: error: {error}", file=sys.stderr)
         return error.code
@@ -78,16 +80,16 @@ def main(arguments: list[str]) -> int:
 
 
 def bench_commands() -> dict[str, str]:
-    """Commands of dtsa_bench that exist, with what they do; nothing has to be installed for that."""
+    """Commands of dtsa_bench and of a checkout, with what they do; nothing has to be installed for that."""
     sys.path.insert(0, str(BENCH))
-    from dtsa_bench.registry import available  # type: ignore[import-not-found, unused-ignore]
+    from dtsa_bench.commands.registry import COMMANDS  # type: ignore[import-not-found, unused-ignore]
 
-    return dict(available())
+    return {**COMMANDS, **DEVELOPERS}
 
 
 def _hint(word: str, words: list[str]) -> str:
     """What may have been meant; nothing has to be installed for that."""
-    from dtsa_bench.nearest import hint  # type: ignore[import-not-found, unused-ignore]
+    from dtsa_bench.commands.spelling import hint  # type: ignore[import-not-found, unused-ignore]
 
     return str(hint(word, words))
 
@@ -118,9 +120,16 @@ def python() -> str:
     return layout.base_python() if layout.has_ros_installation() else str(layout.PYTHON)
 
 
+def module_of(command: str) -> str:
+    """The package that runs a command; completion knows all of a checkout's."""
+    return "dtsa_dev" if command in (*DEVELOPERS, "completion") else "dtsa_bench"
+
+
 def start(program: str, arguments: list[str]) -> int:
-    """Replace this process by a program in the workspace's environment."""
+    """Replace this process by a program in the workspace's environment, in which `dtsa_dev` can be imported."""
     environment = workspace.environment()
+    tools = str(layout.ROOT / "tools")
+    environment["PYTHONPATH"] = os.pathsep.join([tools, *filter(None, [environment.get("PYTHONPATH", "")])])
     path = shutil.which(program, path=environment["PATH"])
     if path is None:
         raise SetupError(f"program: got {program!r}; allowed: a program in PATH", code=2)
@@ -211,7 +220,12 @@ def run_clean(arguments: list[str]) -> int:
         directories.append(layout.VENV)
     with prepare.lock():
         processes.refuse_if_used(directories)
+        workspace.disown(workspace.PACKAGES)
+        if arguments:
+            wheels.disown_venv()
         for directory in directories:
             shutil.rmtree(directory, ignore_errors=True)
         workspace.remove_kernel()
+        if arguments:
+            wheels.venv_begun().unlink()
     return 0

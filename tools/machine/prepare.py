@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from machine import layout, wheels, workspace
+from machine import layout, processes, wheels, workspace
 from machine.layout import SetupError
 
 PATIENCE_S = 1800.0  # for the set-up of another process; a first one takes a few minutes
@@ -43,6 +43,7 @@ def prepare(extras: set[str]) -> None:
         workspace.colcon()
         if not wheels.has_venv():
             wheels.make_venv()
+        wheels.note_interruption(extras)
         missing = wheels.missing_sets(extras)
         if missing:
             wheels.install(missing)
@@ -58,7 +59,7 @@ def interrupt(number: int, frame: object) -> None:
 
 @contextmanager
 def lock() -> Iterator[None]:
-    """One set-up at a time in this checkout.
+    """One set-up at a time in this checkout; what is left running of one that was killed is ended.
 
     :raises SetupError: if another one holds the lock for longer than `PATIENCE_S`.
     """
@@ -69,6 +70,7 @@ def lock() -> Iterator[None]:
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
+        processes.end_orphans()
         yield
 
 

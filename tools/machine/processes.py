@@ -1,12 +1,52 @@
-"""Which processes use a directory: what is in use is never removed."""
+"""Which processes use a directory: what is in use is never removed. What a killed set-up left running is ended."""
 
 from __future__ import annotations
 
 import os
+import signal
+import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
+from machine import layout
 from machine.layout import SetupError
+
+MARK = "DTSA_SETUP_OF"  # in the environment of what the steps of a set-up start
+ORPHANS_S = 30.0  # for orphans to end after SIGKILL
+
+
+def mark() -> dict[str, str]:
+    """What a step's command has in its environment: the checkout that is set up."""
+    return {MARK: str(layout.ROOT)}
+
+
+def marked() -> list[int]:
+    """Processes that the steps of this checkout's set-up have started, whoever their parent is by now."""
+    wanted = f"{MARK}={layout.ROOT}".encode()
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if wanted in (entry / "environ").read_bytes().split(b"\0") and int(entry.name) != os.getpid():
+                found.append(int(entry.name))
+    return found
+
+
+def end_orphans() -> None:
+    """End what a set-up that was killed has left running: it would write into the same directories.
+
+    Only for the process that holds the lock: what is marked then is nobody's.
+
+    :raises SetupError: if it does not end.
+    """
+    deadline = time.monotonic() + ORPHANS_S
+    while found := marked():
+        if time.monotonic() > deadline:
+            raise SetupError(f"process {found[0]}, left by a set-up that was killed, cannot be ended")
+        for process in found:
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        time.sleep(0.05)
 
 
 def users_of(directories: Iterable[Path]) -> list[int]:

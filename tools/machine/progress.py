@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from machine import layout
+from machine import layout, processes
 from machine.layout import SetupError
 
 REASON = re.compile(r"(?i)\b(error|fatal|failed|no space left|could not|cannot|no matching distribution)\b")
@@ -60,7 +60,7 @@ class Step:
             start = log.tell()
             process = subprocess.Popen(
                 [str(word) for word in command],
-                env=dict(environment),
+                env={**environment, **processes.mark()},
                 cwd=layout.ROOT,
                 stdin=subprocess.DEVNULL,
                 stdout=log,

@@ -9,16 +9,21 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from machine import cmake_paths, layout, processes
+from machine import cmake_paths, layout, leftovers, processes
 from machine.layout import SetupError
 from machine.progress import Step, step
 
+UNFINISHED = "unfinished"  # the stamp of a set while pip installs it
+PART = ".part-"  # begins the names of unfinished downloads
+PART_AGE_S = 86400.0  # an unfinished download that is older belongs to nobody
 BATCH = 24  # packages in one call of pip: shows progress, and keeps what came before an interruption
 SYSTEM_PACKAGES = {
     "numpy": "python3-numpy",
@@ -68,6 +73,17 @@ def has_venv() -> bool:
     return layout.PYTHON.exists() and layout.read(layout.VENV_STAMPS / "venv") == venv_key()
 
 
+def venv_begun() -> Path:
+    """A file that is there while the environment is made or removed: what is there of it then is of no use."""
+    return layout.STATE / f"venv{layout.SUFFIX}"
+
+
+def disown_venv() -> None:
+    """Note that the environment is about to be made or removed, before anything of it changes."""
+    layout.write(venv_begun(), "")
+    (layout.VENV_STAMPS / "venv").unlink(missing_ok=True)
+
+
 def make_venv() -> None:
     """Make the virtual environment; one without a stamp that fits this Python is taken over as it is.
 
@@ -77,17 +93,19 @@ def make_venv() -> None:
         environment = clean_environment()
         if not usable():
             processes.refuse_if_used([layout.VENV])
+            disown_venv()
             command = [layout.base_python(), "-m", "venv", "--clear"]
             if layout.has_ros_installation():
                 command.append("--system-site-packages")
             current.run([*command, layout.VENV], environment)
         layout.write(layout.VENV_STAMPS / "venv", venv_key())
+        venv_begun().unlink(missing_ok=True)
 
 
 def usable() -> bool:
     """Whether an environment without our stamp may be used: same Python, made at this place, with pip."""
-    stamped = layout.VENV_STAMPS / "venv"
-    if layout.has_ros_installation() or stamped.exists() or not layout.PYTHON.exists():
+    ours = (layout.VENV_STAMPS / "venv").exists() or venv_begun().exists()
+    if layout.has_ros_installation() or ours or not layout.PYTHON.exists():
         return False
     pip = layout.VENV / "bin" / "pip"
     show = [str(layout.PYTHON), "-I", "-S", "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
@@ -96,18 +114,36 @@ def usable() -> bool:
     return result.stdout.strip() == layout.python_version() and str(layout.VENV) in first_line
 
 
+def note_interruption(extras: set[str]) -> None:
+    """Where pip was interrupted without a stamp that says so, all sets are unfinished.
+
+    :param extras: sets of requirements beyond those of every machine.
+    """
+    names = required_sets(extras)
+    if leftovers.found({leftovers.canonical(pin.split("==")[0]) for name in names for pin in pinned(name)}):
+        for name in names:
+            layout.write(layout.VENV_STAMPS / name, UNFINISHED)
+
+
 def install(names: list[str]) -> None:
     """Install sets of requirements as pinned, wheels first from the local store.
+
+    Where an interruption left a set unfinished, half packages are removed first: pip would take them for installed.
 
     :param names: the sets.
     """
     environment = clean_environment()
+    unfinished = [name for name in names if layout.read(layout.VENV_STAMPS / name) == UNFINISHED]
+    if unfinished:
+        leftovers.remove([pin for name in unfinished for pin in pinned(name)])
     present = system_distributions(str(layout.PYTHON)) if layout.has_ros_installation() else set()
     for name in names:
         lines = [line for line in pinned(name) if line.split("==")[0] not in present]
         if lines:
             with step(f"install-{name}", f"{len(lines)} packages of requirements/{name}.txt") as current:
-                install_set(current, lines, environment)
+                options = fetch(current, lines, environment)
+                layout.write(layout.VENV_STAMPS / name, UNFINISHED)
+                current.run([*pip(), "install", *options, *lines], environment)
                 if name == "ros":
                     mend_cmake_files(environment)
         layout.write(layout.VENV_STAMPS / name, set_key(name))
@@ -153,27 +189,43 @@ def applicable(text: str) -> list[str]:
     return lines
 
 
-def install_set(current: Step, lines: list[str], environment: Mapping[str, str]) -> None:
-    """Fetch what the store lacks, then install from the store alone."""
-    pip = [str(layout.PYTHON), "-m", "pip", "--disable-pip-version-check", "--no-input"]
+def pip() -> list[str]:
+    """Words that run the environment's pip."""
+    return [str(layout.PYTHON), "-m", "pip", "--disable-pip-version-check", "--no-input"]
+
+
+def fetch(current: Step, lines: list[str], environment: Mapping[str, str]) -> list[str]:
+    """Fetch what the store lacks.
+
+    :param lines: requirements `name==version`.
+    :returns: options with which pip then installs: from the store alone, or from the index where there is no store.
+    """
+    options = ["--no-deps", "--progress-bar", "off"]
     store = wheel_store(environment)
     if store is None:
-        current.run([*pip, "install", "--no-deps", "--progress-bar", "off", *lines], environment)
-        return
-    options = ["--no-deps", "--progress-bar", "off", "--find-links", str(store)]
+        return options
+    options += ["--find-links", str(store)]
+    remove_parts(store)
     lacking = [line for line in lines if not stored(store, line)]
     for start in range(0, len(lacking), BATCH):
         current.note = f"(fetching {start} of {len(lacking)})"
         current.show()
         batch = lacking[start : start + BATCH]
         # Other checkouts use the store as well: a wheel gets into it whole, in one go.
-        with tempfile.TemporaryDirectory(prefix=".part-", dir=store) as part:
-            fetch = ["wheel", *options, "--no-cache-dir", "--wheel-dir", part]
-            current.run([*pip, *fetch, *batch], environment)
+        with tempfile.TemporaryDirectory(prefix=PART, dir=store) as part:
+            command = ["wheel", *options, "--no-cache-dir", "--wheel-dir", part]
+            current.run([*pip(), *command, *batch], environment)
             for wheel in Path(part).glob("*.whl"):
                 os.replace(wheel, store / wheel.name)
     current.note = ""
-    current.run([*pip, "install", *options, "--no-index", *lines], environment)
+    return [*options, "--no-index"]
+
+
+def remove_parts(store: Path) -> None:
+    """Remove unfinished downloads that a kill left in the store."""
+    for part in store.glob(f"{PART}*"):
+        if time.time() - part.lstat().st_mtime > PART_AGE_S:
+            shutil.rmtree(part, ignore_errors=True)
 
 
 def wheel_store(environment: Mapping[str, str]) -> Path | None:

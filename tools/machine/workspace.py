@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from machine import layout, wheels
@@ -94,6 +94,12 @@ def stamp(package: str) -> None:
     layout.write(stamp_file(package), json.dumps({"key": build_key(), "files": files}))
 
 
+def disown(packages: Iterable[str]) -> None:
+    """Forget what packages were built from, before anything of them changes."""
+    for package in packages:
+        stamp_file(package).unlink(missing_ok=True)
+
+
 def changed_packages() -> list[str]:
     """Packages that have to be built, in order."""
     return [package for package in PACKAGES if not is_built(package)]
@@ -146,6 +152,7 @@ def build(packages: list[str]) -> None:
                 shutil.rmtree(layout.INSTALL / package, ignore_errors=True)
                 if package == "dtsa_agent":
                     remove_kernel()
+        disown(packages)  # after an interruption they are built from the beginning: half a library looks like a new one
         remove_kernel("cpython-*.so")  # made for one Python: Python looks for these first
         (layout.INSTALL / ".dtsa-environment.json").unlink(missing_ok=True)
         arguments = ["--base-paths", str(layout.SOURCES), "--symlink-install", "--packages-select", *packages]
@@ -167,7 +174,11 @@ def kernel() -> Path:
 def compiled() -> list[Path]:
     """All that is compiled: the kernel, what agents on a network hear, what the middleware's waits need."""
     package = layout.SOURCES / "dtsa_agent" / "dtsa_agent"
-    return [kernel(), package / "air" / "udp" / "_hearing.abi3.so", package / "ros" / "common" / "_endless.abi3.so"]
+    return [
+        kernel(),
+        package / "air" / "udp" / "_hearing.abi3.so",
+        package / "ros" / "common" / "workarounds" / "_endless.abi3.so",
+    ]
 
 
 def remove_kernel(ending: str = "*.so") -> None:

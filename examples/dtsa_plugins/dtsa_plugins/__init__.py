@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.config import SwarmConfig
-from dtsa_agent.core.plugins import Table
+from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_agent.core.settings.config import SwarmConfig
 
 Array = NDArray[np.float64]
 
@@ -35,6 +35,8 @@ class LeastKnown:
 
 class Damped:
     """Estimator: an agent keeps its velocity at first and is believed to have come to rest after about a second."""
+
+    options = ("rest_s",)
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         self.slot_s = config.slot_s

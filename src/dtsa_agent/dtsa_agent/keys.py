@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 
-from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig
-from dtsa_agent.core.authentication import AuthenticatedSwarm, Authenticator
+from dtsa_agent.core.agents.authentication import AuthenticatedSwarm, Authenticator
+
+from .core import AbstractSwarm, ConfigError, SwarmConfig
 
 VARIABLE = "DTSA_AUTH_KEY"
 

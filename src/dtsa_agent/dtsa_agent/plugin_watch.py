@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.plugin_guard import RUNNING, Call, Overdue
-from dtsa_agent.core.plugins import uses_plugins
+from dtsa_agent.core.plugins.entry_points import uses_plugins
+from dtsa_agent.core.plugins.guard import RUNNING, Call, Overdue
+from dtsa_agent.core.settings.config import SwarmConfig
 
 VARIABLE = "DTSA_PLUGIN_LIMIT_S"
 LIMIT_S = 5.0  # of wall time; below the time that a channel in lockstep waits for an answer

@@ -35,7 +35,7 @@ def _end_after(limit_s: float) -> None:
 class Stop:
     """Turns SIGINT, SIGTERM and SIGHUP into a flag, so that whoever runs ends in good order.
 
-    A context manager that puts the old handlers back.
+    Hang-ups that are ignored already, as under ``nohup``, stay so. A context manager that puts the old handlers back.
 
     :param patience_s: s after the first signal; a process that has not come to the end of the context by then writes
         down where each of its threads stands, and ends with exit code 1. 0: it has as long as it wants.
@@ -50,7 +50,8 @@ class Stop:
 
     def __enter__(self) -> Stop:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            self._old[number] = signal.signal(number, self._handle)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._old[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *unused: object) -> None:

@@ -16,13 +16,13 @@ from typing import Any
 
 from waiting import wait_for
 
-from dtsa_agent.crazyflie import units
-from dtsa_agent.crazyflie.bridge import Bridge
-from dtsa_agent.crazyflie.config import parse_swarm
-from dtsa_agent.crazyflie.state_machine import State
-from dtsa_bench.fake_crazyflie import send_fault
-from dtsa_bench.fake_crazyflie.ports import free_base_port
-from dtsa_bench.fake_crazyflie.truth import read_truth
+from dtsa_agent.crazyflie.node.bridge import Bridge
+from dtsa_agent.crazyflie.settings.config import parse_swarm
+from dtsa_agent.crazyflie.state import conversions
+from dtsa_agent.crazyflie.state.state_machine import State
+from dtsa_bench.crazyflies.simulated import send_fault
+from dtsa_bench.crazyflies.simulated.ports import free_base_port
+from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 
 @dataclass
@@ -63,7 +63,15 @@ def fake_fleet(
     """Simulated Crazyflies in a process of their own."""
     base = free_base_port(count)
     truth = folder / f"truth-{base}.jsonl"
-    command = [sys.executable, "-m", "dtsa_bench.fake_crazyflie.cli", "--count", str(count), "--base-port", str(base)]
+    command = [
+        sys.executable,
+        "-m",
+        "dtsa_bench.crazyflies.simulated.cli",
+        "--count",
+        str(count),
+        "--base-port",
+        str(base),
+    ]
     command += ["--truth", str(truth), "--quiet", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
@@ -107,7 +115,7 @@ class Flight:
         while not self.stop.wait(0.02):
             for name, velocity in self.velocity.items():
                 if velocity is not None:
-                    self.bridge.vehicles[name].command(units.velocity_world(velocity, 0.0, time.monotonic()))
+                    self.bridge.vehicles[name].command(conversions.velocity_world(velocity, 0.0, time.monotonic()))
 
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, and begin to stream zero velocity."""

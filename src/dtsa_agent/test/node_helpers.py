@@ -11,17 +11,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dtsa_dev.soak.nodes import node_command, node_environment
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from waiting import wait_for
 
-from dtsa_agent.ros.common.dds import limit_to_machine
-from dtsa_agent.ros.common.process import init_ros
-from dtsa_agent.ros.common.serving import Serving
-from dtsa_bench.fly.domain import ros_domain
-from dtsa_bench.soak.nodes import node_command, node_environment
+from dtsa_agent.ros.common.process.node_process import init_ros
+from dtsa_agent.ros.common.process.serving import Serving
+from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_bench.flights.domain import ros_domain
 
 PATIENCE_S = 120.0
 

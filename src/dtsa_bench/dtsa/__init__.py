@@ -24,13 +24,13 @@ if TYPE_CHECKING:
         SlotOutcome,
         SwarmConfig,
     )
-    from dtsa_agent.core.plugins import Table
+    from dtsa_agent.core.plugins.entry_points import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
-    from dtsa_bench.bag.errors import BagError, UnusableBag
-    from dtsa_bench.figures.palette import agent_colour
-    from dtsa_bench.run_config import RunConfig, RunLimits
-    from dtsa_bench.verify import Difference
-    from dtsa_bench.verify import Result as Verification
+    from dtsa_bench.drawing.palette import agent_colour
+    from dtsa_bench.recordings.bag.errors import BagError, UnusableBag
+    from dtsa_bench.recordings.verify import Difference
+    from dtsa_bench.recordings.verify import Result as Verification
+    from dtsa_bench.runs.config import RunConfig, RunLimits
     from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig, Verdict
 
     from ._flight import Flight, run_config, simulate
@@ -90,12 +90,12 @@ _HOMES = {
         "Agent", "ConfigError", "Decision", "DtsaError", "LocalProtocolError", "PluginError", "RemoteProtocolError",
         "SlotOutcome", "SwarmConfig",
     ),
-    "dtsa_agent.core.plugins": ("Table",),
+    "dtsa_agent.core.plugins.entry_points": ("Table",),
     "dtsa_agent.core.registry": ("REASONS",),
-    "dtsa_bench.bag.errors": ("BagError", "UnusableBag"),
-    "dtsa_bench.figures.palette": ("agent_colour",),
-    "dtsa_bench.run_config": ("RunConfig", "RunLimits"),
-    "dtsa_bench.verify": ("Difference", "Verification"),
+    "dtsa_bench.recordings.bag.errors": ("BagError", "UnusableBag"),
+    "dtsa_bench.drawing.palette": ("agent_colour",),
+    "dtsa_bench.runs.config": ("RunConfig", "RunLimits"),
+    "dtsa_bench.recordings.verify": ("Difference", "Verification"),
     "dtsa_channel_sim": ("Channel", "ChannelConfig", "ClockConfig", "Verdict"),
 }  # fmt: skip
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASONS
-from dtsa_bench.run_config import RunConfig
-from dtsa_bench.simulate import Flight as _Flight
-from dtsa_bench.simulate import Trace
-from dtsa_bench.simulate import simulate as _simulate
-from dtsa_bench.sweep.spec import run_config as _run_config
+from dtsa_bench.experiments.sweep.spec import run_config as _run_config
+from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.simulation.simulate import Flight as _Flight
+from dtsa_bench.simulation.simulate import Trace
+from dtsa_bench.simulation.simulate import simulate as _simulate
 from dtsa_channel_sim import OUTCOMES
 
 from ._frames import data_frame

@@ -14,10 +14,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.figures import charts
-from dtsa_bench.figures.flights import draw_paths
-from dtsa_bench.figures.style import QUIET, colours, panels, style
-from dtsa_bench.sweep.aggregate import CRASHED, MEASURES
+from dtsa_bench.drawing.style import QUIET, colours, panels, style
+from dtsa_bench.experiments.figures import charts
+from dtsa_bench.experiments.figures.flights import draw_paths
+from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES
 
 from ._flight import Flight
 from ._recording import Recording

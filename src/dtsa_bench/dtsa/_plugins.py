@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.flight_models import AVOIDERS
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, Registry
+from dtsa_agent.core.settings.flight_models import AVOIDERS
 
 _REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in (POLICIES, ESTIMATORS, AVOIDERS)}
 

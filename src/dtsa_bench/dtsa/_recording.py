@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_bench.bag.place import find_file
-from dtsa_bench.bag.run import RecordedRun, load_run
-from dtsa_bench.run_config import RunConfig
-from dtsa_bench.tables.ages import follow_run
-from dtsa_bench.tables.export import ages_table, arrow_table
-from dtsa_bench.tables.followed import Followed
-from dtsa_bench.verify import Result, verify_bag
+from dtsa_bench.recordings.bag.place import find_file
+from dtsa_bench.recordings.bag.run import RecordedRun, load_run
+from dtsa_bench.recordings.tables.ages import follow_run
+from dtsa_bench.recordings.tables.export import ages_table, arrow_table
+from dtsa_bench.recordings.tables.followed import Followed
+from dtsa_bench.recordings.verify import Result, verify_bag
+from dtsa_bench.runs.config import RunConfig
 
 from ._frames import data_frame, from_arrow
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.batch.journal import Journal
-from dtsa_bench.batch.pool import run_all
-from dtsa_bench.sweep.aggregate import MEASURES, Group, Table, collected, write_table
-from dtsa_bench.sweep.columns import COMMON, VALUES
-from dtsa_bench.sweep.spec import Sweep, load_preset, make_sweep
-from dtsa_bench.sweep.work import WORK
+from dtsa_bench.experiments.batch.journal import Journal
+from dtsa_bench.experiments.batch.pool import run_all
+from dtsa_bench.experiments.sweep.aggregate import MEASURES, Group, Table, collected, write_table
+from dtsa_bench.experiments.sweep.columns import COMMON, VALUES
+from dtsa_bench.experiments.sweep.spec import Sweep, load_preset, make_sweep
+from dtsa_bench.experiments.sweep.work import work_of
 
 from ._frames import data_frame
 from ._plugins import registered
@@ -129,10 +129,11 @@ def sweep(
         if progress is not None:
             progress(runs)
 
+    work = work_of(plan)
     if out is None:
-        table = Table(plan, collected(plan, run_all(plan, WORK, jobs=jobs, progress=advance)))
+        table = Table(plan, collected(plan, run_all(plan, work, jobs=jobs, progress=advance)))
     else:
-        with closing(Journal(Path(out), plan, WORK.code())) as journal:
-            table = Table(plan, collected(plan, run_all(plan, WORK, journal, jobs=jobs, progress=advance)))
-        write_table(Path(out), table, WORK.code())
+        with closing(Journal(Path(out), plan, work.code())) as journal:
+            table = Table(plan, collected(plan, run_all(plan, work, journal, jobs=jobs, progress=advance)))
+        write_table(Path(out), table, work.code())
     return SweepResult(plan.name, plan.axes, table)

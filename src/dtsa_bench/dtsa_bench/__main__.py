@@ -1,7 +1,7 @@
-"""`python -m dtsa_bench COMMAND ...`: see :mod:`dtsa_bench.cli`."""
+"""`python -m dtsa_bench COMMAND ...`: see :mod:`dtsa_bench.commands.cli`."""
 
 import sys
 
-from dtsa_bench.entry import dtsa
+from .entry import dtsa
 
 sys.exit(dtsa())

@@ -7,12 +7,12 @@ import os
 import sys
 from typing import NoReturn
 
-from dtsa_bench.missing import say_missing
+from dtsa_bench.commands.missing_packages import say_missing
 
 
 def dtsa() -> int:
     """``dtsa``, and ``python -m dtsa_bench``."""
-    from dtsa_bench.cli import INTERRUPTED, main
+    from dtsa_bench.commands.cli import INTERRUPTED, main
 
     code = main()
     if code == INTERRUPTED or "rclpy" in sys.modules:  # the middleware's own end may wait for locks of the dead
@@ -36,7 +36,7 @@ def _leave_at_once(code: int) -> NoReturn:
 def recorded_channel() -> int:
     """``ros2 run dtsa_bench recorded_channel``."""
     try:
-        from dtsa_bench.fly.recorded_channel import main
+        from dtsa_bench.flights.recorded_channel import main
     except ImportError as error:
         return say_missing("recorded_channel", error)
     return main()
@@ -45,7 +45,7 @@ def recorded_channel() -> int:
 def fake_crazyflie() -> int:
     """``ros2 run dtsa_bench fake_crazyflie``."""
     try:
-        from dtsa_bench.fake_crazyflie.cli import main
+        from dtsa_bench.crazyflies.simulated.cli import main
     except ImportError as error:
         return say_missing("fake_crazyflie", error)
     return main()

@@ -17,12 +17,12 @@ from launch_ros.actions import Node
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import settings_of
-from dtsa_agent.ros.common import names
-from dtsa_bench.fly.agent_parameters import clock_parameters
-from dtsa_bench.fly.options import FlightOptions
-from dtsa_bench.options import whole_number
-from dtsa_bench.run_config import FROM_SWARM, MODES, RunConfig, RunLimits, from_swarm
+from dtsa_agent.core.settings.declaration import settings_of
+from dtsa_agent.ros.common.graph import names
+from dtsa_bench.flights.agent_parameters import clock_parameters
+from dtsa_bench.flights.options import FlightOptions
+from dtsa_bench.runs.config import FROM_SWARM, MODES, RunConfig, RunLimits, from_swarm
+from dtsa_bench.runs.options import whole_number
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
 UNSET = ""  # the node's own default

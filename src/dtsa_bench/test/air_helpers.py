@@ -18,8 +18,8 @@ from waiting import wait_for
 from dtsa_agent.air.udp import AgentSettings, MulticastSocket, SlotRecord, UdpAgent, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
-from dtsa_bench.air.recorder import AgentRecorder
-from dtsa_bench.air.sniffer import Sniffer
+from dtsa_bench.network.sniffer import Sniffer
+from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 
 _PATIENCE_S = 60.0
 

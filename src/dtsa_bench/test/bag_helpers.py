@@ -13,11 +13,11 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from dtsa_bench.bag import schema
-from dtsa_bench.bag.cdr import MarkerPacker, OdometryPacker
-from dtsa_bench.bag.errors import BagError
-from dtsa_bench.bag.writer import BagWriter
-from dtsa_bench.fly.domain import ros_domain
+from dtsa_bench.flights.domain import ros_domain
+from dtsa_bench.recordings.bag import schema
+from dtsa_bench.recordings.bag.cdr import MarkerPacker, OdometryPacker
+from dtsa_bench.recordings.bag.errors import BagError
+from dtsa_bench.recordings.bag.writer import BagWriter
 
 MESSAGES = Path(__file__).parents[2] / "dtsa_msgs" / "msg"
 RUN = 0x1234  # id of all synthetic runs

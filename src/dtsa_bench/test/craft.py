@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from dtsa_bench.fake_crazyflie import crtp
-from dtsa_bench.fake_crazyflie.estimate import Estimate
-from dtsa_bench.fake_crazyflie.firmware import OFF, Firmware
-from dtsa_bench.fake_crazyflie.peer import Peer
+from dtsa_bench.crazyflies.simulated import crtp
+from dtsa_bench.crazyflies.simulated.estimate import Estimate
+from dtsa_bench.crazyflies.simulated.firmware import OFF, Firmware
+from dtsa_bench.crazyflies.simulated.peer import Peer
 
 
 class Craft:

@@ -9,10 +9,10 @@ import numpy as np
 from bag_helpers import RUN, SECOND, cdr, definition, header
 
 from dtsa_agent.core import REASONS, Swarm
-from dtsa_agent.core.config import SwarmConfig
-from dtsa_bench.bag.cdr import OdometryPacker
-from dtsa_bench.bag.writer import BagWriter
-from dtsa_bench.run_config import RunConfig
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_bench.recordings.bag.cdr import OdometryPacker
+from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_bench.runs.config import RunConfig
 
 
 def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings: Any) -> None:
@@ -47,7 +47,7 @@ def flight_bag(directory: Path, slots: int = 400, loss: float = 0.0, **settings:
                 run=RUN,
                 slot=slot,
                 agent=ids,
-                length=swarm.frame_length if len(data) else np.zeros(n, np.uint8),
+                length=np.array([len(swarm.frame(k)) if len(data) else 0 for k in range(n)], np.uint8),
                 data=data,
                 offset_ns=np.zeros(0, np.int64),
                 chosen=swarm.chosen,

@@ -10,12 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from dtsa_dev.soak.flights import end_all, process_with
 from waiting import wait_for
 
-from dtsa_agent.ros.common.wire import split_frames
-from dtsa_bench.bag.reader import Bag
-from dtsa_bench.soak.flights import end_all, process_with
-from dtsa_bench.verify import verify_bag
+from dtsa_agent.ros.common.wire.packing import split_frames
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.verify import verify_bag
 
 PATIENCE_S = 120.0
 

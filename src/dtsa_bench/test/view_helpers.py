@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from flight_helpers import flight_bag
 
-from dtsa_bench.view.recording import BagSource
-from dtsa_bench.view.track import Track
+from dtsa_bench.pages.view.recording import BagSource
+from dtsa_bench.pages.view.track import Track
 
 SLOTS, AGENTS = 150, 6
 PATIENCE_S = 60.0

@@ -1,14 +1,14 @@
 """The radio channel that a swarm shares: slots, collisions, losses, ranges and clocks."""
 
-from .model.air import Air, FrameVerdict
-from .model.airtime import Airtime
-from .model.channel import Channel
-from .model.clocks import AgentClock, ClockConfig, make_clocks
-from .model.config import CHANGEABLE, Change, ChannelConfig
-from .model.medium import Medium, OnAir, Reception
-from .model.simulated_air import SimulatedAir, SimulatedPort
-from .model.topology import LinkLoss
-from .model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
+from dtsa_channel_sim.model.air import Air, FrameVerdict
+from dtsa_channel_sim.model.airtime import Airtime
+from dtsa_channel_sim.model.channel import Channel
+from dtsa_channel_sim.model.clocks import AgentClock, ClockConfig, make_clocks
+from dtsa_channel_sim.model.config import CHANGEABLE, Change, ChannelConfig
+from dtsa_channel_sim.model.medium import Medium, OnAir, Reception
+from dtsa_channel_sim.model.simulated_air import SimulatedAir, SimulatedPort
+from dtsa_channel_sim.model.topology import LinkLoss
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
 
 __all__ = [
     "CHANGEABLE",

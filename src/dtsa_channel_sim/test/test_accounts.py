@@ -16,8 +16,8 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Report
 from rclpy.serialization import serialize_message
 
-from dtsa_agent.ros.common.checks import Unusable
-from dtsa_agent.ros.common.report_fields import ReportFields, read_report
+from dtsa_agent.ros.common.wire.checks import Unusable
+from dtsa_agent.ros.common.wire.report_fields import ReportFields, read_report
 from dtsa_channel_sim.ros.accounts import Accounts, Delivered
 
 AGENTS, STEPS, LATEST = 5, 1, 50

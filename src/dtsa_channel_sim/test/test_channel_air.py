@@ -216,3 +216,30 @@ def test_impossible_frames(frame):
     line.begin("twice", 1, 0, 24)
     with pytest.raises(LocalProtocolError):
         line.begin(*frame)
+
+
+@pytest.mark.parametrize(("gap", "collided"), [(0, 0), (-1, 4), (1, 0)])
+def test_frames_that_touch_do_not_collide(gap, collided):
+    """The first bit of one may follow the last bit of the other at once; a nanosecond earlier both are lost."""
+    channel = Channel(ChannelConfig(agents=6))
+    airtime, line = channel.config.airtime, arbiter()
+    first = OnAir.of(airtime, 1, 0, 24)
+    second = OnAir.of(airtime, 2, first.end_ns - airtime.ramp_up_ns + gap, 24)
+    assert second.air_ns == first.end_ns + gap
+    assert first.overlaps(second) == second.overlaps(first) == bool(collided)
+    assert second.deafens(first)  # turns to sending while the first one is on air
+    assert first.deafens(second) == bool(collided)
+    for frame in (second, first):
+        line.begin(frame.sender, frame.sender, frame.start_ns, 24)
+    verdicts = {v.sender: v for v in line.settle(60 * MS)}
+    assert verdicts[1].collided == 1 + collided
+    assert verdicts[2].collided == (5 if collided else 0)
+
+
+def test_a_sender_that_ends_as_another_frame_begins_hears_that_frame():
+    """Its radio is back in time; one that turns to sending as the other frame ends has heard it."""
+    earlier, frame, later = OnAir(1, 0, 10, 20), OnAir(2, 15, 20, 30), OnAir(3, 30, 40, 50)
+    assert not earlier.deafens(frame)
+    assert not later.deafens(frame)
+    assert OnAir(1, 0, 10, 21).deafens(frame)
+    assert OnAir(3, 29, 40, 50).deafens(frame)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import settings_of
+from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_channel_sim import CHANGEABLE, Change, Channel, ChannelConfig, LinkLoss
 from dtsa_channel_sim.model.timeline import Timeline
 from dtsa_channel_sim.model.topology import format_ids, format_partition, parse_ids, parse_partition

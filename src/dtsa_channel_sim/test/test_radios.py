@@ -10,7 +10,7 @@ import pytest
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugin_guard import Guarded
+from dtsa_agent.core.plugins.guard import Guarded
 from dtsa_agent.core.registry import POLICIES
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 from dtsa_channel_sim.model.radios import NEVER, Radios, radio_rules
@@ -27,6 +27,9 @@ class Waits:
 
     def __init__(self, config: object = None, agent: int = 0) -> None:
         self.answer: Any = 100_000
+
+    def wake(self, table: object, now_ns: int, radio: object) -> int:
+        return now_ns + 1
 
     def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> Any:
         return self.answer if busy else 0

@@ -9,7 +9,7 @@ import pytest
 
 from dtsa_agent.air import AirPort, SlotHearing
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.core.outcome import SlotOutcome
+from dtsa_agent.core.swarms.outcome import SlotOutcome
 from dtsa_channel_sim import Channel, ChannelConfig, SimulatedAir
 
 MS = 1_000_000

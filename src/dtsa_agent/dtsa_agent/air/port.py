@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from dtsa_agent.core.outcome import SlotOutcome
+from dtsa_agent.core.swarms.outcome import SlotOutcome
 
 
 class AirPort(Protocol):

@@ -9,7 +9,7 @@ EXTENDED_RECORD: int
 SWARM_IMAGE: int  # bytes of the images that core/binding.py makes
 METRICS_IMAGE: int
 
-# Agents in slots (libdtsa_sim/swarm.h), on arrays that core/swarm.py owns.
+# Agents in slots (libdtsa_sim/swarm.h), on arrays that core/swarms/swarm.py owns.
 
 class Swarm: ...  # an opaque handle
 
@@ -31,7 +31,7 @@ def reset(swarm: Swarm, /) -> None: ...
 # -> probation, deaf, woke, alive, absent, silent slots
 def lease_status(swarm: Swarm, index: int, /) -> tuple[bool, bool, int, int, int, int]: ...
 
-# Sums over a flight (libdtsa_sim/metrics.h), on arrays that dtsa_bench/metrics.py owns.
+# Sums over a flight (libdtsa_sim/metrics.h), on arrays that dtsa_bench/runs/metrics.py owns.
 
 class Metrics: ...
 

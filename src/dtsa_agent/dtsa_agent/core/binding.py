@@ -105,7 +105,9 @@ SWARM = Layout(
 METRICS = Layout(
     (
         ("n", "i", ""), ("news_from", "q", ""), ("collision_m", "d", ""), ("r_min", "d", ""), ("path", "f8", "n"),
-        ("last_position", "f8", "3n"), ("target", "f8", "3n"), ("moving", "u1", "n"), ("sums", "i8", "9"),
+        ("last_position", "f8", "3n"), ("target", "f8", "3n"), ("moving", "u1", "n"),
+        ("gone", "u1", "n"), ("goal", "f8", "3n"), ("woken", "i8", "n"), ("heard", "u1", "n"), ("delays", "i8", "d"),
+        ("sums", "i8", "s"),
     ),
     getattr(_kernel, "METRICS_IMAGE", 0),
 )  # fmt: skip

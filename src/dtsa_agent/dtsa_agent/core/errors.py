@@ -9,6 +9,18 @@ class DtsaError(Exception):
     """Base of all errors that this project raises on purpose."""
 
 
+def shown(value: object) -> str:
+    """A value as errors repeat it: not too long, whatever its own ``__repr__`` does.
+
+    :param value: the value.
+    """
+    try:
+        given = repr(value)
+    except Exception:
+        given = f"<{type(value).__name__}>"
+    return given if len(given) <= _LONGEST else given[:_LONGEST] + " ..."
+
+
 class ConfigError(DtsaError, ValueError):
     """A setting is not usable: the user's to mend.
 
@@ -18,10 +30,7 @@ class ConfigError(DtsaError, ValueError):
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
-        given = repr(value)
-        if len(given) > _LONGEST:
-            given = given[:_LONGEST] + " ..."
-        super().__init__(f"{field}: got {given}; allowed: {allowed}")
+        super().__init__(f"{field}: got {shown(value)}; allowed: {allowed}")
         self.field = field
         self.value = value
         self.allowed = allowed
@@ -61,7 +70,7 @@ class PluginError(DtsaError):
         super().__init__(f"{part}: {fault}")
 
     @classmethod
-    def raised(cls, part: str, error: Exception) -> PluginError:
+    def raised(cls, part: str, error: BaseException) -> PluginError:
         """An error that the part raised, with the place in it.
 
         :param part: what it is: kind, name and method.

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import struct
 
+from dtsa_agent.core.reference.arithmetic import Vector
+from dtsa_agent.core.reference.frame import Frame
+
 from .compiled import MISSING
 from .compiled import kernel as _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
 from .reference import frame as plain
 from .reference import tag
-from .reference.arithmetic import Vector
-from .reference.frame import Frame
 from .registry import PROFILES
 
 PROFILE_PAPER = PROFILES.index("paper")  # id, c_r, slot, position, velocity: 19 bytes

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import struct
 
+from dtsa_agent.core.reference.frame import EXTENDED_HEAD, EXTENDED_LENGTH
+from dtsa_agent.core.reference.frame_extended import OPEN, ExtendedFrame, Gossip
+
 from .compiled import MISSING
 from .compiled import kernel as _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
@@ -19,8 +22,6 @@ from .frame import (
     record_of,
 )
 from .reference import frame_extended as plain
-from .reference.frame import EXTENDED_HEAD, EXTENDED_LENGTH
-from .reference.frame_extended import OPEN, ExtendedFrame, Gossip
 
 HEAD_LENGTH = EXTENDED_HEAD  # bytes of the sender's own state: enough for who hears only the beginning of a frame
 
@@ -30,28 +31,43 @@ __all__ = [
 ]  # fmt: skip
 
 # The structure of libdtsa/frame.h after the sender's own fields: c_s, leaving, probation, numbers of gossip and leases,
-# mask of the relay; three entries of gossip (id, age, c_r, position, velocity); leases; the relay's lessees.
-_REST = struct.Struct("=5iI" + 3 * "3i4x6d" + "33s8s7x")
+# mask of the relay; three entries of gossip (id, age, c_r, position, velocity); leases; the relay's lessees; the lessee
+# and the mask of turns handed on far ahead.
+_REST = struct.Struct("=5iI" + 3 * "3i4x6d" + "33s8sB10s4x")
 _ENTRY = 9  # values of one entry
+_FAR_BYTES = plain.SECTION_BYTES - 1
+_NEAR = range(1, plain.RELAY_REACH + 1)  # slots ahead that a relay speaks of
+_FAR = range(plain.RELAY_REACH + 1, plain.FAR_REACH + 1)  # ... and that are handed on to one agent
 if not MISSING and RECORD.size + _REST.size != _kernel.EXTENDED_RECORD:
     raise ImportError("the compiled kernel is of another version; build dtsa_agent again")
 
 
+def _mask_of(ahead: tuple[int, ...], reach: range) -> int:
+    """A bit for each of the slots ahead; -1 if they are not ascending or not within reach."""
+    if any(slots not in reach for slots in ahead) or list(ahead) != sorted(set(ahead)):
+        return -1
+    return sum(1 << (slots - reach.start) for slots in ahead)
+
+
+def _slots_of(mask: int, reach: range) -> tuple[int, ...]:
+    return tuple(slots for slots in reach if mask >> (slots - reach.start) & 1)
+
+
 def _rest_of(frame: ExtendedFrame) -> bytes:
     """What an extended frame says of others, as the kernel's structure; none if it does not fit."""
-    mask, lessees = 0, [lessee for _, lessee in frame.relay]
-    for ahead, _ in frame.relay:
-        if not 1 <= ahead <= 24 or mask >> (ahead - 1):
-            return b""
-        mask |= 1 << (ahead - 1)
-    if len(lessees) > 8 or not all(0 < lessee < 256 for lessee in lessees) or len(frame.gossip) > 3:
+    lessees = [lessee for _, lessee in frame.relay]
+    mask, far = _mask_of(tuple(ahead for ahead, _ in frame.relay), _NEAR), _mask_of(frame.far, _FAR)
+    if min(mask, far) < 0 or not all(0 < lessee < 256 for lessee in lessees):
+        return b""
+    if len(lessees) > plain.RELAY_IDS or len(frame.gossip) > plain.SECTIONS:
         return b""
     entries: list[float] = []
     for g in frame.gossip:
         entries += (g.agent, g.age, int(g.moving), *g.position, *g.velocity)
-    entries += [0] * (3 * _ENTRY - len(entries))
+    entries += [0] * (plain.SECTIONS * _ENTRY - len(entries))
     numbers = (frame.c_s, frame.leaving, frame.probation, len(frame.gossip), len(frame.leases), mask)
-    return _REST.pack(*numbers, *entries, frame.leases, bytes(lessees))
+    others = (frame.leases, bytes(lessees), frame.far_lessee, far.to_bytes(_FAR_BYTES, "little"))
+    return _REST.pack(*numbers, *entries, *others)
 
 
 def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
@@ -91,10 +107,13 @@ def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
     for at in range(0, gossips * _ENTRY, _ENTRY):
         agent, age, moving, *state = rest[at : at + _ENTRY]
         gossip.append(Gossip(agent, age, bool(moving), (state[0], state[1], state[2]), (state[3], state[4], state[5])))
-    leases, relayed = rest[-2:]
-    relay = tuple(zip((d for d in range(1, 25) if mask >> (d - 1) & 1), relayed, strict=False))
+    leases, relayed, far_lessee, far_mask = rest[-4:]
+    relay = tuple(zip(_slots_of(mask, _NEAR), relayed, strict=False))
+    far = _slots_of(int.from_bytes(far_mask, "little"), _FAR)
     own = Frame(sender, slot, c_r, (v[0], v[1], v[2]), (v[3], v[4], v[5]), (v[6], v[7], v[8]))
-    return ExtendedFrame(own, c_s, bool(leaving), bool(probation), tuple(gossip), leases[:given], relay)
+    return ExtendedFrame(
+        own, c_s, bool(leaving), bool(probation), tuple(gossip), leases[:given], relay, far, far_lessee
+    )
 
 
 def decode_head(data: bytes, extent_m: float = EXTENT_M) -> Frame:

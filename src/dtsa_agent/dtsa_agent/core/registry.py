@@ -1,6 +1,6 @@
 """Policies and estimators: one row each. Whatever depends on the nature of one asks its row.
 
-Avoiders and their vehicles are rows as well: :data:`dtsa_agent.core.flight_models.AVOIDERS`. Rows are in the order of
+Avoiders and their vehicles are rows as well: :data:`.settings.flight_models.AVOIDERS`. Rows are in the order of
 the kernel's numbers, which is checked when this module is imported. Plug-ins get their rows from what they declare.
 
 A built-in policy is a row here, a file in ``libdtsa/policy``, and its number and name in ``libdtsa``.
@@ -167,6 +167,10 @@ class Registry(Generic[Row]):
                 raise ConfigError(self.group, name, allowed)
         return points
 
+    def plug_in_names(self) -> set[str]:
+        """Names of the plug-ins that this process can use."""
+        return self.registered | self.plug_ins().keys()
+
     def _plug_in(self, name: str) -> tuple[Any, Row]:
         if name not in self._plug_ins:
             points = self.plug_ins()
@@ -191,10 +195,17 @@ def _own_bytes(name: str, factory: Any) -> int:
     return own
 
 
+def _flag(name: str, factory: Any, attribute: str) -> bool:
+    value = getattr(factory, attribute, False)
+    if not isinstance(value, bool):
+        raise ConfigError(f"{name}.{attribute}", value, "True or False")
+    return value
+
+
 def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
-    port = tuple(getattr(factory, "port", ("send", "received")))
-    if not set(port) <= set(PORT):
-        raise ConfigError(f"{name}.port", port, "some of " + ", ".join(PORT))
+    port = getattr(factory, "port", ("send", "received"))
+    if not isinstance(port, (tuple, list)) or any(part not in PORT for part in port):
+        raise ConfigError(f"{name}.port", port, "a tuple of some of " + ", ".join(PORT))
     needs_everybody = callable(getattr(factory, "senders", None))
     if needs_everybody and _own_bytes(name, factory):
         raise ConfigError(f"{name}.own_bytes", factory.own_bytes, "0 for a policy that looks into all agents")
@@ -209,8 +220,8 @@ def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
         name,
         "plug-in",
         "as it was written",
-        may_join=bool(getattr(factory, "may_join", False)),
-        port=port,
+        may_join=_flag(name, factory, "may_join"),
+        port=tuple(port),
         own_bytes=_own_bytes(name, factory),
         needs_everybody=needs_everybody,
         unslotted=unslotted,
@@ -219,7 +230,7 @@ def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
 
 
 def _estimator_plug_in(name: str, factory: Any) -> EstimatorRow:
-    needs_intent = bool(getattr(factory, "needs_intent", False))
+    needs_intent = _flag(name, factory, "needs_intent")
     return EstimatorRow(name, "plug-in", needs_intent, own_bytes=_own_bytes(name, factory))
 
 

@@ -184,7 +184,7 @@ int agent_speak(dtsa_agent *a, int64_t slot, uint8_t *out)
     }
     if (c->profile != DTSA_PROFILE_EXTENDED) return frame_encode(&e.own, c->position_step, out);
     if (a->policy->speak) a->policy->speak(a, slot, &e);
-    const int used = (e.lease_count + SECTION_BYTES - 1) / SECTION_BYTES + (e.relay_mask != 0);
+    const int used = (e.lease_count + SECTION_BYTES - 1) / SECTION_BYTES + (e.relay_mask != 0) + (e.far_id != 0);
     if (c->gossip)
         e.gossip_count = gossip_collect(a->table, a->self, slot, SECTIONS - used, e.gossip);
     return extended_encode(&e, c->position_step, out);
@@ -214,7 +214,7 @@ int dtsa_agent_hear(dtsa_agent *a, int64_t slot, const uint8_t *data, long lengt
 
 void dtsa_agent_end(dtsa_agent *a, int64_t slot)
 {
-    if (a->frame_length) table_said(a->table, a->self, slot, a->frame, a->frame_length);
+    if (a->frame_length) agent_said(a, slot, a->frame, a->frame_length);
     a->policy->end(a, slot);
 }
 

@@ -102,13 +102,16 @@ int frame_admit(const dtsa_config *config, int64_t slot, const uint8_t *data, lo
 /* A table takes in what was heard. -> whether its sender was not in A_p and is now. */
 int table_take(dtsa_table *table, const heard_frame *heard);
 void agent_take(dtsa_agent *agent, const heard_frame *heard);
-/* A sender's entry for itself is its own last SENT state, whether or not anybody heard it. */
-void table_said(dtsa_table *table, int self, int64_t slot, const uint8_t *data, long length);
+/* A sender's entry for itself is its own last SENT state, whether or not anybody heard it; but for a frame in an OPEN turn,
+ * where others may send, too. */
+void agent_said(dtsa_agent *a, int64_t slot, const uint8_t *data, long length);
 
 /* gossip.c */
 int gossip_collect(const dtsa_table *table, int self, int64_t slot, int room,
                    gossip_entry *out); /* -> number */
 void gossip_learn(dtsa_table *table, int64_t sampled, const gossip_entry *entry);
+/* The same, of the table's own agent: somebody has heard it. */
+void gossip_confirm(dtsa_table *table, int64_t sampled, const gossip_entry *entry);
 
 /* avoider/avoider.c: command of one agent from others' states as believed, docs/avoiders.md. `ages` may be NULL. */
 int avoid_scratch_doubles(int n);

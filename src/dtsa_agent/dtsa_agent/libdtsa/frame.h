@@ -12,6 +12,7 @@ enum {
     EXTENDED_LENGTH = EXTENDED_HEAD + SECTIONS * SECTION_BYTES
 };
 enum { RELAY_IDS = 8, RELAY_REACH = 24, GOSSIP_AGE_MAX = 127, LEASE_ROOM = 2 * SECTION_BYTES };
+enum { FAR_BYTES = SECTION_BYTES - 1, FAR_REACH = RELAY_REACH + 8 * FAR_BYTES };
 enum {
     LEASE_NONE = 0,  /* a turn is its owner's */
     LEASE_OPEN = 255 /* a turn is whoever's has just woken or joined */
@@ -41,6 +42,8 @@ typedef struct extended_frame {
     gossip_entry gossip[SECTIONS];
     uint8_t leases[SECTIONS * SECTION_BYTES];
     uint8_t relay_ids[RELAY_IDS];
+    uint8_t far_id; /* lessee of the turns handed on beyond the relay's reach, 0: none */
+    uint8_t far_mask[FAR_BYTES]; /* bit b: turn slot + RELAY_REACH + 1 + b is handed on to it */
 } extended_frame;
 
 /* ---- frame.c ---- */

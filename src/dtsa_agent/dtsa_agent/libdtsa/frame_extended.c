@@ -10,13 +10,14 @@
  *       velocity 3 x 10 bits at 2 cm/s
  *     kind 1, leases: a byte a turn (0: none, id of the lessee, 255: open)
  *     kind 2, relay: 24 bits, bit d - 1: turn slot + d is leased; then at most 8 lessees
+ *     kind 3, far: id of a lessee; 80 bits, bit d - 25: turn slot + d is handed on to it
  */
 #include <math.h>
 #include <string.h>
 
 #include "frame.h"
 
-enum { KIND_GOSSIP, KIND_LEASES, KIND_RELAY };
+enum { KIND_GOSSIP, KIND_LEASES, KIND_RELAY, KIND_FAR };
 
 static const double VELOCITY_STEP = 0.02;
 
@@ -89,10 +90,19 @@ static int get_relay(const uint8_t *in, extended_frame *e)
     return FRAME_OK;
 }
 
+static int get_far(const uint8_t *in, extended_frame *e)
+{
+    int any = 0;
+    e->far_id = in[0];
+    memcpy(e->far_mask, in + 1, FAR_BYTES);
+    for (int i = 0; i < FAR_BYTES; i++) any |= e->far_mask[i];
+    return any && e->far_id && e->far_id <= DTSA_EXTENDED_AGENTS_MAX ? FRAME_OK : FRAME_BAD_FIELD;
+}
+
 /* Whether all that a frame says of others is within range. */
 static int sayable(const extended_frame *e)
 {
-    int relayed = 0, last = 0;
+    int relayed = 0, last = 0, far = 0;
     if (e->c_s < 0 || e->c_s >= DTSA_EXTENDED_AGENTS_MAX || e->gossip_count < 0 ||
         e->gossip_count > SECTIONS || e->lease_count < 0 ||
         e->lease_count > SECTIONS * SECTION_BYTES || e->relay_mask >> RELAY_REACH)
@@ -104,6 +114,8 @@ static int sayable(const extended_frame *e)
         for (int axis = 0; axis < 3; axis++)
             if (g->p[axis] != g->p[axis] || g->v[axis] != g->v[axis]) return 0;
     }
+    for (int i = 0; i < FAR_BYTES; i++) far |= e->far_mask[i];
+    if (!far != !e->far_id || e->far_id > DTSA_EXTENDED_AGENTS_MAX) return 0;
     for (int d = 0; d < RELAY_REACH; d++) relayed += e->relay_mask >> d & 1;
     while (last < RELAY_IDS && e->relay_ids[last]) last++;
     return relayed <= RELAY_IDS && relayed == last;
@@ -129,6 +141,13 @@ int extended_encode(const extended_frame *e, double position_step, uint8_t *out)
         memcpy(at + 3, e->relay_ids, RELAY_IDS);
         at += SECTION_BYTES;
     }
+    if (e->far_id) {
+        if (section == SECTIONS) return 0;
+        kinds[section++] = KIND_FAR;
+        at[0] = e->far_id;
+        memcpy(at + 1, e->far_mask, FAR_BYTES);
+        at += SECTION_BYTES;
+    }
     for (int i = 0; i < e->gossip_count; i++, at += SECTION_BYTES) {
         if (section == SECTIONS) return 0;
         kinds[section++] = KIND_GOSSIP;
@@ -151,6 +170,8 @@ int extended_decode(const uint8_t *data, long length, double position_step, exte
     e->probation = data[3] >> 1 & 1;
     e->gossip_count = e->lease_count = 0;
     e->relay_mask = 0;
+    e->far_id = 0;
+    memset(e->far_mask, 0, FAR_BYTES);
     int relays = 0;
     for (int i = 0; i < SECTIONS; i++) {
         const uint8_t *at = data + EXTENDED_HEAD + i * SECTION_BYTES;
@@ -168,7 +189,7 @@ int extended_decode(const uint8_t *data, long length, double position_step, exte
             bad = relays++ ? FRAME_BAD_FIELD : get_relay(at, e);
             break;
         default:
-            bad = FRAME_BAD_FIELD;
+            bad = e->far_id ? FRAME_BAD_FIELD : get_far(at, e);
         }
         if (bad != FRAME_OK) return bad;
     }

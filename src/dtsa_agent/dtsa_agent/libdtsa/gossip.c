@@ -58,7 +58,12 @@ int gossip_collect(const dtsa_table *t, int self, int64_t slot, int room, gossip
 /* A state that somebody else heard replaces an older one only; one at the codec's limit may be a wrong one. */
 void gossip_learn(dtsa_table *t, int64_t sampled, const gossip_entry *g)
 {
-    if (sampled < 0 || t->observer == g->id - 1) return;
+    if (t->observer != g->id - 1) gossip_confirm(t, sampled, g);
+}
+
+void gossip_confirm(dtsa_table *t, int64_t sampled, const gossip_entry *g)
+{
+    if (sampled < 0) return;
     if (t->sent_slot[g->id - 1] >= sampled || !gossip_fits(g->p, g->v, t->config->position_step))
         return;
     dtsa_frame f = {.sender = g->id, .c_r = g->c_r};

@@ -7,7 +7,7 @@ static int known(int id, int n) { return id <= n; }
 static int known_ids(int n, const extended_frame *e, int64_t slot)
 {
     const int own_turn = slot % n == e->own.sender - 1;
-    if (e->c_s >= n || (e->lease_count && !own_turn)) return 0;
+    if (e->c_s >= n || !known(e->far_id, n) || (e->lease_count && !own_turn)) return 0;
     for (int i = 0; i < e->gossip_count; i++)
         if (!known(e->gossip[i].id, n)) return 0;
     for (int i = 0; i < e->lease_count; i++)
@@ -55,10 +55,12 @@ void agent_take(dtsa_agent *a, const heard_frame *heard)
     if (a->policy->heard && !own) a->policy->heard(a, heard->sampled, &heard->e, wakes);
 }
 
-void table_said(dtsa_table *t, int self, int64_t slot, const uint8_t *data, long length)
+void agent_said(dtsa_agent *a, int64_t slot, const uint8_t *data, long length)
 {
+    dtsa_table *t = a->table;
     dtsa_frame f;
-    if (t->sent_slot[self] == slot) return;
+    if (t->sent_slot[a->self] == slot) return;
+    if (a->decision.reason == DTSA_REASON_LEASE_OPEN) return; /* gossip says whether it was heard */
     if (frame_decode(data, length, t->config->position_step, &f) == FRAME_OK)
         table_learn(t, &f, slot);
 }

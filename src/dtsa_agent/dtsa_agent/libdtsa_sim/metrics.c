@@ -117,11 +117,45 @@ static void news(metrics *m, swarm *s, int64_t slot, const double *truth)
     }
 }
 
+/* Ages from waking on in one table: of all that fly, heard or not. */
+static void table_wakings(metrics *m, const dtsa_table *t, int64_t last)
+{
+    const int n = m->n, observer = t->observer;
+    if (observer >= 0 && m->gone[observer]) return;
+    const int64_t weight = observer < 0 ? n - 1 : 1;
+    metrics_sums *sum = m->sums;
+    for (int k = 0; k < n; k++) {
+        const int64_t woken = m->woken[k], sent = t->sent_slot[k];
+        if (woken < 0 || !m->moving[k] || k == observer) continue;
+        const int64_t age = last - (sent >= woken ? sent : woken - 1);
+        sum->waking_count += weight;
+        sum->waking_sum += weight * age;
+        if (age > sum->waking_max) sum->waking_max = age;
+        if (sent < woken || m->heard[k]) continue;
+        m->heard[k] = 1;
+        const int64_t delay = last - woken;
+        m->delays[delay < METRICS_DELAYS ? delay : METRICS_DELAYS - 1]++;
+    }
+}
+
+static void wakings(metrics *m, const swarm *s, int64_t last, const double *now)
+{
+    const int n = m->n;
+    for (int table = 0; table < s->table_count; table++) table_wakings(m, &s->tables[table], last);
+    for (int k = 0; k < n; k++) {
+        if (m->woken[k] < 0) continue;
+        const double dx = now[k] - m->goal[k], dy = now[n + k] - m->goal[n + k],
+                     dz = now[2 * n + k] - m->goal[2 * n + k];
+        if (sqrt(dx * dx + dy * dy + dz * dz) <= m->r_min) m->woken[k] = -1;
+    }
+}
+
 int metrics_update(metrics *m, int64_t slot, int steps, const double *track, swarm *tables)
 {
     const double *now = track + (long)(steps - 1) * 3 * m->n;
     int state = distances(m, steps, slot, track) ? METRICS_CRASHED : 0;
     if (arrived(m, now)) state |= METRICS_ARRIVED;
     if (tables && slot >= m->news_from) news(m, tables, slot, now);
+    if (tables) wakings(m, tables, slot - 1, now);
     return state;
 }

@@ -4,12 +4,13 @@
 
 #include "swarm.h"
 
-enum { METRICS_CRASHED = 1, METRICS_ARRIVED = 2 };
+enum { METRICS_CRASHED = 1, METRICS_ARRIVED = 2, METRICS_DELAYS = 256 };
 
-/* Eight bytes each, in this order: dtsa_bench/metrics.py reads them. */
+/* Eight bytes each, in this order: dtsa_bench/runs/metrics.py reads them. */
 typedef struct metrics_sums {
     double min_distance2, error_sum, error_max;
     int64_t pair_1, pair_2, min_slot, age_count, age_sum, age_max;
+    int64_t waking_count, waking_sum, waking_max; /* ages from waking on */
 } metrics_sums;
 
 typedef struct metrics {
@@ -21,6 +22,11 @@ typedef struct metrics {
     double *last_position; /* (3, n) m */
     double *target;        /* (3, n) m */
     uint8_t *moving;       /* (n) */
+    uint8_t *gone;         /* (n) receives nothing any more */
+    double *goal;          /* (3, n) m, where each flies to now; NaN: it does not stop there */
+    int64_t *woken;        /* (n) slot in which each that flies got a goal; -1: it stands */
+    uint8_t *heard;        /* (n) somebody has heard it since */
+    int64_t *delays;       /* (METRICS_DELAYS) wakings by slots until the first frame was heard; the last: or more */
     metrics_sums *sums;    /* so far */
 } metrics;
 

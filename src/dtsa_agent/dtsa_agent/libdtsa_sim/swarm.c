@@ -188,8 +188,8 @@ void swarm_end(swarm *s, int64_t slot)
     const int count = s->shared ? s->local_count > 0 : s->local_count;
     for (int i = 0; i < s->sender_count; i++) {
         const int l = s->senders[i];
-        table_said(s->agents[l].table, s->local[l], slot, s->frames + (long)l * DTSA_FRAME_MAX,
-                   s->frame_len[l]);
+        s->agents[l].decision.reason = s->reason[l];
+        agent_said(&s->agents[l], slot, s->frames + (long)l * DTSA_FRAME_MAX, s->frame_len[l]);
     }
     for (int l = 0; l < count; l++) {
         dtsa_agent *a = &s->agents[l];

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
-from dtsa_agent.core.config import MAX_AGENTS
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import Setting
+from dtsa_agent.core.settings.config import MAX_AGENTS
+from dtsa_agent.core.settings.declaration import Setting
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.namespaces import declare_swarm_namespace
+from dtsa_agent.ros.common.graph.parameters import declare_setting
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
 
-from .common import names
-from .common.loop import Stop
-from .common.namespaces import declare_swarm_namespace
-from .common.parameters import declare_setting
-from .common.process import ending, node_options, run_node
 from .hosting import declare_swarm, host_agents
 
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dtsa_agent.core.plugins import PluginSwarm
+from dtsa_agent.core.plugins.entry_points import PluginSwarm
 
 
 class HandedOver:

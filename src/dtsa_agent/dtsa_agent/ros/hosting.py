@@ -12,16 +12,16 @@ from rclpy.node import Node
 
 from dtsa_agent.core import AbstractSwarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.core.plugins import make_swarm, shareable
-from dtsa_agent.core.settings import Settings, setting
-from dtsa_agent.core.unslotted import check_carried, check_slotted
+from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
+from dtsa_agent.core.plugins.unslotted import check_carried, check_slotted
+from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.keys import with_key
 from dtsa_agent.plugin_watch import watched
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.priority import PrioritySettings, give_way_by
 
-from .common import names
-from .common.loop import Stop
-from .common.parameters import declare_settings
-from .common.priority import PrioritySettings, give_way_by
 from .swarm_node import SwarmNode
 
 

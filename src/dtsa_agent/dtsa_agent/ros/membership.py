@@ -13,11 +13,12 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from dtsa_agent.core.agreement import settings_hash
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
-
-from .common import names
-from .common.checks import (
+from dtsa_agent.core.settings.agreement import settings_hash
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.runs import Call, run_text
+from dtsa_agent.ros.common.process.waiting import Patience
+from dtsa_agent.ros.common.wire.checks import (
     FORGED_END,
     OTHER_RUN,
     OTHER_SENDER,
@@ -28,10 +29,8 @@ from .common.checks import (
     parse_json,
     plain,
 )
-from .common.intake import Intake, add_counts
-from .common.runs import Call, run_text
-from .common.slot_fields import SlotFields
-from .common.waiting import Patience
+from dtsa_agent.ros.common.wire.intake import Intake, add_counts
+from dtsa_agent.ros.common.wire.slot_fields import SlotFields
 
 _GONE_S = 6.0  # a channel that nobody has seen for so long will not come back; it announces itself every 3 s
 _TELL_S = 0.5  # counts are told that often at most

@@ -1,4 +1,28 @@
-"""Agents on their own clocks: nobody waits for anybody, and who is late is late."""
+"""Agents on their own clocks: nobody waits for anybody, and a frame that is late is late.
+
+How a flight in real time works, and where each part stands ("channel": `dtsa_channel_sim/ros`):
+
+1. **The time line.** The channel calls all processes (`roll_call`), then sends START with the time of slot 0 on
+   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own, off by an offset and a
+   drift; :meth:`RealtimeNode.starts` says when its slots begin on the time line.
+2. **A slot here.** :meth:`RealtimeNode._step` takes in messages until a lead before the slot's start
+   (`core/agents/pacing.py`). :meth:`~RealtimeNode._open` ends the slot before, decides, sends, and moves the vehicles.
+   A frame is published with the time at which its transmission starts; one that would leave half a slot late is not
+   sent.
+3. **On the air.** The channel (`realtime_channel`) puts each frame on the time line (`live_air`, `model/air`). Once no
+   frame that overlaps it can come any more, it is settled: who heard it, by reach, overlap and losses. A RUN message
+   delivers it to all processes with the receivers' bits.
+4. **Heard.** :meth:`~RealtimeNode._take_frames` hands it to those agents whose bit is set, in the slot in which it was
+   sent. The lateness of its start moves their own slots (`core/reference/alignment.py`).
+5. **Told.** Some ten times a second a process reports what its agents decided, took in and flew (`reporter`). The
+   channel fills an account for each slot (`accounts`); it closes when all have reported or have been given up. The
+   recorder, the metrics and the live view get closed accounts only: what agents had, not what they should have had.
+6. **Late.** Nobody is waited for. A process that is behind by too much begins anew with the present slot, in probation.
+   `pace` says how far the channel itself is behind; a flight that cannot keep up is ended with the reason.
+7. **Coming and going.** A late process listens, takes the time from the first frame it hears, and begins in probation
+   (`core/agents/joining.py`). One that gets a signal says in its own turns that it leaves, and ends then
+   (:meth:`~RealtimeNode._ended`).
+"""
 
 from __future__ import annotations
 
@@ -15,22 +39,22 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
-from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING
+from dtsa_agent.core.agents.joining import Listeners, check_joinable
+from dtsa_agent.core.agents.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
-from dtsa_agent.core.joining import Listeners, check_joinable
-from dtsa_agent.core.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
-from dtsa_agent.core.plugins import plug_ins_of
+from dtsa_agent.core.plugins.entry_points import plug_ins_of
 from dtsa_agent.core.reference.alignment import ClockAligner
-from dtsa_agent.core.scenario import STREAM_CLOCKS, generator
+from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, generator
+from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.priority import take_priority
+from dtsa_agent.ros.common.wire.checks import SIZES, SLOT, Unusable, check_start
+from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
+from dtsa_agent.ros.common.wire.slot_fields import SlotFields
+from dtsa_agent.ros.common.wire.stamps import header_of, time_of
 
-from .common import names
-from .common.checks import SIZES, SLOT, Unusable, check_start
-from .common.loop import Stop
-from .common.priority import take_priority
-from .common.slot_fields import SlotFields
-from .common.stamps import header_of, time_of
-from .common.wire import split_frames, unpack_received
 from .handed_over import HandedOver
 from .reporter import Reporter
 from .swarm_node import SwarmNode
@@ -68,7 +92,7 @@ class RealtimeNode(SwarmNode):
 
     A process that was there at the channel's call begins with slot 0. One that comes later is told where the time line
     lies, too, because the stamps of messages are on it; but its agents take the time of their slots from the first
-    frame that each hears, and know nothing: :mod:`dtsa_agent.core.joining`.
+    frame that each hears, and know nothing: :mod:`dtsa_agent.core.agents.joining`.
 
     :param args: as for :class:`SwarmNode`.
     :param offset_ns: (L,) ns, offset of each agent's clock: positive clocks are early.
@@ -114,6 +138,7 @@ class RealtimeNode(SwarmNode):
         parts = plug_ins_of(self.swarm) if self.config.policy_row.listens else None
         self._handed = None if parts is None else HandedOver(parts)
         self._aligners = [ClockAligner() for _ in range(count)] if align and self._slotted else []
+        self._lengths: NDArray[np.uint8] = np.zeros(count, dtype=np.uint8)  # bytes sent in the present slot
         self._free_ns = [0] * count  # when each radio has done with its last frame; of policies without slots
         self._jitter_ns = jitter_ns
         self._random = [generator(self.config.seed, STREAM_CLOCKS, agent) for agent in self.swarm.ids]
@@ -226,7 +251,7 @@ class RealtimeNode(SwarmNode):
             self._called = True
             if message.slot > names.FIRST_CALL:
                 self._go_first()
-            self._reporter.add_slot(message.slot, self.starts(0))
+            self._reporter.add_slot(message.slot, self.starts(0), self._lengths)
             self._reporter.publish(message.run)
         elif message.phase == Slot.START and (self._called or self._may_join()):
             self._go_first()
@@ -393,10 +418,10 @@ class RealtimeNode(SwarmNode):
             swarm.present[~self._gone] = PRESENT_LEAVING
         senders = self.agents.on_slot(slot)
         starts = self.starts(slot)
-        offsets = self._send(slot, senders, starts) if senders else starts
+        offsets = self._send(slot, senders, starts)
         self.slot = slot
         self._awaits = not self._own_or_nobody.issuperset(swarm.chosen.tolist())
-        self._reporter.add_slot(slot, offsets)
+        self._reporter.add_slot(slot, offsets, self._lengths)
         if self._watched:
             self._publish_odometry(time_of(names.slot_time_ns(slot, self.slot_ns)))
         swarm.fly(slot)
@@ -406,7 +431,7 @@ class RealtimeNode(SwarmNode):
         if self._reporter.due():
             self._reporter.publish(self.run_id)
 
-    def _still_sends(self, index: int, begin_ns: int) -> bool:
+    def _still_sends(self, index: int, begin_ns: int, length: int) -> bool:
         """Whether a radio is still busy with its last frame; it takes the next one if not.
 
         With slots it never is, and a radio that listens knows by itself.
@@ -415,7 +440,6 @@ class RealtimeNode(SwarmNode):
             return False
         if begin_ns < self._free_ns[index]:
             return True
-        length = int(self.swarm.frame_length[index])
         self._free_ns[index] = begin_ns + self._fixed_ns + self._per_byte_ns * length
         return False
 
@@ -428,26 +452,27 @@ class RealtimeNode(SwarmNode):
         """
         swarm = self.swarm
         offsets = starts.copy()
+        self._lengths[:] = 0
         for index in senders:
+            data = swarm.frame(index)
             jitter = self._jitter_ns * self._random[index].standard_normal() if self._jitter_ns else 0.0
             now = time.monotonic_ns() - self._zero - slot * self.slot_ns
             due = starts[index] + swarm.send_offset_ns[index]
             offset = max(int(due + jitter), now)
-            if offset - due > self.slot_ns // 2 or self._still_sends(index, slot * self.slot_ns + offset):
+            if offset - due > self.slot_ns // 2 or self._still_sends(index, slot * self.slot_ns + offset, len(data)):
                 # The turn is as good as over: speaking now would disturb whoever has the next one.
-                swarm.frame_length[index] = 0
+                swarm.drop(index)
                 self.unsent += 1
                 if self._handed is not None:
                     self._handed.not_sent(index, slot)
                 continue
-            offsets[index] = offset
+            offsets[index], self._lengths[index] = offset, len(data)
             if self._handed is not None:
                 self._handed.note(index, slot, slot * self.slot_ns + offset)
-            data = swarm.frames[index, : swarm.frame_length[index]].tobytes()
             header = header_of(names.slot_time_ns(slot, self.slot_ns) + offset)
             self._air.publish(
                 Frame(header=header, run=self.run_id, slot=slot, agent=swarm.ids[index], data=array("B", data))
             )
             if swarm.present[index] == PRESENT_LEAVING:
-                self._gone[index] = decode_extended(data).leaving
+                self._gone[index] = decode_extended(self.config.protocol_part(data, sealed=True)).leaving
         return offsets

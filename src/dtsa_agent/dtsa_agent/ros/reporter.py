@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm
-
-from .common import names
-from .common.report_fields import pack_report
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.report_fields import pack_report
 
 _PERIOD_NS = 100_000_000
 _MOST_HEARD = 1000  # frames taken in that wait to be told: far more than a swarm sends in one period
@@ -38,16 +37,17 @@ class Reporter:
         self._heard_by: list[bytes] = []
         self._ids = array("H", swarm.ids).tobytes()
 
-    def add_slot(self, slot: int, offset_ns: NDArray[np.int64]) -> None:
+    def add_slot(self, slot: int, offset_ns: NDArray[np.int64], length: NDArray[np.uint8]) -> None:
         """Takes note of what all agents have decided for a slot, and of where they are; before they fly on.
 
         :param slot: the slot; before slot 0 the number of a call.
         :param offset_ns: (L,) ns, start of each agent's slot or transmission, from the channel's start of the slot.
+        :param length: (L,) bytes of each frame that was sent, as the air carries it; 0: none.
         """
         swarm, rows = self._swarm, self._rows
         self._slots.append(slot)
         rows["offset_ns"].append(offset_ns.tobytes())
-        rows["length"].append(swarm.frame_length.tobytes())
+        rows["length"].append(length.tobytes())
         for name in _FIELDS:
             rows[name].append(getattr(swarm, name).tobytes())
 

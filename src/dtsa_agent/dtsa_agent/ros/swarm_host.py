@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 
-from dtsa_agent.core.settings import Setting
+from dtsa_agent.core.settings.declaration import Setting
+from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
+from dtsa_agent.ros.common.graph.parameters import declare_setting
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.node_process import ending, node_options, run_node
 
-from .common.loop import Stop
-from .common.namespaces import swarm_wide_node
-from .common.parameters import declare_setting
-from .common.process import ending, node_options, run_node
 from .hosting import declare_swarm, host_agents
 from .swarm_node import parse_ids
 

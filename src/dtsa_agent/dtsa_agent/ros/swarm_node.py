@@ -17,18 +17,19 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from dtsa_agent.core import AbstractSwarm, AgentGroup
-from dtsa_agent.core.agreement import agreed_settings
+from dtsa_agent.core.agents.agent import REFUSED
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.settings.agreement import agreed_settings
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Loop, Stop
+from dtsa_agent.ros.common.process.waiting import Waiting
+from dtsa_agent.ros.common.wire.checks import SLOT, Unusable
+from dtsa_agent.ros.common.wire.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
+from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
+from dtsa_agent.ros.common.wire.slot_fields import SlotFields, read_slot
+from dtsa_agent.ros.common.wire.stamps import time_of
+from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, transmission_layout
 
-from .common import names
-from .common.checks import SLOT, Unusable
-from .common.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
-from .common.loop import HOUSEKEEPING_S, Loop, Stop
-from .common.slot_fields import SlotFields, read_slot
-from .common.stamps import time_of
-from .common.transmission_fields import TransmissionFields, transmission_layout
-from .common.waiting import Waiting
-from .common.wire import split_frames, unpack_received
 from .membership import Membership
 
 _LOOK_S = 0.001  # an executor looks for messages so often
@@ -90,12 +91,13 @@ class SwarmNode:
         return self.membership.run
 
     def _dropped_frames(self) -> dict[str, int]:
-        """Frames that these agents have kept out so far, by reason."""
+        """Frames that this process has kept out so far, by reason, and from how many agents in all."""
         swarm = self.agents.swarm
         return {
             "frame malformed": swarm.malformed,
             "frame foreign": swarm.foreign,
             "frame rejected": swarm.rejected,
+            REFUSED: self.agents.refused,
         }
 
     def _plausible(self, message: SlotFields) -> None:
@@ -177,7 +179,7 @@ class SwarmNode:
             self.idle()
             return True
 
-        # Messages are taken by the loop's own hands: what cannot be read would end an executor that takes it.
+        # The loop takes messages itself: one that cannot be read would end an executor that takes it.
         self.node.create_timer(_LOOK_S, guarded(serve))
         self.node.create_timer(HOUSEKEEPING_S, guarded(look_around))
         return over
@@ -213,7 +215,7 @@ class SwarmNode:
         """Takes in frames that the air carried.
 
         :param slot: the slot in which they are heard.
-        :returns: (F, L) who of the local agents received them; None if they share a table, or there are none.
+        :returns: (F, L) who of the local agents took them in; None if they share a table, or there are none.
         """
         count = len(message.sender)
         if not count:

@@ -8,9 +8,9 @@ from rclpy.node import Node
 
 from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.ros.common.graph.parameters import declare_settings
 from dtsa_agent.stop import Stop
 
-from .common.parameters import declare_settings
 from .udp_vehicle import ODOMETRY, OdometryVehicle, VehicleSettings
 
 _DEFAULTS = {"policy": "lease", "auth": True}  # as of `tools/dtsa agent`

@@ -16,13 +16,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from dtsa_agent.core.abstract_swarm import AbstractSwarm
-from dtsa_agent.core.settings import Settings, setting
-
-from .common import names
-from .common.checks import OTHER_SENDER, RANGE, OnePublisher, Unusable, check_odometry
-from .common.intake import Intake
-from .common.loop import HOUSEKEEPING_S, Feed
+from dtsa_agent.core.settings.declaration import Settings, setting
+from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Feed
+from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, RANGE, OnePublisher, Unusable, check_odometry
+from dtsa_agent.ros.common.wire.intake import Intake
 
 SIMULATED, ODOMETRY = "simulated", "odometry"
 BODY, MAP = "body", "map"

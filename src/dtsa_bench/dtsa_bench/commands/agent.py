@@ -19,7 +19,7 @@ DEFAULT_POLICY = "lease"
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
     from dtsa_agent.air.udp.settings import AgentSettings
-    from dtsa_bench.options import add_options
+    from dtsa_bench.runs.options import add_options
 
     parser = subparsers.add_parser("agent", help="one agent on a real network", description=DESCRIPTION)
     parser.usage = "%(prog)s --id N --interface NAME [OPTIONS]"
@@ -39,7 +39,7 @@ def add_air(parser: argparse.ArgumentParser) -> None:
 def add_network(parser: argparse.ArgumentParser) -> None:
     """Adds the options of the network, and whether frames are sealed."""
     from dtsa_agent.air.udp.settings import UdpSettings
-    from dtsa_bench.options import add_options
+    from dtsa_bench.runs.options import add_options
 
     network = parser.add_argument_group("the network")
     add_options(network, UdpSettings, "udp")
@@ -54,8 +54,8 @@ def add_network(parser: argparse.ArgumentParser) -> None:
 def add_swarm(parser: argparse.ArgumentParser) -> None:
     """Adds the options of the swarm, with the defaults of this air."""
     from dtsa_agent.core import SwarmConfig
-    from dtsa_agent.core.settings import settings_of
-    from dtsa_bench.options import add_options
+    from dtsa_agent.core.settings.declaration import settings_of
+    from dtsa_bench.runs.options import add_options
 
     swarm = parser.add_argument_group("the swarm: what all agents share")
     swarm.add_argument("--policy", metavar="NAME", default=DEFAULT_POLICY, help=f"who sends next [{DEFAULT_POLICY}]")
@@ -70,7 +70,7 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
     :raises ConfigError: for one that cannot be.
     """
     from dtsa_agent.core import SwarmConfig
-    from dtsa_bench.options import given
+    from dtsa_bench.runs.options import given
 
     return SwarmConfig.from_dict({**given(args, SwarmConfig, "swarm"), "policy": args.policy, "auth": args.seal})
 
@@ -79,10 +79,10 @@ def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C, and print what came of it."""
     from dtsa_agent.air.udp import AgentSettings, UdpSettings
     from dtsa_agent.air.udp.prepared import prepare
-    from dtsa_agent.core.joining import check_joinable
+    from dtsa_agent.core.agents.joining import check_joinable
     from dtsa_agent.keys import check_key
-    from dtsa_bench.air.flying import Order, become, fly
-    from dtsa_bench.options import given
+    from dtsa_bench.network.flying import Order, become, fly
+    from dtsa_bench.runs.options import given
 
     own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
     udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
@@ -93,5 +93,5 @@ def run(args: argparse.Namespace) -> int:
         print("dtsa: with --auth-session 0 frames of earlier flights with this key are believed", file=sys.stderr)
     order = Order(own, config, udp, prepare(config), args.out, args.json)
     if args.own_process:
-        become(order)
+        become(order, "dtsa_bench.commands.agent_process")
     return fly(order)

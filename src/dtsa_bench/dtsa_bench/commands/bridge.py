@@ -61,7 +61,7 @@ def add_simulated_radio(parser: argparse._ActionsContainer) -> None:
 
 def use_simulated_radio(args: argparse.Namespace) -> None:
     """Tell this process and those that it starts."""
-    from dtsa_agent.crazyflie.link import SIMULATED_RADIO
+    from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
 
     if args.simulated_radio is not None:
         os.environ[SIMULATED_RADIO] = str(args.simulated_radio.resolve())
@@ -69,9 +69,9 @@ def use_simulated_radio(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the bridge until Ctrl-C."""
-    from dtsa_agent.crazyflie.budget import check_budget, radio_loads
-    from dtsa_agent.crazyflie.config import load_swarm
-    from dtsa_agent.crazyflie.link import require_cflib
+    from dtsa_agent.crazyflie.links.link import require_cflib
+    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_agent.crazyflie.settings.radio_budget import check_budget, radio_loads
 
     use_simulated_radio(args)
     settings = load_swarm(args.config)
@@ -96,7 +96,7 @@ def run_bridge(config: Path, *, interfaces: str = "dtsa", teleop: str = "", chec
     :param teleop: name of the vehicle that a person steers; empty: of none.
     :param check: only connect, and say what a flight would lack.
     """
-    from dtsa_agent.crazyflie import bridge_node
+    from dtsa_agent.crazyflie.node import bridge_node
 
     arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config.resolve()}"]
     arguments += ["-p", f"interfaces:={interfaces}"] if interfaces != "dtsa" else []
@@ -117,9 +117,9 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     """
     import yaml
 
-    from dtsa_agent.crazyflie.config import load_swarm
-    from dtsa_bench.fake_crazyflie.ports import FIRST, free_base_port
-    from dtsa_bench.fake_crazyflie.process import FleetError, running_fleet
+    from dtsa_agent.crazyflie.settings.config import load_swarm
+    from dtsa_bench.crazyflies.simulated.ports import FIRST, free_base_port
+    from dtsa_bench.crazyflies.simulated.process import FleetError, running_fleet
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))
     robots = load_swarm(config).robots

@@ -31,9 +31,9 @@ def script(shell: str) -> str:
 
     :param shell: "bash" or "zsh".
     """
-    from dtsa_bench.registry import available
+    from .registry import COMMANDS
 
-    names = [name for name, _ in available()]
+    names = list(COMMANDS)
     options, values = [], []
     for name in names:
         found = dict(_options(name))
@@ -67,7 +67,7 @@ def _options(command: str) -> Iterator[tuple[str, tuple[str, ...]]]:
 
     :param command: its name.
     """
-    from dtsa_bench.cli import build_parser, command_parser
+    from .cli import build_parser, command_parser
 
     parser, _ = build_parser(command)
     for action in command_parser(parser, command)._actions:

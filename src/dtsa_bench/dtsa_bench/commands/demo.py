@@ -10,13 +10,13 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dtsa_bench.browser import open_page
-from dtsa_bench.options import new_directory, whole_number
+from dtsa_bench.pages.browser import open_page
+from dtsa_bench.runs.options import new_directory, whole_number
 
 if TYPE_CHECKING:
-    from dtsa_bench.demo.flown import Flights
-    from dtsa_bench.demo.flying import Landed
-    from dtsa_bench.demo.story import Step
+    from dtsa_bench.pages.demo.flown import Flights
+    from dtsa_bench.pages.demo.flying import Landed
+    from dtsa_bench.pages.demo.story import Step
 
 INTERRUPTED = 130
 NUMBERS = "demo.json"
@@ -76,9 +76,9 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
     seed = whole_number(args.seed, "seed", 0, 2**63 - 1)
     directory = _directory(args.out)
 
-    from dtsa_agent.ros.common.loop import Stop
-    from dtsa_bench.demo.flying import fly_all
-    from dtsa_bench.demo.story import story
+    from dtsa_agent.ros.common.process.loop import Stop
+    from dtsa_bench.pages.demo.flying import fly_all
+    from dtsa_bench.pages.demo.story import story
 
     begin = time.monotonic()
     steps = story(seed)
@@ -99,7 +99,7 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
 
 def _check(key: str, bag: Path) -> bool:
     """Verifies a bag and says in a line what was found."""
-    from dtsa_bench.verify import verify_bag
+    from dtsa_bench.recordings.verify import verify_bag
 
     found = verify_bag(bag)
     if found.ok:
@@ -114,10 +114,10 @@ def _show(steps: tuple[Step, ...], landed: dict[str, Landed], directory: Path, a
 
     :returns: the page.
     """
-    from dtsa_bench.demo.flown import read
-    from dtsa_bench.demo.page import write_page
-    from dtsa_bench.demo.picture import draw_demo
-    from dtsa_bench.demo.table import for_terminal
+    from dtsa_bench.pages.demo.flown import read
+    from dtsa_bench.pages.demo.page import write_page
+    from dtsa_bench.pages.demo.picture import draw_demo
+    from dtsa_bench.pages.demo.table import for_terminal
 
     flights = {}
     for take in (take for step in steps for take in step.takes):
@@ -128,7 +128,7 @@ def _show(steps: tuple[Step, ...], landed: dict[str, Landed], directory: Path, a
     draw_demo(picture, steps, flights)
     write_page(page, steps, flights, _commands(directory))
     if animation:
-        from dtsa_bench.demo.animation import draw_animation
+        from dtsa_bench.pages.demo.animation import draw_animation
 
         _progress("drawing the animation")
         draw_animation(directory / "demo.gif", flights)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 
-from dtsa_bench.registry import RECORDED_RUN
+from .registry import RECORDED_RUN
 
 TABLES = ("slots", "frames", "receptions", "decisions", "states", "ages", "ages_by_observer")
 DESCRIPTION = """\
@@ -26,12 +27,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Export the bag."""
-    from dtsa_bench.bag.place import bag_of
-    from dtsa_bench.tables.export import export
+    from dtsa_bench.recordings.bag.place import bag_of
+    from dtsa_bench.recordings.tables.export import export
 
     bag = bag_of(args.bag).resolve()
     target = args.out or bag.with_name(f"{bag.name if bag.is_dir() else bag.stem}_tables")
-    written = export(args.bag, target, args.to, args.tables)
+    written = export(args.bag, target, args.to, args.tables, note=lambda text: print(f"dtsa: {text}", file=sys.stderr))
     if args.json:
         print(json.dumps([{"path": str(table.path), "rows": table.rows} for table in written], indent=2))
         return 0

@@ -7,7 +7,7 @@ import argparse
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
-    from dtsa_bench.fake_crazyflie.cli import DESCRIPTION, add_arguments
+    from dtsa_bench.crazyflies.simulated.cli import DESCRIPTION, add_arguments
 
     parser = subparsers.add_parser(
         "fake-crazyflie",
@@ -19,6 +19,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Fly the fleet until Ctrl-C."""
-    from dtsa_bench.fake_crazyflie import cli
+    from dtsa_bench.crazyflies.simulated import cli
 
     return cli.run(args)

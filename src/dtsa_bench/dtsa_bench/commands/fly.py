@@ -7,19 +7,22 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dtsa_agent.core.settings import settings_of
-from dtsa_bench.commands.bridge import add_simulated_radio, use_simulated_radio
-from dtsa_bench.fly.options import FlightOptions
-from dtsa_bench.options import add_mode_options, add_options, add_run_options, given, run_config, whole_number
+from dtsa_agent.core.settings.declaration import settings_of
+from dtsa_bench.flights.options import FlightOptions
+from dtsa_bench.runs.options import add_mode_options, add_options, add_run_options, given, run_config, whole_number
+
+from .bridge import add_simulated_radio, use_simulated_radio
 
 if TYPE_CHECKING:
-    from dtsa_agent.ros.common.loop import Stop
-    from dtsa_bench.view.link import ViewLink
+    from dtsa_agent.ros.common.process.loop import Stop
+    from dtsa_bench.flights.recorded_channel import RecordedFlight
+    from dtsa_bench.pages.view.link import ViewLink
 
 INTERRUPTED = 130
 LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
@@ -95,7 +98,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Flies.
 
-    :returns: 0, or 130 when interrupted.
+    :returns: 0; 1 when the flight was cut short or its agents did not hear each other; 130 when interrupted.
     """
     if args.backend == "cflib":
         return run_crazyflies(args)
@@ -116,8 +119,8 @@ def run(args: argparse.Namespace) -> int:
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     directory = Path(args.out)
 
-    from dtsa_agent.ros.common.loop import Stop
-    from dtsa_bench.fly.flight import fly
+    from dtsa_agent.ros.common.process.loop import Stop
+    from dtsa_bench.flights.flight import fly
 
     options = FlightOptions(
         processes=processes,
@@ -127,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
         **given(args, FlightOptions, "flight"),
     )
     with Stop(LONGEST_END_S) as stop, viewed(args, stop) as view:
-        flight = fly(config, directory, options, stop, view=view)
+        flight = fly(config, directory, options, stop, watch=_watch(view))
         interrupted = bool(stop)
         _tell(args, flight)
     if flight.summary.get("warning"):
@@ -137,11 +140,20 @@ def run(args: argparse.Namespace) -> int:
         print(f"picture: {directory / 'trajectories.png'}")
     if interrupted:
         print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
+        _unheard(flight.summary)
         return INTERRUPTED
     if cut_short:
         print(f"dtsa: the flight was cut short: {cut_short}", file=sys.stderr)
-        return 1
-    return 0
+    return 1 if _unheard(flight.summary) or cut_short else 0
+
+
+def _watch(view: ViewLink | None) -> Callable[[RecordedFlight, object], None] | None:
+    """What lets a page show the flight."""
+    if view is None:
+        return None
+    from dtsa_bench.pages.view.flight_observer import show_flight  # what it needs is large, and few flights are watched
+
+    return partial(show_flight, view)
 
 
 @contextmanager
@@ -155,7 +167,7 @@ def viewed(args: argparse.Namespace, stop: Stop) -> Iterator[ViewLink | None]:
     if port is None:
         yield None
         return
-    from dtsa_bench.view.link import ViewLink
+    from dtsa_bench.pages.view.link import ViewLink
 
     view = ViewLink(port, args.control)
     try:
@@ -204,10 +216,10 @@ def late_agents(text: str | None) -> dict[int, float]:
 def run_crazyflies(args: argparse.Namespace) -> int:
     """A mission with Crazyflies.
 
-    :returns: 0; 1 when the exchange was cut short by a vehicle; 130 when interrupted.
+    :returns: 0; 1 when a vehicle cut the exchange short or the agents did not hear each other; 130 when interrupted.
     """
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_agent.crazyflie.config import load_swarm
+    from dtsa_agent.crazyflie.settings.config import load_swarm
 
     for name, value in {"late": args.late, **given(args, FlightOptions, "flight")}.items():
         if value is not None and name != "answer_s":
@@ -217,9 +229,9 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     use_simulated_radio(args)
     path = Path(args.config)
     settings = load_swarm(path)
-    from dtsa_agent.ros.common.loop import Stop
-    from dtsa_bench.fly.crazyflie import fly_crazyflies, mission_defaults
-    from dtsa_bench.view.mission import PageOptions
+    from dtsa_agent.ros.common.process.loop import Stop
+    from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies, mission_defaults
+    from dtsa_bench.pages.view.mission import PageOptions
 
     if getattr(args, "run.mode") is None:
         setattr(args, "run.mode", "realtime")
@@ -233,7 +245,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     page = None if port is None else PageOptions(port, args.control)
     with Stop() as stop:
         if args.dry_run:
-            from dtsa_bench.fly.rehearsal import rehearse
+            from dtsa_bench.crazyflies.missions.rehearsal import rehearse
 
             flight, cut_short = rehearse(config, settings, path, args.out, options, stop, page=page)
         else:
@@ -241,11 +253,12 @@ def run_crazyflies(args: argparse.Namespace) -> int:
                 config, settings, path, args.out, options, stop, attach=args.attach, page=page
             )
     _tell(args, flight)
+    unheard = _unheard(flight.summary)
     not_landed = [] if stop and not cut_short else flight.summary.get("not_landed", [])
     if problem := mission_problem(cut_short, not_landed):
         print(f"dtsa: {problem}", file=sys.stderr)
         return 1
-    return INTERRUPTED if stop else 0
+    return INTERRUPTED if stop else int(unheard)
 
 
 def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
@@ -259,6 +272,13 @@ def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
     exchange = f"the exchange was cut short: {cut_short}" if cut_short else "the exchange is complete"
     end = f"not known to have landed: {', '.join(not_landed)}" if not_landed else "all have landed"
     return f"{exchange}; {end}"
+
+
+def _unheard(summary: dict[str, Any]) -> bool:
+    """Says so if nobody has heard anybody, or most frames were of no use; whether it is so."""
+    if summary["unheard"]:
+        print(f"dtsa: {summary['unheard']}", file=sys.stderr)
+    return bool(summary["unheard"])
 
 
 def _tell(args: argparse.Namespace, flight: Any) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 DESCRIPTION = """\
 Lays the bags that agents on a network have made of their own flights on one time line, by the frames that they share,
 and says what came of the flight: clocks, ages, errors, agreement, the closest pair; whether two spoke in one turn;
-whether all decisions follow from what each agent heard, made again by the core. Exit code 1 if they do not. --out keeps
-the whole flight as one bag, which report, export, verify, replay and ros2 bag take like any other."""
+whether all decisions follow from what each agent heard, made again by the core. Exit code 1 if they do not, or if the
+agents did not hear each other. --out keeps the whole flight as one bag, which report, export, verify, replay and ros2
+bag take like any other."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -26,14 +28,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Merge, and print what came of it."""
-    from dtsa_agent.core.settings import Setting
-    from dtsa_bench.air.agent_bag import read
-    from dtsa_bench.air.merge import Merge, verified
+    from dtsa_agent.core.settings.declaration import Setting
+    from dtsa_bench.recordings.merge.agent_bag import read
+    from dtsa_bench.recordings.merge.merge import Merge, verified
 
     out = Path(args.out) if args.out else None
     if out is not None:
-        from dtsa_bench.air.merged_run import lay
-        from dtsa_bench.air.merged_writer import check_free, write
+        from dtsa_bench.recordings.merge.merged_run import lay
+        from dtsa_bench.recordings.merge.merged_writer import check_free, write
 
         check_free(out)
     air_us = Setting("air_us", "float", 0.0, "time of a frame on the air", unit="us", minimum=0, maximum=1e6)
@@ -44,7 +46,9 @@ def run(args: argparse.Namespace) -> int:
         write(out, lay(merged, summary), summary)
     text = json.dumps(summary, indent=2) + "\n"
     print(text if args.json else "\n".join(lines(summary)) + "\n", end="")
-    return 0 if verified(summary) else 1
+    if summary["unheard"]:
+        print(f"dtsa: {summary['unheard']}", file=sys.stderr)
+    return 0 if verified(summary) and not summary["unheard"] else 1
 
 
 def lines(summary: dict[str, object]) -> list[str]:

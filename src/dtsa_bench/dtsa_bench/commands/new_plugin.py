@@ -20,7 +20,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Write the package."""
-    from dtsa_bench.new_plugin import write_package
+    from dtsa_bench.experiments.plugin_template import write_package
 
     for path in write_package(args.name, Path(args.out or args.name)):
         print(path)

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import sys
 
-from dtsa_bench.registry import RECORDED_RUN
+from .registry import RECORDED_RUN
 
 DESCRIPTION = """\
 Makes a full bag of what a killed recorder, a full disk or a damaged file left, and says what was saved.
@@ -29,7 +29,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Recover the bag."""
-    from dtsa_bench.bag.recover import recover
+    from dtsa_bench.recordings.bag.recover import recover
 
     def progress(count: int) -> None:
         sys.stderr.write(f"\r{count} messages")

@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from dtsa_bench.registry import RECORDED_RUN
+from .registry import RECORDED_RUN
 
 if TYPE_CHECKING:
-    from dtsa_bench.bag.reader import Bag
-    from dtsa_bench.bag.replay import Player, RosOutput
+    from dtsa_bench.recordings.bag.reader import Bag
+    from dtsa_bench.recordings.bag.replay import Player, RosOutput
 
 DESCRIPTION = """\
 Publishes a recorded run: the recorded bytes on the recorded topics with the recorded QoS, in time, and
@@ -50,7 +50,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Play the bag."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.bag.reader import Bag
+    from dtsa_bench.recordings.bag.reader import Bag
 
     if not 0 <= args.delay <= 3600:
         raise ConfigError("delay", args.delay, "0 to 3600 s")
@@ -61,9 +61,9 @@ def run(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace, bag: Bag) -> int:
     import rclpy
 
-    from dtsa_agent.ros.common.dds import limit_to_machine
-    from dtsa_agent.ros.common.process import init_ros
-    from dtsa_bench.bag.replay import Player, RosOutput, steady_timing
+    from dtsa_agent.ros.common.process.node_process import init_ros
+    from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+    from dtsa_bench.recordings.bag.replay import Player, RosOutput, steady_timing
 
     topics = [bag.topic(name) for name in args.topics] if args.topics else list(bag.topics.values())
     limit_to_machine(os.environ)

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from dtsa_bench.registry import RECORDED_RUN
+from .registry import RECORDED_RUN
 
 DESCRIPTION = """\
 Writes one self-contained HTML page about one recorded run, or several side by side: the flight in 3D, the
@@ -28,8 +28,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Write the report."""
-    from dtsa_bench.bag.place import bag_of
-    from dtsa_bench.report.page import write_report
+    from dtsa_bench.pages.report.page import write_report
+    from dtsa_bench.recordings.bag.place import bag_of
 
     first = bag_of(args.bags[0]).resolve()
     out = Path(args.out) if args.out else first.parent / "report.html"

@@ -14,7 +14,7 @@ every slot has the same sender and every quadcopter the same positions as with `
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
-    from dtsa_bench.options import add_run_options
+    from dtsa_bench.runs.options import add_run_options
 
     parser = subparsers.add_parser("simulate", help="one flight without ROS", description=DESCRIPTION)
     parser.usage = "%(prog)s [OPTIONS]"
@@ -33,9 +33,9 @@ def run(args: argparse.Namespace) -> int:
     """Fly and print what came of it."""
     from dtsa_agent.core import make_scenario
     from dtsa_agent.keys import check_key
-    from dtsa_bench.options import new_directory, run_config
-    from dtsa_bench.simulate import simulate
-    from dtsa_bench.summary_text import describe
+    from dtsa_bench.runs.options import new_directory, run_config
+    from dtsa_bench.runs.summary_text import describe
+    from dtsa_bench.simulation.simulate import simulate
 
     config = run_config(args)
     check_key(config.swarm)  # before anything is made

@@ -13,7 +13,7 @@ lease that it does not know looks like a broken rule."""
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
-    from dtsa_bench.commands.agent import add_air, add_network, add_swarm
+    from .agent import add_air, add_network, add_swarm
 
     parser = subparsers.add_parser("sniff", help="listen to agents on a real network", description=DESCRIPTION)
     parser.usage = "%(prog)s --interface NAME [OPTIONS]"
@@ -26,14 +26,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Listen until Ctrl-C, and print what came of it."""
     from dtsa_agent.air.udp import UdpSettings
-    from dtsa_agent.core.settings import Setting
+    from dtsa_agent.core.settings.declaration import Setting
     from dtsa_agent.keys import check_key
     from dtsa_agent.stop import Stop
-    from dtsa_bench.air.sniffer import Sniffer
-    from dtsa_bench.bag.errors import BagError
-    from dtsa_bench.commands.agent import swarm_of
-    from dtsa_bench.commands.merge import lines
-    from dtsa_bench.options import given, new_directory
+    from dtsa_bench.network.sniffer import Sniffer
+    from dtsa_bench.recordings.bag.errors import BagError
+    from dtsa_bench.runs.options import given, new_directory
+
+    from .agent import swarm_of
+    from .merge import lines
 
     duration = Setting("duration_s", "float", 0.0, "how long", unit="s", minimum=0, maximum=1e6).read(args.duration_s)
     udp, config = UdpSettings.from_dict(given(args, UdpSettings, "udp")), swarm_of(args)

@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dtsa_bench.sweep.spec import Sweep
-
-PROTOCOL = "protocol"  # a preset that flies nothing
+    from dtsa_bench.experiments.sweep.spec import Sweep
 
 DESCRIPTION = """\
 Flies every combination of a sweep's axes with every seed, without ROS, on all cores or on a Dask cluster, and
@@ -44,24 +42,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Fly what is missing, then sum up."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.sweep import spec
+    from dtsa_bench.experiments.sweep import spec
 
     if args.list:
         for name in spec.preset_names():
             sweep = spec.load_preset(name)
             print(f"{name:14}{len(sweep.cells) * len(sweep.seeds):>6} flights  {sweep.title}")
-        print(f"{PROTOCOL:14}     no flights  The slot protocols alone: ages, waking, joins, deaths, jams, partitions")
-        return 0
-    if args.preset == PROTOCOL:
-        return _protocol(args)
-    if args.show == PROTOCOL:
-        from dtsa_bench.protocol_bench.plan import as_yaml
-
-        print(as_yaml(), end="")
         return 0
     if args.show:
         if args.show not in spec.preset_names():
-            raise ConfigError("show", args.show, ", ".join((*spec.preset_names(), PROTOCOL)))
+            raise ConfigError("show", args.show, ", ".join(spec.preset_names()))
         print((spec.PRESETS / f"{args.show}.yaml").read_text(encoding="utf-8"), end="")
         return 0
     if args.json and args.preset and "," in args.preset:
@@ -75,35 +65,10 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def _protocol(args: argparse.Namespace) -> int:
-    """The table of the slot protocols: runs without flight, which have no axes and no report of their own."""
-    from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.options import whole_number
-    from dtsa_bench.protocol_bench import plan, table
-
-    if args.json:
-        raise ConfigError("json", True, f"nothing with --preset {PROTOCOL}, which writes results.json")
-    changed = _base(args.set)
-    slots = changed.pop("slots", None)
-    for name in changed:
-        raise ConfigError(f"set {name}", changed[name], f"slots=NUMBER with --preset {PROTOCOL}")
-    if args.cluster:
-        raise ConfigError("cluster", args.cluster, f"nothing with --preset {PROTOCOL}: it runs on this machine")
-    return table.run_table(
-        Path(args.out) if args.out else Path("runs") / PROTOCOL,
-        None if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1000),
-        slots=None if slots is None else whole_number(str(slots), "slots", 4000, 10_000_000),
-        jobs=_jobs(args),
-        first_seed=plan.FIRST_SEED
-        if args.first_seed is None
-        else whole_number(args.first_seed, "first-seed", 0, 2**62),
-    )
-
-
 def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.options import whole_number
-    from dtsa_bench.sweep import spec
+    from dtsa_bench.experiments.sweep import spec
+    from dtsa_bench.runs.options import whole_number
 
     changes = {
         "seeds": None if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1_000_000),
@@ -115,7 +80,7 @@ def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     names = [name.strip() for name in args.preset.split(",")]
     for name in names:
         if name not in spec.preset_names():
-            raise ConfigError("preset", name, ", ".join(spec.preset_names()) + f"; {PROTOCOL}, but alone")
+            raise ConfigError("preset", name, ", ".join(spec.preset_names()))
     return [spec.load_preset(name, **changes) for name in names]
 
 
@@ -137,15 +102,15 @@ def _base(words: list[str]) -> dict[str, object]:
 
 
 def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
-    from dtsa_bench.batch.progress import run_batch
-    from dtsa_bench.sweep.aggregate import Table, collected, write_table
-    from dtsa_bench.sweep.text import claims_text, table_text
-    from dtsa_bench.sweep.work import WORK
+    from dtsa_bench.experiments.batch.progress import run_batch
+    from dtsa_bench.experiments.sweep.aggregate import Table, collected, write_table
+    from dtsa_bench.experiments.sweep.text import claims_text, table_text
+    from dtsa_bench.experiments.sweep.work import work_of
 
-    begun = time.monotonic()
-    rows = collected(sweep, run_batch(sweep, WORK, directory, jobs=_jobs(args), cluster=args.cluster))
+    begun, work = time.monotonic(), work_of(sweep)
+    rows = collected(sweep, run_batch(sweep, work, directory, jobs=_jobs(args), cluster=args.cluster))
     table = Table(sweep, rows)
-    write_table(directory, table, WORK.code())
+    write_table(directory, table, work.code())
     flown = time.monotonic() - begun
     if args.json:
         print((directory / "results.json").read_text(encoding="utf-8"), end="")
@@ -154,9 +119,9 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
         if claims := claims_text(table):
             print(f"\n{claims}\n")
     if not args.no_report:
-        from dtsa_bench.report.sweep import write_report
+        from dtsa_bench.pages.report.sweep import write_report
 
-        path = write_report(table, directory, WORK.code(), f"tools/dtsa {shlex.join(sys.argv[1:])}")
+        path = write_report(table, directory, work.code(), f"tools/dtsa {shlex.join(sys.argv[1:])}")
         if not args.json:
             print(f"report: {path}")
     if not args.json:
@@ -171,6 +136,6 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
 
 
 def _jobs(args: argparse.Namespace) -> int | None:
-    from dtsa_bench.options import whole_number
+    from dtsa_bench.runs.options import whole_number
 
     return None if args.jobs is None else whole_number(args.jobs, "jobs", 1, 1024)

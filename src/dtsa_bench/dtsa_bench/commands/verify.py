@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from dtsa_bench.registry import RECORDED_RUN
+from .registry import RECORDED_RUN
 
 DESCRIPTION = """\
 Rebuilds every agent and the channel from the recorded configuration, feeds them what they heard, and compares
@@ -26,7 +26,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Verify the bags."""
-    from dtsa_bench.verify import verify_bag
+    from dtsa_bench.recordings.verify import verify_bag
 
     live = sys.stderr.isatty()
 
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print(result: object) -> None:
-    from dtsa_bench.verify import Result
+    from dtsa_bench.recordings.verify import Result
 
     assert isinstance(result, Result)
     pace = result.simulated_s / result.wall_time_s if result.wall_time_s else 0.0
@@ -62,5 +62,7 @@ def _print(result: object) -> None:
         print(f"  not checked: {what}: {why}")
     for what, value in result.safety.items():
         print(f"  {what.replace('_', ' ')}: {value if not isinstance(value, float) else format(value, '.3f')}")
+    if result.unheard:
+        print(f"  {result.unheard}")
     if result.difference:
         print(f"  first difference: {result.difference}")

@@ -9,12 +9,12 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from dtsa_bench.registry import RECORDED_RUN
+from .registry import RECORDED_RUN
 
 if TYPE_CHECKING:
-    from dtsa_bench.view.orders import Order
-    from dtsa_bench.view.server import ViewServer
-    from dtsa_bench.view.track import Track
+    from dtsa_bench.pages.view.orders import Order
+    from dtsa_bench.pages.view.server import ViewServer
+    from dtsa_bench.pages.view.track import Track
 
 DESCRIPTION = """\
 Shows a swarm on a page that this machine alone can open: a recorded run to be played, one that is being
@@ -59,7 +59,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--listen", metavar="ADDRESS", default=None, help="an address of this machine that others reach [127.0.0.1]"
     )
-    from dtsa_bench.commands.agent import add_network, add_swarm
+    from .agent import add_network, add_swarm
 
     add_network(parser)
     add_swarm(parser)
@@ -69,10 +69,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until a signal comes."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.options import whole_number
-    from dtsa_bench.view.link import give_way
-    from dtsa_bench.view.server import ViewServer, new_token
-    from dtsa_bench.view.track import Track
+    from dtsa_bench.pages.view.link import give_way
+    from dtsa_bench.pages.view.server import ViewServer, new_token
+    from dtsa_bench.pages.view.track import Track
+    from dtsa_bench.runs.options import whole_number
 
     port = whole_number(args.port, "port", 0, 65535)
     if len(args.bags) > _MOST:
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         give_way()
         tracks, sources, order = _air(args) if args.air == _UDP else _graph(args)
     for bag in args.bags:
-        from dtsa_bench.view.recording import BagSource
+        from dtsa_bench.pages.view.recording import BagSource
 
         tracks.append(Track(_name(bag)))
         sources.append(BagSource(bag, tracks[-1]))
@@ -108,7 +108,7 @@ def _check_source(args: argparse.Namespace) -> None:
     from dtsa_agent.air.udp.settings import UdpSettings
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.options import given
+    from dtsa_bench.runs.options import given
 
     for name in ("domain", "namespace", "control"):
         if getattr(args, name) and (args.bags or args.air == _UDP):
@@ -126,10 +126,11 @@ def _check_source(args: argparse.Namespace) -> None:
 def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
     from dtsa_agent.air.udp.settings import UdpSettings
     from dtsa_agent.keys import check_key
-    from dtsa_bench.commands.agent import DEFAULT_POLICY, swarm_of
-    from dtsa_bench.options import given
-    from dtsa_bench.view.air import AirSource
-    from dtsa_bench.view.track import Track
+    from dtsa_bench.pages.view.air import AirSource
+    from dtsa_bench.pages.view.track import Track
+    from dtsa_bench.runs.options import given
+
+    from .agent import DEFAULT_POLICY, swarm_of
 
     udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
     args.policy, args.seal = args.policy or DEFAULT_POLICY, args.seal is not False
@@ -140,10 +141,10 @@ def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
 
 
 def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callable[[Order], str] | None]:
-    from dtsa_agent.ros.common import names
-    from dtsa_bench.options import whole_number
-    from dtsa_bench.view.graph import GraphSource
-    from dtsa_bench.view.track import Track
+    from dtsa_agent.ros.common.graph import names
+    from dtsa_bench.pages.view.graph import GraphSource
+    from dtsa_bench.pages.view.track import Track
+    from dtsa_bench.runs.options import whole_number
 
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     space = "/" + args.namespace.strip("/") if args.namespace else names.SWARM
@@ -153,7 +154,7 @@ def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callabl
 
 
 def _name(bag: str) -> str:
-    from dtsa_bench.bag.place import find_file
+    from dtsa_bench.recordings.bag.place import find_file
 
     path = find_file(bag).resolve()
     inner = path.parent
@@ -173,7 +174,7 @@ async def _serve(server: ViewServer, threads: Sequence[threading.Thread], port: 
     """Serves until a signal comes."""
     import signal
 
-    from dtsa_bench.view.server import LOOPBACK
+    from dtsa_bench.pages.view.server import LOOPBACK
 
     url = await server.start(port, address or LOOPBACK)
     over = asyncio.Event()

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import Settings, setting
+from dtsa_agent.core.settings.declaration import Settings, setting
 
 from .draws import CLOCK, generator
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import REQUIRED, Setting, Settings, build, check, setting, settings_of
+from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, build, check, setting, settings_of
 
 from .airtime import Airtime
 from .gilbert import GilbertElliott

@@ -1,6 +1,6 @@
 """Radios that listen before they send, as those that sense the carrier do: each holds one frame until it may begin.
 
-The rule is that of the agents' policy (``dtsa_agent.core.plugin_kinds.Listens.sensed``); whether the air is in use
+The rule is that of the agents' policy (``dtsa_agent.core.plugins.kinds.Listens.sensed``); whether the air is in use
 where a radio is says the medium: range, hidden senders, turning from listening to sending. The simulator and the
 channel in real time carry frames by the same radios.
 """
@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from typing import Generic, NamedTuple, TypeVar
 
-from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugin_guard import Guarded
+from dtsa_agent.core.plugins.guard import Guarded
+from dtsa_agent.core.plugins.unslotted import whole_ns
 from dtsa_agent.core.registry import POLICIES
-from dtsa_agent.core.scenario import STREAM_RADIOS, generator
-from dtsa_agent.core.unslotted import whole_ns
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.settings.scenario import STREAM_RADIOS, generator
 
 from .air import Air
 from .medium import Positions

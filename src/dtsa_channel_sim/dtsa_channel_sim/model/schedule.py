@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import Setting, settings_of
+from dtsa_agent.core.settings.declaration import Setting, settings_of
 
 from .topology import LinkLoss, format_partition, parse_partition
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import Setting
+from dtsa_agent.core.settings.declaration import Setting
 
 _RANGE = re.compile(r"(\d+)(?:\s*-\s*(\d+))?")
 _PROBABILITY = Setting("loss", "float", None, "loss of a link", minimum=0.0, maximum=1.0)

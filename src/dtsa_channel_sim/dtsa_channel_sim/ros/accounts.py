@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_ids
-from dtsa_agent.ros.common.report_fields import ReportFields
+from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_ids
+from dtsa_agent.ros.common.wire.report_fields import ReportFields
 
 from .answers import Answers, TakenIn, named
 
@@ -58,7 +58,7 @@ class Accounts:
         return None if book is None else book.silent
 
     def last_place(self, agent: int) -> NDArray[np.float64] | None:
-        """Where an agent has reported to be last, (3,) m; None: in no open slot.
+        """Where an agent has reported to be last, (3,) m; None: in no slot yet.
 
         :param agent: its id.
         """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dtsa_agent.core.settings import Settings, setting
+from dtsa_agent.core.settings.declaration import Settings, setting
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,9 @@ import numpy as np
 from dtsa_msgs.msg import Transmission
 from numpy.typing import NDArray
 
-from dtsa_agent.ros.common.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unusable, check_frames
-from dtsa_agent.ros.common.transmission_fields import TransmissionFields
-from dtsa_agent.ros.common.wire import split_frames
+from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unusable, check_frames
+from dtsa_agent.ros.common.wire.packing import split_frames
+from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields
 
 Array = NDArray[np.float64]
 _ONES = b"\1" * 65536  # at most so many agents have ids

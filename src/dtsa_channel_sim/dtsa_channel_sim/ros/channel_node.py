@@ -16,13 +16,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import setting, settings_of
-from dtsa_agent.ros.common.loop import Stop
-from dtsa_agent.ros.common.names import MODES
-from dtsa_agent.ros.common.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.parameters import declare_settings, from_parameter
-from dtsa_agent.ros.common.priority import PrioritySettings, take_priority
-from dtsa_agent.ros.common.process import ending, run_node
+from dtsa_agent.core.settings.declaration import setting, settings_of
+from dtsa_agent.ros.common.graph.names import MODES
+from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
+from dtsa_agent.ros.common.graph.parameters import declare_settings, from_parameter
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.node_process import ending, run_node
+from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.config import CHANGEABLE, ChannelConfig
 from dtsa_channel_sim.model.schedule import Change

@@ -6,8 +6,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.stamps import time_of
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.stamps import time_of
 from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
 
 from .answers import Answers

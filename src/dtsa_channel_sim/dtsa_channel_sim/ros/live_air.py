@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.registry import POLICIES
-from dtsa_agent.core.settings import settings_of
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.plugin_watch import watched
 from dtsa_channel_sim.model.air import Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel

@@ -11,12 +11,12 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.checks import OTHER_RUN, OTHER_SENDER, SLOT, UNREADABLE, Unusable
-from dtsa_agent.ros.common.runs import run_text
-from dtsa_agent.ros.common.stamps import header_of
-from dtsa_agent.ros.common.transmission_fields import TransmissionFields, read_transmission
-from dtsa_agent.ros.common.waiting import Patience
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.runs import run_text
+from dtsa_agent.ros.common.process.waiting import Patience
+from dtsa_agent.ros.common.wire.checks import OTHER_RUN, OTHER_SENDER, SLOT, UNREADABLE, Unusable
+from dtsa_agent.ros.common.wire.stamps import header_of
+from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, read_transmission
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 

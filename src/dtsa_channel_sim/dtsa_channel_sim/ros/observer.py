@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.ros.common.report_fields import ReportFields
+from dtsa_agent.ros.common.wire.report_fields import ReportFields
 from dtsa_channel_sim.model.schedule import Change
 from dtsa_channel_sim.model.verdict import Verdict
 

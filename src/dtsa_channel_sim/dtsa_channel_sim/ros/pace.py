@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dtsa_agent.core.delays import Delays
+from dtsa_agent.core.agents.delays import Delays
 
 _NS = 1_000_000_000
 _STALL_SLOTS, _STALL_NS = 5, 50_000_000

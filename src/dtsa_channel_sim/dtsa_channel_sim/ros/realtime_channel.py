@@ -16,13 +16,13 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame import named_in
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.checks import OTHER_RUN, RANGE, SIZES, UNREADABLE, Unusable, check_start
-from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.report_fields import ReportFields, read_report
-from dtsa_agent.ros.common.runs import run_text
-from dtsa_agent.ros.common.stamps import header_of, ns_of, time_of
-from dtsa_agent.ros.common.waiting import Patience
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.loop import Feed
+from dtsa_agent.ros.common.process.runs import run_text
+from dtsa_agent.ros.common.process.waiting import Patience
+from dtsa_agent.ros.common.wire.checks import OTHER_RUN, RANGE, SIZES, UNREADABLE, Unusable, check_start
+from dtsa_agent.ros.common.wire.report_fields import ReportFields, read_report
+from dtsa_agent.ros.common.wire.stamps import header_of, ns_of, time_of
 from dtsa_channel_sim.model.air import FrameVerdict
 from dtsa_channel_sim.model.airtime import LONGEST_FRAME
 from dtsa_channel_sim.model.channel import Channel

@@ -12,10 +12,10 @@ import numpy as np
 from dtsa_msgs.msg import Slot
 from rclpy.publisher import Publisher
 
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.checks import Unusable
-from dtsa_agent.ros.common.loop import Feed
-from dtsa_agent.ros.common.report_fields import ReportFields, read_report
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.loop import Feed
+from dtsa_agent.ros.common.wire.checks import Unusable
+from dtsa_agent.ros.common.wire.report_fields import ReportFields, read_report
 
 from .accounts import Accounts
 from .answers import Answers

@@ -16,13 +16,13 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.checks import OTHER_SENDER, check_slot
-from dtsa_agent.ros.common.intake import Intake, add_counts
-from dtsa_agent.ros.common.loop import Feed, Loop
-from dtsa_agent.ros.common.runs import Run
-from dtsa_agent.ros.common.waiting import Patience
-from dtsa_agent.ros.common.wire import pack_received
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.loop import Feed, Loop
+from dtsa_agent.ros.common.process.runs import Run
+from dtsa_agent.ros.common.process.waiting import Patience
+from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, check_slot
+from dtsa_agent.ros.common.wire.intake import Intake, add_counts
+from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
 

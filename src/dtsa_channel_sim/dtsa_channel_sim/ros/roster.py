@@ -9,9 +9,10 @@ from typing import Any
 
 from dtsa_msgs.msg import Process
 
-from dtsa_agent.core.agreement import settings_hash
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.checks import (
+from dtsa_agent.core.settings.agreement import settings_hash
+from dtsa_agent.ros.common.process.runs import run_text
+from dtsa_agent.ros.common.wire.checks import (
     OTHER_RUN,
     OTHER_SENDER,
     RANGE,
@@ -22,8 +23,7 @@ from dtsa_agent.ros.common.checks import (
     parse_json,
     plain,
 )
-from dtsa_agent.ros.common.intake import add_counts
-from dtsa_agent.ros.common.runs import run_text
+from dtsa_agent.ros.common.wire.intake import add_counts
 
 from .answers import named
 

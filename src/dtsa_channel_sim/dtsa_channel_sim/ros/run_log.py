@@ -6,7 +6,7 @@ import time
 
 from rclpy.node import Node
 
-from dtsa_agent.ros.common.waiting import Waiting
+from dtsa_agent.ros.common.process.waiting import Waiting
 from dtsa_channel_sim.model.config import Change
 
 from .answers import Answers, named

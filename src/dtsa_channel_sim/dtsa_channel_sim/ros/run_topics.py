@@ -10,8 +10,8 @@ from typing import Any
 from dtsa_msgs.msg import Configuration, RunStatus
 from rclpy.node import Node
 
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.stamps import header_of
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.stamps import header_of
 
 from .answers import Answers
 from .observer import ChannelObserver, ChannelStatus

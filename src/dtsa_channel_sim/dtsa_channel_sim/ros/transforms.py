@@ -8,8 +8,8 @@ from typing import Any
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
-from dtsa_agent.ros.common import names
-from dtsa_agent.ros.common.stamps import header_of
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.stamps import header_of
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .answers import Answers

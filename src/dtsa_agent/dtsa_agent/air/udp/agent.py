@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.core.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
-from dtsa_agent.core.agent import AgentGroup
-from dtsa_agent.core.config import SwarmConfig
+from dtsa_agent.core.agents.agent import AgentGroup
+from dtsa_agent.core.agents.joining import check_joinable
+from dtsa_agent.core.agents.pacing import BETWEEN, LEAD, MOST_EARLY, latest_send_ns, too_long_ns
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
-from dtsa_agent.core.joining import check_joinable
-from dtsa_agent.core.pacing import BETWEEN, LEAD, MOST_EARLY, latest_send_ns, too_long_ns
-from dtsa_agent.core.plugins import make_swarm
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 
@@ -87,7 +87,7 @@ class UdpAgent:
         self._waiting = b""  # frame of this slot, ready to be sent
         self._early: list[_Frame] = []
         self._said: deque[bytes] = deque(maxlen=_SAID)  # own datagrams
-        self._record: SlotRecord | None = None  # of the open slot
+        self._record: SlotRecord | None = None  # of the present slot
         self._before: list[Heard] = []  # heard after it began anew and before its first slot
         self._leaves_by: int | None = None  # CLOCK_MONOTONIC, ns
         self._signals = 0
@@ -304,7 +304,7 @@ class UdpAgent:
         late = max(0, self._late_ns(self.slot))
         frame, self._waiting = self._waiting, b""
         if late > self._latest_send_ns:  # it would disturb whoever has the next turn
-            self.swarm.frame_length[0] = 0
+            self.swarm.drop(0)
             self.tally.unsent += 1
             return
         datagram = self.hearing.wrap(frame, self.slot, late)
@@ -315,13 +315,13 @@ class UdpAgent:
             self._record.sent_ns = self.hearing.slot_start_ns(self.slot) + late
             self._record.datagram = datagram
         if self._leaves_by is not None and self.config.policy_row.says_leaving:
-            self._gone = decode_extended(frame[: len(frame) - self.config.own_bytes], self.config.extent_m).leaving
+            self._gone = decode_extended(self.config.protocol_part(frame), self.config.extent_m).leaving
 
     def _close_slot(self) -> SlotRecord | None:
-        """The open slot is over; its record."""
+        """The present slot is over; its record."""
         if self._group.slot >= 0:
             if self._waiting:  # it ends, or begins anew, before its turn has come
-                self.swarm.frame_length[0] = 0
+                self.swarm.drop(0)
                 self._waiting = b""
             self._group.on_slot_end()
             self.tally.slots += 1

@@ -19,10 +19,10 @@ import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from dtsa_agent.core.agreement import agreed_settings, settings_hash
-from dtsa_agent.core.authentication import Authenticator
-from dtsa_agent.core.config import SwarmConfig
+from dtsa_agent.core.agents.authentication import Authenticator
 from dtsa_agent.core.frame import named_in
+from dtsa_agent.core.settings.agreement import agreed_settings, settings_hash
+from dtsa_agent.core.settings.config import SwarmConfig
 
 from .delay import PEERS, Peer
 

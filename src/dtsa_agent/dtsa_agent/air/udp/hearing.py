@@ -5,9 +5,9 @@ from __future__ import annotations
 import socket
 import time
 
-from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.frame import position_step
 from dtsa_agent.core.reference.timebase import ALONE, JOINED, LISTENING
+from dtsa_agent.core.settings.config import SwarmConfig
 
 from ._hearing import Hearing
 from .datagram import (

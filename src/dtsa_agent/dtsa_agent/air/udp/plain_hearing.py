@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.errors import RemoteProtocolError
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
+from dtsa_agent.core.settings.config import SwarmConfig
 
 from .clock import OwnClock
 from .datagram import NO_FRAME, OTHER_TIME, OWN_ID, REPEATED, Said, Wrapping
@@ -75,7 +75,7 @@ class PlainHearing:
         if self._config.auth:
             return True
         try:
-            decode_frame(frame[: len(frame) - self._config.own_bytes], self._config.extent_m)
+            decode_frame(self._config.protocol_part(frame), self._config.extent_m)
         except RemoteProtocolError:
             return False
         return True

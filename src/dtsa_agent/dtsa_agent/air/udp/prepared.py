@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from dtsa_agent.core.config import SwarmConfig
-from dtsa_agent.core.scenario import Scenario, make_scenario, policy_key
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.settings.scenario import Scenario, make_scenario, policy_key
 
 from .datagram import header_of
 

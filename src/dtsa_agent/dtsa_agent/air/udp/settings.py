@@ -5,9 +5,9 @@ from __future__ import annotations
 import socket
 from dataclasses import dataclass
 
-from dtsa_agent.core.config import MAX_AGENTS
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings import REQUIRED, Settings, check, setting
+from dtsa_agent.core.settings.config import MAX_AGENTS
+from dtsa_agent.core.settings.declaration import REQUIRED, Settings, check, setting
 
 _GROUP = "a multicast group and a port, as 239.68.84.83:7583"
 

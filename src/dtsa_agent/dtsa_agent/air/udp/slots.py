@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dtsa_agent.core.config import SwarmConfig
 from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_agent.core.reference.timebase import ALIGNED, LISTENING, TimeBase
+from dtsa_agent.core.settings.config import SwarmConfig
 
 _DOUBTS = 9  # frames in a row that do not fit the time that an agent has
 

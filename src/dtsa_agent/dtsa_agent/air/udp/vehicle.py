@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from dtsa_agent.core.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
 
 
 class Vehicle(Protocol):

@@ -1,4 +1,4 @@
-/* Python's door to libdtsa: what Python can call; _kernel.pyi says what each function does.
+/* The binding of libdtsa: what Python can call; _kernel.pyi says what each function does.
  *
  * What crosses are whole numbers, doubles and bytes, and the images of structures that live on (a swarm, metrics):
  * core/binding.py makes them, and their arrays are NumPy's, borrowed by address, so that both sides look at the same memory.

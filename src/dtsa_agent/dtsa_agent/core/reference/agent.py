@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from dtsa_agent.core.reference.lease.decide import decide as decide_lease
+from dtsa_agent.core.reference.lease.issue import Said, say
+from dtsa_agent.core.reference.lease.listen import end_slot, listen
+from dtsa_agent.core.reference.lease.memory import Memory
+
 from . import gossip, policies
 from .arithmetic import ZERO, Vector, minus, norm
 from .frame import PROFILE_EXTENDED, WRONG_HEADER, Frame, Refused, decode, encode
 from .frame_extended import SECTION_BYTES, SECTIONS, ExtendedFrame, decode_extended, encode_extended
-from .lease.decide import decide as decide_lease
-from .lease.issue import Said, say
-from .lease.listen import end_slot, listen
-from .lease.memory import Memory
 from .policies import NOBODY, Weights
 from .rules import EXTENDED, LEAVES, OFF, ON, PAPER, Rules
 from .selection import Choice
@@ -88,12 +89,13 @@ class Agent:
         said = Said()
         if rules.policy == "lease":
             said = say(self.memory, self.index, self.table, slot, self.final, self.present == LEAVES)
-        used = -(-len(said.leases) // SECTION_BYTES) + bool(said.relay)
+        used = -(-len(said.leases) // SECTION_BYTES) + bool(said.relay) + bool(said.far)
         carried = gossip.collect(self.table, self.index, slot, SECTIONS - used, rules) if rules.gossip else ()
-        return encode_extended(
-            ExtendedFrame(own, said.c_s, said.leaving, self.memory.probation, carried, said.leases, said.relay),
-            rules.position_step,
-        )
+        frame = ExtendedFrame(
+            own, said.c_s, said.leaving, self.memory.probation, carried,
+            said.leases, said.relay, said.far, said.far_lessee,
+        )  # fmt: skip
+        return encode_extended(frame, rules.position_step)
 
     def end(self, slot: int) -> None:
         """The slot is over: counters and silence, after :meth:`remember_own` and all that was heard.
@@ -111,10 +113,12 @@ class Agent:
     def remember_own(self, slot: int, sent: bytes) -> None:
         """A sender knows what it said, whether or not anybody heard it: its own entry is the last sent state.
 
+        A frame in an OPEN turn is left out: others may send there, too, and gossip says whether it was heard.
+
         :param slot: the slot that is over.
         :param sent: the agent's own frame in it, empty if it was silent.
         """
-        if sent and self.table.rows[self.index].sent_slot != slot:
+        if sent and self.choice.reason != "open" and self.table.rows[self.index].sent_slot != slot:
             self.table.learn(decode(sent, self.rules.position_step), slot)
 
 
@@ -174,4 +178,4 @@ def hear(ears: Sequence[Ear], frame: Frame | ExtendedFrame, sampled: int, rules:
             for entry in frame.gossip:
                 gossip.learn(ear.table, sampled - entry.age, entry, rules)
             if rules.policy == "lease" and ear.agent is not None:
-                listen(ear.agent.memory, ear.agent.index, sampled, frame, wakes)
+                listen(ear.agent.memory, ear.agent.index, ear.table, sampled, frame, wakes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import ConfigError
+from dtsa_agent.core.errors import ConfigError
 
 
 class ClockAligner:

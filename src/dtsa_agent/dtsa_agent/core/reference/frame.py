@@ -15,7 +15,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..errors import LocalProtocolError, RemoteProtocolError
+from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
+
 from .arithmetic import ZERO, Vector, quantise, signed
 
 VERSION = 1

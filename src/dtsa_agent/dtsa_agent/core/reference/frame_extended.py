@@ -5,14 +5,15 @@
 2      c_s, 0..253; 255: the sender leaves with this frame
 3      bit 0: c_r is not 0; bit 1: in probation; bits 2-3, 4-5, 6-7: kinds of the three sections
 4-22   slot, position, velocity, commanded velocity as in profile paper with intent
-23-33, 34-44, 45-55   sections: leases first, then a relay, then gossip
+23-33, 34-44, 45-55   sections: leases first, then a relay, what is handed on far ahead, then gossip
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..errors import LocalProtocolError
+from dtsa_agent.core.errors import LocalProtocolError
+
 from .arithmetic import Vector, quantise, signed
 from .frame import (
     EXTENDED_HEAD,
@@ -27,8 +28,9 @@ from .frame import (
 )
 
 SECTIONS, SECTION_BYTES = 3, 11
-KIND_GOSSIP, KIND_LEASES, KIND_RELAY = 0, 1, 2
+KIND_GOSSIP, KIND_LEASES, KIND_RELAY, KIND_FAR = 0, 1, 2, 3
 RELAY_IDS, RELAY_REACH = 8, 24  # lessees in a relay; slots ahead that it speaks of
+FAR_REACH = RELAY_REACH + 8 * (SECTION_BYTES - 1)  # slots ahead of turns that are handed on to one agent
 GOSSIP_AGE_MAX = 127  # slots
 LEASE_ROOM = 2 * SECTION_BYTES  # turns that one frame can give away
 C_S_MAX, LEAVING = 253, 255
@@ -51,7 +53,8 @@ class Gossip:
 class ExtendedFrame:
     """What one agent says in one slot (profile ``extended``).
 
-    ``own.c_r`` is 0 or 1 on the air. Gossip, a section of 11 leases and the relay take one of three places each.
+    ``own.c_r`` is 0 or 1 on the air. Gossip, a section of 11 leases, the relay and what is handed on far ahead take one
+    of three places each.
     """
 
     own: Frame
@@ -61,6 +64,8 @@ class ExtendedFrame:
     gossip: tuple[Gossip, ...] = ()
     leases: bytes = b""  # a byte a turn: 0 none, id of the lessee, OPEN
     relay: tuple[tuple[int, int], ...] = ()  # (slots ahead, 1 .. 24, ascending; lessee), at most 8
+    far: tuple[int, ...] = ()  # slots ahead, 25 .. 104, ascending, of turns that are handed on to `far_lessee`
+    far_lessee: int = 0  # id, 1 .. 254; 0: nothing is handed on far ahead
 
 
 def gossip_fits(position: Vector, velocity: Vector, position_step: float) -> bool:
@@ -90,6 +95,8 @@ def encode_extended(frame: ExtendedFrame, position_step: float) -> bytes:
         sections.append((KIND_LEASES, frame.leases[first : first + SECTION_BYTES]))
     if frame.relay:
         sections.append((KIND_RELAY, _pack_relay(frame.relay)))
+    if frame.far:
+        sections.append((KIND_FAR, _pack_far(frame.far, frame.far_lessee)))
     for entry in frame.gossip:
         sections.append((KIND_GOSSIP, _pack_gossip(entry, 2.0 * position_step)))
     if len(sections) > SECTIONS:
@@ -109,6 +116,10 @@ def _sayable(frame: ExtendedFrame) -> bool:
         and len(frame.leases) <= SECTIONS * SECTION_BYTES
         and len(frame.relay) <= RELAY_IDS
         and ahead == sorted(set(ahead))
+        and list(frame.far) == sorted(set(frame.far))
+        and all(RELAY_REACH < slots <= FAR_REACH for slots in frame.far)
+        and bool(frame.far) == bool(frame.far_lessee)
+        and 0 <= frame.far_lessee <= EXTENDED_SENDER_MAX
         and all(1 <= slots <= RELAY_REACH and 1 <= lessee <= 255 for slots, lessee in frame.relay)
         and all(1 <= g.agent <= EXTENDED_SENDER_MAX and 1 <= g.age <= GOSSIP_AGE_MAX for g in frame.gossip)
         and all(x == x for g in frame.gossip for x in (*g.position, *g.velocity))
@@ -120,6 +131,11 @@ def _pack_relay(relay: tuple[tuple[int, int], ...]) -> bytes:
     for slots, _ in relay:
         mask |= 1 << (slots - 1)
     return mask.to_bytes(3, "little") + bytes(lessee for _, lessee in relay)
+
+
+def _pack_far(far: tuple[int, ...], lessee: int) -> bytes:
+    mask = sum(1 << (slots - RELAY_REACH - 1) for slots in far)
+    return bytes([lessee]) + mask.to_bytes(SECTION_BYTES - 1, "little")
 
 
 def _pack_gossip(entry: Gossip, step: float) -> bytes:
@@ -146,6 +162,8 @@ def decode_extended(data: bytes, position_step: float) -> ExtendedFrame:
     gossip: list[Gossip] = []
     relays: list[tuple[tuple[int, int], ...]] = []
     leases = b""
+    far: tuple[int, ...] = ()
+    far_lessee = 0
     for place in range(SECTIONS):
         section = data[EXTENDED_HEAD + place * SECTION_BYTES :][:SECTION_BYTES]
         kind = data[3] >> (2 + 2 * place) & 3
@@ -153,13 +171,16 @@ def decode_extended(data: bytes, position_step: float) -> ExtendedFrame:
             leases += section
         elif kind == KIND_RELAY and not relays:
             relays.append(_unpack_relay(section, data))
+        elif kind == KIND_FAR and not far:
+            far, far_lessee = _unpack_far(section, data)
         elif kind == KIND_GOSSIP:
             gossip += _unpack_gossip(section, 2.0 * position_step, data)
         else:
             raise Refused(WRONG_FIELD, data)
     probation = bool(data[3] >> 1 & 1)
     c_s = 0 if leaving else data[2]
-    return ExtendedFrame(own, c_s, leaving, probation, tuple(gossip), leases, relays[0] if relays else ())
+    relay = relays[0] if relays else ()
+    return ExtendedFrame(own, c_s, leaving, probation, tuple(gossip), leases, relay, far, far_lessee)
 
 
 def _unpack_relay(section: bytes, data: bytes) -> tuple[tuple[int, int], ...]:
@@ -169,6 +190,13 @@ def _unpack_relay(section: bytes, data: bytes) -> tuple[tuple[int, int], ...]:
     if len(ahead) > RELAY_IDS or 0 in lessees[: len(ahead)] or any(lessees[len(ahead) :]):
         raise Refused(WRONG_FIELD, data)
     return tuple(zip(ahead, lessees, strict=False))
+
+
+def _unpack_far(section: bytes, data: bytes) -> tuple[tuple[int, ...], int]:
+    mask = int.from_bytes(section[1:], "little")
+    if not mask or not 1 <= section[0] <= EXTENDED_SENDER_MAX:
+        raise Refused(WRONG_FIELD, data)
+    return tuple(d for d in range(RELAY_REACH + 1, FAR_REACH + 1) if mask >> (d - RELAY_REACH - 1) & 1), section[0]
 
 
 def _unpack_gossip(section: bytes, step: float, data: bytes) -> list[Gossip]:

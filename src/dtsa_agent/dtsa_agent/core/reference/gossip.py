@@ -55,7 +55,19 @@ def learn(table: Table, sampled: int, entry: Gossip, rules: Rules) -> None:
     :param entry: the state.
     :param rules: what all agree on.
     """
-    if sampled < 0 or table.observer == entry.agent or table.rows[entry.agent - 1].sent_slot >= sampled:
+    if table.observer != entry.agent:
+        confirm(table, sampled, entry, rules)
+
+
+def confirm(table: Table, sampled: int, entry: Gossip, rules: Rules) -> None:
+    """:func:`learn`, of the observer's entry for itself, too: somebody has heard it.
+
+    :param table: what the receiver knows.
+    :param sampled: the slot of the state.
+    :param entry: the state.
+    :param rules: what all agree on.
+    """
+    if sampled < 0 or table.rows[entry.agent - 1].sent_slot >= sampled:
         return
     if gossip_fits(entry.position, entry.velocity, rules.position_step):
         table.learn(
@@ -73,6 +85,7 @@ def known(frame: ExtendedFrame, slot: int, rules: Rules) -> bool:
     return (
         frame.own.sender <= n
         and frame.c_s < n
+        and frame.far_lessee <= n
         and (own_turn or not frame.leases)
         and all(entry.agent <= n for entry in frame.gossip)
         and all(lessee <= n or lessee == OPEN for lessee in lessees)

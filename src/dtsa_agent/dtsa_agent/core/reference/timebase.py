@@ -16,7 +16,8 @@ part.
 
 from __future__ import annotations
 
-from ..errors import ConfigError
+from dtsa_agent.core.errors import ConfigError
+
 from .alignment import ClockAligner
 from .arithmetic import mix64
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ..arithmetic import mix64, share_of
-from ..frame_extended import OPEN
-from ..selection import Choice
+from dtsa_agent.core.reference.arithmetic import mix64, share_of
+from dtsa_agent.core.reference.frame_extended import OPEN
+from dtsa_agent.core.reference.selection import Choice
+
 from .memory import HANDED, NEVER, Memory
 
-CROWD = 8.0  # chance of an OPEN turn: 1 / ((1 + CROWD w) 2^a)
 _OPEN_DRAW = 0x4F50454E  # "OPEN": these draws are none of another policy's
 
 
@@ -21,7 +21,7 @@ def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> C
     """
     if not memory.started:
         memory.start(slot)
-    memory.roll(slot)
+    memory.roll(self_index, slot)
     watch_goal(memory, slot, far_from_goal)
     memory.heard_now = False
     memory.expected = -1
@@ -70,13 +70,13 @@ def own_right_is_near(memory: Memory, self_index: int, slot: int) -> bool:
 
 
 def takes_open(memory: Memory, self_index: int, slot: int) -> bool:
-    """Whether a waking agent uses an OPEN turn: with the chance 1 / ((1 + 8 w) 2^a), a at most 5.
+    """Whether a waking agent uses an OPEN turn: with the chance 1 / ((1 + 3 w) 2^a), a at most 5.
 
     w agents woke lately; a frames of its own in OPEN turns were not known to be heard. So many that woke together get
     out of each other's way.
     """
     if memory.woke == NEVER or own_right_is_near(memory, self_index, slot):
         return False
-    chance = 1.0 / ((1.0 + CROWD * memory.wakers) * 2.0 ** min(memory.attempts, 5))
+    chance = 1.0 / ((1.0 + 3.0 * memory.wakers) * 2.0 ** min(memory.attempts, 5))
     draw = mix64(memory.rules.key ^ mix64((slot << 16) + self_index + _OPEN_DRAW))
     return share_of(draw) < chance

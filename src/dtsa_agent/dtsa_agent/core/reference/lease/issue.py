@@ -5,13 +5,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ..arithmetic import minus, norm
-from ..frame_extended import LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH
-from ..table import Table
-from .memory import HANDED, MISSED, Lease, Memory
+from dtsa_agent.core.reference.arithmetic import minus, norm
+from dtsa_agent.core.reference.frame_extended import (
+    FAR_REACH,
+    LEASE_ROOM,
+    OPEN,
+    RELAY_IDS,
+    RELAY_REACH,
+    SECTION_BYTES,
+)
+from dtsa_agent.core.reference.table import Table
+
+from .memory import HANDED, MISSED, ROUNDS, Lease, Memory
 
 FEW = 0.5  # more missed frames than this in 8 N slots: movers keep their turns
-MUCH_MORE = 3  # a mover hands on turns that are worth so many times as much to somebody else
+MORE = 2  # a mover hands on turns that are worth so many times as much to somebody else
+MANY = 0.1  # share of frames
+MUCH_MORE = 3  # ... where many are lost, so that some of those named do not learn of it
+KEPT_EVERY = 2  # who may get another goal keeps its turn of every so many rounds
 ROUNDS_TOLD = 3  # who has arrived says so for so many rounds, where frames are lost
 OFTEN = 2.0  # at least so many OPEN turns for each that wakes
 
@@ -24,6 +35,8 @@ class Said:
     leaving: bool = False
     leases: bytes = b""
     relay: tuple[tuple[int, int], ...] = ()
+    far: tuple[int, ...] = ()
+    far_lessee: int = 0
 
 
 @dataclass(slots=True)
@@ -63,8 +76,11 @@ def say(memory: Memory, self_index: int, table: Table, slot: int, final: bool, l
     leases = b""
     if own_turn:
         leases = issue(memory, self_index, table, slot, c_s, 0 if leaving else None, final)
-    handed = hand_on(memory, self_index, table, slot, final)
-    return Said(c_s, leaving, leases, relay(memory, self_index, slot, handed, own_is_said=bool(leases)))
+    handed = hand_on(memory, self_index, table, slot, final, leases)
+    near = [turn for turn in handed if turn - slot <= RELAY_REACH]
+    far = tuple(turn - slot for turn in handed if turn - slot > RELAY_REACH)
+    lessee = memory.leases[handed[-1]].lessee if far else 0
+    return Said(c_s, leaving, leases, relay(memory, self_index, slot, near, own_is_said=bool(leases)), far, lessee)
 
 
 def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
@@ -92,7 +108,8 @@ def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: 
     settled[self_index] = rests[self_index] and final
     informed = slot >= memory.rules.agents or table.known_goals is not None
     few_move = sum(rests) == sum(settled) > 0 and 3 * sum(able) < memory.rules.agents
-    lends = informed and few_move and memory.lost < FEW
+    # In the first round those that wait for a goal are taken for settled, and give a mover nothing.
+    lends = slot >= memory.rules.agents and few_move and memory.lost < FEW
     last = [row.sent_slot if row.sent_slot >= 0 else slot - memory.rules.agents for row in rows]
     block = open_block(memory.rules.agents, memory.rules.open_every, memory.wakers, sum(rests), sum(settled))
     return Electorate(sum(alive), able, rests, settled, block, informed, lends, last)
@@ -164,10 +181,16 @@ def is_open(memory: Memory, who: Electorate, turn: int) -> bool:
     return not any(is_spare(memory, who, t) for t in range(first, turn))
 
 
+def is_kept(memory: Memory, turn: int) -> bool:
+    """Whether a turn stays with an owner that rests and may get another goal: it must be heard soon when it wakes."""
+    n = memory.rules.agents
+    return (turn // n + turn % n) % KEPT_EVERY == 0 or memory.is_anchor(turn)
+
+
 def is_spare(memory: Memory, who: Electorate, turn: int) -> bool:
     """Whether a turn is one that its owner gives away, as far as is known."""
     owner = memory.owner(turn)
-    kept = memory.is_main(turn) if who.settled[owner] else memory.is_anchor(turn)
+    kept = memory.is_main(turn) if who.settled[owner] else is_kept(memory, turn)
     return who.rests[owner] and turn >= memory.rules.agents and not kept
 
 
@@ -198,7 +221,8 @@ def issue(
         if mine and not (final and idle) and memory.is_anchor(turn):
             rounds_mine = 0
         reach = rounds_mine if mine else rounds_adopted
-        if turn not in memory.leases and rounds_ahead <= reach and not memory.probation:
+        kept = mine and idle and not final and is_kept(memory, turn)
+        if turn not in memory.leases and not kept and rounds_ahead <= reach and not memory.probation:
             lessee = 0
             if idle and mine and is_open(memory, who, turn):
                 lessee = OPEN
@@ -276,39 +300,46 @@ def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> 
     return max(able, key=lambda k: worth(memory, who, k, turn), default=-1)  # the first of several
 
 
-def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: bool) -> list[int]:
-    """Hands on turns that the agent was given and can name in a relay; not the next slot's: frames may arrive late.
+def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: bool, leases: bytes) -> list[int]:
+    """Hands on turns that the agent was given; not the next slot's: frames may arrive late.
 
-    If it rests, all but the last one, for in that it can hand on further ones; if it moves, those that are worth much
-    more to somebody else. The turn's owner, which has given it away, is left out.
+    If it rests, all within reach that come before its last turn there, in which it can hand on further ones; beyond the
+    relay's reach all to one agent, to whom the first of them is worth most. If it moves, those within the relay's reach
+    that are worth much more to somebody else. The turn's owner, which has given it away, is left out.
 
-    :returns: the turns handed on, at most eight.
+    :param leases: the frame's lease bytes; with more than one section of them there is no room for a far lessee.
+    :returns: the turns handed on; at most eight within the relay's reach, the others to one agent.
     """
     handed: list[int] = []
     idle = memory.idle_since >= 0
     if not memory.rules.open_every or not memory.rules.adoption or memory.probation or memory.deaf:
         return handed
-    within = range(slot + 2, slot + min(RELAY_REACH, memory.window - 1) + 1)
-    given = [t for t in within if t in memory.leases and memory.leases[t].lessee == self_index + 1]
-    if idle:
-        given = given[:-1]
+    reach = FAR_REACH if idle and len(leases) <= SECTION_BYTES else RELAY_REACH
+    mine = [t for t in range(slot + 2, slot + min(reach, memory.window - 1) + 1) if memory.scheduled(t) == self_index]
+    given = [t for t in (mine[:-1] if idle else mine) if t in memory.leases]
     if not given:
         return handed
     who = electorate(memory, self_index, table, slot, final)
     who.rights = look_ahead(memory, who, slot)
     who.last[self_index] = slot
+    factor = MORE if memory.lost < MANY * ROUNDS * memory.rules.agents else MUCH_MORE
     foreseen = slot + 1  # up to here, excluded
+    heir = -1  # to whom all turns beyond the relay's reach go
     for turn in given:
-        if len(handed) == RELAY_IDS:
-            break
-        foresee(memory, self_index, who, range(foreseen, turn))
-        foreseen = turn
-        k = choose_lessee(memory, who, turn, but=self_index)
+        far = turn - slot > RELAY_REACH
+        if not far and len(handed) == RELAY_IDS:
+            continue
+        k = heir
+        if not far or heir < 0:
+            foresee(memory, self_index, who, range(foreseen, turn))
+            foreseen = turn
+            k = choose_lessee(memory, who, turn, but=self_index)
         if k < 0 or k == memory.owner(turn):
             continue
-        if idle or worth(memory, who, k, turn) >= MUCH_MORE * worth(memory, who, self_index, turn):
+        if idle or worth(memory, who, k, turn) >= factor * worth(memory, who, self_index, turn):
             memory.leases[turn] = Lease(k + 1, HANDED)
             handed.append(turn)
+            heir = k if far else -1
     return handed
 
 

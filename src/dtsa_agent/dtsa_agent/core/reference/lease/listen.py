@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from ..frame_extended import ExtendedFrame
+from dtsa_agent.core.reference import gossip
+from dtsa_agent.core.reference.frame_extended import ExtendedFrame, Gossip
+from dtsa_agent.core.reference.table import Table
+
 from .memory import DEAF, GONE, MISSED, NEVER, Memory
 
 
-def listen(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, wakes: bool) -> None:
+def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: ExtendedFrame, wakes: bool) -> None:
     """Takes in a frame of somebody else.
 
     :param memory: what the agent remembers.
     :param self_index: its own number, id - 1.
+    :param table: its table.
     :param slot: the slot in which the frame was sent.
     :param frame: what it said.
     :param wakes: its sender was not in A_p and is now.
@@ -28,7 +32,7 @@ def listen(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, wak
     judge_claim(memory, self_index, slot, frame, was_absent)
     memory.resting[sender] = frame.own.c_r == 0
     for entry in frame.gossip:
-        hear_gossip(memory, self_index, entry.agent - 1, slot - entry.age)
+        hear_gossip(memory, self_index, table, slot - entry.age, entry)
     turns = memory.turns_of_leases(slot, frame.c_s, len(frame.leases))
     given = [(turn, lessee) for turn, lessee in zip(turns, frame.leases, strict=False) if lessee]
     if memory.owner(slot) == sender:
@@ -37,6 +41,8 @@ def listen(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, wak
         memory.note(self_index, sender + 1, turn, lessee, sender + 1)
     for ahead, lessee in frame.relay:
         memory.note(self_index, sender + 1, slot + ahead, lessee, 0)
+    for ahead in frame.far:
+        memory.note(self_index, sender + 1, slot + ahead, frame.far_lessee, 0)
 
 
 def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, was_absent: bool) -> None:
@@ -56,11 +62,13 @@ def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame
         memory.probation = False
 
 
-def hear_gossip(memory: Memory, self_index: int, k: int, alive: int) -> None:
+def hear_gossip(memory: Memory, self_index: int, table: Table, alive: int, entry: Gossip) -> None:
     """Somebody says that an agent lived in a slot."""
+    k = entry.agent - 1
     if k == self_index:
         if memory.woke != NEVER and alive >= memory.woke:
             memory.woke = NEVER  # I have been heard
+            gossip.confirm(table, alive, entry, memory.rules)
     elif memory.heard[k] < alive and memory.heard[k] != GONE:
         memory.heard[k] = alive
 

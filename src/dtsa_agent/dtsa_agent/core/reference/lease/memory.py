@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..frame_extended import OPEN
-from ..rules import Rules
+from dtsa_agent.core.reference.frame_extended import OPEN
+from dtsa_agent.core.reference.rules import Rules
 
-DEAF = 4  # more silent slots in a row than this, and an agent does not trust its ears
+DEAF = 4  # more silent slots in a row than this, and an agent is presumed deaf
 MISSED = 4  # who missed so many expected turns gets no leases
 ROUNDS = 8  # in which missed frames are counted
 GONE = -(2**61)  # in ``heard``: said that it leaves
@@ -166,10 +166,10 @@ class Memory:
             self.probation = True
             self.woke = slot
 
-    def roll(self, slot: int) -> None:
+    def roll(self, self_index: int, slot: int) -> None:
         """A slot begins: earlier turns are over; the estimates of how many woke and of missed frames fall."""
         for turn in [turn for turn in self.leases if turn < slot]:
             del self.leases[turn]
-        self.now = slot
+        self.now = self.heard[self_index] = slot
         self.wakers -= self.wakers / self.rules.agents
         self.lost -= self.lost / (ROUNDS * self.rules.agents)

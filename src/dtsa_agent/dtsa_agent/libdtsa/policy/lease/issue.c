@@ -4,11 +4,13 @@
 
 #include "lease.h"
 
-static const double OFTEN = 2.0, FEW = 0.5;
+static const double OFTEN = 2.0, FEW = 0.5, MANY = 0.1; /* MANY: share of frames */
 
 enum {
+    KEPT_EVERY = 2,  /* who may get another goal keeps its turn of every so many rounds */
     ROUNDS_TOLD = 3, /* who has arrived says so for so many rounds, where frames are lost */
-    MUCH_MORE = 3 /* a mover hands on turns that are worth so many times as much to somebody else */
+    MORE = 2, /* a mover hands on turns that are worth so many times as much to somebody else */
+    MUCH_MORE = 3 /* ... where many frames are lost, so that some of those named do not learn of it */
 };
 
 typedef struct {
@@ -102,7 +104,8 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
     }
     who->informed = slot >= v->n || table->config->targets_known;
     const int few_move = settled && settled == resting && 3 * who->members < v->n;
-    who->lends = who->informed && few_move && v->a->lost < FEW;
+    /* In the first round those that wait for a goal are taken for settled, and give a mover nothing. */
+    who->lends = slot >= v->n && few_move && v->a->lost < FEW;
     who->block = open_block(table->config->lease.open_every, v, resting, settled);
 }
 
@@ -139,12 +142,18 @@ static int choose_lessee(const lease_scope *v, const electorate *who, int64_t tu
     return best;
 }
 
+/* Whether a turn stays with an owner that rests and may get another goal: it must be heard soon when it wakes. */
+static int is_kept(const lease_scope *v, int64_t turn)
+{
+    return (turn / v->n + turn % v->n) % KEPT_EVERY == 0 || lease_is_anchor(v, turn);
+}
+
 /* Whether a turn is one that its owner gives away, as far as is known. */
 static int is_spare(const lease_scope *v, const electorate *who, int64_t turn)
 {
     const int owner = (int)(turn % v->n);
     if (!who->rests[owner] || turn < v->n) return 0;
-    return who->sure[owner] ? !lease_is_main(v, turn) : !lease_is_anchor(v, turn);
+    return who->sure[owner] ? !lease_is_main(v, turn) : !is_kept(v, turn);
 }
 
 /* Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known. */
@@ -238,8 +247,9 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
         const int mine = turn % v->n == self;
         uint8_t *given = &v->lessee[turn % v->window];
         if (mine && !(agent->final && idle) && lease_is_anchor(v, turn)) own = 0;
-        if (*given == LEASE_NONE && (turn - slot + v->n - 1) / v->n <= (mine ? own : adopted) &&
-            !v->a->probation) {
+        const int kept = mine && idle && !agent->final && is_kept(v, turn);
+        if (*given == LEASE_NONE && !kept && !v->a->probation &&
+            (turn - slot + v->n - 1) / v->n <= (mine ? own : adopted)) {
             if (idle && mine && is_open(v, &who, turn)) {
                 *given = LEASE_OPEN;
             } else if (who.members && (mine || v->a->deaf <= LEASE_DEAF)) {
@@ -261,7 +271,8 @@ static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extende
 static int is_dispensable(const lease_scope *v, const electorate *who, int k, int64_t turn)
 {
     const long own = worth(v, who, v->self, turn, turn + who->again[turn % v->window]);
-    return worth(v, who, k, turn, who->next[k]) >= MUCH_MORE * own;
+    const int factor = v->a->lost < MANY * LEASE_MEMORY * v->n ? MORE : MUCH_MORE;
+    return worth(v, who, k, turn, who->next[k]) >= factor * own;
 }
 
 /* To whom this agent hands a turn on that it was given. -1: to nobody. Its owner has given it away. */
@@ -272,39 +283,53 @@ static int choose_next(const lease_scope *v, const electorate *who, int idle, in
     return idle || is_dispensable(v, who, k, turn) ? k : -1;
 }
 
-/* Hands on turns within reach that this agent was given: all but the last one if it rests, for in that it can hand on further
- * ones; if it moves, those that are worth much more to somebody else. Not the next slot's: frames may arrive late.
+/* Hands a turn on to another agent, by its index. */
+static void hand(lease_scope *v, electorate *who, int64_t turn, int k)
+{
+    if (who->next[v->self] == turn) who->next[v->self] = turn + who->again[turn % v->window];
+    v->lessee[turn % v->window] = (uint8_t)(k + 1);
+    v->issuer[turn % v->window] = LEASE_HANDED;
+}
+
+/* Hands on turns that this agent was given. If it rests: all within reach that come before its last turn there, in which it can
+ * hand on further ones; beyond the relay's reach all to one agent, to whom the first of them is worth most. If it moves: those
+ * that are worth much more to somebody else. Not the next slot's: frames may arrive late.
  *
- * -> mask of the turns handed on, as in relay_mask. */
-static uint32_t hand_on(const dtsa_agent *agent, lease_scope *v, int64_t slot)
+ * -> mask of the turns handed on, as in relay_mask; e->far_* says those beyond. */
+static uint32_t hand_on(const dtsa_agent *agent, lease_scope *v, int64_t slot, extended_frame *e)
 {
     const dtsa_lease_config *c = &agent->table->config->lease;
-    const int64_t end = slot + (RELAY_REACH < v->window - 1 ? RELAY_REACH : v->window - 1);
     const int idle = v->a->idle_since >= 0, mine = v->self + 1;
-    int64_t last = end, from = slot + 1;
-    int count = 0;
+    const int reach = idle && e->lease_count <= SECTION_BYTES ? FAR_REACH : RELAY_REACH;
+    int64_t last = slot + (reach < v->window - 1 ? reach : v->window - 1), from = slot + 1;
+    int count = 0, heir = -1;
     uint32_t mask = 0;
     electorate who;
     if (!c->open_every || !c->adoption || v->a->probation || v->a->deaf > LEASE_DEAF) return 0;
-    while (last > slot + 1 && v->lessee[last % v->window] != mine) last--;
-    for (int64_t turn = slot + 2; turn <= last && count < RELAY_IDS; turn++) {
-        uint8_t *given = &v->lessee[turn % v->window];
-        if (*given != mine) continue;
-        if (idle && turn == last) break;
+    while (last > slot + 1 && lease_scheduled(v, last) != v->self) last--;
+    for (int64_t turn = slot + 2; turn < last + !idle; turn++) {
+        const int d = (int)(turn - slot), far = d > RELAY_REACH;
+        if (v->lessee[turn % v->window] != mine || (!far && count == RELAY_IDS)) continue;
         if (from == slot + 1) {
             count_electorate(agent, v, slot, &who);
-            look_ahead(v, &who, slot, RELAY_REACH + v->n);
+            look_ahead(v, &who, slot, reach + v->n);
             who.last[v->self] = slot;
         }
-        foresee(v, &who, from, turn);
-        from = turn;
-        const int k = choose_next(v, &who, idle, turn);
-        if (k < 0) continue;
-        if (who.next[v->self] == turn) who.next[v->self] = turn + who.again[turn % v->window];
-        *given = (uint8_t)(k + 1);
-        v->issuer[turn % v->window] = LEASE_HANDED;
-        mask |= 1u << (turn - slot - 1);
-        count++;
+        if (!far || heir < 0) {
+            foresee(v, &who, from, turn);
+            from = turn;
+        }
+        const int k = far && heir >= 0 ? heir : choose_next(v, &who, idle, turn);
+        if (k < 0 || k == turn % v->n) continue;
+        hand(v, &who, turn, k);
+        if (far) {
+            heir = k;
+            e->far_id = (uint8_t)(k + 1);
+            e->far_mask[(d - RELAY_REACH - 1) >> 3] |= (uint8_t)(1u << ((d - RELAY_REACH - 1) & 7));
+        } else {
+            mask |= 1u << (d - 1);
+            count++;
+        }
     }
     return mask;
 }
@@ -336,5 +361,5 @@ void lease_fill(dtsa_agent *agent, int64_t slot, extended_frame *e)
     if (agent->table->config->lease.adoption && !v.a->probation && !e->leaving)
         e->c_s = count_absent_before(&v, slot);
     if (own_turn) issue(agent, &v, slot, e);
-    relay(&v, slot, hand_on(agent, &v, slot), e);
+    relay(&v, slot, hand_on(agent, &v, slot, e), e);
 }

@@ -8,7 +8,6 @@
 
 #include "lease.h"
 
-static const double CROWD = 8.0;
 static const int64_t GONE = INT64_MIN / 4; /* heard: said that it leaves */
 
 static int main_every(const dtsa_config *c)
@@ -136,7 +135,7 @@ static void roll(lease_scope *v, int64_t slot)
         for (int64_t t = a->now; t < slot; t++)
             v->lessee[t % v->window] = v->issuer[t % v->window] = 0;
     }
-    a->now = slot;
+    a->now = v->heard[v->self] = slot;
     a->wakers -= a->wakers / v->n;
     a->lost -= a->lost / (LEASE_MEMORY * v->n);
 }
@@ -193,7 +192,7 @@ static int takes_open(const dtsa_agent *agent, const lease_scope *v, int64_t slo
     const int self = agent->self;
     if (v->a->woke < 0 || own_right_is_near(v, self, slot)) return 0;
     const int halvings = v->a->attempts < 5 ? v->a->attempts : 5;
-    const double chance = 1.0 / ((1.0 + CROWD * v->a->wakers) * (double)(1 << halvings));
+    const double chance = 1.0 / ((1.0 + 3.0 * v->a->wakers) * (double)(1 << halvings));
     const uint64_t what = ((uint64_t)slot << 16) + (uint64_t)self + 0x4f50454eULL;
     return draw_uniform(agent->table->config->key, what) < chance;
 }
@@ -267,7 +266,9 @@ static void hear_gossip(const dtsa_agent *agent, lease_scope *v, int64_t slot,
         const int64_t alive = slot - g->age;
         int64_t *heard = &v->heard[g->id - 1];
         if (g->id - 1 == agent->self) {
-            if (v->a->woke >= 0 && alive >= v->a->woke) v->a->woke = -1;
+            if (v->a->woke < 0 || alive < v->a->woke) continue;
+            v->a->woke = -1;
+            gossip_confirm(agent->table, alive, g);
         } else if (*heard < alive && *heard != GONE) {
             *heard = alive;
         }
@@ -303,6 +304,9 @@ static void lease_listen(dtsa_agent *agent, int64_t slot, const extended_frame *
     for (int d = 0, i = 0; d < RELAY_REACH && e->relay_mask >> d; d++)
         if (e->relay_mask >> d & 1)
             lease_note(&v, e->own.sender, slot + 1 + d, e->relay_ids[i++], 0);
+    for (int b = 0; b < 8 * FAR_BYTES && e->far_id; b++)
+        if (e->far_mask[b >> 3] >> (b & 7) & 1)
+            lease_note(&v, e->own.sender, slot + RELAY_REACH + 1 + b, e->far_id, 0);
 }
 
 /* ---- the slot is over ---- */

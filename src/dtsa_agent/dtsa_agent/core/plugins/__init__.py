@@ -1,0 +1,1 @@
+"""Policies, estimators and avoiders from other packages: found, checked, called."""

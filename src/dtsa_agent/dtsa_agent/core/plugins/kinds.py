@@ -1,0 +1,169 @@
+"""The kinds of plug-ins: what policies, estimators and avoiders from other packages have, and what they are given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarms.outcome import SlotOutcome
+
+if TYPE_CHECKING:
+    from .entry_points import Table
+
+Array = NDArray[np.float64]
+
+
+class Speaks(Protocol):
+    """What policies and estimators may have besides: bytes of their own in frames, and the outcome of each slot.
+
+    All of it may be left out. ``own_bytes``, a class attribute, is the number of bytes, 0 to ``MAX_OWN_BYTES``.
+    """
+
+    own_bytes: ClassVar[int] = 0
+
+    def say(self, table: Table, slot: int) -> bytes:
+        """The bytes for the frame that this agent sends in a slot: exactly ``own_bytes`` of them."""
+
+    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
+        """Takes in what the same part of another agent has said.
+
+        :param table: what this observer knows, with the frame's state in it.
+        :param slot: the slot in which the frame is heard.
+        :param sender: id of who sent it.
+        :param data: its bytes: not to be trusted more than its sender.
+        """
+
+    def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
+        """A slot is over for this observer.
+
+        :param outcome: what it could tell; collisions are silence to receivers that cannot tell.
+        """
+
+
+class Policy(Protocol):
+    """Who sends next. It may have what :class:`Speaks` has.
+
+    ``port``, a class attribute, says what it uses of the air (``dtsa_agent.core.registry.PORT``); ``may_join = True``:
+    agents may come late, because nobody needs a table that all have equal.
+    """
+
+    def choose(self, table: Table, slot: int) -> int:
+        """The id that this observer takes for the sender of a slot, 0: nobody. It sends if that is its own."""
+
+
+class Genie(Protocol):
+    """Who sends next, said by one who looks into all agents: a bound to compare with. Made once, for agent 0."""
+
+    def senders(self, swarm: AbstractSwarm, slot: int) -> Sequence[int]:
+        """The ids that send in a slot.
+
+        :param swarm: all agents: true states and everybody's table, to be read only.
+        """
+
+
+class Radio(Protocol):
+    """The radio of an agent that is not bound to slots."""
+
+    def send(self) -> bool:
+        """Begins to send the agent's frame, with its state at the start of the slot; False: it still sends another.
+
+        A radio that listens takes the frame, and begins when :meth:`Listens.sensed` says so.
+        """
+
+
+class Unslotted(Protocol):
+    """A policy that is not bound to slots. Slots only say how often vehicles are steered and ages are counted."""
+
+    def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
+        """Acts at an instant; first called at 0.
+
+        :param table: what this agent knew when the slot began.
+        :param now_ns: ns since the start of slot 0.
+        :param radio: its radio.
+        :returns: when to be called again, ns, later than now.
+        """
+
+
+class Listens(Unslotted, Protocol):
+    """The same with ``busy`` in its ``port``: its radio listens before it sends, as radios do that sense the carrier.
+
+    ``wake`` hands a frame over by ``radio.send()``; what it returns then does not count, and it is not called again
+    before the radio has told what became of the frame.
+    """
+
+    def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> int:
+        """What the radio does that holds a frame and has just listened.
+
+        In flights of nodes radios are where the air is, with an instance of the policy each: it must not depend on
+        what the other methods have noted.
+
+        :param busy: whether it has found the air in use, or sends itself.
+        :param now_ns: ns since the start of slot 0.
+        :param sent_ns: ns, when it began its last frame; 0: none yet.
+        :returns: ns until it listens again; 0: it begins now, if the air is free.
+        """
+
+    def sent(self, table: Table, now_ns: int, begun: bool) -> int:
+        """The radio has begun to send, or given the frame up.
+
+        :param table: what this agent knows.
+        :param now_ns: ns since the start of slot 0: when the frame began; else now.
+        :param begun: whether it has been sent.
+        :returns: when ``wake`` is to be called, ns, later than that.
+        """
+
+
+class PacketRadio(Radio, Protocol):
+    """The radio of an agent whose policy has packets of its own. It sends nothing while it still sends another."""
+
+    def send(self, note: bytes = b"", to: int = 0) -> bool:
+        """As for all, with some bytes that precede the frame.
+
+        :param note: the bytes.
+        :param to: id of the one agent that takes the frame in; 0: all do.
+        """
+
+    def say(self, note: bytes) -> bool:
+        """Begins to send a packet without a frame.
+
+        :param note: its bytes.
+        """
+
+
+class Reacts(Unslotted, Protocol):
+    """An unslotted policy that acts on each packet as it arrives, for example a token ring. In the simulator only."""
+
+    def received(self, table: Table, now_ns: int, sender: int, note: bytes) -> int:
+        """A packet has arrived, as far as the air lets this agent hear it.
+
+        :param table: what this agent knew when the slot began.
+        :param now_ns: ns since the start of slot 0.
+        :param sender: id of who sent it.
+        :param note: its bytes, without the frame.
+        :returns: when ``wake`` is to be called next, in place of what was asked for before, ns, later than now.
+        """
+
+
+class Estimator(Protocol):
+    """Where the others are by now. It may have what :class:`Speaks` has.
+
+    ``needs_intent = True`` makes frames carry the commanded velocity.
+    """
+
+    needs_intent: ClassVar[bool] = False
+
+    def estimate(self, table: Table, slot: int, step: int, position: Array, velocity: Array) -> None:
+        """Writes the estimates for control instant ``step`` of a slot into (3, N) arrays, m and m/s."""
+
+
+class Avoider(Protocol):
+    """Where to fly. ``model`` names the built-in flight model whose vehicle and spacing are used."""
+
+    model: ClassVar[str] = "orca"
+
+    def command(self, table: Table, slot: int, step: int) -> Sequence[float]:
+        """Commanded velocity, (3,), m/s, frame map; the estimates in ``table`` are those of this instant."""

@@ -1,0 +1,399 @@
+"""Settings that describe themselves: validation, plain values, texts, ROS parameters and tables come from this.
+
+A settings class is a frozen dataclass that inherits :class:`Settings` and whose fields are made with :func:`setting`.
+Everything else asks :func:`settings_of`: command line, parameters of nodes, YAML files, bags, documentation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from dtsa_agent.core.errors import ConfigError, range_text
+
+#: What a setting holds. ``vector``: three numbers; ``values``: numbers by name; ``structure``: files only.
+KINDS = ("int", "float", "bool", "text", "vector", "values", "structure")
+#: The default of a setting that has none.
+REQUIRED: Any = dataclasses.MISSING
+
+_KIND_OF_TYPE = {"int": "int", "float": "float", "bool": "bool", "str": "text", "Vector": "vector"}
+_NUMBERS = {"int": "a whole number", "float": "a number"}
+_WORDS = {"bool": "true or false", "text": "a text", "values": "name=number, separated by commas"}
+_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+_TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
+
+Choices = tuple[Any, ...] | Callable[[], tuple[Any, ...]]
+T = TypeVar("T", bound="Settings")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting: all that is needed to check it, to ask for it and to explain it.
+
+    :param name: name of the dataclass's field.
+    :param kind: one of :data:`KINDS`.
+    :param default: value used when nothing is given; None if there is none.
+    :param help: one line for the user.
+    :param unit: unit of the numbers; empty or "1": none.
+    :param minimum: smallest number allowed, or None.
+    :param maximum: largest number allowed, or None.
+    :param words: the values allowed, or a function that gives them; empty: any value of the kind and the range.
+    :param open_choices: other words are allowed too: they name plug-ins.
+    :param required: there is no default.
+    :param optional: None is allowed: the value then follows from the other settings.
+    :param changeable: may change in flight.
+    :param custom: the settings class checks it itself.
+    :param section: the settings class of a nested section, or None.
+    :param group: heading under which the documentation lists it.
+    """
+
+    name: str
+    kind: str
+    default: Any
+    help: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    words: Choices = ()
+    open_choices: bool = False
+    required: bool = False
+    optional: bool = False
+    changeable: bool = False
+    custom: bool = False
+    section: type[Settings] | None = None
+    group: str = ""
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """The values allowed, those of plug-ins apart; empty: any value of the kind and the range."""
+        return self.words() if callable(self.words) else self.words
+
+    @property
+    def description(self) -> str:
+        """The help text with the unit and the words allowed."""
+        text = f"{self.help} ({self.unit})" if self.unit and self.unit != "1" else self.help
+        return f"{text}: {', '.join(map(str, self.choices))}" if self.choices else text
+
+    @property
+    def range(self) -> str:
+        """The range in words; empty if there is none."""
+        if self.minimum is None and self.maximum is None:
+            return ""
+        return range_text(self.minimum, self.maximum, self.unit)
+
+    @property
+    def allowed(self) -> str:
+        """What may be given, in words."""
+        if self.choices:
+            return ", ".join(map(str, self.choices))
+        if self.custom:
+            return self.help
+        if self.kind == "vector":
+            return f"three numbers: x, y, z in {self.unit}" if self.unit else "three numbers"
+        if self.kind not in _NUMBERS:
+            return _WORDS.get(self.kind, self.help)
+        if not self.range:
+            return _NUMBERS[self.kind] + (f", {self.unit}" if self.unit else "")
+        return self._allowed_range if self._bare else f"{_NUMBERS[self.kind]}, {self.range}"
+
+    @property
+    def _bare(self) -> bool:
+        return self.kind == "float" and self.unit in ("", "1")
+
+    @property
+    def _allowed_range(self) -> str:
+        """The range; "0 to 1" of numbers without a unit would be read as two whole numbers."""
+        return f"a number from {self.range}" if self._bare and self.minimum is not None else self.range
+
+    def check(self, value: Any, name: str | None = None) -> Any:
+        """The value as the configuration keeps it: whole numbers become floats where floats are meant.
+
+        :param value: what the user gave; NumPy scalars are welcome, True is not a number.
+        :param name: how the user calls the setting, if not by its own name.
+        :raises ConfigError: if it has the wrong type or is out of range.
+        """
+        if value is None and self.optional:
+            return None
+        name = name or self.name
+        if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
+            value = value.item()
+        if self.kind in _NUMBERS:
+            return self._number(value, name)
+        if self.kind == "bool" and not isinstance(value, bool):
+            raise ConfigError(name, value, self.allowed)
+        if self.kind == "text" and not (
+            isinstance(value, str) and (not self.words or self.open_choices or value in self.choices)
+        ):
+            raise ConfigError(name, value, self.allowed)
+        if self.kind == "vector":
+            return self._vector(value, name)
+        if self.kind == "values":
+            return _checked_values(value, name)
+        if self.section and not isinstance(value, self.section):
+            raise ConfigError(name, value, "names with values")
+        return value
+
+    def _number(self, value: Any, name: str) -> int | float:
+        if self.kind == "int" and isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if isinstance(value, bool) or not isinstance(value, int if self.kind == "int" else (int, float)):
+            raise ConfigError(name, value, self.allowed)
+        low, high = self.minimum, self.maximum
+        if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
+            raise ConfigError(name, value, self._allowed_range or self.allowed)
+        if self.words and value not in self.choices:
+            raise ConfigError(name, value, self.allowed)
+        return float(value) if self.kind == "float" else int(value)
+
+    def _vector(self, value: Any, name: str) -> tuple[float, float, float]:
+        if not isinstance(value, (list, tuple)) or len(value) != 3 or not all(map(_is_number, value)):
+            raise ConfigError(name, value, self.allowed)
+        return float(value[0]), float(value[1]), float(value[2])
+
+    def parse(self, text: str) -> Any:
+        """The value that a text means. Its range is checked by the configuration itself.
+
+        :param text: as the user typed it.
+        :raises ConfigError: if it is of another kind.
+        """
+        try:
+            if self.kind == "text":
+                return text
+            if self.kind == "int":
+                return int(text)
+            if self.kind == "float":
+                return float(text)
+            if self.kind == "values":
+                return parse_values(text)
+            if self.kind == "bool" and text.lower() in _TRUE + _FALSE:
+                return text.lower() in _TRUE
+        except ValueError:
+            pass
+        raise ConfigError(self.name, text, self.allowed)
+
+    def read(self, text: str) -> Any:
+        """The value that a text means, checked.
+
+        :param text: as the user typed it.
+        :raises ConfigError: if it is none, or not allowed.
+        """
+        try:
+            return self.check(self.parse(text))
+        except ConfigError:
+            raise ConfigError(self.name, text, self.allowed) from None
+
+
+def setting(
+    default: Any,
+    help: str,
+    *,
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: Choices = (),
+    open_choices: bool = False,
+    changeable: bool = False,
+    custom: bool = False,
+    kind: str = "",
+    section: type[Settings] | None = None,
+    group: str = "",
+) -> Any:
+    """A field of a settings class. What the other parameters mean: :class:`Setting`.
+
+    :param default: its default value, :data:`REQUIRED`, or for a section None: its own defaults.
+    :param help: one line for the user.
+    :param kind: one of :data:`KINDS`; empty: what the field's annotation says.
+    :param group: heading in the documentation, for this field and those that follow.
+    """
+    if not isinstance(choices, tuple) and not callable(choices):
+        raise TypeError(f"choices: a tuple or a function, not {choices!r}")
+    metadata = {
+        "help": help,
+        "unit": unit,
+        "minimum": minimum,
+        "maximum": maximum,
+        "words": choices,
+        "open_choices": open_choices,
+        "changeable": changeable,
+        "custom": custom,
+        "kind": kind,
+        "section": section,
+        "group": group,
+    }
+    if isinstance(default, dict):
+        return dataclasses.field(default_factory=dict, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def nested(section: type[Settings], help: str, group: str = "") -> Any:
+    """A field that holds a section of settings, by default with that section's defaults.
+
+    :param section: its settings class.
+    :param help: one line for the user.
+    :param group: heading in the documentation.
+    """
+    metadata = {"help": help, "kind": "structure", "section": section, "group": group}
+    return dataclasses.field(default_factory=section, metadata=metadata)
+
+
+def settings_of(cls: type) -> tuple[Setting, ...]:
+    """The settings of a settings class, in the order of its fields.
+
+    :param cls: a dataclass whose fields are made with :func:`setting` or :func:`nested`.
+    """
+    found = _described.get(cls)
+    if found is None:
+        result: list[Setting] = []
+        for spec in dataclasses.fields(cls):
+            if spec.metadata:
+                result.append(_setting(spec, result[-1].group if result else ""))
+        found = _described[cls] = tuple(result)
+    return found
+
+
+_described: dict[type, tuple[Setting, ...]] = {}  # what settings_of has found, by class
+
+
+def _setting(spec: dataclasses.Field[Any], group: str) -> Setting:
+    meta, type_name = dict(spec.metadata), str(spec.type)
+    base = type_name.split("|")[0].strip()
+    kind = meta.pop("kind") or _KIND_OF_TYPE.get(base) or ("values" if base.startswith("Mapping") else "structure")
+    default: Any = None if spec.default is dataclasses.MISSING else spec.default
+    if spec.default_factory is not dataclasses.MISSING:
+        default = spec.default_factory()
+    required = spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING
+    meta["group"] = meta["group"] or group
+    return Setting(spec.name, kind, default, required=required, optional="None" in type_name, **meta)
+
+
+class Settings:
+    """Base of all settings classes.
+
+    :raises ConfigError: at creation, naming the field, the value and what is allowed.
+    """
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as plain values; :meth:`from_dict` reads them back."""
+        return {spec.name: _plain(getattr(self, spec.name)) for spec in settings_of(type(self))}
+
+    @classmethod
+    def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
+        """Builds settings from plain values.
+
+        :param values: names and values; settings that are left out keep their defaults.
+        :raises ConfigError: for unknown names and values that are not allowed.
+        """
+        return build(cls, values)
+
+
+def build(cls: type[T], values: Mapping[str, Any]) -> T:
+    """What :meth:`Settings.from_dict` does, for classes that read their values in a way of their own first.
+
+    :param cls: the settings class.
+    :param values: names and values.
+    :raises ConfigError: for unknown names and values that are not allowed.
+    """
+    known = {spec.name: spec for spec in settings_of(cls)}
+    given = dict(names_with_values(values, "settings"))
+    for name, value in given.items():
+        if name not in known:
+            raise ConfigError(str(name), value, "one of the settings " + ", ".join(known))
+        section = known[name].section
+        if section and isinstance(value, Mapping):
+            with named(name):
+                given[name] = section.from_dict(value)
+    for spec in known.values():
+        if spec.required and spec.name not in given:
+            raise ConfigError(spec.name, None, spec.allowed)
+    return cls(**given)
+
+
+def check(config: Any) -> None:
+    """Checks all settings of a settings object and stores them as :meth:`Setting.check` gives them.
+
+    :param config: the object, in its ``__post_init__``.
+    :raises ConfigError: naming the field, the value and what is allowed.
+    """
+    for spec in settings_of(type(config)):
+        if not spec.custom:
+            value = getattr(config, spec.name)
+            checked = spec.check(value)
+            if checked is not value:
+                object.__setattr__(config, spec.name, checked)
+
+
+@contextmanager
+def named(prefix: str) -> Iterator[None]:
+    """Errors of settings within are named with a prefix and a dot.
+
+    :param prefix: where the settings stand, as ``robots.cf3``.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{prefix}.{error.field}", error.value, error.allowed) from None
+
+
+def names_with_values(value: object, name: str) -> Mapping[str, Any]:
+    """The value, if it is a mapping.
+
+    :param value: what the user gave.
+    :param name: what it is called.
+    :raises ConfigError: if it is none.
+    """
+    if not isinstance(value, Mapping):
+        raise ConfigError(name, value, "names with values")
+    return value
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (str, int, float)) or value is None:
+        return value
+    if isinstance(value, Mapping):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value.to_dict() if hasattr(value, "to_dict") else value
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _checked_values(value: object, name: str) -> dict[str, float]:
+    values = names_with_values(value, name)
+    for key, number in values.items():
+        if not isinstance(key, str) or not _NAME.fullmatch(key):
+            raise ConfigError(name, key, "names of letters, digits, dots, dashes and underscores")
+        if not _is_number(number):
+            raise ConfigError(f"{name}.{key}", number, "a number")
+    return {key: float(number) for key, number in values.items()}
+
+
+def parse_values(text: str) -> dict[str, float]:
+    """Reads ``name=number, name=number``.
+
+    :raises ValueError: if it is not of this form.
+    """
+    result = {}
+    for part in filter(None, (piece.strip() for piece in text.split(","))):
+        name, equals, value = part.partition("=")
+        if not equals or not name.strip():
+            raise ValueError(part)
+        result[name.strip()] = float(value)
+    return result
+
+
+def format_values(values: Mapping[str, float]) -> str:
+    """The text that :func:`parse_values` reads back."""
+    return ", ".join(f"{name}={value!r}" for name, value in values.items())

@@ -1,0 +1,1 @@
+"""The link to one Crazyflie, over a radio or UDP: all that talks to cflib."""

@@ -1,0 +1,1 @@
+"""What a Crazyflie is told to fly: commands, paths, trajectories, and their limits."""

@@ -1,0 +1,1 @@
+"""The bridge to all Crazyflies of a swarm, as a node on the graph."""

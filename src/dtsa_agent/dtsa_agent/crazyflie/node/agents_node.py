@@ -1,0 +1,175 @@
+"""The same agents on vehicles that fly elsewhere: state from `/cfN/odom`, commands to `/cfN/cmd_velocity_world`.
+
+    python -m dtsa_agent.crazyflie.node.agents_node --ros-args -p agents:=12 -p policy:=lease ...
+
+The node is a `swarm_host` whose vehicles are flown by somebody else. Protocol, estimator and avoider are untouched:
+only the motion of the vehicles is not simulated (:mod:`dtsa_agent.crazyflie.node.external_vehicles`).
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dtsa_msgs.msg import Slot, VelocityWorld
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Empty
+
+from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins.unslotted import check_slotted
+from dtsa_agent.core.settings.declaration import Settings, setting
+from dtsa_agent.crazyflie.state.conversions import rotate
+from dtsa_agent.keys import with_key
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
+from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.ros.common.process.loop import Feed, Stop
+from dtsa_agent.ros.common.process.node_process import run_node
+from dtsa_agent.ros.common.process.priority import take_priority
+from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, OnePublisher, Unusable, check_odometry
+from dtsa_agent.ros.common.wire.slot_fields import SlotFields
+from dtsa_agent.ros.hosting import declare_swarm
+from dtsa_agent.ros.realtime import RealtimeNode
+from dtsa_agent.ros.swarm_node import parse_ids
+
+from .external_vehicles import ExternalVehicles
+
+LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+STALE_S = 0.3  # an agent that does not know where it is gives no commands: the bridge then holds its vehicle
+LONGEST_PREDICTION_S = 0.15
+STOP_HERE = "/all/stop_here"  # of the ground station: nobody flies on to its goal
+
+
+class StationNode(RealtimeNode):
+    """Agents that open their slots by the station's clock and whose vehicles are flown elsewhere.
+
+    :param node: the ROS node.
+    :param swarm: the agents that live here.
+    :param command_hz: rate of the commands, Hz; at most one a slot.
+    """
+
+    def __init__(self, node: Node, swarm: AbstractSwarm, *args: Any, command_hz: float, **more: Any) -> None:
+        every = max(1, round(1.0 / command_hz / swarm.config.slot_s))
+        self._vehicles = ExternalVehicles(swarm, every, self._command)
+        super().__init__(node, self._vehicles, *args, **more)
+        count = len(self.swarm.ids)
+        self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
+        self._measured = np.zeros((3, count))  # m, where each was by its last odometry
+        self._stamp = np.zeros(count)  # s, system clock, of that
+        self._inputs: list[Feed] = []
+        self._bridges: list[OnePublisher] = []  # who tells where each vehicle is
+        self._outputs = []
+        self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=self.membership.intake)
+        for agent in self.swarm.ids:
+            space = names.agent_namespace(agent, self._namespace)
+            topic = f"{space}/{names.ODOMETRY}"
+            self._inputs.append(Feed(node, Odometry, topic, LATEST, intake=self.membership.intake))
+            self._bridges.append(OnePublisher())
+            self._outputs.append(node.create_publisher(VelocityWorld, f"{space}/cmd_velocity_world", 1))
+
+    @property
+    def _blind(self) -> bool:
+        """Whether some agent does not know yet where it is."""
+        return bool(np.isinf(self._heard).any())
+
+    def _sense(self) -> None:
+        if self._stop_here.take() is not None:
+            self._vehicles.stop_here()
+        for index, feed in enumerate(self._inputs):
+            message = feed.take()
+            if message is not None:
+                with self.membership.intake.guard():
+                    self._check(index, message, feed)
+                    self._note(index, message)
+        # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
+        age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
+        self._vehicles.place(self._measured + self.swarm.velocity * age)
+
+    def _check(self, index: int, message: Odometry, feed: Feed) -> None:
+        """Whether odometry can be that of a vehicle, and of the bridge that has told of it so far.
+
+        :raises Unusable: if it cannot. Without any for a while the vehicle gets no commands, and the bridge holds it.
+        """
+        check_odometry(message)
+        if not self._bridges[index].admits(feed.number, time.monotonic(), feed.sender):
+            raise Unusable(OTHER_SENDER, f"odometry of cf{self.swarm.ids[index]} from two publishers")
+
+    def _note(self, index: int, message: Odometry) -> None:
+        place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
+        self._measured[:, index] = place.x, place.y, place.z
+        self._stamp[index] = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        # The twist of an odometry message is in the body's frame (REP-103).
+        self.swarm.velocity[:, index] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
+        self._heard[index] = time.monotonic()
+
+    def _command(self, velocities: NDArray[np.float64]) -> None:
+        """Publishes the commands to the vehicles, (3, L), m/s, frame map."""
+        now = time.monotonic()
+        message = VelocityWorld()
+        for index, publisher in enumerate(self._outputs):
+            if now - self._heard[index] < STALE_S:
+                v = message.vel
+                v.x, v.y, v.z = velocities[:, index].tolist()
+                publisher.publish(message)
+
+    def _prepare(self, message: SlotFields) -> bool:
+        self._sense()
+        if message.phase == Slot.PREPARE and self._blind:
+            return True
+        return super()._prepare(message)
+
+    def _open(self, slot: int) -> None:
+        self._sense()
+        super()._open(slot)
+
+
+@dataclass(frozen=True, slots=True)
+class StationNodeSettings(Settings):
+    """What the node needs beside what the whole swarm agrees on.
+
+    :raises ConfigError: for values that are not allowed.
+    """
+
+    command_hz: float = setting(50.0, "rate of the commands", unit="Hz", minimum=1, maximum=100)
+    priority: int = setting(0, "real-time priority; 0: none", minimum=0, maximum=90)
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    plain = {"start_parameter_services": False, "enable_rosout": False} if supervised else {}
+    node, space = swarm_wide_node("crazyflie_agents", plain)
+    try:
+        config = declare_swarm(node)
+        listed = ParameterDescriptor(description="ids of the agents in this process; [0]: all", read_only=True)
+        ids = [agent for agent in node.declare_parameter("ids", [0], listed).value if agent]
+        station = StationNodeSettings(**declare_settings(node, StationNodeSettings))
+        take_priority(station.priority)
+        ids = parse_ids(ids, config.agents)
+        zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
+        check_slotted(config.policy)
+        swarm = with_key(make_swarm(config, local=ids))
+        rate = station.command_hz
+        agents = StationNode(node, swarm, space, command_hz=rate, offset_ns=zero, drift_ppb=zero, align=False)
+        try:
+            agents.run(stop)
+        finally:
+            agents.loop.close()
+    finally:
+        node.destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node."""
+    return run_node("crazyflie_agents", _body, args, real_time=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,267 @@
+"""All Crazyflies of a swarm: connects them, watches over them, and lands them. Without ROS."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from dtsa_agent.crazyflie.links.emergency_radio import EmergencyRadio
+from dtsa_agent.crazyflie.links.link import require_cflib
+from dtsa_agent.crazyflie.links.ownership import Ownership
+from dtsa_agent.crazyflie.motion.limits import room_of
+from dtsa_agent.crazyflie.safety.landing_places import SINK, Descent, LandingPlaces, Other
+from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
+from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.settings.radio_budget import WATCHDOG_HZ, check_budget, radio_loads
+from dtsa_agent.crazyflie.state.conversions import VehicleState
+from dtsa_agent.crazyflie.state.state_machine import IN_AIR, State
+from dtsa_agent.crazyflie.vehicle.reports import snapshot, watched
+from dtsa_agent.crazyflie.vehicle.snapshot import Snapshot
+from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
+
+TICK_S = 0.02
+GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
+ON_GROUND = frozenset({State.DISCONNECTED, State.CONNECTING, State.READY, State.EMERGENCY})
+LAND_WAIT = frozenset({State.ARMED, State.FLYING, State.LANDING})
+
+
+class Bridge:
+    """The swarm. Its own thread applies the safety rules 50 times a second.
+
+    :param settings: robots and station.
+    :param log: called with a level (info, warn, error) and a line.
+    :param on_state: called with a vehicle and each new state of it, in a thread of the link's.
+    :param on_event: called with a vehicle's name (empty: all), the rule and the reason when a safety rule acts.
+    :raises ConfigError: cflib is missing, or the radios cannot carry the swarm.
+    """
+
+    def __init__(
+        self,
+        settings: SwarmSettings,
+        log: Callable[[str, str], None],
+        on_state: Callable[[Vehicle, VehicleState], None] | None = None,
+        on_event: Callable[[str, str, str], None] | None = None,
+    ) -> None:
+        self.settings = settings
+        station = settings.station
+        loads = radio_loads(settings.radio_rates())
+        for load in loads:
+            log("info" if load.fits else "warn", str(load))
+        wired = len(settings.robots) - sum(len(load.robots) for load in loads)
+        if wired:
+            log("info", f"{wired} Crazyflies without a radio (udp, usb): no budget")
+        check_budget(loads, force=station.force_budget)
+        require_cflib()
+        self._ownership = Ownership((robot.name, robot.uri) for robot in settings.robots)
+        self._log = log
+        self._on_event = on_event
+        cache = Path(
+            station.toc_cache or Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dtsa/crazyflie"
+        )
+        cache = cache.expanduser()
+        cache.mkdir(parents=True, exist_ok=True)
+        self._landing_places = LandingPlaces(*room_of(station))
+        self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state, self._descent) for r in settings.robots}
+        self.emergency = EmergencyRadio([r.uri for r in settings.robots], log)
+        self.monitor = SafetyMonitor(station.safety)
+        self._heartbeat: float | None = None
+        self._closing = threading.Event()
+        self._guard = threading.Thread(target=self._watch, name="safety", daemon=True)
+        self.slowest_tick = 0.0  # s, longest time between two applications of the rules
+        self._guard.start()
+
+    # -- connection -------------------------------------------------------------------------------------------------
+    def connect(self, names: Iterable[str] | None = None, stop: Callable[[], bool] = lambda: False) -> list[str]:
+        """Connect in parallel and wait; one that is missing does not keep the others.
+
+        :param names: whom; None: all.
+        :param stop: asked ten times a second; True ends the wait.
+        :return: names of those that are not connected.
+        """
+        vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
+        waiting = threading.Semaphore(0)
+        for vehicle in vehicles:
+            vehicle.connect(waiting.release)
+        for _ in vehicles:
+            while not (waiting.acquire(timeout=0.1) or stop()):
+                pass
+        return [v.name for v in vehicles if v.state in (State.DISCONNECTED, State.CONNECTING)]
+
+    @property
+    def connected(self) -> int:
+        """Number of connected Crazyflies."""
+        return sum(v.state not in (State.DISCONNECTED, State.CONNECTING) for v in self.vehicles.values())
+
+    def reconnect(self, name: str) -> str:
+        """Connect one again that is lost, disconnected or stopped; why not, or an empty text. Does not wait."""
+        vehicle = self.vehicles[name]
+        with vehicle.lock:
+            state, age = vehicle.state, vehicle.log_age(time.monotonic())
+            if state == State.LOST and age < GROUNDED_S:
+                return (
+                    f"{name} may still be in the air: wait until it was silent for {GROUNDED_S:g} s (now {age:.1f} s)"
+                )
+            if state not in (State.LOST, State.DISCONNECTED, State.EMERGENCY):
+                return f"{name} is {state.name.lower()}"
+            vehicle.connect(lambda: None)
+        return ""
+
+    # -- orders to several ------------------------------------------------------------------------------------------
+    def each(self, names: Iterable[str], order: Callable[[Vehicle], str | None]) -> tuple[bool, str]:
+        """Give an order to several; success and why not for those that refused.
+
+        With more than one name, those that are not there are skipped: one missing drone must not ground the swarm.
+        """
+        names = list(names)
+        problems = []
+        done = 0
+        for name in names:
+            vehicle = self.vehicles[name]
+            if len(names) > 1 and vehicle.state in (State.DISCONNECTED, State.CONNECTING, State.EMERGENCY, State.LOST):
+                problems.append(f"{name} skipped: {vehicle.standing}")
+                continue
+            problem = order(vehicle)
+            if problem:
+                problems.append(problem)
+            else:
+                done += 1
+        refused = [p for p in problems if " skipped: " not in p]
+        if problems:
+            self._log("warn", "; ".join(problems))
+        return done > 0 and not refused, "; ".join(problems)
+
+    def enough(self) -> str:
+        """Why the swarm may not take off; empty if it may."""
+        needed = self.settings.station.min_connected
+        usable = sum(v.state in (State.READY, State.ARMED, State.FLYING, State.LANDING) for v in self.vehicles.values())
+        if usable < needed:
+            return f"{usable} Crazyflies are usable, min_connected is {needed}"
+        return ""
+
+    def land_all(self, reason: str) -> None:
+        """Land whoever flies."""
+        for vehicle in self.vehicles.values():
+            if vehicle.state in (State.ARMED, State.FLYING):
+                vehicle.land(reason)
+
+    def _descent(self, vehicle: Vehicle, down_to: float, since: float) -> Descent:
+        now, places = time.monotonic(), self._landing_places
+        others = []
+        for v in self.vehicles.values():
+            place, state = v.known.whereabouts(now), v.state
+            if v is not vehicle and place is not None:
+                flies = state in IN_AIR or state == State.LOST
+                others.append(Other(v.name, place, flies, state == State.LANDING, places.goal(v.name)))
+        here = vehicle.known.whereabouts(now)
+        return SINK if here is None else places.descent(vehicle.name, here, others, since, now, down_to)
+
+    def stop_all(self, reason: str) -> None:
+        """Emergency stop of all."""
+        self._log("error", f"EMERGENCY STOP of all: {reason}")
+        self.emergency.stop_all()
+        for vehicle in self.vehicles.values():
+            vehicle.stop(reason)
+
+    def heartbeat(self) -> None:
+        """The ground station is alive. From the first one on its silence stops the swarm."""
+        self._heartbeat = time.monotonic()
+
+    def end_heartbeat(self) -> None:
+        """The ground station ends its watch in good order."""
+        self._heartbeat = None
+
+    # -- safety -----------------------------------------------------------------------------------------------------
+    def _watch(self) -> None:
+        last = time.monotonic()
+        keep_alive = last
+        while not self._closing.wait(TICK_S):
+            now = time.monotonic()
+            self.slowest_tick = max(self.slowest_tick, now - last)
+            last = now
+            vehicles = self.vehicles.values()
+            age = None if self._heartbeat is None else now - self._heartbeat
+            for verdict in self.monitor.check(now, [watched(v, now) for v in vehicles], age):
+                self._act(verdict, now)
+            for vehicle in vehicles:
+                vehicle.tick(now)
+            if now >= keep_alive:
+                keep_alive = now + 1.0 / WATCHDOG_HZ
+                for vehicle in vehicles:
+                    vehicle.keep_alive(now, self.settings.station.safety.emergency_watchdog)
+
+    def _act(self, verdict: Verdict, now: float) -> None:
+        level = "warn" if verdict.action in (Action.WARN, Action.HOLD) else "error"
+        self._log(level, f"{verdict.name or 'all'}: {verdict.rule}: {verdict.reason}: {verdict.action.value}")
+        if verdict.action is Action.STOP_ALL:
+            self.stop_all(verdict.reason)
+        else:
+            vehicle = self.vehicles[verdict.name]
+            if verdict.action is Action.WARN:
+                vehicle.action = verdict.reason
+            elif verdict.action is Action.HOLD:
+                vehicle.hold(verdict.reason, stale=True, until_seen=verdict.rule == "positions")
+            elif verdict.action is Action.LAND:
+                vehicle.land(verdict.reason)
+            elif verdict.action is Action.LOST:
+                vehicle.lose(verdict.reason, now)
+            elif verdict.action is Action.STOP:
+                vehicle.stop(verdict.reason)
+        if self._on_event is not None:
+            self._on_event(verdict.name, verdict.rule, verdict.reason)
+
+    # -- the end ----------------------------------------------------------------------------------------------------
+    def snapshots(self) -> list[Snapshot]:
+        """State of all."""
+        now = time.monotonic()
+        return [snapshot(v, now) for v in self.vehicles.values()]
+
+    def in_air(self, now: float) -> list[str]:
+        """Names of those whose link must not be closed now."""
+        return [
+            v.name
+            for v in self.vehicles.values()
+            if v.state in LAND_WAIT or (v.state == State.LOST and v.log_age(now) < GROUNDED_S and v.link.connected)
+        ]
+
+    def wait_landed(self, stop: Callable[[], bool]) -> list[str]:
+        """Wait until all stand, or the station's time for that is over.
+
+        :param stop: asked 50 times a second; True ends the wait at once.
+        :return: names of those that still fly.
+        """
+        end = time.monotonic() + self.settings.station.landing_timeout_s
+        while True:
+            now = time.monotonic()
+            flying = self.in_air(now)
+            for name in flying:  # armed on the ground: nothing to wait for but the lock of the motors
+                vehicle = self.vehicles[name]
+                if vehicle.state == State.ARMED:
+                    vehicle.arm(False)
+            if not flying or now > end or stop():
+                return flying
+            time.sleep(TICK_S)
+
+    def close(self) -> None:
+        """Close all links in parallel. Whoever still flies is stopped first: a closed link would let it fall anyway."""
+        flying = self.in_air(time.monotonic())
+        for name in flying:
+            self.vehicles[name].stop("the bridge ends")
+        self._closing.set()
+        self._guard.join(1.0)
+        guarded = [v.name for v in self.vehicles.values() if v.guarded]
+        if guarded:
+            self._log(
+                "info",
+                f"{', '.join(guarded)}: locked by the emergency watchdog within 1 s: restart before flying again",
+            )
+        for vehicle in self.vehicles.values():
+            vehicle.link.close()
+        deadline = time.monotonic() + 5.0
+        for vehicle in self.vehicles.values():
+            if not vehicle.link.join(max(0.0, deadline - time.monotonic())):
+                self._log("warn", f"{vehicle.name}: the link does not close")
+        self.emergency.close()
+        self._ownership.release()

@@ -1,0 +1,312 @@
+"""The bridge as a ROS node: `ros2 run dtsa_agent crazyflie_bridge --ros-args -p config:=swarm.yaml`.
+
+Topics and services have the names that Crazyswarm2's users know. The node is a thin shell: its start and end are here,
+what comes in and goes out is in `bridge_inputs` and `bridge_outputs`; everything that decides is in `bridge`, `vehicle`
+and `safety`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.declaration import named
+from dtsa_agent.crazyflie.positions.motion_capture import PositionSettings
+from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.crazyflie.settings.config import SwarmSettings, load_swarm
+from dtsa_agent.crazyflie.state.state_machine import State
+from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
+from dtsa_agent.ros.common.process.priority import stay_on_one_processor, take_priority
+from dtsa_agent.ros.common.process.serving import Serving
+from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+
+from .bridge import Bridge
+from .command_thread import CommandThread
+from .inputs import Inputs, helper_node
+from .outputs import Outputs
+from .position_inputs import subscribe_positions
+from .preflight import FAIL, preflight
+
+DTSA, CRAZYSWARM2 = "dtsa", "crazyswarm2"
+NODES = {DTSA: "crazyflie_bridge", CRAZYSWARM2: "crazyflie_server"}  # by the interfaces that are offered
+STATUS_HZ = 5.0
+SETTLE_S = 1.2  # of a check before flight
+SWITCH_S = 0.0005
+INTERFACES_DESCRIPTOR = ParameterDescriptor(
+    description="whose messages, names and units: dtsa or crazyswarm2", read_only=True, dynamic_typing=True
+)
+
+TELEOP_DESCRIPTOR = ParameterDescriptor(
+    description="name of the vehicle that a person steers by cmd_vel; empty: of none", read_only=True
+)
+
+
+def safety_parameters(node: Node, given: SafetySettings) -> SafetySettings:
+    """Declare one parameter a safety setting; a parameter that was set beats the YAML's value.
+
+    :raises ConfigError: a value is out of range.
+    """
+    values = declare_settings(node, SafetySettings, defaults=given.to_dict(), prefix="safety.")
+    with named("safety"):
+        return SafetySettings(**values)
+
+
+def position_parameters(node: Node, given: PositionSettings) -> PositionSettings:
+    """Declare one parameter a setting of motion capture; a parameter that was set beats the YAML's value.
+
+    :raises ConfigError: a value is out of range.
+    """
+    values = declare_settings(node, PositionSettings, defaults=given.to_dict(), prefix="positions.")
+    with named("positions"):
+        return PositionSettings(**values)
+
+
+def wanted_interfaces(argv: Sequence[str]) -> str:
+    """Whose messages, names and units the command line asks for; it says so before the node has its name.
+
+    :raises ConfigError: nobody's.
+    """
+    if not any("interfaces" in argument or "params-file" in argument for argument in argv):
+        return DTSA
+    probe = Node(NODES[DTSA], enable_rosout=False, start_parameter_services=False)
+    try:
+        value = probe.declare_parameter("interfaces", DTSA, INTERFACES_DESCRIPTOR).value
+    finally:
+        probe.destroy_node()
+    if value not in tuple(NODES):
+        raise ConfigError("interfaces", value, "one of " + ", ".join(NODES))
+    return str(value)
+
+
+def _load_crazyswarm2() -> Any:
+    """What offers Crazyswarm2's interfaces.
+
+    :raises ConfigError: its messages are not in the workspace.
+    """
+    from dtsa_agent.crazyflie.node.crazyswarm2.server import server
+
+    return server()
+
+
+class BridgeNode(Node):
+    """ROS side of the bridge.
+
+    :param config: the swarm's YAML; None: the node's parameter `config`.
+    :param interfaces: whose messages, names and units: `DTSA` or `CRAZYSWARM2`.
+    :raises ConfigError: the configuration is not usable, or the messages are not there.
+    """
+
+    def __init__(self, config: Path | None = None, interfaces: str = DTSA, **node_options: Any) -> None:
+        foreign = _load_crazyswarm2() if interfaces == CRAZYSWARM2 else None
+        super().__init__(NODES[interfaces], enable_rosout=False, **node_options)
+        self.declare_parameter("interfaces", interfaces, INTERFACES_DESCRIPTOR)
+        given = self.declare_parameter(
+            "config", str(config or ""), ParameterDescriptor(description="the swarm's YAML file", read_only=True)
+        ).value
+        if not given:
+            raise ConfigError("config", "", "the path of a swarm's YAML file")
+        settings = load_swarm(Path(given))
+        teleop = str(self.declare_parameter("teleop", "", TELEOP_DESCRIPTOR).value)
+        if teleop not in ("", *(robot.name for robot in settings.robots)):
+            raise ConfigError("teleop", teleop, "one of " + ", ".join(robot.name for robot in settings.robots))
+        safety = safety_parameters(self, settings.station.safety)
+        positions = position_parameters(self, settings.station.positions)
+        station = dataclasses.replace(settings.station, safety=safety, positions=positions)
+        self.settings = SwarmSettings(settings.robots, station)
+        self.outputs = Outputs(self, self.settings) if foreign is None else foreign.outputs(self, self.settings)
+        self._commands = helper_node(self, "commands")
+        self.command_thread = CommandThread(self._commands)
+        self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
+        self._inputs = (Inputs if foreign is None else foreign.inputs)(self, self.bridge, self.command_thread, self.say)
+        self._inputs.teleop = teleop
+        self._cameras = helper_node(self, "positions") if positions.on else None
+        self.positions = CommandThread(self._cameras) if self._cameras is not None else None
+        if self.positions is not None:
+            subscribe_positions(self.positions, positions, self.bridge.vehicles)
+
+    def close(self) -> None:
+        """End of what this node added to itself."""
+        self._inputs.close()
+        self.command_thread.close()
+        self._commands.destroy_node()
+        if self.positions is not None and self._cameras is not None:
+            self.positions.close()
+            self._cameras.destroy_node()
+        self.destroy_node()
+
+    def say(self, level: str, line: str) -> None:
+        """One line in the log, and on the topic of events."""
+        self.outputs.publish_event(level, line)
+        logger = self.get_logger()  # rclpy wants each place in the code to keep to one level
+        if level == "error":
+            logger.error(line)
+        elif level == "warn":
+            logger.warning(line)
+        else:
+            logger.info(line)
+
+    # -- connection -------------------------------------------------------------------------------------------------
+    def start(self, stop: Callable[[], bool] = lambda: False) -> str:
+        """Connect all, then offer topics and services; why the swarm cannot fly, or an empty text.
+
+        :param stop: asked ten times a second; True ends the wait for the connections.
+        """
+        began = time.monotonic()
+        if self.positions is not None:
+            self.positions.start()
+        missing = self.bridge.connect(stop=stop)
+        if stop():
+            return "interrupted while connecting"
+        total = len(self.bridge.vehicles)
+        self.say("info", f"{total - len(missing)} of {total} connected in {time.monotonic() - began:.2f} s")
+        if missing:
+            self.say("warn", f"not connected: {', '.join(missing)} (service reconnect)")
+        if self.bridge.connected < self.settings.station.min_connected:
+            return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
+        self._inputs.offer()
+        self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.snapshots()))
+        self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.snapshots()))
+        return ""
+
+
+class _Interrupts:
+    """The first Ctrl-C (or SIGTERM, or a terminal that is closed) lands all; one more Ctrl-C is the emergency stop.
+
+    Only that: who starts processes, like `ros2 launch`, sends SIGTERM to those that take long to end.
+    Signals may come at once. A handler that interrupts another one must not wait for a lock that this one holds, as
+    that of `threading.Event` does: the bridge would stand still, and nobody would land.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._come: SimpleQueue[int] = SimpleQueue()  # its `put` may interrupt itself
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup wants it to go on
+                signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: object) -> None:
+        if number == signal.SIGINT or not self.count:
+            self.count += 1
+        self._come.put(number)
+
+    def any(self) -> bool:
+        """Whether a signal has come."""
+        return self.count > 0
+
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Wait for a signal, unless one has come.
+
+        :param timeout_s: s at most; None: as long as it takes.
+        """
+        if not self.any():
+            with suppress(Empty):
+                self._come.get(timeout=timeout_s)
+
+
+def run_node(node: BridgeNode) -> int:
+    """Spin until Ctrl-C, then land all and close; exit code."""
+    interrupts = _Interrupts()
+    # Several threads a Crazyflie share one interpreter; a command that waits for its turn shall not wait 5 ms.
+    sys.setswitchinterval(SWITCH_S)
+    level = node.settings.station.priority
+    if level and (problem := take_priority(level)):
+        node.say("warn", f"no real-time priority ({problem}): keep this station free of other work")
+    elif level:
+        stay_on_one_processor()
+    problem = node.start(interrupts.any)
+    if problem:
+        node.say("error", problem)
+        node.bridge.close()
+        return 1
+    serving = Serving(node.context, "executor", node)
+    serving.start()
+    node.say("info", "ready; Ctrl-C lands all, a second one stops all motors")
+    interrupts.wait()
+    code = _end(node, interrupts)
+    serving.close()
+    return code
+
+
+def check_node(node: BridgeNode, say: Callable[[str], None]) -> int:
+    """Connect, look at everything that a flight needs, and close; exit code 1 if something is missing.
+
+    No motor turns, and the emergency watchdog is not fed: afterwards everybody can fly as before.
+    """
+    interrupts = _Interrupts()
+    level = node.settings.station.priority
+    problem = take_priority(level) if level else ""
+    if node.positions is not None:
+        node.positions.start()
+    node.bridge.connect(stop=interrupts.any)
+    interrupts.wait(SETTLE_S)  # rates and qualities are counted over a second
+    firmware = {v.name: v.link.firmware for v in node.bridge.vehicles.values() if v.link.firmware is not None}
+    findings = preflight(node.settings, node.bridge.snapshots(), firmware, problem)
+    node.bridge.close()
+    for finding in findings:
+        say(str(finding))
+    return int(any(finding.level == FAIL for finding in findings))
+
+
+def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
+    bridge = node.bridge
+    bridge.end_heartbeat()  # from here on the bridge alone brings them down
+    flying = first = bridge.in_air(time.monotonic())
+    if flying:
+        node.say("warn", f"landing {', '.join(flying)}; Ctrl-C again stops all motors")
+        bridge.land_all("the bridge ends")
+        flying = bridge.wait_landed(lambda: interrupts.count > 1)
+    if interrupts.count > 1:
+        bridge.stop_all("second Ctrl-C")
+        time.sleep(0.3)  # three packets a vehicle, then the links may close
+    elif flying:
+        node.say("error", f"still flying: {', '.join(flying)}")
+    lost = [name for name in first if name not in flying and bridge.vehicles[name].state == State.LOST]
+    if lost:
+        node.say("error", f"not known to have landed: {', '.join(lost)}")
+    bridge.close()
+    return 0 if interrupts.count == 1 and not (flying or lost) else 1
+
+
+def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = run_node) -> int:
+    """Entry point of the executable `crazyflie_bridge`.
+
+    :param use: what is done with the node; returns the exit code.
+    """
+    argv = list(sys.argv if args is None else args)
+    follow_supervisor()
+    limit_to_machine(os.environ, shared_memory=False)
+    try:
+        init_ros(argv)
+    except Exception as error:  # rclpy's errors for a wrong command line have no common base
+        print(f"crazyflie_bridge: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 2
+    node = None
+    try:
+        node = BridgeNode(interfaces=wanted_interfaces(argv))
+        code = use(node)
+    except ConfigError as error:
+        print(f"crazyflie_bridge: {error}", file=sys.stderr)
+        code = 2
+    finally:
+        if node is not None:
+            node.close()
+        rclpy.try_shutdown()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The safety rules, and where those that land come down. Pure."""

@@ -1,0 +1,261 @@
+"""The safety rules. Pure: what is known about all vehicles goes in, what must be done comes out.
+
+| rule | what it watches | what it does |
+|---|---|---|
+| geofence | a flying vehicle outside the box | land it; farther out than `geofence_hard_m`: stop its motors |
+| battery | voltage below a limit for `battery_s` | warn; below the critical limit: land |
+| link | age of the last log packet in flight | declare it lost, order a landing blindly |
+| commands | age of the last streamed command | hold the place, then land |
+| heartbeat | the ground station's heartbeat, once heard | stop all motors |
+| positions | age of the last pose from motion capture in flight | hold the place, then land |
+| estimate | where a flying vehicle believes to be, if that cannot be | stop where it is, then sink |
+| distance | two flying vehicles too close | land both |
+| supervisor | tumbled, crashed, locked | stop sending to it |
+
+A rule speaks once when it begins to apply, and again only after it has ceased to.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.declaration import Settings, check, setting
+from dtsa_agent.crazyflie.state.conversions import Vector, outside_by
+from dtsa_agent.crazyflie.state.state_machine import IN_AIR, State
+
+ESTIMATE_HOLD_S = 1.0  # a vehicle whose estimate is wrong stands still that long, then it sinks
+
+
+class Action(enum.Enum):
+    """What has to be done."""
+
+    WARN = "warn"
+    HOLD = "hold"
+    LAND = "land"
+    LOST = "lost"
+    STOP = "stop"  # this vehicle's motors
+    STOP_ALL = "stop all"
+
+
+@dataclass(frozen=True, slots=True)
+class SafetySettings(Settings):
+    """Limits of all rules.
+
+    :raises ConfigError: a value is out of range.
+    """
+
+    geofence: bool = setting(True, "watch that no vehicle leaves the box")
+    geofence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
+    geofence_max: Vector = setting((1.5, 2.3, 0.95), "upper corner of the box, frame map", unit="m")
+    geofence_tolerance_m: float = setting(
+        0.05, "measuring error that the fence lets pass", unit="m", minimum=0, maximum=1
+    )
+    geofence_hard_m: float = setting(
+        0.8, "this far outside the motors are stopped", unit="m", minimum=0.05, maximum=100
+    )
+    battery: bool = setting(True, "watch the batteries")
+    battery_s: float = setting(1.0, "how long the voltage must be low", unit="s", minimum=0, maximum=60)
+    link_age_s: float = setting(
+        0.5, "silence that makes a flying vehicle lost; 0: never", unit="s", minimum=0, maximum=10
+    )
+    command_age_s: float = setting(
+        0.25, "age of the streamed command at which the place is held; 0: never", unit="s", minimum=0, maximum=0.45
+    )
+    command_land_s: float = setting(
+        3.0, "age of the streamed command at which the vehicle lands", unit="s", minimum=0.1, maximum=600
+    )
+    heartbeat_s: float = setting(
+        1.0,
+        "silence of the ground station, once heard, that stops all motors; 0: never",
+        unit="s",
+        minimum=0,
+        maximum=60,
+    )
+    min_distance_m: float = setting(
+        0.15, "two flying vehicles closer than this land; 0: never", unit="m", minimum=0, maximum=10
+    )
+    position_age_s: float = setting(
+        0.3, "age of the last pose from motion capture at which the place is held; 0: never",
+        unit="s", minimum=0, maximum=10,
+    )  # fmt: skip
+    position_land_s: float = setting(
+        1.0, "age of the last pose from motion capture at which the vehicle lands", unit="s", minimum=0.05, maximum=60
+    )
+    estimate_jump_m: float = setting(
+        0.5, "an estimate that moves so far at once, its velocity apart, is wrong; 0: never",
+        unit="m", minimum=0, maximum=100,
+    )  # fmt: skip
+    estimate_freeze_s: float = setting(
+        0.5, "an estimate that does not change at all for so long in flight is wrong; 0: never",
+        unit="s", minimum=0, maximum=60,
+    )  # fmt: skip
+    estimate_error_m: float = setting(
+        0.4, "an estimate so far from where motion capture sees the vehicle is wrong; 0: never",
+        unit="m", minimum=0, maximum=100,
+    )  # fmt: skip
+    emergency_watchdog: bool = setting(True, "the firmware stops the motors 1 s after it last heard the bridge")
+
+    def __post_init__(self) -> None:
+        check(self)
+        for axis, low, high in zip("xyz", self.geofence_min, self.geofence_max, strict=True):
+            if low >= high:
+                raise ConfigError("geofence_min", list(self.geofence_min), f"below geofence_max in {axis}")
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """What the rules need to know about one vehicle."""
+
+    name: str
+    state: State
+    position: Vector | None  # m, map
+    battery: float  # V
+    battery_warning: float  # V
+    battery_critical: float  # V
+    log_age: float  # s; infinite before the first packet
+    command_age: float | None  # s since the last streamed command; None: high-level commands are in charge
+    position_age: float | None = None  # s since motion capture saw it; None: there is no motion capture
+    wrong: str = ""  # what is wrong with its estimate; empty: nothing
+    wrong_s: float = 0.0  # s, for how long
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Something has to be done."""
+
+    name: str  # the vehicle; empty: all
+    action: Action
+    rule: str
+    reason: str
+
+
+class SafetyMonitor:
+    """Applies the rules again and again.
+
+    :param settings: limits.
+    """
+
+    def __init__(self, settings: SafetySettings) -> None:
+        self.settings = settings
+        self._active: set[tuple[str, str]] = set()
+        self._low_since: dict[tuple[str, str], float] = {}
+
+    def check(self, now: float, vehicles: Sequence[Watched], heartbeat_age: float | None) -> list[Verdict]:
+        """What has to be done now.
+
+        :param now: s, monotonic.
+        :param heartbeat_age: s since the ground station's last heartbeat; None: it has never been heard.
+        """
+        found: list[Verdict] = []
+        for vehicle in vehicles:
+            found += self._fence(vehicle)
+            found += self._battery(now, vehicle)
+            found += self._link(vehicle)
+            found += self._commands(vehicle)
+            found += self._positions(vehicle)
+            found += self._estimate(vehicle)
+        found += self._distance(vehicles)
+        found += self._heartbeat(vehicles, heartbeat_age)
+        keys = {(v.name, v.rule + v.action.value) for v in found}
+        fresh = [v for v in found if (v.name, v.rule + v.action.value) not in self._active]
+        self._active = keys
+        return fresh
+
+    def _fence(self, v: Watched) -> list[Verdict]:
+        s = self.settings
+        if not s.geofence or v.state not in IN_AIR or v.position is None:
+            return []
+        worst, axis = max(outside_by(v.position, s.geofence_min, s.geofence_max))
+        if worst <= s.geofence_tolerance_m:
+            return []
+        where = ", ".join(f"{p:.2f}" for p in v.position)
+        reason = f"{worst:.2f} m outside the geofence in {axis} at ({where})"
+        verdicts = [Verdict(v.name, Action.LAND, "geofence", reason)] if v.state != State.LANDING else []
+        if worst > s.geofence_hard_m:
+            verdicts.append(Verdict(v.name, Action.STOP, "geofence", reason))
+        return verdicts
+
+    def _battery(self, now: float, v: Watched) -> list[Verdict]:
+        verdicts = []
+        for level, limit, action in (
+            ("warning", v.battery_warning, Action.WARN),
+            ("critical", v.battery_critical, Action.LAND),
+        ):
+            key = (v.name, level)
+            if not self.settings.battery or v.state in (State.DISCONNECTED, State.CONNECTING) or v.battery >= limit:
+                self._low_since.pop(key, None)
+                continue
+            since = self._low_since.setdefault(key, now)
+            if now - since >= self.settings.battery_s and (action is Action.WARN or v.state == State.FLYING):
+                reason = f"battery {v.battery:.2f} V, {level} limit {limit:.2f} V"
+                verdicts.append(Verdict(v.name, action, "battery", reason))
+        return verdicts
+
+    def _link(self, v: Watched) -> list[Verdict]:
+        limit = self.settings.link_age_s
+        if not limit or v.state in (State.DISCONNECTED, State.CONNECTING) or v.log_age <= limit:
+            return []
+        return [Verdict(v.name, Action.LOST, "link", f"no log packet for {v.log_age:.2f} s (limit {limit:.2f} s)")]
+
+    def _commands(self, v: Watched) -> list[Verdict]:
+        s = self.settings
+        return _waiting(v, v.command_age, s.command_age_s, s.command_land_s, "commands", "no command")
+
+    def _positions(self, v: Watched) -> list[Verdict]:
+        s = self.settings
+        what = "not seen by motion capture"
+        return _waiting(v, v.position_age, s.position_age_s, s.position_land_s, "positions", what)
+
+    def _estimate(self, v: Watched) -> list[Verdict]:
+        if not v.wrong or v.state not in IN_AIR:
+            return []
+        if v.state == State.LANDING:
+            return [Verdict(v.name, Action.LAND, "estimate", v.wrong)]
+        verdicts = [Verdict(v.name, Action.HOLD, "estimate", v.wrong)]
+        if v.wrong_s > ESTIMATE_HOLD_S:
+            verdicts.append(Verdict(v.name, Action.LAND, "estimate", v.wrong))
+        return verdicts
+
+    def _distance(self, vehicles: Sequence[Watched]) -> list[Verdict]:
+        limit = self.settings.min_distance_m
+        if not limit:
+            return []
+        flying = [v for v in vehicles if v.state in IN_AIR and v.position is not None]
+        verdicts = []
+        for i, a in enumerate(flying):
+            for b in flying[i + 1 :]:
+                distance = math.dist(a.position, b.position)  # type: ignore[arg-type]
+                if distance < limit:
+                    for one, other in ((a, b), (b, a)):
+                        reason = f"{distance:.2f} m from {other.name} (limit {limit:.2f} m)"
+                        if one.state == State.FLYING:
+                            verdicts.append(Verdict(one.name, Action.LAND, "distance", reason))
+        return verdicts
+
+    def _heartbeat(self, vehicles: Sequence[Watched], age: float | None) -> list[Verdict]:
+        limit = self.settings.heartbeat_s
+        if not limit or age is None or age <= limit:
+            return []
+        if not any(v.state in (State.ARMED, State.FLYING, State.LANDING, State.LOST) for v in vehicles):
+            return []
+        return [Verdict("", Action.STOP_ALL, "heartbeat", f"no heartbeat of the ground station for {age:.2f} s")]
+
+
+def _waiting(v: Watched, age: float | None, hold_s: float, land_s: float, rule: str, what: str) -> list[Verdict]:
+    """What to do with one that flies and waits for something.
+
+    :param age: s, since it came last; None: never.
+    :param hold_s: age at which it is held; 0: never. :param land_s: age at which it lands.
+    :param rule: the rule's name. :param what: what is missing.
+    """
+    if not hold_s or age is None or v.state != State.FLYING or age <= hold_s:
+        return []
+    reason = f"{what} for {age:.2f} s"
+    verdicts = [Verdict(v.name, Action.HOLD, rule, reason)]
+    if age > land_s:
+        verdicts.append(Verdict(v.name, Action.LAND, rule, reason))
+    return verdicts

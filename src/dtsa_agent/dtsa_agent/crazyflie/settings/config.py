@@ -1,0 +1,335 @@
+"""The swarm's YAML: robots, their types, and what holds for all. A robot's value beats its type's, which beats `all`.
+
+robots:
+  cf1: {uri: radio://0/80/2M/E7E7E7E701, initial_position: [1.2, 0.0, 0.0], type: cf21}
+robot_types:
+  cf21: {battery: {voltage_warning: 3.4, voltage_critical: 3.2}}
+all:
+  firmware_params: {stabilizer: {estimator: 2}}
+station:
+  min_connected: 10
+  safety: {geofence_max: [1.5, 2.3, 0.95]}
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting, settings_of
+from dtsa_agent.crazyflie.positions.motion_capture import PositionSettings
+from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.crazyflie.state.conversions import Vector
+
+from .radio_budget import radio_of
+
+NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*?(\d+)$")
+CHANNEL = re.compile(r"radio://[^/]+/(\d+)")
+PORT = re.compile(r"udp://.*:(\d+)$")
+VARIABLE = re.compile(r"^\w+\.\w+$")
+LAST_CHANNEL, LAST_PORT = 125, 65535
+SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
+# Keys that Crazyswarm2's files have and that mean nothing here: its files can be used as they are.
+IGNORED = frozenset({"motion_capture", "big_quad", "reference_frame", "broadcasts", "marker"})
+LOGGING = ("enabled", "default_topics", "custom_topics")
+
+
+@dataclass(frozen=True, slots=True)
+class BatterySettings(Settings):
+    """Voltages of a battery in flight.
+
+    :raises ConfigError: a value is out of range.
+    """
+
+    voltage_warning: float = setting(3.4, "warning below this", unit="V", minimum=2.0, maximum=5.0)
+    voltage_critical: float = setting(3.2, "landing below this", unit="V", minimum=2.0, maximum=5.0)
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.voltage_critical > self.voltage_warning:
+            allowed = f"at most voltage_warning, {self.voltage_warning} V"
+            raise ConfigError("voltage_critical", self.voltage_critical, allowed)
+
+
+@dataclass(frozen=True, slots=True)
+class LogTopic:
+    """Variables of the firmware that are published together."""
+
+    name: str
+    frequency: float  # Hz
+    variables: tuple[str, ...]  # group.name
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSettings(Settings):
+    """One Crazyflie.
+
+    :raises ConfigError: a value is out of range.
+    """
+
+    name: str = setting(REQUIRED, "key of the robot: letters, then the agent's id")
+    id: int = setting(REQUIRED, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
+    uri: str = setting(REQUIRED, "the Crazyflie's address, such as radio://0/80/2M/E7E7E7E701", custom=True)
+    enabled: bool = setting(True, "false: it takes no part")
+    type: str = setting("", "one of robot_types, whose values it takes over")
+    group_mask: int = setting(
+        0, "groups that it belongs to, a bit each: services with a group_mask reach those that share a bit with it",
+        minimum=0, maximum=255,
+    )  # fmt: skip
+    initial_position: Vector = setting(
+        (0.0, 0.0, 0.0), "place at the start, in the Crazyflies' own world (z = 0 is the floor)", unit="m"
+    )
+    command_rate_hz: float = setting(50.0, "rate of the streamed commands", unit="Hz", minimum=1, maximum=100)
+    log_rate_hz: float = setting(50.0, "rate of the state log", unit="Hz", minimum=4, maximum=100)
+    connect_timeout_s: float = setting(
+        20.0,
+        "time for one attempt to connect; a first connection over the air reads the tables of variables",
+        unit="s",
+        minimum=0.2,
+        maximum=300,
+    )
+    connect_attempts: int = setting(
+        3,
+        "attempts to connect; before the first one counts, a closed UDP port is asked for up to 10 s",
+        minimum=1,
+        maximum=100,
+    )
+    estimator_timeout_s: float = setting(10.0, "time for the estimator to settle", unit="s", minimum=0.1, maximum=300)
+    estimator_variance_m2: float = setting(
+        0.01,
+        "largest variance of a settled estimator without motion capture; a Flow deck alone, which knows no place, "
+        "stays at 100",
+        unit="m²",
+        minimum=1e-6,
+        maximum=1000,
+    )
+    reset_estimator: bool = setting(True, "restart the Kalman filter and wait until it has settled")
+    battery: BatterySettings = nested(BatterySettings, "voltages in flight")
+    firmware_params: Mapping[str, float] = setting(
+        {}, "parameters of the firmware, {group: {name: value}}, set after connecting", custom=True
+    )
+    firmware_logging: Mapping[str, LogTopic] = setting(
+        {},
+        "topics with variables of the firmware, {custom_topics: {name: {frequency: Hz, vars: [group.name]}}}; "
+        "with Crazyswarm2's interfaces only",
+        custom=True,
+        kind="structure",
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+        object.__setattr__(self, "uri", str(self.uri))
+        radio_of(self.uri)
+        _check_numbers(self.uri)
+        object.__setattr__(self, "firmware_params", _params(self.firmware_params))
+        object.__setattr__(self, "firmware_logging", _log_topics(self.firmware_logging))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as a swarm's YAML has them under the robot's name, which says the id as well."""
+        result = {spec.name: getattr(self, spec.name) for spec in settings_of(RobotSettings)}
+        del result["name"], result["id"]
+        groups: dict[str, dict[str, float]] = {}
+        for name, value in self.firmware_params.items():
+            group, _, parameter = name.partition(".")
+            groups.setdefault(group, {})[parameter] = value
+        topics = {t.name: {"frequency": t.frequency, "vars": list(t.variables)} for t in self.firmware_logging.values()}
+        return {
+            **result,
+            "initial_position": list(self.initial_position),
+            "battery": self.battery.to_dict(),
+            "firmware_params": groups,
+            "firmware_logging": {"custom_topics": topics},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class StationSettings(Settings):
+    """The ground station.
+
+    :raises ConfigError: a value is out of range.
+    """
+
+    min_connected: int = setting(
+        1,
+        "fewer usable Crazyflies than this: the bridge ends (exit code 1), nobody takes off",
+        minimum=1,
+        maximum=1000,
+    )
+    room_origin_in_world: Vector = setting(
+        (0.0, 0.0, 0.95),
+        "where the Crazyflies' world sees the origin of the frame map, the room's centre",
+        unit="m",
+    )
+    force_budget: bool = setting(False, "fly although the radios cannot carry it")
+    toc_cache: str = setting("", "folder of the tables of variables; empty: ~/.cache/dtsa/crazyflie")
+    land_speed_mps: float = setting(
+        0.4, "mean speed of a landing without a duration", unit="m/s", minimum=0.05, maximum=2
+    )
+    max_speed_mps: float = setting(
+        1.2, "largest speed on the way of a take-off, a go_to or a landing", unit="m/s", minimum=0.1, maximum=10
+    )
+    max_stream_mps: float = setting(
+        3.0, "streamed commands that are faster are refused", unit="m/s", minimum=0.1, maximum=30
+    )
+    landing_timeout_s: float = setting(
+        20.0, "longest wait for all to land at the end", unit="s", minimum=1, maximum=300
+    )
+    priority: int = setting(
+        20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
+    )
+    positions: PositionSettings = nested(PositionSettings, "positions from motion capture")
+    safety: SafetySettings = nested(SafetySettings, "the safety rules")
+
+
+@dataclass(frozen=True, slots=True)
+class SwarmSettings:
+    """Everything in the swarm's YAML."""
+
+    robots: tuple[RobotSettings, ...]  # the enabled ones, by id
+    station: StationSettings
+
+    def radio_rates(self) -> list[tuple[str, str, float, float]]:
+        """Name, URI, packets/s to and log packets/s from each robot: what `radio_loads` counts."""
+        positions = self.station.positions.max_rate_hz if self.station.positions.on else 0.0
+        return [(r.name, r.uri, r.command_rate_hz + positions, r.log_rate_hz) for r in self.robots]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The contents of a swarm's YAML; :func:`parse_swarm` reads them back."""
+        return {
+            "robots": {robot.name: robot.to_dict() for robot in self.robots},
+            "robot_types": {robot.type: {} for robot in self.robots if robot.type},
+            "station": self.station.to_dict(),
+        }
+
+
+def load_swarm(path: Path) -> SwarmSettings:
+    """Read and check a swarm's YAML.
+
+    :raises ConfigError: the file cannot be read, or something in it is not usable.
+    """
+    from dtsa_agent.yaml_file import read_yaml
+
+    return parse_swarm(read_yaml(path, "config"))
+
+
+def parse_swarm(data: object) -> SwarmSettings:
+    """Settings from the contents of a swarm's YAML.
+
+    :raises ConfigError: something in it is not usable.
+    """
+    top = _mapping("config", data)
+    for key in top:
+        if key not in SECTIONS and key not in IGNORED:
+            raise ConfigError(f"config.{key}", top[key], "one of " + ", ".join(SECTIONS))
+    types = _mapping("robot_types", top.get("robot_types"))
+    common = _mapping("all", top.get("all"))
+    robots = []
+    for name, own in _mapping("robots", top.get("robots")).items():
+        robots.append(_robot(str(name), _mapping(f"robots.{name}", own), types, common))
+    robots = sorted((r for r in robots if r.enabled), key=lambda r: r.id)
+    if not robots:
+        raise ConfigError("robots", [], "at least one robot that is enabled")
+    numbers: dict[int, str] = {}
+    uris: dict[str, str] = {}
+    for robot in robots:
+        link = robot.uri.partition("?")[0]
+        if link in uris:
+            raise ConfigError(f"robots.{robot.name}.uri", robot.uri, f"a URI of its own ({uris[link]} has it)")
+        uris[link] = robot.name
+        if robot.id in numbers:
+            raise ConfigError(f"robots.{robot.name}", robot.id, f"a number of its own ({numbers[robot.id]} has it)")
+        numbers[robot.id] = robot.name
+    with named("station"):
+        station = StationSettings.from_dict(_used(_mapping("station", top.get("station"))))
+    if station.min_connected > len(robots):
+        raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(robots)}, the enabled robots")
+    return SwarmSettings(tuple(robots), station)
+
+
+def _check_numbers(uri: str) -> None:
+    """Channel and port of an address.
+
+    :raises ConfigError: there is no such channel or port.
+    """
+    channel, port = CHANNEL.match(uri), PORT.match(uri)
+    if channel is not None and int(channel[1]) > LAST_CHANNEL:
+        raise ConfigError("uri", uri, f"a channel from 0 to {LAST_CHANNEL}")
+    if port is not None and not 1 <= int(port[1]) <= LAST_PORT:
+        raise ConfigError("uri", uri, f"a port from 1 to {LAST_PORT}")
+
+
+def _mapping(field: str, value: object) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise ConfigError(field, value, "a mapping of names to values")
+    return value
+
+
+def _used(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What is not ignored; an empty section is one that was left out."""
+    return {key: value for key, value in values.items() if key not in IGNORED and value is not None}
+
+
+def _merge(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested mappings, `high` beats `low`."""
+    result = dict(low)
+    for key, value in high.items():
+        both = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = _merge(result[key], value) if both else value
+    return result
+
+
+def _robot(name: str, own: dict[str, Any], types: dict[str, Any], common: dict[str, Any]) -> RobotSettings:
+    match = NAME.match(name)
+    if match is None:
+        raise ConfigError("robots", name, "names such as cf3: letters, then the agent's number")
+    kind = own.get("type", "")
+    if kind and kind not in types:
+        allowed = "one of robot_types: " + (", ".join(map(str, types)) or "(there are none)")
+        raise ConfigError(f"robots.{name}.type", kind, allowed)
+    merged = _used(_merge(_merge(common, _mapping(f"robot_types.{kind}", types.get(kind))), own))
+    with named(f"robots.{name}"):
+        for key in ("name", "id"):
+            if key in merged:
+                raise ConfigError(key, merged[key], "nothing: the robot's key says it")
+        return build(RobotSettings, {**merged, "name": name, "id": int(match[1])})
+
+
+def _params(groups: object) -> dict[str, float]:
+    """Parameters of the firmware as `group.name`; they stay whole numbers where they are."""
+    result: dict[str, float] = {}
+    for group, names in _mapping("firmware_params", groups).items():
+        for name, value in _mapping(f"firmware_params.{group}", names).items():
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise ConfigError(f"firmware_params.{group}.{name}", value, "a number")
+            result[f"{group}.{name}"] = value
+    return result
+
+
+def _log_topics(given: object) -> dict[str, LogTopic]:
+    """The topics in a robot's `firmware_logging`, by their names; its default topics are always there."""
+    logging = _mapping("firmware_logging", given)
+    if logging and all(isinstance(topic, LogTopic) for topic in logging.values()):
+        return logging
+    for key in logging:
+        if key not in LOGGING:
+            raise ConfigError(f"firmware_logging.{key}", logging[key], "one of " + ", ".join(LOGGING))
+    if logging.get("enabled", True) is False:
+        return {}
+    result = {}
+    for name, topic in _mapping("firmware_logging.custom_topics", logging.get("custom_topics")).items():
+        field = f"firmware_logging.custom_topics.{name}"
+        own = _mapping(field, topic)
+        frequency, variables = own.get("frequency"), own.get("vars")
+        if isinstance(frequency, bool) or not isinstance(frequency, (int, float)) or not 0.4 <= frequency <= 100:
+            raise ConfigError(f"{field}.frequency", frequency, "a rate from 0.4 to 100 Hz")
+        if not isinstance(variables, list) or not variables or not all(VARIABLE.match(str(v)) for v in variables):
+            raise ConfigError(f"{field}.vars", variables, "a list of variables, group.name")
+        result[str(name)] = LogTopic(str(name), float(frequency), tuple(map(str, variables)))
+    return result

@@ -1,0 +1,1 @@
+"""What is said of a Crazyflie: values with units and frames, and the states that it goes through."""

@@ -1,0 +1,129 @@
+"""ROS parameters made from the settings classes: name, description, range and default stand there, once."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.declaration import Setting, Settings, format_values, settings_of
+
+_UNBOUNDED = 2.0**62
+_NOTHING = -1  # stands for None in a parameter that may be left open
+
+
+def descriptor(setting: Setting, read_only: bool) -> ParameterDescriptor:
+    """The description that ``ros2 param describe`` shows.
+
+    :param setting: the setting.
+    :param read_only: whether it is fixed once the node runs.
+    """
+    result = ParameterDescriptor(description=setting.description, read_only=read_only)
+    low = -_UNBOUNDED if setting.minimum is None else setting.minimum
+    high = _UNBOUNDED if setting.maximum is None else setting.maximum
+    if setting.optional:
+        low = _NOTHING
+        result.description += f"; {_NOTHING}: the default"
+    if setting.kind == "int":
+        result.integer_range = [IntegerRange(from_value=int(low), to_value=min(int(high), 2**63 - 1), step=0)]
+    elif setting.kind == "float":
+        result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)]
+        result.dynamic_typing = True  # `-p slot_ms:=10` shall do as well as 10.0
+    elif setting.kind == "vector":
+        result.dynamic_typing = True
+        result.additional_constraints = setting.allowed
+    elif setting.choices:
+        result.additional_constraints = "one of: " + ", ".join(setting.choices)
+    return result
+
+
+def declare_settings(
+    node: Node,
+    cls: type[Settings],
+    skip: Iterable[str] = (),
+    changeable: bool = False,
+    defaults: Mapping[str, Any] | None = None,
+    prefix: str = "",
+) -> dict[str, Any]:
+    """Declares a parameter for every setting of a settings class and gives the values that the node was started with.
+
+    :param node: the node.
+    :param cls: the settings class.
+    :param skip: fields that become no parameter.
+    :param changeable: settings that say so may be changed while the node runs; all others are read-only.
+    :param defaults: values that replace the settings' defaults.
+    :param prefix: stands before the settings' names in the parameters'.
+    :returns: values by the settings' names, for the class's ``from_dict``.
+    :raises ConfigError: for a value of the wrong type or out of range.
+    """
+    values: dict[str, Any] = {}
+    for setting in settings_of(cls):
+        if setting.kind == "structure" or setting.name in skip:
+            continue
+        own = dataclasses.replace(setting, default=(defaults or {}).get(setting.name, setting.default))
+        values[setting.name] = declare_setting(node, own, prefix, not (changeable and setting.changeable))
+    return values
+
+
+def declare_setting(node: Node, setting: Setting, prefix: str = "", read_only: bool = True) -> Any:
+    """Declares one parameter and gives the value that the node was started with.
+
+    :param node: the node.
+    :param setting: name, default, description and range.
+    :param prefix: stands before the setting's name in the parameter's.
+    :param read_only: whether it is fixed once the node runs.
+    :raises ConfigError: for a value of the wrong type or out of range.
+    """
+    name = prefix + setting.name
+    default = _NOTHING if setting.default is None else to_parameter(setting, setting.default)
+    try:
+        parameter = node.declare_parameter(name, default, descriptor(setting, read_only))
+    except Exception as error:  # rclpy has no common base for wrong types and values out of range
+        given = node._parameter_overrides.get(name)
+        value = given.value if given is not None else default
+        raise ConfigError(name, value, setting.allowed) from error
+    return from_parameter(setting, parameter.value)
+
+
+def from_parameter(setting: Setting, value: Any) -> Any:
+    """The setting's value from that of its parameter.
+
+    :raises ConfigError: if it is none.
+    """
+    if setting.optional and value == _NOTHING:
+        return None
+    if setting.kind == "values":
+        return setting.parse(value)
+    if setting.kind == "vector":
+        return tuple(value) if isinstance(value, Iterable) else value
+    if setting.kind == "float" and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value
+
+
+def to_parameter(setting: Setting, value: Any) -> Any:
+    """The value of the parameter that stands for a setting's value; the inverse of :func:`from_parameter`.
+
+    :param setting: the setting.
+    :param value: its value.
+    """
+    if setting.kind == "values" and isinstance(value, Mapping):
+        return format_values(value)
+    return list(value) if setting.kind == "vector" else value
+
+
+def to_parameters(values: Mapping[str, Any], cls: type[Settings]) -> dict[str, Any]:
+    """Parameters, as a parameter file holds them, that make a node read back these settings.
+
+    :param values: values by name, as the class's ``to_dict`` gives them.
+    :param cls: the settings class.
+    """
+    return {
+        setting.name: to_parameter(setting, values[setting.name])
+        for setting in settings_of(cls)
+        if setting.kind != "structure" and values.get(setting.name) is not None
+    }

@@ -1,0 +1,213 @@
+"""The inner loop of a node that lives on one topic: waits, takes, calls back; nothing else on the way.
+
+rclpy's executors build their wait set anew for every message, which takes longer than a whole slot of the protocol.
+This loop keeps one wait set on one subscription. Whatever else the node has (parameter services, timers) is served by
+an ordinary executor a few times a second.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+
+from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.ros.common.wire.checks import UNREADABLE
+from dtsa_agent.ros.common.wire.intake import Intake
+from dtsa_agent.ros.common.workarounds.taking import Taker
+from dtsa_agent.stop import Stop
+
+_POLL_NS = 50_000_000  # a signal is noticed after this time at the latest
+HOUSEKEEPING_S = 0.1
+_SPIN_S = 5.0  # at the latest after so long an executor looks, too
+_MOST_DROPPED = 16  # messages thrown away in a row before others get their turn
+
+
+class _OwnHands(CallbackGroup):
+    """Keeps ordinary executors away from a subscription."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+class Feed:
+    """A subscription whose messages are taken by whoever wants them, when they want them.
+
+    :param node: the node that subscribes.
+    :param msg_type: type of the messages.
+    :param topic: what it subscribes to.
+    :param qos: quality of service.
+    :param raw: messages are taken as serialised bytes.
+    :param read: makes messages of serialised bytes, in place of rclpy.
+    :param intake: counts messages that cannot be read; None: they are errors.
+    :param admits: says by a message, its number and its sender whether it is taken in; None: all are.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        msg_type: Any,
+        topic: str,
+        qos: QoSProfile,
+        raw: bool = False,
+        intake: Intake | None = None,
+        admits: Callable[[Any, int | None, bytes | None], bool] | None = None,
+        read: Callable[[bytes], Any] | None = None,
+    ) -> None:
+        self.subscription = node.create_subscription(
+            msg_type, topic, self._never, qos, callback_group=_OwnHands(), raw=True
+        )
+        self.handle = self.subscription.handle
+        self._type, self._intake, self._admits = msg_type, intake, admits
+        self._read = read or (bytes if raw else partial(deserialize_message, message_type=msg_type))
+        self._stack = ExitStack()
+        self._stack.enter_context(self.handle)
+        self._taker = Taker(self.handle)
+        self._stack.callback(self._taker.close)
+
+    @property
+    def number(self) -> int | None:
+        """Number of the message taken last, as its publisher counts; None: not known."""
+        return self._taker.number
+
+    @property
+    def sender(self) -> bytes | None:
+        """Participant of DDS that sent the message taken last, which is a process; None: not known."""
+        return self._taker.sender
+
+    def _never(self, message: Any) -> None:
+        raise LocalProtocolError("an executor took a message that is not its own")
+
+    def take(self) -> Any:
+        """A message that is there already, or None; also None after many that were not taken in."""
+        taker = self._taker
+        for _ in range(_MOST_DROPPED):
+            try:
+                data = taker.take()
+                if data is None:
+                    return None
+                message = self._read(data)
+            except Exception as error:  # rclpy has no common base for what a message can do to it
+                if self._intake is None:
+                    raise
+                self._intake.drop(UNREADABLE, f"no {self._type.__name__}: {(str(error).splitlines() or [''])[0]}")
+                continue
+            if self._admits is None or self._admits(message, taker.number, taker.sender):
+                return message
+        return None
+
+    def close(self) -> None:
+        """Gives the handles back."""
+        self._stack.close()
+
+
+class Loop(Feed):
+    """Serves one subscription as fast as Python can, and the rest of its node now and then.
+
+    :param node: the node that subscribes.
+    :param msg_type: type of the messages.
+    :param topic: what it subscribes to.
+    :param qos: quality of service.
+    :param more: as for :class:`Feed`.
+    """
+
+    def __init__(self, node: Node, msg_type: Any, topic: str, qos: QoSProfile, **more: Any) -> None:
+        super().__init__(node, msg_type, topic, qos, **more)
+        self._node = node
+        self._executor: SingleThreadedExecutor | None = None
+        context = node.context.handle
+        self._stack.enter_context(context)
+        self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, context)
+        self._next_housekeeping = self._next_spin = 0.0
+        gc.freeze()  # nothing made so far is garbage: do not look at it again and again
+
+    def wait(self, timeout_ns: int = _POLL_NS) -> Any:
+        """The next message, or None after a while.
+
+        :param timeout_ns: longest time to wait, ns.
+        """
+        wait_set = self._wait_set
+        wait_set.clear_entities()
+        wait_set.add_subscription(self.handle)
+        wait_set.wait(timeout_ns)
+        return self.take()
+
+    def _something_waits(self) -> bool:
+        """Whether anything of the node but this subscription has to be served.
+
+        An executor takes milliseconds to find out that there is nothing to do.
+        """
+        node = self._node
+        waiting = {
+            "subscription": [one for one in node.subscriptions if not isinstance(one.callback_group, _OwnHands)],
+            "timer": list(node.timers),
+            "client": list(node.clients),
+            "service": list(node.services),
+        }
+        if not any(waiting.values()):
+            return False
+        if time.monotonic() > self._next_spin:  # an executor serves rarer things as well
+            self._next_spin = time.monotonic() + _SPIN_S
+            return True
+        subscriptions, timers, clients, services = (len(entities) for entities in waiting.values())
+        with ExitStack() as stack:
+            wait_set = _rclpy.WaitSet(subscriptions, 0, timers, clients, services, 0, node.context.handle)
+            for kind, entities in waiting.items():
+                add = getattr(wait_set, f"add_{kind}")
+                for entity in entities:
+                    stack.enter_context(entity.handle)
+                    add(entity.handle)
+            wait_set.wait(0)
+            return any(wait_set.get_ready_entities(kind) for kind in waiting)
+
+    def housekeeping(self) -> bool:
+        """Serves parameters and timers if it is time; whether it did."""
+        now = time.monotonic()
+        if now < self._next_housekeeping:
+            return False
+        self._next_housekeeping = now + HOUSEKEEPING_S
+        if self._something_waits():
+            if self._executor is None:
+                self._executor = SingleThreadedExecutor(context=self._node.context)
+                self._executor.add_node(self._node)
+            for _ in range(2):
+                self._executor.spin_once(timeout_sec=0.0)
+        return True
+
+    def run(self, on_message: Callable[[Any], bool], idle: Callable[[], None], stop: Stop) -> None:
+        """Calls back until ``on_message`` says False or a signal comes.
+
+        :param on_message: gets each message; says whether to go on.
+        :param idle: called about ten times a second.
+        :param stop: the flag.
+        """
+        while not stop:
+            message = self.wait()
+            if message is not None and not on_message(message):
+                return
+            if self.housekeeping():
+                idle()
+            if not self._node.context.ok():
+                raise ExternalShutdownException
+
+    def close(self) -> None:
+        """Gives the handles back."""
+        if self._executor is not None:
+            self._executor.shutdown(timeout_sec=0)
+        super().close()

@@ -1,0 +1,95 @@
+"""Process priority: what flies vehicles, or is the air of all others, does not wait for what else there is to do.
+
+A Crazyflie levels out when it has heard nothing for half a second, and its emergency watchdog stops the motors after
+one second. On a busy station an ordinary process can be kept waiting for that long. The simulated channel is needed by
+all agents in every slot: it goes first, agents give way to it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dtsa_agent.core.settings.declaration import Settings, setting
+
+
+@dataclass(frozen=True, slots=True)
+class PrioritySettings(Settings):
+    """Who goes first on a computer.
+
+    :raises ConfigError: for values that are not allowed.
+    """
+
+    priority: int = setting(
+        0, "in real time: real-time priority of this process, where allowed; 0: none", minimum=0, maximum=90
+    )
+
+
+def take_priority(level: int, inherited: bool = True) -> str:
+    """Lets all threads of this process run before everything ordinary (SCHED_RR).
+
+    :param level: 1 (low) to 99; 0: ordinary.
+    :param inherited: whether threads and processes that they start do so, too.
+    :returns: why not, or an empty text.
+    """
+    policy = os.SCHED_RR if level else os.SCHED_OTHER
+    if level and not inherited:
+        policy |= os.SCHED_RESET_ON_FORK
+    try:
+        _for_all_threads(lambda task: os.sched_setscheduler(task, policy, os.sched_param(level)))
+    except OSError as error:
+        return f"{error.strerror}; see ulimit -r"
+    return ""
+
+
+def stay_on_one_processor() -> None:
+    """Keeps all threads of this process, and those that they start, on the last processor that it may use.
+
+    Only one thread of an interpreter runs at a time. Threads that wake on several processors at once wait for each
+    other there: a bridge of twelve Crazyflies takes half as much again. Only sensible with real-time priority: others
+    leave that processor to it.
+    """
+    last = max(os.sched_getaffinity(0))
+    _for_all_threads(lambda task: os.sched_setaffinity(task, {last}))
+
+
+def _for_all_threads(act: Callable[[int], None]) -> None:
+    for task in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(ProcessLookupError):  # a thread that has ended meanwhile
+            act(int(task.name))
+
+
+def give_way() -> None:
+    """This thread alone is ordinary again."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def give_way_by(nice: int) -> str:
+    """Lets all threads of this process, and those that they start, give way to others, or go first.
+
+    It counts among the processes of one session: Linux shares the processor between sessions before it looks at it.
+
+    :param nice: 0 (ordinary) to 19 (gives way to all); down to -20 with the right to go first.
+    :returns: why not, or an empty text.
+    """
+    try:
+        _for_all_threads(lambda task: os.setpriority(os.PRIO_PROCESS, task, nice))
+    except OSError as error:
+        return f"{error.strerror}; see ulimit -e"
+    return ""
+
+
+def take_place(priority: int, nice: int, inherited: bool = True) -> str:
+    """Real-time priority for this process where it may have it, nice otherwise.
+
+    :param priority: 1 (low) to 99; 0: none.
+    :param nice: as for :func:`give_way_by`.
+    :param inherited: as for :func:`take_priority`.
+    :returns: why neither, or an empty text.
+    """
+    if priority and not take_priority(priority, inherited):
+        return ""
+    return give_way_by(nice) if nice else ""

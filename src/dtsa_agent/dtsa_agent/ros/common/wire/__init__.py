@@ -1,0 +1,1 @@
+"""Messages as bytes and arrays, and the checks of what comes in."""

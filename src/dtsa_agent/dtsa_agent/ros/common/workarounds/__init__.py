@@ -1,0 +1,1 @@
+"""What works around Fast DDS and rclpy; each says which defect, and when it can go."""

@@ -1,0 +1,172 @@
+"""Keyed frames: only those of a holder of the key, of this session and of this slot, are taken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dtsa_agent.core import ConfigError, LocalProtocolError, Swarm, SwarmConfig
+from dtsa_agent.core.agents.authentication import TAG_LENGTH, Authenticator, is_pattern
+
+KEY = bytes(range(32))
+RANDOM_KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
+FUZZ_FRAMES = 1_000_000
+
+
+@given(st.binary(min_size=1, max_size=56), st.integers(0, 2**40), st.integers(0, 2**64 - 1))
+def test_what_was_sealed_opens(data: bytes, slot: int, session: int) -> None:
+    sealed = Authenticator(KEY, session).seal(data, slot)
+    other = Authenticator(KEY, session)
+    assert len(sealed) == len(data) + TAG_LENGTH
+    assert other.open(sealed, slot) == data
+    assert other.rejected == 0
+
+
+def test_golden_tag() -> None:
+    """Ties the tag to its definition: BLAKE2s with key and person, over session, slot and frame."""
+    assert Authenticator(KEY, 5).seal(b"frame", 7).hex() == "6672616d6500ba891a"
+
+
+@pytest.mark.parametrize(("change", "counter"), [
+    (lambda frame: bytes([frame[0] ^ 1]) + frame[1:], "forged"),
+    (lambda frame: frame[:-1] + bytes([frame[-1] ^ 0x80]), "forged"),
+    (lambda frame: frame[:-1], "forged"),
+    (lambda frame: frame + b"\0", "forged"),
+    (lambda frame: frame[:4], "truncated"),
+    (lambda frame: b"", "truncated"),
+])  # fmt: skip
+def test_changed_frames(change, counter: str) -> None:  # type: ignore[no-untyped-def]
+    auth = Authenticator(KEY)
+    assert auth.open(change(auth.seal(b"position and so on", 12)), 12) is None
+    assert getattr(auth, counter) == auth.rejected == 1
+
+
+def test_replays_and_foreign_frames() -> None:
+    auth = Authenticator(KEY, session=1)
+    frame = auth.seal(b"frame", 100)
+    assert auth.open(frame, 101) is None
+    assert auth.open(frame, 99, late=1) is None
+    assert Authenticator(KEY, session=2).open(frame, 100) is None
+    assert Authenticator(KEY[::-1], session=1).open(frame, 100) is None
+    assert auth.open(frame, 101, late=1) == b"frame"
+    assert auth.forged == 2
+
+
+@pytest.mark.parametrize("key", [b"", bytes(15), bytes(33)])
+def test_bad_keys(key: bytes) -> None:
+    with pytest.raises(ConfigError, match=r"auth_key: got '\d+ bytes'; allowed: 16 to 32 bytes"):
+        Authenticator(key)
+
+
+def test_the_key_is_never_shown() -> None:
+    with pytest.raises(ConfigError) as caught:
+        Authenticator.from_hex("secret" * 6)
+    assert "secret" not in str(caught.value)
+    with pytest.raises(ConfigError, match="auth_session"):
+        Authenticator.from_hex(RANDOM_KEY, 2**64)
+    assert Authenticator.from_hex(RANDOM_KEY).seal(b"x", 1) == Authenticator(bytes.fromhex(RANDOM_KEY)).seal(b"x", 1)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        bytes(16),
+        b"\xa5" * 32,
+        b"secret" * 4,
+        b"swarmkey" * 2,
+        bytes(range(32)),
+        bytes(range(255, 239, -1)),
+        bytes(17 * k % 256 for k in range(16)),
+    ],
+)
+def test_keys_that_are_a_pattern_are_refused(key: bytes) -> None:
+    with pytest.raises(ConfigError, match="auth_key: got 'bytes in a pattern'; allowed: random ones"):
+        Authenticator.from_hex(key.hex())
+
+
+@given(st.binary(min_size=16, max_size=32).filter(lambda key: len(set(key)) > 8))
+def test_keys_with_a_pattern_nowhere_are_taken(key: bytes) -> None:
+    assert is_pattern(key + key)
+    if not is_pattern(key):
+        Authenticator.from_hex(key.hex())
+
+
+def test_of_ten_thousand_frames_of_another_run_with_the_same_key_none_is_taken() -> None:
+    """Slots count from 0 in each flight: only the session tells one from another."""
+    flight, other = (Authenticator(KEY, session) for session in (0x1234_5678_9ABC, 0x1234_5678_9ABD))
+    taken = 0
+    for slot in range(10_000):
+        data = slot.to_bytes(4, "little") * 5
+        taken += flight.open(other.seal(data, slot), slot, late=1) is not None
+    assert (taken, flight.rejected) == (0, 10_000)
+    flight.begin(0x1234_5678_9ABD)
+    assert flight.open(other.seal(b"frame", 3), 3) == b"frame"
+
+
+@pytest.mark.parametrize("length", [0, 57])
+def test_frames_that_do_not_fit(length: int) -> None:
+    with pytest.raises(LocalProtocolError, match="cannot be sealed"):
+        Authenticator(KEY).seal(bytes(length), 1)
+
+
+def mutated(random: np.random.Generator, frames: list[bytes], count: int) -> list[bytes]:
+    """Noise, and real frames with a few changed bytes, cut off or drawn out."""
+    noise = random.bytes(64 * count)
+    kinds, picks, lengths = (random.integers(0, top, count) for top in (4, len(frames), 64))
+    places, masks = random.integers(0, 60, (3, count)), random.integers(1, 256, (3, count))
+    result = []
+    for i in range(count):
+        piece = noise[64 * i : 64 * i + int(lengths[i])]
+        if kinds[i] == 0:
+            result.append(piece)
+            continue
+        frame = bytearray(frames[picks[i]])
+        for place, mask in zip(places[: kinds[i], i], masks[: kinds[i], i], strict=True):
+            frame[place % len(frame)] ^= int(mask)
+        result.append(bytes(frame) if kinds[i] < 3 else bytes(frame[: lengths[i]]) + piece[:4])
+    return result
+
+
+def recorded(policy: str, auth: Authenticator) -> tuple[Swarm, list[bytes]]:
+    """A swarm after 200 slots, and the sealed frames that it sent."""
+    swarm = Swarm(SwarmConfig(agents=12, moving=6, policy=policy, avoider="none"))
+    frames = []
+    for slot in range(200):
+        swarm.scenario.advance(slot, swarm)
+        for sender in swarm.begin(slot):
+            frames.append(auth.seal(swarm.frame(sender), slot))
+            swarm.hear(slot, swarm.frame(sender))
+        swarm.fly(slot)
+        swarm.end(slot)
+    return swarm, frames
+
+
+@pytest.mark.parametrize("policy", ["tdma", "lease"])
+def test_fuzz_a_million_frames(policy: str) -> None:
+    """With a key none is accepted, without one none raises or breaks a table."""
+    auth = Authenticator(KEY)
+    swarm, frames = recorded(policy, auth)
+    random = np.random.default_rng(4)
+    authentic = set(frames)
+    rejected = heard = 0
+    for _ in range(FUZZ_FRAMES // 100_000 // 2):
+        for data in mutated(random, frames, 100_000):
+            frame = auth.open(data, 200)
+            assert frame is None or data in authentic
+            rejected += frame is None
+            swarm.hear(200, data[:-TAG_LENGTH])
+            heard += 1
+    assert rejected == heard == FUZZ_FRAMES // 2
+    assert auth.rejected == rejected
+    assert swarm.malformed + swarm.foreign > heard * 0.9
+    swarm.end(200)
+    assert np.isfinite(swarm.sent_position).all()
+    assert np.isfinite(swarm.sent_velocity).all()
+    assert swarm.sent_slot.max() <= 200
+    for slot in range(201, 300):
+        swarm.begin(slot)
+        swarm.fly(slot)
+        swarm.end(slot)
+    assert np.isfinite(swarm.position).all()

@@ -1,0 +1,330 @@
+"""The compiled avoiders against the specification, and what every avoider promises."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from dtsa_agent.core import Swarm, SwarmConfig, _kernel
+from dtsa_agent.core.binding import AVOID
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.reference import avoiders
+from dtsa_agent.core.reference.avoiders import Avoidance, Neighbour, Scene
+from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, flight_model
+
+MODELS = tuple(FLIGHT_MODELS)
+
+
+@dataclasses.dataclass
+class Case:
+    """One question to an avoider."""
+
+    index: int
+    position: np.ndarray  # (3, N)
+    velocity: np.ndarray  # (3, N)
+    goal: np.ndarray  # (3,)
+    age: np.ndarray  # (N,)
+
+
+def make_case(seed: int, count: int, size: float, speed: float = 1.5) -> Case:
+    random = np.random.default_rng(seed)
+    position = random.uniform(-size, size, (3, count))
+    velocity = random.uniform(-speed, speed, (3, count)) / math.sqrt(3)
+    return Case(int(random.integers(count)), position, velocity, random.uniform(-9, 9, 3), random.uniform(0, 2, count))
+
+
+cases = st.builds(
+    make_case,
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(1, 45),
+    size=st.sampled_from([0.3, 0.8, 1.5, 3.0, 8.0]),
+    speed=st.sampled_from([0.0, 1.5, 3.0]),
+)
+
+
+def command(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np.ndarray:
+    i = case.index
+    return model.command(i, case.position[:, i], case.velocity[:, i], case.goal, case.position, case.velocity, age)
+
+
+def scene_of(case: Case, age: np.ndarray | None = None) -> Scene:
+    """The same question to the specification."""
+    ages = np.zeros(len(case.age)) if age is None else age
+    places, speeds = (list(map(tuple, array.T.tolist())) for array in (case.position, case.velocity))
+    others = [Neighbour(j + 1, places[j], speeds[j], float(ages[j])) for j in range(len(places)) if j != case.index]
+    return Scene(case.index + 1, places[case.index], speeds[case.index], tuple(case.goal.tolist()), others)
+
+
+def plain(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np.ndarray:
+    params = Avoidance(**model.avoider.to_dict())
+    return np.array(avoiders.command(model.avoider_kind, scene_of(case, age), params))
+
+
+# --- the compiled kernel computes what the formulas say -------------------------------------------
+
+orca_params = st.builds(
+    AvoiderParams,
+    radius=st.floats(0.2, 0.6),
+    horizon=st.floats(0.5, 3),
+    softness=st.sampled_from([1.0, 30.0, 300.0]),
+    bias=st.floats(-0.3, 0.3),
+    margin_rate=st.sampled_from([0.0, 0.05, 0.5]),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(cases, orca_params, st.booleans())
+def test_orca_minimises_the_soft_problem(case: Case, params: AvoiderParams, aged: bool) -> None:
+    model = dataclasses.replace(FLIGHT_MODELS["orca"], avoider=params)
+    age = case.age if aged else None
+    for j in range(case.position.shape[1]):
+        # the cone is badly conditioned where the neighbour's sphere just touches
+        gap = np.linalg.norm(case.position[:, j] - case.position[:, case.index]) - params.radius
+        wider = 0.0 if age is None else min(params.margin_max, params.margin_rate * age[j])
+        assume(j == case.index or abs(gap - wider) > 1e-4)
+    assert command(model, case, age) == pytest.approx(plain(model, case, age), abs=1e-9)
+
+
+def test_orca_agrees_with_hildreth_sweeps() -> None:
+    """Another way to the same minimum: coordinate ascent of the dual."""
+    model = FLIGHT_MODELS["orca"]
+    rho, params = model.avoider.softness, Avoidance(**model.avoider.to_dict())
+    for seed in range(20):
+        case = make_case(seed, 12, 1.2)
+        scene = scene_of(case)
+        x, y, z = avoiders.preferred(scene, params)
+        v = np.array(avoiders.limited((x + params.bias * y, y - params.bias * x, z), params.v_max))
+        spaces = [avoiders.orca_half_space(scene, other, params) for other in scene.neighbours]
+        normals, dual = [np.array(space.normal) for space in spaces], np.zeros(len(spaces))
+        for _ in range(3000):
+            for j, space in enumerate(spaces):
+                n = normals[j]
+                new = max(0.0, dual[j] + (space.bound - n @ v - dual[j] / rho) / (1 + 1 / rho))
+                v = v + (new - dual[j]) * n
+                dual[j] = new
+        assert command(model, case) == pytest.approx(avoiders.limited(tuple(v), params.v_max), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["potential", "jerky"])
+@settings(max_examples=100, deadline=None)
+@given(case=cases, aged=st.booleans(), rate=st.sampled_from([0.0, 0.1]))
+def test_potential_adds_the_forces(name: str, case: Case, aged: bool, rate: float) -> None:
+    model = flight_model(name, {"margin_rate": rate})
+    age = case.age if aged else None
+    assert command(model, case, age) == pytest.approx(plain(model, case, age), abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["bvc", "bvc-firmware"])
+@settings(max_examples=100, deadline=None)
+@given(case=cases)
+def test_bvc_flies_to_the_nearest_point_of_its_cell(name: str, case: Case) -> None:
+    params = dataclasses.replace(FLIGHT_MODELS[name].avoider, gain=0.05, sidestep=1e-6)
+    model = dataclasses.replace(FLIGHT_MODELS[name], avoider=params)
+    same = Avoidance(**params.to_dict())
+    walls = [*avoiders.bvc_walls(scene_of(case), same), *avoiders.bvc_box(same)]
+    a, c = -np.array([wall.normal for wall in walls]), -np.array([wall.bound for wall in walls])
+    goal = case.goal - case.position[:, case.index]
+    target = command(model, case) / params.gain  # the gain is so small that no speed limit acts
+    assume(np.all(c > 1e-3))  # in its own cell: the cell is not empty
+    assert np.all(a @ target <= c + 1e-4)
+    # nearest: no other point of the cell lies further in the direction of the goal (variational inequality)
+    pull = goal - target
+    touched = a[a @ target > c - 1e-4]
+    if np.linalg.norm(pull) > 1e-3:
+        weights = np.linalg.lstsq(touched.T, pull, rcond=None)[0] if len(touched) <= 3 else None
+        assert len(touched) > 0
+        if weights is not None:
+            assert touched.T @ weights == pytest.approx(pull, abs=1e-3 * np.linalg.norm(pull) + 1e-6)
+            assert np.all(weights > -1e-3 * np.linalg.norm(pull))
+
+
+def test_bvc_stays_when_its_cell_is_empty() -> None:
+    position = np.array([[0.0, 0.2, -0.2], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    case = Case(0, position, np.zeros((3, 3)), np.array([3.0, 0.0, 0.0]), np.zeros(3))
+    assert command(FLIGHT_MODELS["bvc"], case) == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_bvc_steps_to_its_right_in_front_of_a_wall() -> None:
+    position = np.array([[0.0, 0.4], [0.0, 0.0], [0.0, 0.0]])
+    case = Case(0, position, np.zeros((3, 2)), np.array([3.0, 0.0, 0.0]), np.zeros(2))
+    assert command(FLIGHT_MODELS["bvc"], case)[1] < -0.1
+    far = dataclasses.replace(case, position=np.array([[0.0, 2.0], [0.0, 0.0], [0.0, 0.0]]))
+    assert command(FLIGHT_MODELS["bvc"], far)[1] == pytest.approx(0.0, abs=1e-9)
+
+
+@given(case=cases)
+def test_none_flies_straight(case: Case) -> None:
+    model = FLIGHT_MODELS["none"]
+    assert command(model, case) == pytest.approx(plain(model, case), abs=1e-12)
+
+
+# --- what all avoiders promise --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MODELS)
+@settings(max_examples=60, deadline=None)
+@given(case=cases, aged=st.booleans())
+def test_commands_are_finite_and_within_v_max(name: str, case: Case, aged: bool) -> None:
+    model = flight_model(name, {"margin_rate": 0.1})
+    result = command(model, case, case.age if aged else None)
+    assert np.all(np.isfinite(result))
+    assert np.linalg.norm(result) <= model.avoider.v_max * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@settings(max_examples=60, deadline=None)
+@given(case=cases, aged=st.booleans())
+def test_same_bits_with_and_without_avx2(name: str, case: Case, aged: bool) -> None:
+    model = flight_model(name, {"margin_rate": 0.1})
+    best = _kernel.vector_level(-1)
+    results = []
+    try:
+        for level in (0, best):
+            _kernel.vector_level(level)
+            results.append(command(model, case, case.age if aged else None).tobytes())
+    finally:
+        _kernel.vector_level(best)
+    assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("name", MODELS)
+@settings(max_examples=30, deadline=None)
+@given(case=cases)
+def test_own_entry_and_unknown_neighbours_are_ignored(name: str, case: Case) -> None:
+    model = FLIGHT_MODELS[name]
+    expected = command(model, case)
+    changed = dataclasses.replace(case, position=case.position.copy(), velocity=case.velocity.copy())
+    changed.position[:, case.index] = changed.velocity[:, case.index] = 77.0
+    i = case.index
+    result = model.command(i, case.position[:, i], case.velocity[:, i], case.goal, changed.position, changed.velocity)
+    assert result.tobytes() == expected.tobytes()
+    nan = np.full((3, 1), np.nan)
+    wider = [np.hstack((a, nan)) for a in (case.position, case.velocity)]
+    result = model.command(i, case.position[:, i], case.velocity[:, i], case.goal, *wider)
+    assert result.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("name", ["orca", "potential", "jerky", "bvc"])
+def test_two_agents_at_one_point_part(name: str) -> None:
+    model = FLIGHT_MODELS[name]
+    both = np.zeros((3, 2))
+    commands = [model.command(i, both[:, i], both[:, i], np.zeros(3), both, both) for i in (0, 1)]
+    assert all(np.all(np.isfinite(c)) for c in commands)
+    if name == "orca":
+        assert commands[0][0] < -0.1
+        assert commands[1][0] > 0.1
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_all_agents_at_once_give_the_same_bits(name: str) -> None:
+    model = FLIGHT_MODELS[name]
+    case = make_case(3, 30, 2.0)
+    goals = np.random.default_rng(1).uniform(-9, 9, (3, 30))
+    swarm = Swarm(SwarmConfig(agents=30, avoider=name, estimator="oracle"), shared_table=True)
+    swarm.position[:], swarm.velocity[:], swarm.goal[:] = case.position, case.velocity, goals
+    swarm.steer(0, 0)
+    for i in range(30):
+        one = model.command(i, case.position[:, i], case.velocity[:, i], goals[:, i], case.position, case.velocity)
+        assert one.tobytes() == swarm.command[:, i].tobytes()
+
+
+def test_margin_grows_with_age_up_to_its_limit() -> None:
+    position = np.array([[0.0, 1.2], [0.0, 0.02], [0.0, 0.0]])
+    velocity = np.array([[1.0, -1.0], [0.0, 0.0], [0.0, 0.0]])
+    goal = np.array([5.0, 0.0, 0.0])
+    model = flight_model("orca", {"margin_rate": 0.2, "margin_max": 0.3})
+    fresh, old, older, oldest = (
+        model.command(0, position[:, 0], velocity[:, 0], goal, position, velocity, np.full(2, age))
+        for age in (0.0, 0.5, 1.5, 9.0)
+    )
+    assert fresh[1] > old[1] > older[1]  # evades more widely
+    assert older.tobytes() == oldest.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "movers", "shortest"),
+    [("orca", 12, 0.25), ("potential", 12, 0.35), ("bvc", 12, 0.22), ("jerky", 12, 0.25)],
+)
+def test_exchange_with_perfect_knowledge_is_safe(name: str, movers: int, shortest: float) -> None:
+    model = FLIGHT_MODELS[name]
+    random = np.random.default_rng(5)
+    angle = 2 * np.pi * np.arange(movers) / movers
+    radius = max(model.min_radius, model.spacing * movers / 2 / np.pi)
+    position = radius * np.stack((np.cos(angle), np.sin(angle), 0 * angle)) + random.uniform(-0.05, 0.05, (3, movers))
+    goal = np.roll(position, movers // 2, axis=1).copy()
+    swarm = Swarm(SwarmConfig(agents=movers, avoider=name, estimator="oracle"), shared_table=True)
+    assert swarm.config.slot_s == 0.01
+    assert swarm.config.steps == 1
+    swarm.position[:], swarm.goal[:] = position, goal
+    first, second = np.triu_indices(movers, 1)
+    nearest = math.inf
+    for _ in range(1200):
+        swarm.fly(0)
+        nearest = min(nearest, np.linalg.norm(swarm.position[:, first] - swarm.position[:, second], axis=0).min())
+        if np.all(np.linalg.norm(swarm.position - goal, axis=0) < 0.3):
+            break
+    else:
+        pytest.fail("did not arrive within 12 s")
+    assert nearest > shortest
+
+
+# --- named models and bad input -------------------------------------------------------------------
+
+
+def test_kinds_match_the_kernel() -> None:
+    assert [FLIGHT_MODELS[name].kind for name in ("orca", "potential", "bvc", "none")] == [0, 1, 2, 3]
+    assert len(KINDS) == 4
+
+
+def test_options_replace_values_of_all_groups() -> None:
+    model = flight_model("orca", {"v_max": 1, "tau": 0.5, "spacing": 2.0})
+    assert (model.avoider.v_max, model.vehicle.tau, model.spacing) == (1.0, 0.5, 2.0)
+    assert FLIGHT_MODELS["orca"].avoider.v_max == 1.5
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "field"),
+    [
+        ("orcas", {}, "avoider"),
+        ("orca", {"speed": 1.0}, "options.speed"),
+        ("orca", {"v_max": 0.0}, "v_max"),
+        ("orca", {"v_max": math.nan}, "v_max"),
+        ("orca", {"v_max": "fast"}, "v_max"),
+        ("orca", {"v_max": True}, "v_max"),
+        ("orca", {"tau": -1.0}, "tau"),
+        ("orca", {"spacing": 0.0}, "spacing"),
+        ("potential", {"core": 1.31}, "core"),
+    ],
+)
+def test_bad_settings_are_named(name: str, options: dict, field: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        flight_model(name, options)
+    assert caught.value.field == field
+
+
+def test_wrong_arrays_are_refused() -> None:
+    model = FLIGHT_MODELS["orca"]
+    params, good, table = AVOID.image(model.avoider.to_dict()), bytes(3 * 8), bytes(3 * 4 * 8)
+    assert len(_kernel.avoid_command(0, params, 0, good, good, good, table, table, None)) == 3 * 8
+    for bad in (bytes(2 * 8), bytes(3 * 4), bytes(4 * 8)):
+        with pytest.raises(ValueError, match="argument 4"):
+            _kernel.avoid_command(0, params, 0, bad, good, good, table, table, None)
+    for bad in (np.zeros(3), None):
+        with pytest.raises(TypeError):
+            _kernel.avoid_command(0, params, 0, bad, good, good, table, table, None)
+    with pytest.raises(ValueError, match="argument 8"):
+        _kernel.avoid_command(0, params, 0, good, good, good, table, bytes(3 * 5 * 8), None)
+    with pytest.raises(ValueError, match="argument 9"):
+        _kernel.avoid_command(0, params, 0, good, good, good, table, table, bytes(3 * 8))
+    for kind in (4, -1):
+        with pytest.raises(ValueError, match="kind"):
+            _kernel.avoid_command(kind, params, 0, good, good, good, table, table, None)
+    with pytest.raises(ValueError, match="params"):
+        _kernel.avoid_command(0, params[8:], 0, good, good, good, table, table, None)
+    with pytest.raises(KeyError, match="softness"):
+        AVOID.image({"v_max": 1.0, "gain": 1.0, "radius": 1.0, "horizon": 1.0})

@@ -1,0 +1,557 @@
+"""Policy lease, agent by agent: who may send when, who gives turns away, and what each takes from the air."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from lease_helpers import FAR, is_anchor, still
+
+from dtsa_agent.core import ConfigError, Scenario, Swarm, SwarmConfig, make_scenario
+from dtsa_agent.core.frame import Frame
+from dtsa_agent.core.frame_extended import (
+    OPEN,
+    ExtendedFrame,
+    Gossip,
+    decode_extended,
+    encode_extended,
+)
+from dtsa_agent.core.reference.lease.issue import open_block
+from dtsa_agent.core.reference.lease.memory import HANDED, NEVER, Lease, Memory
+from dtsa_agent.core.reference.rules import Rules
+
+OWN = {"position": (0.0, 0.0, 0.0), "velocity": (0.0, 0.0, 0.0), "intent": (0.0, 0.0, 0.0)}
+
+
+def make(agents: int = 12, movers: int = 6, local: list[int] | None = None, **settings: Any) -> Swarm:
+    """Agents that stand still; the first ``movers`` ids have something to say."""
+    config = SwarmConfig(agents=agents, **{"policy": "lease", "avoider": "none", **settings})
+    swarm = Swarm(config, still(agents), local=local)
+    swarm.active[:] = 0
+    swarm.goal[0, np.array(swarm.ids) <= movers] = FAR
+    return swarm
+
+
+class Air:
+    """A channel for a swarm: draws who receives what; keeps what was sent."""
+
+    def __init__(self, swarm: Swarm, loss: float = 0.0, seed: int = 1) -> None:
+        self.swarm, self.loss = swarm, loss
+        self.random = np.random.default_rng(seed)
+        self.slot = 0
+        self.sent: list[tuple[int, ...]] = []
+        self.frames: dict[int, ExtendedFrame] = {}
+        self.also: list[Callable[[int, bytes, np.ndarray], object]] = []
+
+    def run(self, slots: int, jam: bool = False) -> Air:
+        swarm = self.swarm
+        for slot in range(self.slot, self.slot + slots):
+            senders = swarm.begin(slot)
+            mask = (self.random.random(len(swarm.ids)) >= self.loss).astype(np.uint8)
+            if len(senders) == 1:
+                data = swarm.frame(senders[0])
+                self.frames[slot] = decode_extended(data)
+                if not jam:
+                    swarm.hear(slot, data, mask)
+                    for hear in self.also:
+                        hear(slot, data, mask)
+            swarm.end(slot)
+            self.sent.append(tuple(swarm.ids[k] for k in senders))
+        self.slot += slots
+        return self
+
+    def leases(self, first: int, last: int) -> int:
+        """Lease bytes said in slots first .. last - 1."""
+        return sum(sum(b > 0 for b in self.frames[t].leases) for t in range(first, last) if t in self.frames)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_all_moving_is_tdma_bit_for_bit(loss: float) -> None:
+    lease = Air(make(10, 10), loss).run(600)
+    tdma = Air(make(10, 10, policy="tdma", frame="extended"), loss).run(600)
+    assert lease.sent == tdma.sent == [(slot % 10 + 1,) for slot in range(600)]
+    np.testing.assert_array_equal(lease.swarm.sent_slot, tdma.swarm.sent_slot)
+    np.testing.assert_array_equal(lease.swarm.sent_position, tdma.swarm.sent_position)
+
+
+def test_idle_agents_give_their_turns_to_movers() -> None:
+    air = Air(make(12, 4, open_every=0)).run(1200)
+    late = air.sent[600:]
+    share = sum(1 for senders in late if senders and senders[0] <= 4) / len(late)
+    assert share > 0.8  # 4 of 12 own a third
+    for slot in range(600, 1200):
+        if is_anchor(slot, 12):
+            assert air.sent[slot] == (slot % 12 + 1,)
+    reasons = {air.swarm.reason_name(k) for k in range(12)}
+    assert reasons <= {"own", "anchor", "leased"}
+
+
+@pytest.mark.parametrize("movers", [0, 12])
+def test_nothing_to_give_or_nobody_to_take(movers: int) -> None:
+    air = Air(make(12, movers)).run(600)
+    assert air.leases(0, 600) == 0
+
+
+def test_no_leases_above_the_share() -> None:
+    assert Air(make(12, 8, lease_share=0.5)).run(600).leases(0, 600) == 0
+    assert Air(make(12, 6, lease_share=0.5)).run(600).leases(0, 600) > 0
+
+
+def test_who_may_get_another_goal_gives_away_little_by_little() -> None:
+    swarm = make(12, 6, depth_rate=0.1, open_every=0)
+    swarm.final[:] = 0
+    air = Air(swarm).run(12 * 100)
+    first = next(slot for slot in range(1200) if air.leases(slot, slot + 1))
+    assert 12 * 10 <= first <= 12 * 12  # one turn after ten idle rounds
+    assert air.leases(1000, 1200) > air.leases(200, 400) > 0
+
+
+def test_deaf_agents_give_nothing_away() -> None:
+    air = Air(make(12, 6)).run(600)
+    air.run(300, jam=True)
+    # What is still said at first was given away before the jam.
+    later = [slot for slot in range(600 + 16 * 12, 900) if slot in air.frames and any(air.frames[slot].leases)]
+    assert later == []
+    before = len(air.sent)
+    air.run(600)
+    assert all(len(senders) <= 1 for senders in air.sent[before:])
+    assert air.leases(1200, 1500) > 0
+
+
+def test_a_goodbye_frees_the_turns_at_once() -> None:
+    air = Air(make(12, 12)).run(240)
+    air.swarm.leave(3)
+    air.run(12)
+    last = next(slot for slot in range(240, 252) if air.sent[slot] == (4,))
+    assert air.frames[last].leaving
+    assert air.swarm.present[3] == 0
+    air.run(120)
+    turns = [slot for slot in range(last + 13, 372) if slot % 12 == 3]
+    used = [slot for slot in turns if air.sent[slot]]
+    assert used == [slot for slot in turns if not is_anchor(slot, 12)]
+    assert air.frames[next(slot for slot in range(last + 1, 372) if air.sent[slot] == (5,))].c_s == 1
+
+
+def test_a_dead_agents_turns_are_adopted() -> None:
+    air = Air(make(12, 12), loss=0.1).run(300)
+    air.swarm.present[3] = 0
+    limit = 1000 + 2 * 5 * 12
+    air.run(limit + 60)
+    turns = [slot for slot in range(300 + limit, 360 + limit) if slot % 12 == 3 and not is_anchor(slot, 12)]
+    assert all(len(air.sent[slot]) == 1 for slot in turns)
+    assert all(len(senders) <= 1 for senders in air.sent)
+
+
+def test_without_adoption_a_dead_agents_turns_stay_empty() -> None:
+    air = Air(make(12, 12, adoption=False)).run(300)
+    air.swarm.present[3] = 0
+    air.run(1500)
+    assert {senders for slot, senders in enumerate(air.sent) if slot > 300 and slot % 12 == 3} == {()}
+
+
+@pytest.mark.parametrize("adoption", [False, True])
+@pytest.mark.parametrize("restart_at", range(600, 660, 7))
+def test_a_restarted_agent_uses_anchors_only_at_first(adoption: bool, restart_at: int) -> None:
+    """It may have given turns away that it has forgotten."""
+    swarm = make(12, 6, adoption=adoption, open_every=0)
+    air = Air(swarm, loss=0.2).run(restart_at)
+    swarm.restart(11)
+    swarm.goal[0, 11] = FAR
+    air.run(240)
+    own = [slot for slot in range(restart_at, restart_at + 240) if 12 in air.sent[slot] and slot % 12 == 11]
+    assert is_anchor(own[0], 12)
+    assert own[0] - restart_at < 5 * 12
+    assert any(not is_anchor(slot, 12) for slot in own)
+    assert air.frames[own[0]].probation
+    assert not swarm.lease_status(11)["probation"]
+    assert all(len(senders) <= 1 for senders in air.sent)
+
+
+def test_joining_late() -> None:
+    swarm = make(12, 12)
+    swarm.present[6] = 0
+    air = Air(swarm, loss=0.1).run(1700)
+    assert all(7 not in senders for senders in air.sent)
+    swarm.present[6] = 1
+    air.run(400)
+    first = next(slot for slot, senders in enumerate(air.sent) if senders == (7,))
+    assert first - 1700 <= (5 + 2) * 12
+    assert all(len(senders) <= 1 for senders in air.sent)
+    assert (swarm.sent_slot[:, 6] > 1700).all()
+    assert not swarm.lease_status(6)["probation"]
+
+
+def test_what_was_known_is_gone_after_an_absence() -> None:
+    swarm = make(12, 6)
+    air = Air(swarm).run(200)
+    swarm.present[2] = 0
+    air.run(1)
+    swarm.present[2] = 1
+    air.run(1)
+    assert (np.delete(swarm.sent_slot[2], 2) < 0).sum() >= 8  # but for one frame and its gossip
+    assert swarm.lease_status(2)["probation"]
+
+
+def test_waking_takes_the_next_open_turn() -> None:
+    swarm = make(40, 10)
+    air = Air(swarm).run(2000)
+    swarm.goal[0, 30] = FAR
+    air.run(200)
+    first = next(slot for slot in range(2000, 2200) if 31 in air.sent[slot])
+    assert first - 2000 < 60
+    assert swarm.lease_status(30)["woke"] == -1
+    assert swarm.in_ap[:, 30].all()
+
+
+def test_many_that_wake_together_get_out_of_each_others_way() -> None:
+    swarm = make(40, 10)
+    swarm.final[:] = 0
+    air = Air(swarm).run(2000)
+    swarm.goal[0, 20:] = FAR
+    air.run(5 * 40)
+    assert sum(len(senders) > 1 for senders in air.sent) <= 6
+    assert (swarm.sent_slot[:, 20:] >= 2000).all()
+
+
+def test_a_listener_believes_what_each_agent_believes() -> None:
+    swarm = make(12, 6)
+    listener = Swarm(swarm.config, swarm.scenario, local=[], observers=list(swarm.ids))
+    air = Air(swarm, loss=0.3)
+    air.also.append(listener.hear)
+    for _ in range(40):
+        air.run(15)
+        for name in ("sent_slot", "sent_position", "sent_velocity", "sent_intent", "in_ap", "last_turn"):
+            np.testing.assert_array_equal(getattr(listener, name), getattr(swarm, name), err_msg=name)
+
+
+def test_processes_with_some_agents_each_do_what_one_process_does() -> None:
+    whole = Air(make(12, 6), loss=0.2)
+    parts = [make(12, 6, local=list(range(1, 6))), make(12, 6, local=list(range(6, 13)))]
+    random = np.random.default_rng(1)
+    for slot in range(900):
+        whole.run(1)
+        frames = [(part.ids[k], part.frame(k)) for part in parts for k in part.begin(slot)]
+        mask = (random.random(12) >= 0.2).astype(np.uint8)
+        assert tuple(sender for sender, _ in frames) == whole.sent[slot]
+        for part in parts:
+            if len(frames) == 1:
+                part.hear(slot, frames[0][1], np.ascontiguousarray(mask[part.local]))
+            part.end(slot)
+    for part in parts:
+        np.testing.assert_array_equal(part.sent_slot, whole.swarm.sent_slot[part.local])
+        np.testing.assert_array_equal(part.digest, whole.swarm.digest[part.local])
+
+
+def frame_of(sender: int, slot: int, **more: Any) -> bytes:
+    return encode_extended(ExtendedFrame(Frame(sender, slot, 1, **OWN), **more))
+
+
+def test_gossip_replaces_only_what_is_older() -> None:
+    swarm = make(4, 4)
+    swarm.begin(50)
+
+    def gossip(age: int, x: float) -> tuple[Gossip, ...]:
+        return (
+            Gossip(2, age, True, (x, 0.0, 0.0), (0.0, 0.0, 0.0)),
+            Gossip(1, 1, True, (9.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        )
+
+    swarm.hear(50, frame_of(3, 50, gossip=gossip(10, 1.0)))
+    assert swarm.sent_slot[0, 1] == 40
+    assert swarm.sent_position[0, 0, 1] == pytest.approx(1.0)
+    for age, x, expected in ((10, 2.0, 1.0), (20, 3.0, 1.0), (9, 4.0, 4.0)):
+        swarm.hear(50, frame_of(3, 50, gossip=gossip(age, x)))
+        assert swarm.sent_position[0, 0, 1] == pytest.approx(expected)
+    assert swarm.sent_slot[0, 0] == -1  # an agent knows better what it has said itself
+    assert swarm.sent_slot[1, 0] == 49
+
+
+def test_gossip_can_be_switched_off() -> None:
+    with_gossip = Air(make(12, 12), loss=0.3).run(600)
+    without = Air(make(12, 12, gossip=False), loss=0.3).run(600)
+    assert all(not frame.gossip for frame in without.frames.values())
+    assert (600 - with_gossip.swarm.sent_slot).mean() < (600 - without.swarm.sent_slot).mean()
+
+
+@pytest.mark.parametrize("data", [
+    frame_of(13, 100), frame_of(3, 98), frame_of(3, 101), frame_of(3, 100, c_s=12),
+    frame_of(3, 100, leases=b"\x01" + bytes(10)), frame_of(5, 100, leases=b"\x0d" + bytes(10)),
+    frame_of(5, 100, relay=((1, 13),)),
+    frame_of(5, 100, gossip=(Gossip(13, 1, True, (0.0,) * 3, (0.0,) * 3),)),
+])  # fmt: skip
+def test_frames_of_others_are_counted_and_ignored(data: bytes) -> None:
+    """Unknown agents, other times, and leases said in somebody else's turn (slot 100 is agent 5's)."""
+    swarm = make(12, 6)
+    swarm.begin(100)
+    before = swarm.sent_slot.copy()
+    assert not swarm.hear(100, data)
+    assert swarm.foreign == 1
+    np.testing.assert_array_equal(swarm.sent_slot, before)
+    assert swarm.hear(100, frame_of(5, 100, leases=bytes([6, OPEN]) + bytes(9)))
+
+
+def test_paper_frames_do_not_reach_an_extended_swarm_nor_the_other_way_round() -> None:
+    lease, tdma = make(4, 4), make(4, 4, policy="tdma", frame="paper")
+    lease.begin(0), tdma.begin(0)
+    assert not lease.hear(0, tdma.frame(0))
+    assert not tdma.hear(0, lease.frame(0))
+    assert lease.malformed == tdma.malformed == 1
+
+
+@pytest.mark.parametrize(("settings", "field"), [
+    ({"frame": "paper"}, "frame"), ({"agents": 255, "moving": 0}, "agents"), ({"anchor_every": 0}, "anchor_every"),
+    ({"open_every": -1}, "open_every"), ({"depth_rate": -0.1}, "depth_rate"), ({"lease_share": 1.5}, "lease_share"),
+])  # fmt: skip
+def test_settings_that_are_refused(settings: dict[str, Any], field: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        SwarmConfig(**{"policy": "lease", **settings})
+    assert caught.value.field == field
+
+
+def test_every_agent_needs_a_table_of_its_own() -> None:
+    with pytest.raises(ConfigError, match="shared_table"):
+        Swarm(SwarmConfig(policy="lease"), shared_table=True)
+
+
+def test_open_turns_visit_all_owners() -> None:
+    for agents in range(2, 255):
+        period = SwarmConfig(agents=agents, moving=0, policy="lease").open_period
+        assert period == max(11, agents // 5)
+        for resting in {1, agents // 3, agents} - {0}:
+            kinds = ((0.0, 0), (0.0, resting), (1.0, 0), (1.0, resting))
+            blocks = [open_block(agents, period, wakers, resting, settled) for wakers, settled in kinds]
+            assert all(np.gcd(block, agents) == 1 for block in blocks)
+            assert blocks[0] >= period * agents / resting
+            assert blocks[2] <= blocks[0] <= blocks[1]
+    assert SwarmConfig(policy="lease", open_every=0).open_period == 0
+    assert open_block(12, 0, 0.0, 6, 6) == open_block(12, 11, 0.0, 0, 0) == 0
+
+
+@pytest.mark.parametrize(("wakers", "block"), [(0.3, 11), (1.0, 4), (2.0, 2), (3.0, 2), (50.0, 2)])
+def test_while_many_wake_open_turns_are_as_often_as_every_second_one(wakers: float, block: int) -> None:
+    assert open_block(9, 11, wakers, 9, 0) == block
+
+
+def test_open_turns_are_spaced_evenly() -> None:
+    """So who wakes waits for one block at most, the odd one that is nobody's apart."""
+    air = Air(make(40, 10, open_every=20)).run(3000)
+    block = open_block(40, 20, 0.0, 30, 30)
+    opened = [slot for slot in range(3000, 3600) if air.run(1).swarm.reason_name(0) == "open"]
+    assert len(opened) >= 0.9 * 600 / block
+    assert max(np.diff(opened)) < 2 * block
+
+
+def test_who_knows_that_it_will_rest_speaks_at_main_anchors_only() -> None:
+    """Agent 12 does not know: it goes on speaking every M rounds."""
+    swarm = make(12, 6)
+    swarm.final[11] = 0
+    air = Air(swarm).run(3000)
+    main = Memory(Rules(agents=12, slot_s=0.01, main_every=15)).is_main
+    for agent in range(7, 12):
+        assert [slot for slot in range(1000, 3000) if (agent,) == air.sent[slot]] == [
+            slot for slot in range(1000, 3000) if slot % 12 == agent - 1 and main(slot)
+        ]
+    assert all(air.sent[slot] == (12,) for slot in range(1000, 3000) if slot % 12 == 11 and is_anchor(slot, 12))
+    assert all(len(senders) <= 1 for senders in air.sent)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_who_has_arrived_hands_its_turns_on(loss: float) -> None:
+    """Within reach all but the last one: it goes to those that move on; without OPEN turns nobody does that."""
+    sent = {}
+    for handing in (True, False):
+        swarm = make(24, 4, open_every=11 if handing else 0, anchor_rest=1)
+        swarm.final[3] = 0  # gives away none of its own turns for now
+        air = Air(swarm, loss).run(900)
+        swarm.goal[:, 3] = swarm.position[:, 3]
+        air.run(72)
+        sent[handing] = air.sent[912:972].count((4,))
+        assert all(len(senders) <= 1 for senders in air.sent)
+    assert 3 <= sent[True] <= 0.6 * sent[False]
+
+
+def test_who_wakes_is_given_turns_by_those_that_have_plenty() -> None:
+    """Owners have given theirs away for rounds to come: agent 5 has one turn of its own a round."""
+    swarm = make(24, 4)
+    swarm.final[4] = 0
+    air = Air(swarm).run(905)
+    swarm.goal[0, 4] = FAR
+    air.run(120)
+    assert air.sent[930:1020].count((5,)) >= 10  # three own turns, and a fair share is 18
+
+
+def test_a_turn_is_changed_by_its_lessee_alone() -> None:
+    memory = Memory(Rules(agents=6, slot_s=0.01))
+    memory.start(0)
+    memory.leases = {9: Lease(3, 2), 8: Lease(3, 1), 11: Lease(3, HANDED), 13: Lease(3, 2)}
+    for turn in (8, 9, 11):
+        memory.note(0, 4, turn, 2, 0)  # agent 4 relays what it knows
+        assert memory.leases[turn].lessee == 3
+        memory.note(0, 3, turn, 5, 0)  # agent 3 hands it on
+        assert memory.leases[turn].lessee == 5
+    memory.note(0, 5, 9, 1, 0)
+    assert memory.leases[9] == Lease(1, 2)
+    for turn in (8, 11):  # agent 1 itself has given them away
+        memory.note(0, 5, turn, 1, 0)
+        memory.note(0, 2, turn, 1, 2)
+        assert memory.leases[turn].lessee == 5
+    memory.note(0, 6, 13, 4, 6)  # adopted
+    assert memory.leases[13].lessee == 3
+    memory.note(0, 6, 13, 1, 6)
+    assert memory.leases[13] == Lease(1, 6)
+
+
+def test_patience_is_six_times_as_long_as_an_agent_may_be_silent() -> None:
+    """Up to its next main anchor where it rests, or where nothing is known of it; at least 1000 slots."""
+    anchor, main = 6 * 5 * 40, 6 * 15 * 40
+    for agents, expected in ((40, [anchor, main, main, main]), (2, [1000] * 4)):
+        rules = Rules(agents=agents, slot_s=0.01, anchor_every=5, main_every=15)
+        memory = Memory(rules, heard=[7, 7, NEVER, NEVER], resting=[False, True, False, True])
+        assert [memory.patience(k) for k in range(4)] == expected
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_who_rests_is_thought_dead_later(rests: bool) -> None:
+    """It may speak in its main anchors only: two of them lost mean nothing."""
+    swarm = make(40, 10)
+    air = Air(swarm).run(1200)
+    quiet = 20 if rests else 2
+    swarm.present[quiet - 1] = 0
+    air.run(1300)
+    assert bool(swarm.lease_status(0)["absent"]) is not rests
+
+
+def test_turns_are_spread_evenly_over_those_that_move() -> None:
+    """Half move: each has about every sixth slot, and never waits for longer than a round."""
+    air = Air(make(12, 6)).run(3000)
+    gaps = [np.diff([slot for slot in range(1500, 3000) if air.sent[slot] == (agent,)]) for agent in range(1, 7)]
+    assert max(each.max() for each in gaps) <= 12
+    ages = [((each**2).sum() / each.sum() - 1.0) / 2.0 for each in gaps]
+    assert 2.5 <= np.mean(ages) < 3.1  # (6 - 1) / 2 is the bound
+
+
+def test_movers_that_are_few_are_spaced_evenly() -> None:
+    """They give turns of their own away, too, but none waits for longer than a round; with losses they keep them."""
+    for agents, movers in ((12, 2), (12, 3), (18, 5)):
+        air = Air(make(agents, movers)).run(1800)
+        gaps = [np.diff([t for t in range(900, 1800) if air.sent[t] == (k,)]) for k in range(1, movers + 1)]
+        assert max(each.max() for each in gaps) <= agents
+        ages = [((each**2).sum() / each.sum() - 1.0) / 2.0 for each in gaps]
+        assert np.mean(ages) < (movers - 1) / 2 * 1.16 + 0.12  # (N_p - 1) / 2 is the bound; anchors, OPEN turns
+    given = [t for t in range(900, 1800) if t % 18 < 5 and air.sent[t] and air.sent[t] != (t % 18 + 1,)]
+    assert not any(is_anchor(t, 18) for t in given)
+    assert len(given) > 100
+    lossy = Air(make(18, 5), loss=0.1).run(1800).sent
+    assert sum(lossy[t] == (t % 18 + 1,) for t in range(900, 1800) if t % 18 < 5) > 0.95 * 250
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_who_arrives_says_so_for_three_rounds_where_frames_are_lost(loss: float) -> None:
+    """Who missed it would take it for a mover until its next main anchor."""
+    swarm = make(12, 6)
+    air = Air(swarm, loss).run(600)
+    swarm.goal[:, 2] = swarm.position[:, 2]
+    air.run(36)
+    own = [slot for slot in range(600, 636) if slot % 12 == 2]
+    assert [air.sent[slot] == (3,) for slot in own] == ([True] * 3 if loss else [True, False, False])
+    told = sum(any(air.frames[slot].leases) for slot in own if air.sent[slot] == (3,))
+    assert told == (0 if loss else 1)
+
+
+def test_who_knows_where_all_want_to_be_gives_turns_away_from_the_first_round_on() -> None:
+    """But not to those who are known to stand at their targets, nor where nobody knows that."""
+    for known in (False, True):
+        plain = still(12)
+        target = plain.target.copy()
+        target[0, [4, 9]] += 20.0
+        swarm = Swarm(
+            SwarmConfig(agents=12, policy="lease", avoider="none"),
+            Scenario(plain.start, target, plain.moving, goals_known=known),
+        )
+        swarm.active[:] = 0
+        air = Air(swarm).run(36)
+        assert air.sent[:12] == [(slot + 1,) for slot in range(12)]
+        said = {byte for slot in range(12) for byte in air.frames[slot].leases} - {0, OPEN}
+        assert said == {5, 10}
+        first = [slot for slot in range(12) if any(air.frames[slot].leases)]
+        assert (first[0] == 0) is known
+        late = sum(air.sent[slot] in ((5,), (10,)) for slot in range(12, 36))
+        assert (late >= 20) is known
+
+
+@pytest.mark.parametrize(("agents", "every"), [(3, 5), (5, 2), (2, 8)])
+def test_small_swarms_that_hear_late_relay_no_turn_that_nobody_gave_away(agents: int, every: int) -> None:
+    """24 slots reach beyond their memory of (M + 2) N turns."""
+    swarm = make(agents, 1, open_every=0, adoption=False, anchor_every=every)
+    relayed, heard = set(), None
+    for slot in range(200):
+        senders = swarm.begin(slot)
+        assert len(senders) < 2
+        if heard is not None and slot % 3:
+            swarm.hear(slot, heard)  # a slot late
+        heard = swarm.frame(senders[0]) if senders else None
+        if heard is not None:
+            relayed |= {ahead for ahead, _ in decode_extended(heard).relay}
+            if not slot % 3:
+                swarm.hear(slot, heard)
+        swarm.end(slot)
+    assert 0 < max(relayed) < (every + 2) * agents
+
+
+def test_who_may_get_another_goal_keeps_its_turn_of_every_second_round() -> None:
+    swarm = make(12, 4)
+    swarm.final[:] = 0
+    air = Air(swarm).run(12 * 60)
+    for slot in range(12 * 40, 12 * 60):
+        if slot % 12 >= 4 and (slot // 12 + slot % 12) % 2 == 0:
+            assert air.sent[slot] == (slot % 12 + 1,)
+    assert air.leases(12 * 40, 12 * 60) > 0  # its other turns are given away
+
+
+class Flight:
+    """A flight without loss along the plan of its scenario, slot by slot."""
+
+    def __init__(self, **settings: Any) -> None:
+        config = SwarmConfig(policy="lease", **settings)
+        self.swarm = Swarm(config, make_scenario(config))
+        self.sent: list[tuple[int, ...]] = []
+
+    def slot(self) -> None:
+        slot, swarm = len(self.sent), self.swarm
+        swarm.scenario.advance(slot, swarm)
+        senders = swarm.begin(slot)
+        swarm.fly(slot)
+        if len(senders) == 1:
+            swarm.hear(slot, swarm.frame(senders[0]))
+        swarm.end(slot)
+        self.sent.append(tuple(swarm.ids[k] for k in senders))
+
+
+@pytest.mark.parametrize("seed", [1004, 1022])
+def test_nobody_sets_out_unheard(seed: int) -> None:
+    # Two wake in one slot, send in one OPEN turn, and both frames are lost.
+    flight = Flight(agents=24, scenario="staggered", avoider="bvc", slot_ms=33, seed=seed)
+    course, collisions, flown = flight.swarm.course, 0, set()
+    assert course is not None
+    for _ in range(900):
+        flight.slot()
+        collisions += len(flight.sent[-1]) > 1
+        table = flight.swarm.sent_slot
+        for k in np.flatnonzero(flight.swarm.active & (course.changed > 0)):
+            others = np.delete(table[:, k], k)
+            assert others.max() >= course.changed[k]
+            flown.add(int(k))
+    assert len(flown) >= 14
+    assert collisions
+
+
+def test_movers_keep_their_turns_in_the_first_round() -> None:
+    # Who waits for its start is taken for settled then, but gives nothing away.
+    flight = Flight(agents=24, scenario="staggered", avoider="jerky", slot_ms=33, seed=5101)
+    for _ in range(120):
+        flight.slot()
+    first = flight.sent[0][0]
+    turns = [slot for slot, senders in enumerate(flight.sent) if first in senders]
+    assert max(np.diff(turns)) <= 24

@@ -1,0 +1,173 @@
+"""Rules of policy lease that a slip in both statements would break alike; each statement is judged by what it sends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from lease_helpers import FAR, is_anchor, still
+
+from dtsa_agent.core import Swarm, SwarmConfig
+from dtsa_agent.core.frame_extended import ExtendedFrame, decode_extended, encode_extended
+from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
+
+STATEMENTS = pytest.mark.parametrize("statement", [Swarm, ReferenceSwarm], ids=["C", "Python"])
+MAIN = 15  # K M of the default settings
+
+
+class Flight:
+    """Agents of one statement that stand still; the first ``movers`` have something to say."""
+
+    def __init__(self, statement: Any, agents: int, movers: int, **settings: Any) -> None:
+        config = SwarmConfig(agents=agents, **{"policy": "lease", "avoider": "none", **settings})
+        self.swarm = statement(config, still(agents))
+        self.swarm.active[:] = 0
+        self.swarm.goal[0, :movers] = FAR
+        self.agents, self.slot = agents, 0
+        self.sent: list[tuple[int, ...]] = []  # ids by slot
+        self.frames: dict[int, ExtendedFrame] = {}
+        self.chosen: list[list[int]] = []  # by slot: whom each expects
+
+    def run(self, slots: int, deaf: dict[int, set[int]] | None = None, changed: Any = None) -> Flight:
+        """Flies.
+
+        :param deaf: ids of those that each agent does not hear, by id.
+        :param changed: makes another frame of a slot's frame, for all that hear it.
+        """
+        for slot in range(self.slot, self.slot + slots):
+            senders = self.swarm.begin(slot)
+            self.sent.append(tuple(k + 1 for k in senders))
+            self.chosen.append(self.swarm.chosen.tolist())
+            if len(senders) == 1:
+                sender = senders[0] + 1
+                frame = self.frames[slot] = decode_extended(self.swarm.frame(senders[0]))
+                said = changed(slot, frame) if changed else frame
+                mask = [k != sender and sender not in (deaf or {}).get(k, ()) for k in range(1, self.agents + 1)]
+                assert self.swarm.hear(slot, encode_extended(said), np.array(mask, dtype=np.uint8))
+            self.swarm.end(slot)
+        self.slot += slots
+        return self
+
+    def own(self, agent: int, first: int) -> list[int]:
+        """Slots from the first on in which an agent sent."""
+        return [slot for slot in range(first, self.slot) if self.sent[slot] == (agent,)]
+
+
+def claim(flight: Flight, of: int, by: int) -> int:
+    """Agent ``by`` says once that it thinks the ids before it dead, back to ``of``; the slot of that frame."""
+    slots: list[int] = []
+
+    def lie(slot: int, frame: ExtendedFrame) -> ExtendedFrame:
+        if frame.own.sender != by or slots:
+            return frame
+        slots.append(slot)
+        return replace(frame, c_s=(by - of) % flight.agents, leases=bytes(len(frame.leases)))
+
+    while not slots:
+        flight.run(1, changed=lie)
+    return slots[0]
+
+
+@STATEMENTS
+def test_who_is_in_probation_claims_nobody_dead(statement: Any) -> None:
+    flight = Flight(statement, 6, 6).run(60)
+    flight.swarm.present[3] = 0
+    flight.run(1600)
+    assert {flight.frames[slot].c_s for slot in flight.own(5, 1500)} == {1}  # it gives away the turns of agent 4
+    at = claim(flight, of=5, by=6)
+    flight.run(2 * MAIN * 6, deaf={5: {6}})  # nobody who would know better is heard
+    said = [flight.frames[slot] for slot in flight.own(5, at)]
+    in_probation = [frame for frame in said if frame.probation]
+    assert len(in_probation) >= 3
+    assert {frame.c_s for frame in in_probation} == {0}
+    assert not any(lease for frame in in_probation for lease in frame.leases)
+
+
+@STATEMENTS
+@pytest.mark.parametrize("settings", [{"adoption": False}, {}])
+def test_without_adoption_and_when_leaving_nobody_is_claimed(statement: Any, settings: dict[str, Any]) -> None:
+    flight = Flight(statement, 6, 6, **settings).run(60)
+    flight.swarm.present[3] = 0
+    flight.run(1600)
+    if settings:
+        assert {frame.c_s for frame in flight.frames.values()} == {0}
+    flight.swarm.present[4] = 2
+    flight.run(30)
+    (farewell,) = [frame for frame in flight.frames.values() if frame.leaving]
+    assert farewell.c_s == 0
+
+
+@STATEMENTS
+def test_who_was_claimed_waits_until_everybody_has_spoken_twice(statement: Any) -> None:
+    """2 K M N slots after the claim, where the next one alive is not heard to say otherwise."""
+    flight = Flight(statement, 6, 6).run(200)
+    at = claim(flight, of=5, by=6)
+    flight.run(3 * MAIN * 6, deaf={5: {6}})
+    other = [slot for slot in flight.own(5, at) if not is_anchor(slot, 6)]
+    assert at + 2 * MAIN * 6 <= other[0] <= at + 2 * MAIN * 6 + 2 * 6
+    assert all(is_anchor(slot, 6) for slot in flight.own(5, at) if slot < other[0])
+    assert len([slot for slot in flight.own(5, at) if slot < other[0]]) >= 4
+
+
+@STATEMENTS
+def test_who_missed_four_turns_is_given_none(statement: Any) -> None:
+    """Long before it is thought dead."""
+    flight = Flight(statement, 12, 3).run(600)
+    assert any(1 in frame.leases for slot, frame in flight.frames.items() if slot > 500)
+    flight.swarm.present[0] = 0
+    flight.run(MAIN * 12 + 120)  # until then frames repeat what was given away before
+    begin = flight.slot
+    flight.run(500)
+    assert not flight.swarm.lease_status(5)["absent"]
+    frames = [frame for slot, frame in flight.frames.items() if slot >= begin]
+    assert any(2 in frame.leases for frame in frames)
+    assert not any(1 in frame.leases or 1 in [lessee for _, lessee in frame.relay] for frame in frames)
+
+
+@STATEMENTS
+def test_no_turn_is_handed_on_to_its_owner(statement: Any) -> None:
+    flight = Flight(statement, 12, 6)
+    handed = 0
+    for stage in range(12):
+        flight.swarm.goal[0, :] = 0.0
+        moving = [(stage * 5 + k) % 12 for k in range(4)]
+        here = np.array(flight.swarm.position)
+        flight.swarm.goal[:] = here
+        flight.swarm.goal[0, moving] = FAR
+        given: dict[int, int] = {}  # lessee of each turn, as its owner said
+        for slot in range(flight.slot, flight.slot + 200):
+            flight.run(1)
+            frame = flight.frames.get(slot)
+            if frame is None:
+                continue
+            for ahead, lessee in frame.relay:
+                turn = slot + ahead
+                assert lessee != turn % 12 + 1, (slot, turn)
+                handed += given.get(turn, 0) == frame.own.sender != lessee
+                given[turn] = lessee
+    assert handed > 20
+
+
+@STATEMENTS
+def test_a_relay_of_somebody_else_changes_no_entry(statement: Any) -> None:
+    """Of a turn leased to one mover, an agent that has nothing to do with it says that it is another's."""
+    flight = Flight(statement, 12, 2).run(600)
+    told: list[tuple[int, int]] = []  # turn, its lessee
+
+    def lie(slot: int, frame: ExtendedFrame) -> ExtendedFrame:
+        known = [(ahead, lessee) for ahead, lessee in frame.relay if lessee in (1, 2) and ahead > 2]
+        fits = [(ahead, lessee) for ahead, lessee in known if frame.own.sender not in (lessee, (slot + ahead) % 12 + 1)]
+        if not fits or told:
+            return frame
+        ahead, lessee = fits[0]
+        told.append((slot + ahead, lessee))
+        relay = tuple((a, 3 - b if a == ahead else b) for a, b in frame.relay)
+        return replace(frame, relay=relay)
+
+    flight.run(12, changed=lie)
+    (turn, lessee) = told[0]
+    flight.run(max(0, turn - flight.slot + 1))
+    assert flight.chosen[turn] == [lessee] * 12
+    assert flight.sent[turn] == (lessee,)

@@ -1,0 +1,338 @@
+"""The compiled core computes what the specification says: bit for bit where agents must agree, to 1e-12 where not."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+
+from dtsa_agent.core import (
+    Frame,
+    LocalProtocolError,
+    RemoteProtocolError,
+    Swarm,
+    SwarmConfig,
+    decode_frame,
+    encode_frame,
+    priority,
+    select,
+)
+from dtsa_agent.core.compiled import MISSING, kernel
+from dtsa_agent.core.frame import position_step
+from dtsa_agent.core.frame_extended import ExtendedFrame, Gossip, decode_extended, encode_extended
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.reference import arithmetic, frame, frame_extended, selection, tag, timebase
+from dtsa_agent.core.reference import priority as plain_priority
+from dtsa_agent.core.registry import REASONS
+from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, flight_model
+from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
+
+EXTENTS = (65.534, 20.0, 1.0, 9999.0)
+
+numbers = st.floats(-80, 80) | st.floats() | st.sampled_from([0.0, -0.0, 0.001, 0.003, 1e300, -math.inf])
+vectors = st.tuples(numbers, numbers, numbers)
+odd_ids, odd_c_r = st.sampled_from([0, 255, 70000]), st.sampled_from([-1, 256])
+ids, slots, c_r = st.integers(1, 254) | odd_ids, st.integers(0, 2**32 - 1), st.integers(0, 255) | odd_c_r
+frames = st.builds(Frame, ids, slots, c_r, vectors, vectors, st.none() | vectors)
+ages = st.integers(1, 127) | st.sampled_from([0, 128])
+gossips = st.builds(Gossip, st.integers(1, 254) | st.just(255), ages, st.booleans(), vectors, vectors)
+lessees = st.dictionaries(st.integers(1, 24) | st.just(25), st.integers(1, 255) | st.just(0), max_size=9)
+extended = st.builds(
+    ExtendedFrame, frames, st.integers(0, 253) | st.sampled_from([-1, 254]), st.booleans(), st.booleans(),
+    st.lists(gossips, max_size=3).map(tuple), st.binary(max_size=34), lessees.map(lambda d: tuple(sorted(d.items()))),
+)  # fmt: skip
+
+
+def outcome(action: Callable[[], Any]) -> Any:
+    """What comes of something: a value in words (NaN equals NaN), or its refusal."""
+    try:
+        return repr(action())
+    except RemoteProtocolError as error:
+        return str(error)
+    except LocalProtocolError:
+        return "not encodable"
+
+
+@settings(max_examples=150)
+@given(frames, st.sampled_from(EXTENTS))
+def test_both_say_the_same(said: Frame, extent: float) -> None:
+    step = position_step(extent)
+    assert outcome(lambda: encode_frame(said, extent)) == outcome(lambda: frame.encode(said, step))
+
+
+@settings(max_examples=150)
+@given(extended, st.sampled_from(EXTENTS))
+def test_both_say_the_same_about_others(said: ExtendedFrame, extent: float) -> None:
+    step = position_step(extent)
+    assert outcome(lambda: encode_extended(said, extent)) == outcome(lambda: frame_extended.encode_extended(said, step))
+
+
+HEADS = st.sampled_from([b"", b"\x10", b"\x11", b"\x12", b"\x13", b"\x22"])
+
+
+def without_intent(heard: Frame, data: bytes) -> Frame:
+    """:func:`decode_frame` leaves the intent of an extended frame to :func:`decode_extended`."""
+    return dataclasses.replace(heard, intent=None) if data[0] == 0x12 else heard
+
+
+@settings(max_examples=300)
+@given(HEADS, st.binary(max_size=8) | st.binary(min_size=18, max_size=23) | st.binary(min_size=54, max_size=57))
+@example(b"\x12", b"\1\2" + bytes(53))
+def test_both_understand_the_same(head: bytes, body: bytes) -> None:
+    data, step = head + body, position_step(EXTENTS[0])
+    assert outcome(lambda: decode_frame(data)) == outcome(lambda: without_intent(frame.decode(data, step), data))
+    assert outcome(lambda: decode_extended(data)) == outcome(lambda: frame_extended.decode_extended(data, step))
+
+
+@settings(max_examples=300)
+@given(st.integers(0, 7), st.binary(min_size=52, max_size=52))
+def test_both_understand_the_same_sections(kinds: int, body: bytes) -> None:
+    """Heads that are right, so that sections decide."""
+    data = b"\x12\x05\x03" + bytes([kinds << 2 & 0xFF]) + body
+    step = position_step(EXTENTS[0])
+    assert outcome(lambda: decode_extended(data)) == outcome(lambda: frame_extended.decode_extended(data, step))
+
+
+def test_the_arcsine_is_one() -> None:
+    for x in np.linspace(-1, 1, 2001):
+        assert arithmetic.arcsin(float(x)) == pytest.approx(math.asin(x), abs=3e-16)
+
+
+@settings(max_examples=80)
+@given(st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_priorities_have_the_same_bits(count: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    position, velocity = random.normal(size=(2, count, 3))
+    velocity[random.random(count) < 0.2] = 0
+    position[random.random(count) < 0.1] = 1.0
+    compiled = priority(position, velocity, 0.01)
+    plain = plain_priority.priorities(
+        [tuple(p) for p in position.tolist()], [tuple(v) for v in velocity.tolist()], 0.01
+    )
+    assert compiled.tobytes() == np.array(plain).tobytes()
+
+
+@settings(max_examples=200)
+@given(st.integers(1, 20), st.integers(0, 2**32 - 1), st.sampled_from(["candidates", "pairwise"]))
+def test_the_same_is_selected_for_the_same_reason(count: int, seed: int, reading: str) -> None:
+    random = np.random.default_rng(seed)
+    g = random.choice([0.0, 0.1, 0.3, 0.5, 1.0], count) * random.choice([0.0, 1.0, random.random()])
+    h, in_ap, epsilon = random.integers(0, 5, count), random.random(count) < 0.7, float(random.choice([0, 0.5, 1]))
+    index, close, reason = select(g, h, in_ap, epsilon, reading)
+    plain = selection.select(g.tolist(), h.tolist(), in_ap.tolist(), epsilon, reading)
+    assert (index, REASONS[reason]) == (plain.index, plain.reason)
+    if reading == "candidates" and plain.reason in ("tie", "priority"):
+        members = np.flatnonzero(in_ap).tolist()
+        assert np.flatnonzero(close).tolist() == selection.candidates(g.tolist(), members, epsilon)
+
+
+TABLES = ("tdma", "dtsa", "age", "aloha", "lease")
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1))
+def test_random_tables_lead_to_the_same_decisions(seed: int) -> None:
+    """Agents that heard anything, in any order: tables, digests, decisions, frames."""
+    random = np.random.default_rng(seed)
+    agents = int(random.integers(2, 25))
+    config = SwarmConfig(
+        agents=agents, policy=str(random.choice(TABLES)), estimator=str(random.choice(["linear", "intent"])),
+        selection=str(random.choice(["candidates", "pairwise"])), seed=seed, epsilon=float(random.random()),
+        age_cap=float(random.choice([0.0, 1.5, 4.0])), return_every=int(random.choice([0, 3, 20])), moving=0,
+        boot_round=False, frame=str(random.choice(["auto", "extended"])), targets_known=bool(random.random() < 0.5),
+    )  # fmt: skip
+    me = int(random.integers(1, agents + 1))
+    pair = Swarm(config, local=[me]), ReferenceSwarm(config, local=[me])
+    slot = int(random.integers(0, 3))
+    for _ in range(int(random.integers(1, 12))):
+        heard, place = random_frame(random, agents, slot, config.extended), random.uniform(-3, 3, 3)
+        for swarm in pair:
+            swarm.position[:, 0] = place
+            swarm.begin(slot)
+            swarm.hear(slot, heard)
+            swarm.end(slot)
+        slot += int(random.integers(1, 20))
+    for swarm in pair:
+        swarm.begin(slot)
+    compiled, plain = pair
+    for name in ("chosen", "reason", "score", "digest", "counter", "sent_slot", "in_ap", "sent_position"):
+        assert getattr(compiled, name).tobytes() == getattr(plain, name).tobytes(), name
+    known = ~np.isnan(compiled.priority)  # the others did not matter
+    assert compiled.priority[known].tobytes() == plain.priority[known].tobytes()
+    assert compiled.frame(0) == plain.frame(0)
+    assert (compiled.malformed, compiled.foreign) == (plain.malformed, plain.foreign)
+
+
+@settings(max_examples=300)
+@given(st.integers(2, 24), st.integers(0, 2**32 - 1))
+def test_who_is_most_urgent_is_found_without_all_priorities(count: int, seed: int) -> None:
+    """Bounds say who matters: in crowds, symmetry, equal places, with epsilon at the edge of somebody's g."""
+    random = np.random.default_rng(seed)
+    position, velocity = random.normal(size=(2, 3, count)) * random.choice([1e-3, 1.0, 30.0])
+    if random.random() < 0.3:  # mirrored: all g twice
+        position, velocity = ((x - x[:, ::-1]) / 2 for x in (position, velocity))
+    if random.random() < 0.3:  # head on to the middle, where the arccosine is steep
+        velocity = -0.5 * position
+    velocity[:, random.random(count) < random.choice([0, 0, 0.4])] = 0
+    position[:, random.random(count) < random.choice([0, 0, 0.2])] = 1.0
+    g = plain_priority.priorities(
+        [tuple(p) for p in position.T.tolist()], [tuple(v) for v in velocity.T.tolist()], 0.01
+    )  # fmt: skip
+    edge = 1 - random.choice(g) / max(g) if max(g) > 0 else 0.5
+    epsilon = float(random.choice([0, 0.5, 1, np.clip(edge + random.choice([-1e-7, 0, 1e-7]), 0, 1)]))
+    swarm = Swarm(SwarmConfig(agents=count, policy="dtsa", moving=0, boot_round=False, age_cap=0, epsilon=epsilon))
+    in_ap, last = random.random(count) < 0.8, random.integers(0, 5, count)
+    swarm.sent_position[:], swarm.sent_velocity[:], swarm.in_ap[:], swarm.last_turn[:] = position, velocity, in_ap, last
+    swarm.decide(8)  # nobody was heard: states are as they are
+    plain = selection.select(g, (7 - last).tolist(), in_ap.tolist(), epsilon)
+    assert (int(swarm.chosen[0]) - 1, swarm.reason_name(0), swarm.score[0]) == (plain.index, plain.reason, plain.g)
+    known = ~np.isnan(swarm.priority[0]) & in_ap.any()
+    assert swarm.priority[0][known].tobytes() == np.array(g)[known].tobytes()
+
+
+def test_few_priorities_are_computed() -> None:
+    random, known = np.random.default_rng(1), 0
+    swarm = Swarm(SwarmConfig(agents=18, policy="dtsa", moving=0, boot_round=False), shared_table=True)
+    for _ in range(50):
+        swarm.sent_position[:], swarm.sent_velocity[:] = random.normal(size=(2, 3, 18))
+        swarm.decide(8)
+        known += np.isfinite(swarm.priority).sum()
+    assert 50 <= known < 100
+
+
+def random_frame(random: np.random.Generator, agents: int, slot: int, whole: bool) -> bytes:
+    """A frame of somebody for a slot or the one before; now and then one of nobody, of another time, or none."""
+    sender = int(random.integers(1, agents + 2)) if random.random() < 0.7 else slot % agents + 1
+    sent = max(0, slot - int(random.choice([0, 0, 0, 1, 2])))
+    if random.random() < 0.05:
+        return random.bytes(int(random.integers(0, 60)))
+    p, v, c = (tuple(random.uniform(-5, 5, 3).tolist()) for _ in range(3))
+    own = Frame(sender, sent, int(random.integers(0, 2)), p, v, c if whole or random.random() < 0.5 else None)
+    if not whole:
+        return encode_frame(own)
+    leases = bytes(random.integers(0, agents + 1, 11).tolist()) if sent % agents == sender - 1 else b""
+    others = tuple(
+        Gossip(int(random.integers(1, agents + 1)), int(random.integers(1, 20)), bool(random.random() < 0.5), v, c)
+        for _ in range(int(random.integers(0, 3)))
+    )
+    c_s, probation = int(random.choice([0, 0, 1, agents - 1])), bool(random.random() < 0.2)
+    return encode_extended(ExtendedFrame(own, c_s, bool(random.random() < 0.05), probation, others[:2], leases))
+
+
+@settings(max_examples=250)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(sorted(FLIGHT_MODELS)),
+    st.sampled_from([0.0, 0.1]),
+    st.sampled_from([0.5, 1.5, 4.0]),
+)
+def test_avoiders_command_the_same_velocity(seed: int, name: str, rate: float, size: float) -> None:
+    """Random scenes, crowded and wide. Scenes on an edge are left out: a hair decides there, in both."""
+    random, model = np.random.default_rng(seed), flight_model(name, {"margin_rate": rate})
+    count = int(random.integers(1, 20))
+    position, velocity = random.uniform(-size, size, (3, count)), random.uniform(-1, 1, (3, count))
+    goal, ages = random.uniform(-5, 5, 3), random.uniform(0, 2, count)
+    own = int(random.integers(count))
+    away = np.sqrt(((position - position[:, [own]]) ** 2).sum(axis=0))
+    edge = model.avoider.radius + np.minimum(model.avoider.margin_max, rate * ages)
+    assume(not (np.abs(np.delete(away - edge, own)) < 1e-3).any())
+    scene = (own, position[:, own], velocity[:, own], goal, position, velocity, ages)
+    tolerance = 1e-12 if "bvc" not in name else 1e-9  # its walls are stiff: 1e6 times what rounding does
+    np.testing.assert_allclose(model.command(*scene, plain=True), model.command(*scene), rtol=0, atol=tolerance)
+
+
+def test_a_swarm_of_the_specification_is_reset_and_copied() -> None:
+    config = SwarmConfig(agents=4, policy="dtsa", seed=3)
+    swarm = ReferenceSwarm(config, shared_table=True)
+    digest = swarm.table_hash.copy()
+    for slot in range(12):
+        swarm.scenario.advance(slot, swarm)
+        for place in swarm.begin(slot):
+            swarm.fly(slot)
+            swarm.hear(slot, swarm.frame(place))
+        swarm.end(slot)
+    assert swarm.table_hash != digest
+    swarm.reset()
+    assert swarm.table_hash == digest
+    with pytest.raises(ValueError, match="share"):
+        swarm.restart(0)
+
+
+OUTCOMES = (timebase.ALIGNED, timebase.RESTARTED, timebase.FOREIGN)
+
+
+@pytest.fixture(scope="module")
+def library() -> ctypes.CDLL:
+    """The functions of libdtsa that the compiled kernel does not use itself."""
+    assert not MISSING
+    found = ctypes.CDLL(str(kernel.__file__))
+    for name in ("dtsa_timebase_start", "dtsa_timebase_slot", "dtsa_timebase_slot_start"):
+        getattr(found, name).restype = ctypes.c_int64
+    return found
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1))
+def test_the_same_is_heard_at_the_same_times_in_the_same_slots(library: ctypes.CDLL, seed: int) -> None:
+    """Time base and alignment: random frames of one's own time and of others, on a clock that runs on."""
+    random = np.random.default_rng(seed)
+    agents, every, slot_ns = (
+        int(random.integers(1, 255)),
+        int(random.integers(1, 16)),
+        int(random.choice([10**6, 10**7])),
+    )
+    agent, now, long = int(random.integers(1, agents + 1)), int(random.integers(0, 10**15)), ctypes.c_int64
+    plain = timebase.TimeBase(agents=agents, anchor_every=every, slot_ns=slot_ns, agent=agent, seed=seed)
+    compiled = ctypes.byref(ctypes.create_string_buffer(1024))
+    assert library.dtsa_timebase_init(compiled, agents, every, long(slot_ns), agent, ctypes.c_uint64(seed)) == 1
+    deadline = plain.start(now)
+    assert library.dtsa_timebase_start(compiled, long(now)) == deadline
+    if random.random() < 0.4:
+        now = deadline + int(random.integers(-1, 2))
+        assert library.dtsa_timebase_wake(compiled, long(now)) == plain.wake(now)
+    for _ in range(40):
+        now += int(random.integers(0, 3 * slot_ns))
+        expected = plain.slot(now)
+        slot = int(random.integers(0, 10**6)) if expected is None or random.random() < 0.05 else expected
+        late = int(random.choice([-(10**6) - 1, -400_000, 3, 250_001, 10**6, slot_ns // 2, 3 * slot_ns]))
+        start = now if expected is None else plain.slot_start_ns(slot) + late + int(random.integers(-9, 10))
+        assert OUTCOMES[library.dtsa_timebase_hear(compiled, long(slot), long(start))] == plain.hear(slot, start)
+        assert library.dtsa_timebase_slot(compiled, long(now)) == plain.slot(now)
+        assert library.dtsa_timebase_slot_start(compiled, long(slot)) == plain.slot_start_ns(slot)
+
+
+@given(st.binary(min_size=16, max_size=32), st.integers(0, 2**64 - 1), st.integers(0, 2**40), st.binary(max_size=300))
+def test_frames_get_the_same_tags(library: ctypes.CDLL, key: bytes, session: int, slot: int, data: bytes) -> None:
+    said = ctypes.create_string_buffer(tag.LENGTH)
+    session_c, slot_c, length = ctypes.c_uint64(session), ctypes.c_uint64(slot), ctypes.c_long(len(data))
+    library.dtsa_tag(key, len(key), session_c, slot_c, data, length, said)
+    assert said.raw == tag.tag(tag.keyed(key, session), slot, data)
+
+
+@pytest.mark.skipif(bool(MISSING), reason="the core is not compiled")
+@pytest.mark.parametrize("estimator", ["hold", "linear", "intent"])
+def test_a_state_from_the_next_slot_is_estimated_within_its_memory(estimator: str) -> None:
+    """A clock that is ahead: its frame is heard before the receiver's slot is over. Found by fuzzing."""
+    config = SwarmConfig(agents=3, estimator=estimator, policy="tdma")
+    swarms = [make_swarm(config, core=core) for core in ("compiled", "reference")]
+    for swarm in swarms:
+        swarm.velocity[:] = 0.5
+        swarm.begin(0)
+        swarm.command[:] = 1.0
+        swarm.sends[:] = 1
+        swarm.emit(7)
+        for place in range(3):
+            assert swarm.hear(7, swarm.frame(place))
+        for slot in (7, 6, 3):
+            swarm.estimate(slot)
+    compiled, plain = swarms
+    assert np.array_equal(compiled.estimate_position, plain.estimate_position)
+    assert np.array_equal(compiled.estimate_velocity, plain.estimate_velocity)
+    assert np.abs(compiled.estimate_velocity[0, :, 1]).max() <= 0.51  # nothing has decayed yet

@@ -1,0 +1,157 @@
+"""Rows of policies, estimators and avoiders: complete, true, and the kernel's."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, registry
+from dtsa_agent.core.agents.joining import check_joinable
+from dtsa_agent.core.compiled import NAMES
+from dtsa_agent.core.registry import ESTIMATORS, POLICIES, PORT, PolicyRow, check_kernel
+from dtsa_agent.core.settings.declaration import settings_of
+from dtsa_agent.core.settings.flight_models import AVOIDERS, AvoiderParams, flight_model
+
+CORE = Path(registry.__file__).parent
+
+
+def flown(policy: str, shared: bool, slots: int = 60) -> Swarm:
+    swarm = Swarm(SwarmConfig(agents=6, moving=4, policy=policy, seed=3), shared_table=shared)
+    for slot in range(slots):
+        swarm.scenario.advance(slot, swarm)
+        senders = swarm.begin(slot)
+        swarm.fly(slot)
+        if len(senders) == 1:
+            swarm.hear(slot, swarm.frame(senders[0]))
+        swarm.end(slot)
+    return swarm
+
+
+def test_lists_of_names_are_the_kernels_and_a_difference_is_said() -> None:
+    assert NAMES["policies"] == POLICIES.names
+    assert NAMES["reasons"] == registry.REASONS
+    for kind, names in NAMES.items():
+        check_kernel(kind, names)
+        for other in (names[::-1], names[:-1], (*names, "more")):
+            with pytest.raises(ImportError, match=f"{kind}.*build dtsa_agent again"):
+                check_kernel(kind, other)
+
+
+def test_every_list_of_the_kernel_is_compared() -> None:
+    text = (CORE / "registry.py").read_text() + (CORE / "settings" / "flight_models.py").read_text()
+    assert all(f'"{kind}"' in text for kind in NAMES)
+
+
+def test_settings_and_rows_have_the_same_names() -> None:
+    words = {spec.name: spec.choices for spec in settings_of(SwarmConfig)}
+    for rows in (POLICIES, ESTIMATORS, AVOIDERS):
+        assert words[rows.kind] == rows.names
+        assert [rows.number(name) for name in rows.names] == list(range(len(rows.names)))
+        assert rows.number("somebody's own") == len(rows.names)
+        assert all(rows.row(name).name == name for name in rows.names)
+
+
+@pytest.mark.parametrize("row", POLICIES.rows.values(), ids=lambda row: row.name)
+def test_a_policy_is_what_its_row_says(row: PolicyRow) -> None:
+    config = SwarmConfig(agents=6, moving=4, policy=row.name)
+    own = flown(row.name, shared=False)
+    assert config.extended == row.extended
+    assert bool(own.lease_state.size) == row.agent_state
+    assert bool(own.priority.any()) == row.weighs_all
+    assert row.decides
+    assert row.under_loss
+    assert row.label
+    assert set(row.port) <= set(PORT)
+    assert row.own_bytes == 0  # of plug-ins only
+    if row.may_share:
+        assert np.array_equal(flown(row.name, shared=True).position, own.position)
+    if row.agent_state:
+        with pytest.raises(ConfigError, match="shared_table"):
+            flown(row.name, shared=True)
+        assert own.lease_status(0)["probation"] is False
+        own.restart(0)
+        own.begin(60)
+        assert own.lease_status(0)["probation"] is row.probation
+    own.leave(1)
+    assert bool(own.present[1]) == row.says_leaving
+    if row.may_join:
+        check_joinable(row.name)
+    else:
+        with pytest.raises(ConfigError, match="policy"):
+            check_joinable(row.name)
+
+
+@pytest.mark.parametrize("row", ESTIMATORS.rows.values(), ids=lambda row: row.name)
+def test_an_estimator_is_what_its_row_says(row: registry.EstimatorRow) -> None:
+    config = SwarmConfig(agents=3, moving=2, policy="tdma", estimator=row.name)
+    swarm = Swarm(config)
+    swarm.begin(0)
+    assert len(swarm.frame(0)) == (23 if row.needs_intent else 19)
+    assert row.text
+    if row.needs_everybody:
+        with pytest.raises(ConfigError, match="all agents in one process"):
+            Swarm(config, local=[1])
+    else:
+        Swarm(config, local=[1])
+
+
+def test_more_agents_than_a_policy_or_its_frames_can_name_are_refused_with_what_is_possible(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert SwarmConfig(agents=254, policy="lease").extended
+    with pytest.raises(
+        ConfigError, match=r"agents: got 255; allowed: 1 to 254 .*1024 with policy tdma, dtsa, age, alo"
+    ):
+        SwarmConfig(agents=255, policy="lease")
+    with pytest.raises(ConfigError, match=r"agents: got 300; allowed: 1 to 254 .*1024 with frame: paper"):
+        SwarmConfig(agents=300, policy="tdma", frame="extended")
+    assert SwarmConfig(agents=300, policy="tdma").agents == 300
+    few = dataclasses.replace(POLICIES.rows["tdma"], most_agents=5)
+    monkeypatch.setattr(POLICIES, "rows", {**POLICIES.rows, "tdma": few})
+    with pytest.raises(ConfigError, match="agents: got 6; allowed: 1 to 5 with policy tdma"):
+        SwarmConfig(agents=6, policy="tdma")
+
+
+def test_a_plug_in_named_like_a_built_in_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for rows, name in ((POLICIES, "tdma"), (ESTIMATORS, "linear"), (AVOIDERS, "orca")):
+        point = EntryPoint(name, "somebody:Thing", rows.group)
+        monkeypatch.setattr("importlib.metadata.entry_points", lambda group, point=point: [point])
+        with pytest.raises(ConfigError, match=f"{rows.group}: got '{name}'; allowed: another name for somebody:Thing"):
+            rows.plug_ins()
+        with pytest.raises(ConfigError, match="another name"):
+            rows.row("somebody's own")
+
+
+@pytest.mark.parametrize(
+    ("what", "value"), [("own_bytes", 17), ("own_bytes", -1), ("own_bytes", True), ("port", ("send", "telepathy"))]
+)
+def test_what_a_policy_declares_is_checked(monkeypatch: pytest.MonkeyPatch, what: str, value: Any) -> None:
+    class Point:
+        name, value = "odd", "somebody:Odd"
+
+        def load(self) -> type:
+            return type("Odd", (), {what: value})
+
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [Point()])
+    with pytest.raises(ConfigError, match=f"odd.{what}"):
+        POLICIES.row("odd")
+
+
+def test_flight_models_take_the_kernels_parameters() -> None:
+    for name in AVOIDERS.names:
+        model = flight_model(name)
+        assert model.kind == NAMES["avoiders"].index(model.avoider_kind)
+        assert set(model.avoider.to_dict()) == {spec.name for spec in settings_of(AvoiderParams)}
+
+
+def test_the_readme_lists_the_rows() -> None:
+    readme = (CORE.parents[3] / "README.md").read_text()
+    for row in POLICIES.rows.values():
+        assert f"| `{row.name}` | {row.decides} | {row.under_loss} |" in readme
+    listed = readme[readme.index("Estimators: ") : readme.index("The channel: ")]
+    assert all(f"`{name}`" in listed for name in (*ESTIMATORS.names, *AVOIDERS.names))

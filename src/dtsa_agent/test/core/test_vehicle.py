@@ -1,0 +1,63 @@
+"""The vehicle: a point mass with first-order response and limited acceleration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dtsa_agent.core.reference import vehicle
+from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, VehicleParams
+
+vectors = st.lists(st.floats(-5, 5), min_size=3, max_size=3).map(np.array)
+
+
+@given(vectors, vectors, vectors, st.sampled_from(sorted(FLIGHT_MODELS)), st.sampled_from([0.002, 0.01]))
+def test_step_follows_the_formula(p: np.ndarray, v: np.ndarray, c: np.ndarray, name: str, dt: float) -> None:
+    params = FLIGHT_MODELS[name].vehicle
+    now = [tuple(array.tolist()) for array in (p, v, c)]
+    expected_p, expected_v = vehicle.step(params.tau, params.a_max, dt, *now)
+    params.step(dt, p, v, c)
+    assert (tuple(p.tolist()), tuple(v.tolist())) == (expected_p, expected_v)  # bit for bit
+
+
+@given(vectors, vectors, vectors)
+def test_acceleration_never_exceeds_its_limit(p: np.ndarray, v: np.ndarray, c: np.ndarray) -> None:
+    params = VehicleParams(tau=0.1, a_max=2.0)
+    before = v.copy()
+    params.step(0.01, p, v, c)
+    assert np.linalg.norm(v - before) <= 2.0 * 0.01 * (1 + 1e-12)
+
+
+def test_many_vehicles_step_like_single_ones() -> None:
+    params = VehicleParams()
+    random = np.random.default_rng(2)
+    p, v, c = random.normal(size=(3, 3, 23))
+    singles = []
+    for k in range(23):
+        one_p, one_v = p[:, k].copy(), v[:, k].copy()
+        params.step(0.01, one_p, one_v, c[:, k].copy())
+        singles.append((one_p.tobytes(), one_v.tobytes()))
+    params.step(0.01, p, v, c)
+    assert singles == [(p[:, k].tobytes(), v[:, k].tobytes()) for k in range(23)]
+
+
+def test_a_small_change_is_reached_with_the_time_constant() -> None:
+    params = VehicleParams(tau=0.25, a_max=20.0)
+    p, v, c = np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0])
+    for _ in range(250):
+        params.step(0.001, p, v, c)
+    assert v[0] == pytest.approx(1 - np.exp(-1), abs=2e-3)
+
+
+def test_wrong_arrays_are_refused() -> None:
+    params = VehicleParams(tau=0.1, a_max=2.0)
+    with pytest.raises(ValueError, match="argument 5"):
+        params.step(0.01, np.zeros(3), np.zeros(6), np.zeros(3))
+    with pytest.raises(ValueError, match="argument 6"):
+        params.step(0.01, np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(3))
+    frozen = np.zeros(3)
+    frozen.flags.writeable = False
+    with pytest.raises(ValueError, match="read-only"):
+        params.step(0.01, frozen, np.zeros(3), np.zeros(3))

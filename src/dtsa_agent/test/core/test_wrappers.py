@@ -1,0 +1,176 @@
+"""Swarms around swarms: what a wrapper does not change is as in the swarm inside, bit for bit."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+
+from dtsa_agent.core import AbstractSwarm, Swarm, SwarmConfig
+from dtsa_agent.core.agents.authentication import AuthenticatedSwarm, Authenticator
+from dtsa_agent.core.plugins.entry_points import PluginSwarm
+from dtsa_agent.core.settings.flight_models import VehicleParams
+from dtsa_agent.core.swarms.abstract_swarm import SwarmWrapper
+from dtsa_agent.crazyflie.node.external_vehicles import HOLD_GAIN, HOLD_MPS, ExternalVehicles
+
+KEY = bytes(range(16))
+ARRAYS = (
+    "position",
+    "velocity",
+    "command",
+    "chosen",
+    "reason",
+    "digest",
+    "score",
+    "sent_position",
+    "sent_slot",
+    "track",
+)
+
+
+def one_slot(swarm: AbstractSwarm, slot: int, random: np.random.Generator | None) -> tuple[int, ...]:
+    swarm.scenario.advance(slot, swarm)
+    senders = swarm.begin(slot)
+    frames = [swarm.frame(index) for index in senders]
+    swarm.fly(slot)
+    for data in frames if len(frames) == 1 else []:
+        mask = None if random is None else (random.random(len(swarm.observer)) < 0.7).astype(np.uint8)
+        assert swarm.hear(slot, data, mask)
+    swarm.end(slot)
+    return senders
+
+
+@pytest.mark.parametrize("policy", ["tdma", "dtsa", "lease"])
+@pytest.mark.parametrize("wrap", [
+    SwarmWrapper,
+    PluginSwarm,
+    lambda swarm: AuthenticatedSwarm(swarm, Authenticator(KEY)),
+    lambda swarm: AuthenticatedSwarm(PluginSwarm(swarm), Authenticator(KEY)),
+])  # fmt: skip
+def test_wrapped_swarms_fly_like_the_plain_one(policy: str, wrap: type[SwarmWrapper]) -> None:
+    config = SwarmConfig(agents=6, moving=4, policy=policy, estimator="intent", scenario="stop-and-go", seed=3)
+    plain, wrapped = Swarm(config), wrap(Swarm(config))
+    for _ in range(2):
+        draws = np.random.default_rng(1), np.random.default_rng(1)
+        for slot in range(250):
+            assert one_slot(plain, slot, draws[0]) == one_slot(wrapped, slot, draws[1])
+            for name in ARRAYS:
+                assert np.array_equal(getattr(plain, name), getattr(wrapped, name)), (slot, name)
+        assert (wrapped.malformed, wrapped.foreign, wrapped.rejected) == (0, 0, 0)
+        plain.reset()
+        wrapped.reset()
+
+
+def test_an_authenticated_swarm_gives_its_shared_table_up_like_the_plain_one() -> None:
+    config = SwarmConfig(agents=5, policy="dtsa", seed=3)
+    plain: AbstractSwarm = Swarm(config, shared_table=True)
+    sealed: AbstractSwarm = AuthenticatedSwarm(Swarm(config, shared_table=True), Authenticator(KEY))
+    for slot in range(40):
+        for swarm in (plain, sealed):
+            swarm.begin(slot)
+            swarm.fly(slot)
+        if slot == 20:
+            plain, sealed = plain.with_own_tables(slot), sealed.with_own_tables(slot)
+        for index in np.flatnonzero(plain.sends):
+            mask = np.array([slot < 20 or k % 2 for k in range(len(plain.observer))], dtype=np.uint8)
+            assert sealed.hear(slot, sealed.frame(index), mask)
+            assert plain.hear(slot, plain.frame(index), mask)
+        for swarm in (plain, sealed):
+            swarm.end(slot)
+        assert np.array_equal(plain.digest, sealed.digest)
+    assert len(set(sealed.digest.tolist())) > 1
+
+
+def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothing_moves() -> None:
+    config = SwarmConfig(agents=4, moving=2, policy="tdma", seed=2)
+    sent: list[np.ndarray] = []
+    plain = Swarm(config)
+    outside = ExternalVehicles(Swarm(config), 2, lambda command: sent.append(command.copy()))
+    for swarm in (plain, outside):
+        swarm.scenario.advance(0, swarm)
+    still = plain.active == 0
+    for slot in range(10):
+        for swarm in (plain, outside):
+            swarm.position[:, still] = plain.scenario.start[:, still] + 0.1
+            swarm.begin(slot)
+        outside.place(plain.position)
+        outside.velocity[:] = plain.velocity
+        before = outside.position.copy()
+        plain.steer(slot, 0)
+        outside.fly(slot)
+        assert np.array_equal(outside.position, before)
+        assert np.array_equal(outside.track[-1], before)
+        assert len(sent) == slot // 2 + 1
+        if slot % 2 == 0:
+            assert np.array_equal(sent[-1][:, ~still], plain.command[:, ~still])
+            assert sent[-1][:, still] == pytest.approx(max(-HOLD_GAIN * 0.1, -HOLD_MPS))
+        for swarm in (plain, outside):
+            for index in np.flatnonzero(swarm.sends):
+                swarm.hear(slot, swarm.frame(index))
+            swarm.end(slot)
+        plain.move(0)
+
+
+def test_wrappers_hand_on_every_step_of_the_interface() -> None:
+    steps = AbstractSwarm.__abstractmethods__
+    assert steps <= {name for name, _ in inspect.getmembers(SwarmWrapper, inspect.isfunction)}
+    assert steps <= {name for name, _ in inspect.getmembers(Swarm, inspect.isfunction)}
+    assert not [name for name in steps if name in vars(Swarm(SwarmConfig(agents=2)))]  # methods, not attributes
+
+
+def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple[float, float, float]:
+    """Twelve exchange places; smallest distance after a slot, m; 4 s later smallest horizontal distance, largest speed.
+
+    :param stop_here: they are told to come to rest; otherwise their commands break off for 0.4 s, and then they brake.
+    """
+    config = SwarmConfig(
+        agents=12, moving=12, policy="tdma", estimator="linear", avoider="crazyflie", seed=seed, slot_ms=20.0,
+        shape="ellipse", axis_x_m=1.2, axis_y_m=2.0, permute=False,
+    )  # fmt: skip
+    commands = np.zeros((3, 12))
+    swarm = ExternalVehicles(Swarm(config), 1, lambda c: np.copyto(commands, c))
+    swarm.scenario.advance(0, swarm)
+    place, velocity, closest = swarm.scenario.start.copy(), np.zeros((3, 12)), np.inf
+    for now in range(slot + 200):
+        swarm.place(place)
+        swarm.velocity[:] = velocity
+        if now == slot and stop_here:
+            swarm.stop_here()
+        swarm.begin(now)
+        for index in np.flatnonzero(swarm.sends):
+            swarm.hear(now, swarm.frame(index))
+        if now < slot or stop_here:
+            swarm.fly(now)
+        elif now >= slot + 20:
+            commands[:] = 0.0
+        swarm.end(now)
+        for _ in range(2):
+            VehicleParams().step(0.01, place, velocity, commands)
+        gaps = np.linalg.norm(place[:, :, None] - place[:, None, :], axis=0) + 10 * np.eye(12)
+        closest = min(closest, gaps.min()) if now >= slot else closest
+    assert np.array_equal(swarm.goal, swarm.scenario.target)  # the protocol's goals are what they were
+    level = np.linalg.norm(place[:2, :, None] - place[:2, None, :], axis=0) + 10 * np.eye(12)
+    return closest, float(level.min()), float(np.abs(velocity).max())
+
+
+def test_vehicles_that_are_told_to_stop_in_the_midst_of_an_exchange_come_to_rest_apart() -> None:
+    assert closest_once_told_to_stop(3, 36, stop_here=False)[0] < 0.2
+    for seed, slot in ((3, 36), (1, 44), (1, 84)):
+        closest, level, speed = closest_once_told_to_stop(seed, slot, stop_here=True)
+        assert closest > 0.33
+        assert level > 0.4  # nobody lands on another one
+        assert speed < 0.05
+
+
+@pytest.mark.parametrize(("late", "taken"), [(0, True), (1, True), (2, False)])
+def test_a_frame_is_authentic_in_its_slot_and_the_one_after(late: int, taken: bool) -> None:
+    """Where agents have clocks of their own a receiver may be a slot ahead of the sender."""
+    config = SwarmConfig(agents=3, policy="tdma")
+    sender, receiver = (AuthenticatedSwarm(Swarm(config, local=[agent]), Authenticator(KEY)) for agent in (1, 2))
+    (index,) = sender.begin(0)
+    frame = sender.frame(index)
+    for slot in range(late + 1):
+        receiver.begin(slot)
+    assert receiver.hear(late, frame) is taken
+    assert receiver.rejected == (not taken)

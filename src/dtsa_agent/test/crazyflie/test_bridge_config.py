@@ -1,0 +1,192 @@
+"""Configuration of the bridge, its radio budget, and who flies a Crazyflie: without ROS and without links."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+from dtsa_agent.crazyflie.links.ownership import Ownership
+from dtsa_agent.crazyflie.settings.config import LogTopic, load_swarm, parse_swarm
+from dtsa_agent.crazyflie.settings.radio_budget import check_budget, radio_loads, radio_of
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+def swarm(**top: Any) -> dict[str, Any]:
+    return {"robots": {"cf1": {"uri": "udp://127.0.0.1:19850"}}} | top
+
+
+def test_robot_beats_type_beats_all() -> None:
+    settings = parse_swarm(
+        {
+            "robots": {
+                "cf2": {"uri": "radio://0/80/2M/E7E7E7E702", "type": "small", "log_rate_hz": 20},
+                "cf1": {"uri": "radio://0/80/2M/E7E7E7E701"},
+                "cf9": {"uri": "radio://0/80/2M/E7E7E7E709", "enabled": False},
+            },
+            "robot_types": {"small": {"command_rate_hz": 20, "battery": {"voltage_warning": 3.6}}},
+            "all": {
+                "command_rate_hz": 30,
+                "log_rate_hz": 30,
+                "battery": {"voltage_critical": 3.1},
+                "firmware_params": {"stabilizer": {"estimator": 2}},
+                "firmware_logging": {
+                    "enabled": True,
+                    "default_topics": {"pose": {"frequency": 10}},
+                    "custom_topics": {"volts": {"frequency": 5, "vars": ["pm.vbat"]}},
+                },
+            },
+        }
+    )
+    first, second = settings.robots
+    assert (first.name, first.id, first.command_rate_hz, first.log_rate_hz) == ("cf1", 1, 30, 30)
+    assert (second.command_rate_hz, second.log_rate_hz) == (20, 20)
+    assert (second.battery.voltage_warning, second.battery.voltage_critical) == (3.6, 3.1)
+    assert second.firmware_params == {"stabilizer.estimator": 2}
+    assert second.firmware_logging == {"volts": LogTopic("volts", 5.0, ("pm.vbat",))}
+    assert parse_swarm(settings.to_dict()) == settings
+
+
+@pytest.mark.parametrize(
+    ("data", "field"),
+    [
+        (None, "robots"),
+        ([], "config"),
+        (swarm(robotz={}), "config.robotz"),
+        (swarm(robots={}), "robots"),
+        (swarm(robots={"drone": {"uri": "udp://h:1"}}), "robots"),
+        (swarm(robots={"cf1": {}}), "robots.cf1.uri"),
+        (swarm(robots={"cf1": {"uri": "radio:/0"}}), "robots.cf1.uri"),
+        (swarm(robots={"cf1": {"uri": "udp://h:1", "type": "big"}}), "robots.cf1.type"),
+        (swarm(robots={"cf1": {"uri": "udp://h:1", "colour": 1}}), "robots.cf1.colour"),
+        (swarm(robots={"cf1": {"uri": "udp://h:1", "log_rate_hz": 200}}), "robots.cf1.log_rate_hz"),
+        (swarm(robots={"cf1": {"uri": "udp://h:1", "initial_position": [1, 2]}}), "robots.cf1.initial_position"),
+        (swarm(robots={"cf1": {"uri": "udp://h:1"}, "cf2": {"uri": "udp://h:1"}}), "robots.cf2.uri"),
+        (swarm(robots={"cf1": {"uri": "udp://h:1"}, "a1": {"uri": "udp://h:2"}}), "robots.a1"),
+        (swarm(all={"battery": {"voltage_critical": 4.0}}), "robots.cf1.battery.voltage_critical"),
+        (swarm(station={"min_connected": 2}), "station.min_connected"),
+        (swarm(station={"safety": {"geofence_min": [2, 0, 0]}}), "station.safety.geofence_min"),
+        (swarm(station={"safety": {"command_age_s": 0.6}}), "station.safety.command_age_s"),
+        (swarm(station={"safety": {"geofenze": True}}), "station.safety.geofenze"),
+    ],
+)
+def test_bad_configuration_names_the_field(data: object, field: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        parse_swarm(data)
+    assert error.value.field == field
+
+
+def test_unreadable_files_are_the_users_to_mend(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        load_swarm(tmp_path / "missing.yaml")
+    (tmp_path / "broken.yaml").write_text("robots: {cf1: [")
+    with pytest.raises(ConfigError, match="YAML"):
+        load_swarm(tmp_path / "broken.yaml")
+
+
+@pytest.mark.parametrize("name", ["swarm_simulated.yaml", "swarm_radio.yaml"])
+def test_examples_are_usable(name: str) -> None:
+    settings = load_swarm(CONFIG / name)
+    check_budget(radio_loads([(r.name, r.uri, r.command_rate_hz, r.log_rate_hz) for r in settings.robots]), force=False)
+    fence = settings.station.safety
+    origin = settings.station.room_origin_in_world
+    for robot in settings.robots:
+        inside = zip(robot.initial_position, origin, fence.geofence_min, fence.geofence_max, strict=True)
+        assert all(low <= p - o <= high for p, o, low, high in inside)
+
+
+# -- radio budget -----------------------------------------------------------------------------------------------------
+def robots(count: int, rate: float, radio: str = "0", bits: str = "2M") -> list[tuple[str, str, float, float]]:
+    return [(f"cf{k}", f"radio://{radio}/80/{bits}/E7E7E7E7{k:02X}", rate, rate) for k in range(1, count + 1)]
+
+
+@pytest.mark.parametrize(
+    ("rate", "most", "bits"), [(50.0, 4, "2M"), (20.0, 8, "2M"), (50.0, 4, "1M"), (50.0, 2, "250K"), (20.0, 4, "250K")]
+)
+def test_budget_is_what_one_radio_is_known_to_carry(rate: float, most: int, bits: str) -> None:
+    check_budget(radio_loads(robots(most, rate, bits=bits)), force=False)
+    loads = radio_loads(robots(most + 1, rate, bits=bits))
+    assert "DOES NOT FIT" in str(loads[0])
+    with pytest.raises(ConfigError, match=f"{most} Crazyflies"):
+        check_budget(loads, force=False)
+    check_budget(loads, force=True)
+
+
+def test_budget_counts_each_radio_and_no_udp() -> None:
+    loads = radio_loads(robots(4, 50) + robots(3, 50, "1") + [("cf9", "udp://127.0.0.1:19850", 100, 100)])
+    assert [(load.radio, len(load.robots)) for load in loads] == [("0", 4), ("1", 3)]
+    assert radio_of("usb://0") is None
+    assert radio_of("radio://0/80/2M/E7E7E7E701?rate_limit=100") == "0"
+
+
+# -- wrong files ------------------------------------------------------------------------------------------------------
+TWELVE_WRONG_FILES = {
+    "the same robot twice": ("robots:\n  cf1: {uri: 'udp://h:1'}\n  cf1: {uri: 'udp://h:2'}\n", "cf1"),
+    "a place that is no number": ("robots: {cf1: {uri: 'udp://h:1', initial_position: [.nan, 0, 0]}}", "initial_pos"),
+    "a place at infinity": ("robots: {cf1: {uri: 'udp://h:1', initial_position: [0, .inf, 0]}}", "initial_position"),
+    "channel 200": ("robots: {cf1: {uri: radio://0/200/2M/E7E7E7E701}}", "channel from 0 to 125"),
+    "port 99999": ("robots: {cf1: {uri: 'udp://h:99999'}}", "port from 1 to 65535"),
+    "port 0": ("robots: {cf1: {uri: 'udp://h:0'}}", "port from 1 to 65535"),
+    "one Crazyflie under two names": (
+        "robots: {cf1: {uri: 'radio://0/80/2M/E7E7E7E701'}, cf2: {uri: 'radio://0/80/2M/E7E7E7E701?rate_limit=100'}}",
+        "URI of its own",
+    ),
+    "agent 0": ("robots: {cf0: {uri: 'udp://h:1'}}", "robots.cf0.id"),
+    "group 256": ("robots: {cf1: {uri: 'udp://h:1', group_mask: 256}}", "group_mask"),
+    "a list of robots": ("robots: [cf1, cf2]", "a mapping"),
+    "a parameter that is no number": (
+        "robots: {cf1: {uri: 'udp://h:1', firmware_params: {locSrv: {extPosStdDev: .nan}}}}", "extPosStdDev"
+    ),
+    "a log without a rate": (
+        "robots: {cf1: {uri: 'udp://h:1', firmware_logging: {custom_topics: {a: {vars: [pm.vbat]}}}}}", "a.frequency"
+    ),
+    "a fence without an end": (
+        "robots: {cf1: {uri: 'udp://h:1'}}\nstation: {safety: {geofence_max: [1.5, .inf, 1]}}", "geofence_max"
+    ),
+    "half a file": ("robots: {cf1: {uri: 'udp://h:1'", "YAML"),
+    "no text": ("\x00\x01", "YAML"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TWELVE_WRONG_FILES)
+def test_a_wrong_file_is_answered_clearly(tmp_path: Path, name: str) -> None:
+    text, words = TWELVE_WRONG_FILES[name]
+    path = tmp_path / "swarm.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load_swarm(path)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# -- one bridge -------------------------------------------------------------------------------------------------------
+def test_a_crazyflie_belongs_to_one_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    first = Ownership([("cf1", "radio://0/80/2M/E7E7E7E701"), ("cf2", "radio://0/80/2M/E7E7E7E702")])
+    with pytest.raises(ConfigError, match="no other bridge") as error:
+        Ownership([("cf9", "radio://0/80/2M/E7E7E7E709"), ("a2", "radio://0/80/2M/e7e7e7e702?rate_limit=50")])
+    assert error.value.field == "robots.a2.uri"
+    Ownership([("cf9", "radio://0/80/2M/E7E7E7E709")]).release()  # what it had taken before it was refused is free
+    monkeypatch.setenv(SIMULATED_RADIO, str(tmp_path / "radio"))
+    Ownership([("cf2", "radio://0/80/2M/E7E7E7E702")]).release()  # on another air
+    monkeypatch.delenv(SIMULATED_RADIO)
+    first.release()
+    Ownership([("cf2", "radio://0/80/2M/E7E7E7E702")]).release()
+
+
+def test_cflib_shows_no_warnings_of_other_packages() -> None:
+    """Its import turns all DeprecationWarnings on; a mission's error then stood below those of its dependencies."""
+    pytest.importorskip("cflib")
+    program = (
+        "import warnings; from dtsa_agent.crazyflie.links.link import require_cflib; require_cflib(); "
+        "warnings.warn_explicit('old', DeprecationWarning, 'elsewhere.py', 1, module='elsewhere')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

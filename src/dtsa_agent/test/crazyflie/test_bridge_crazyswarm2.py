@@ -1,0 +1,226 @@
+"""The bridge with Crazyswarm2's interfaces: its units, what is said without its messages, and a flight with them."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("cflib")
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs.srv")
+
+from bridge_helpers import end_process, fake_fleet, settings  # noqa: E402
+from builtin_interfaces.msg import Duration  # noqa: E402
+from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
+from metronome import flown_again_when_overloaded  # noqa: E402
+from node_helpers import ServedNode  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
+from std_srvs.srv import Empty  # noqa: E402
+from waiting import wait_for  # noqa: E402
+
+from dtsa_agent.crazyflie.node import bridge_node  # noqa: E402
+from dtsa_agent.crazyflie.node.crazyswarm2.inputs import Answer, Crazyswarm2Inputs  # noqa: E402
+from dtsa_agent.crazyflie.node.inputs import Inputs  # noqa: E402
+from dtsa_bench.commands.cli import main  # noqa: E402
+from dtsa_bench.flights.domain import ros_domain  # noqa: E402
+
+pytestmark = pytest.mark.ros
+MESSAGES = importlib.util.find_spec("crazyflie_interfaces") is not None
+
+
+def bare(kind: type[Inputs]) -> Any:
+    """Inputs without a node."""
+    inputs = kind.__new__(kind)
+    inputs._origin = (0.0, 0.0, 0.95)
+    return inputs
+
+
+def test_units_and_frames_are_those_of_its_server() -> None:
+    theirs, ours = bare(Crazyswarm2Inputs), bare(Inputs)
+    header = SimpleNamespace(frame_id="/world")
+    position = SimpleNamespace(header=header, x=1.0, y=2.0, z=0.5, yaw=90.0)
+    assert theirs._position(position, 0.0).arguments == pytest.approx((1.0, 2.0, 0.5, 90.0))  # degrees
+    velocity = SimpleNamespace(header=header, vel=Point(x=0.1), yaw_rate=45.0)
+    assert theirs._velocity_world(velocity, 0.0).arguments == pytest.approx((0.1, 0.0, 0.0, 45.0))  # degrees/s
+    hover = SimpleNamespace(header=header, vx=0.1, vy=0.2, yaw_rate=1.0, z_distance=0.4)
+    assert theirs._hover(hover, 0.0).arguments == ours._hover(hover, 0.0).arguments  # rad/s
+    assert theirs._hover(hover, 0.0).arguments[2] == pytest.approx(57.29578)
+    twist = SimpleNamespace(linear=Point(x=0.3), angular=Point(x=0.1, y=0.2, z=0.3))
+    pose = SimpleNamespace(position=Point(x=1.0, z=0.5), orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0))
+    state = SimpleNamespace(header=header, pose=pose, twist=twist, acc=Point(z=1.0))
+    place, _, _, _, *rates = theirs._full_state(state, 0.0).arguments
+    assert place == (1.0, 0.0, 0.5)
+    assert rates == [0.1, 0.2, 0.3]  # rad/s
+    assert ours._full_state(state, 0.0).arguments[0] == (1.0, 0.0, 1.45)  # frame map, unless the header says world
+
+
+def test_the_command_says_it_to_the_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[list[str]] = []
+    monkeypatch.setattr(bridge_node, "main", lambda arguments: said.append(arguments) or 0)
+    config = tmp_path / "swarm.yaml"
+    config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9001"}}}))
+    assert main(["bridge", "--config", str(config)]) == 0
+    assert main(["bridge", "--config", str(config), "--interfaces", "crazyswarm2"]) == 0
+    assert ["interfaces:=crazyswarm2" in arguments for arguments in said] == [False, True]
+
+
+def test_all_are_not_sent_to_one_place() -> None:
+    request = SimpleNamespace(relative=False)
+    answer = bare(Crazyswarm2Inputs)._go_to(["cf1", "cf2"], request, Answer())
+    assert (answer.success, answer.message) == (False, "a go_to of all must be relative: they would meet in one place")
+
+
+def test_without_its_messages_the_bridge_says_so_and_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "crazyflie_interfaces", None)
+    config = tmp_path / "swarm.yaml"
+    config.write_text(yaml.safe_dump({"robots": {"cf1": {"uri": "udp://127.0.0.1:9001"}}}))
+    parameters = tmp_path / "parameters.yaml"  # as a launch file hands them over, with the node's name
+    asked = {"config": str(config), "interfaces": "crazyswarm2"}
+    parameters.write_text(yaml.safe_dump({"/crazyflie_server": {"ros__parameters": asked}}))
+    for given, words in (
+        (["-p", "interfaces:=crazyswarm2"], "crazyflie_interfaces"),
+        (["-r", "__node:=crazyflie_server", "--params-file", str(parameters)], "crazyflie_interfaces"),
+        (["-p", "interfaces:=other"], "one of dtsa, crazyswarm2"),
+        (["-p", "interfaces:=[1, 2]"], "one of dtsa, crazyswarm2"),
+    ):
+        arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config}", *given]
+        assert bridge_node.main(arguments) == 2
+        errors = capsys.readouterr().err.strip().splitlines()
+        assert len(errors) == 1
+        assert errors[0].startswith("crazyflie_bridge: interfaces: ")
+        assert words in errors[0]
+
+
+class Program(ServedNode):
+    """What a program of Crazyswarm2's does on the graph."""
+
+    def __init__(self, domain: int) -> None:
+        super().__init__(domain, "program")
+
+    def listen(self, kind: Any, topic: str) -> list[Any]:
+        heard: list[Any] = []
+        self.node.create_subscription(kind, topic, heard.append, 10)
+        return heard
+
+    def get(self, name: str) -> ParameterValue:
+        (value,) = self.call(GetParameters, "/crazyflie_server/get_parameters", names=[name]).values
+        return value
+
+    def set(self, name: str, number: int) -> bool:
+        value = ParameterValue(type=2, integer_value=number)
+        parameters = [Parameter(name=name, value=value)]
+        (result,) = self.call(SetParameters, "/crazyflie_server/set_parameters", parameters=parameters).results
+        return bool(result.successful)
+
+
+def heard(messages: list[Any], number: int = 3) -> Any:
+    """The latest of some messages."""
+    wait_for(lambda: len(messages) >= number)
+    return messages[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not MESSAGES, reason="crazyflie_interfaces is not in the workspace")
+@flown_again_when_overloaded
+def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
+    from crazyflie_interfaces.msg import (
+        ConnectionStatisticsArray,
+        LogDataGeneric,
+        Status,
+        TrajectoryPolynomialPiece,
+    )
+    from crazyflie_interfaces.srv import AddLogging, GoTo, Land, StartTrajectory, Takeoff, UploadTrajectory
+
+    with ros_domain() as domain, fake_fleet(tmp_path, 2) as fleet:
+        config = tmp_path / "swarm.yaml"
+        data = settings(fleet, {"safety": {"link_age_s": 3.0}})
+        for k, robot in enumerate(data["robots"].values()):
+            robot["initial_position"] = [(1.2, -1.2)[k], 0.0, 0.0]
+        volts = {"frequency": 10, "vars": ["pm.vbat"]}
+        data["all"]["firmware_logging"] = {"enabled": True, "custom_topics": {"volts": volts}}
+        config.write_text(yaml.safe_dump(data))
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        parameters = {"config": config, "interfaces": "crazyswarm2", "warnings.communication.publish_stats": "true"}
+        command = [sys.executable, "-m", "dtsa_agent.crazyflie.node.bridge_node", "--ros-args"]
+        command += [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        program = Program(domain)
+        try:
+            program.client(Empty, "/all/emergency")
+            poses, status = program.listen(PoseStamped, "/cf1/pose"), program.listen(Status, "/cf1/status")
+            # Parameters: of one, of all, of the robots; what cannot be is refused.
+            assert list(program.get("robots.cf1.initial_position").double_array_value) == [1.2, 0.0, 0.0]
+            assert program.get("robots.cf2.uri").string_value == fleet.uri(2)
+            assert program.set("cf1.params.ring.effect", 7)
+            assert program.set("all.params.led.bitmask", 128)
+            assert not program.set("cf1.params.ring.effect", 300)
+            assert not program.set("cf1.params.firmware.modified", 1)
+            assert program.get("cf1.params.ring.effect").integer_value == 7
+            assert program.get("cf2.params.ring.effect").integer_value == 6
+            assert program.get("cf2.params.led.bitmask").integer_value == 128
+            # Logs.
+            names = ["pm.vbat", "stateEstimate.z"]
+            assert program.call(AddLogging, "/cf1/add_logging", topic_name="own", frequency=20, vars=names).success
+            assert not program.call(AddLogging, "/cf1/add_logging", topic_name="x", frequency=20, vars=["a.b"]).success
+            logged = program.listen(LogDataGeneric, "/cf1/own")
+            volts_of_two = program.listen(LogDataGeneric, "/cf2/volts")
+            wait_for(lambda: len(logged) > 2 and len(volts_of_two) > 2)
+            assert 3.0 < logged[-1].values[0] < 4.3
+            (counted,) = heard(program.listen(ConnectionStatisticsArray, "/cf1/connection_statistics")).stats
+            assert (counted.uri, counted.receive_count > 10) == (fleet.uri(1), True)
+            # Nobody is armed: they arm themselves. Groups by the firmware's parameter.
+            smooth = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]
+            piece = TrajectoryPolynomialPiece(
+                poly_x=[-0.4 * c for c in smooth], poly_y=[0.0] * 8, poly_z=[0.0] * 8, poly_yaw=[0.0] * 8,
+                duration=Duration(sec=1),
+            )  # fmt: skip
+            for name in ("cf1", "cf2"):
+                program.call(UploadTrajectory, f"/{name}/upload_trajectory", trajectory_id=1, pieces=[piece])
+            assert program.set("cf1.params.hlCommander.groupmask", 2)
+            program.call(Takeoff, "/all/takeoff", height=1.0, duration=Duration(sec=2), group_mask=4)
+            program.call(Takeoff, "/all/takeoff", height=1.0, duration=Duration(sec=2))
+            wait_for(lambda: abs(poses[-1].pose.position.z - 1.0) < 0.05)
+            assert poses[-1].header.frame_id == "world"
+            time.sleep(0.5)
+            # cf2 would leave the room: nobody starts. The group of cf1 alone does.
+            order = {"trajectory_id": 1, "timescale": 1.5, "relative": True}
+            program.call(StartTrajectory, "/all/start_trajectory", **order)
+            assert not fleet.events(name="trajectory")
+            program.call(StartTrajectory, "/all/start_trajectory", group_mask=2, **order)
+            wait_for(lambda: abs(poses[-1].pose.position.x - 0.8) < 0.05)
+            assert [e["cf"] for e in fleet.events(name="trajectory")] == [1]
+            goal = Point(x=0.9, y=0.1, z=1.1)
+            time.sleep(0.6)
+            program.call(GoTo, "/cf1/go_to", goal=goal, yaw=1.0, duration=Duration(sec=1))
+            wait_for(lambda: abs(poses[-1].pose.position.x - 0.9) < 0.03 and poses[-1].pose.orientation.z > 0.45)
+            assert status[-1].supervisor_info & Status.SUPERVISOR_INFO_IS_FLYING
+            assert 3.0 < status[-1].battery_voltage < 4.3
+            program.call(Land, "/all/land", height=0.04, duration=Duration(sec=2))
+            wait_for(lambda: len(fleet.events(name="land")) == 2)
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=60)
+            assert process.returncode == 0, output
+            for words in (
+                "cf2: trajectory 1: (-1.", "parameter cf1.params.ring.effect: ring.effect: 300 is not a whole number",
+                "nobody of cf1, cf2 is in a group of 4", "order /cf1/upload_trajectory (id 1, 1 pieces): done",
+            ):  # fmt: skip
+                assert words in output
+        finally:
+            program.close()
+            end_process(process)

@@ -1,0 +1,129 @@
+"""Durations that no Crazyflie can keep: take-off and go_to are refused, a landing takes longer."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from metronome import flown_again_when_overloaded
+from waiting import wait_for
+
+from dtsa_agent.crazyflie.motion.paths import PEAK, shortest_s, too_short
+
+
+def test_the_shortest_duration_keeps_the_speed_of_the_firmwares_path() -> None:
+    from dtsa_bench.crazyflies.simulated.planner import evaluate, septic
+
+    for distance, limit in ((1.0, 1.2), (0.3, 0.5), (1.9, 1.0)):
+        seconds = shortest_s(distance, limit)
+        path = septic(0.0, 0.0, 0.0, distance, seconds)
+        speed = [evaluate(path, t)[1] for t in np.linspace(0.0, seconds, 201)]
+        assert max(speed) == pytest.approx(limit, rel=1e-6)
+        assert shortest_s(-distance, limit) == seconds
+    assert shortest_s(0.0, 1.0) > 0.0
+    assert pytest.approx(2.1875) == PEAK
+
+
+def test_why_a_duration_is_too_short() -> None:
+    # What Crazyswarm2's examples do: one metre in two seconds, also from a little below zero.
+    assert too_short(2.0, 1.05, 1.2) == ""
+    text = too_short(0.5, -1.0, 1.2)
+    assert text == "duration 0.50 s is too short for 1.00 m: at least 1.82 s (station.max_speed_mps is 1.2)"
+    for duration in (0.0, -1.0, math.nan):
+        assert too_short(duration, 0.5, 1.2)
+
+
+@pytest.mark.slow
+@flown_again_when_overloaded
+def test_in_flight(tmp_path: Path) -> None:
+    pytest.importorskip("cflib")
+    from bridge_helpers import fake_fleet, flight, settings
+
+    from dtsa_agent.crazyflie.state.state_machine import State
+
+    with fake_fleet(tmp_path, 1) as fleet:
+        data = settings(fleet, {"safety": {"link_age_s": 3.0}})
+        with flight(data) as pilot:
+            assert pilot.bridge.connect() == []
+            cf = pilot.bridge.vehicles["cf1"]
+            cf.arm(True)
+            wait_for(lambda: cf.state is State.ARMED)
+            assert "duration 0.30 s is too short" in cf.takeoff(1.0, 0.3)
+            assert "is too short" in cf.takeoff(1.0, 0.0)
+            assert "not finite" in cf.takeoff(math.nan, 3.0)
+            assert not fleet.events(name="takeoff")
+            assert cf.takeoff(1.0, 2.0) == ""
+            wait_for(lambda: cf.state is State.FLYING and cf.last is not None and cf.last.position[2] > 0.95)
+            here = cf.last.position
+            far = (here[0] - 1.0, here[1], here[2])
+            assert "duration 1.00 s is too short for 1.00 m" in cf.go_to(far, 0.0, 1.0, False)
+            assert "is too short for 1.00 m" in cf.go_to((-1.0, 0.0, 0.0), 0.0, 1.0, True)
+            assert not fleet.events(name="go_to")
+            assert cf.go_to((-0.3, 0.0, 0.0), 0.0, 1.0, True) == ""
+            notes: list[str] = []
+            assert cf.land("test", 0.0, 0.2, notes.append) == ""
+            assert len(notes) == 1
+            assert "cf1: landing takes 1." in notes[0]
+            assert "duration 0.20 s is too short" in notes[0]
+            pilot.logged("landing takes 1")
+            wait_for(lambda: cf.state is State.READY)
+        states = [e["state"] for e in fleet.events(1, "state")]
+        assert states[:3] == ["ready to fly", "flying", "landed"]
+        assert not [e for e in fleet.events() if e["event"] in ("hard landing", "crash")]
+        landing = fleet.events(1, "land")[0]["t"]
+        assert fleet.state_event(1, "landed")["t"] - landing > 1.5
+
+
+@pytest.mark.slow
+@flown_again_when_overloaded
+def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None:
+    pytest.importorskip("cflib")
+    from bridge_helpers import fake_fleet, flight, settings
+
+    from dtsa_agent.crazyflie.state.conversions import velocity_world
+    from dtsa_agent.crazyflie.state.state_machine import State
+
+    with fake_fleet(tmp_path, 1) as fleet:
+        with flight(settings(fleet, {"safety": {"link_age_s": 3.0, "geofence": False}})) as pilot:
+            assert pilot.bridge.connect() == []
+            cf = pilot.bridge.vehicles["cf1"]
+
+            def stream() -> None:
+                for _ in range(10):
+                    assert cf.command(velocity_world((0.1, 0.0, 0.0), 0.0, time.monotonic()))
+                    time.sleep(0.05)
+
+            def reaches(height: float) -> None:
+                wait_for(lambda: cf.last is not None and abs(cf.last.position[2] - height) < 0.05)
+
+            cf.arm(True)
+            wait_for(lambda: cf.state is State.ARMED)
+            assert cf.takeoff(1.0, 2.0) == ""
+            reaches(1.0)
+            wait_for(lambda: cf.state is State.FLYING)
+            time.sleep(1.0)  # the take-off is flown to its end
+            stream()
+            assert cf.notify_setpoints_stop(0) == ""
+            wait_for(lambda: fleet.events(name="stream ended"))
+            stream()
+            assert cf.takeoff(1.3, 1.5) == ""
+            reaches(1.3)
+            assert cf.land("test", 0.0, 3.0) == ""
+            reaches(1.1)
+            assert cf.takeoff(1.3, 1.5) == ""
+            reaches(1.3)
+            assert cf.state is State.FLYING
+            assert cf.land("test") == ""
+            wait_for(lambda: cf.state is State.READY)
+        names = [e["event"] for e in fleet.events(1)]
+        assert names.count("takeoff") == 1
+        assert names.count("go_to") >= 3
+        states = [e["state"] for e in fleet.events(1, "state")]
+        assert states[:3] == ["ready to fly", "flying", "landed"]
+        # A stream ends when there is something else to fly. Here both packets come at once, over the air they do not.
+        ended = [k for k, name in enumerate(names) if name == "stream ended"]
+        assert len(ended) >= 2
+        assert {names[k - 1] for k in ended} <= {"go_to", "land"}

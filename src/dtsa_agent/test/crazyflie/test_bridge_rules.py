@@ -1,0 +1,308 @@
+"""State machine, outbox, safety rules and limits of the bridge: without ROS and without links."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import math
+import re
+import threading
+from contextlib import nullcontext
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.crazyflie.links.delivery import LAND, TAKEOFF, Delivery
+from dtsa_agent.crazyflie.links.outbox import Outbox
+from dtsa_agent.crazyflie.motion.limits import check_stream, outside_fence
+from dtsa_agent.crazyflie.safety.rules import ESTIMATE_HOLD_S, Action, SafetyMonitor, SafetySettings, Watched
+from dtsa_agent.crazyflie.settings.config import StationSettings
+from dtsa_agent.crazyflie.state import conversions
+from dtsa_agent.crazyflie.state import state_machine as sm
+from dtsa_agent.crazyflie.state.conversions import Setpoint
+from dtsa_agent.crazyflie.state.state_machine import State, StateMachine
+
+
+# -- state machine ----------------------------------------------------------------------------------------------------
+def machine(*bits: int) -> StateMachine:
+    result = StateMachine(lambda before, state, reason: None)
+    result.go(State.CONNECTING, "")
+    result.go(State.READY, "")
+    for info in bits:
+        result.observe(info)
+    return result
+
+
+def test_a_flight_goes_through_all_states() -> None:
+    seen: list[State] = []
+    m = StateMachine(lambda before, state, reason: seen.append(state))
+    m.go(State.CONNECTING, "")
+    m.go(State.READY, "")
+    m.observe(sm.CAN_BE_ARMED)
+    m.observe(sm.IS_ARMED)
+    m.takeoff("up")
+    m.observe(sm.IS_ARMED | sm.IS_FLYING)
+    m.land("down")
+    m.observe(sm.IS_ARMED | sm.IS_FLYING)
+    m.observe(sm.IS_ARMED)
+    m.observe(sm.CAN_BE_ARMED)
+    assert seen == [1, 2, 3, 4, 5, 3, 2]
+
+
+def test_one_that_arms_itself_is_ready_until_it_is_told_and_again_once_it_has_landed() -> None:
+    m = machine(sm.AUTO_ARM | sm.IS_ARMED)
+    on_ground, in_air = sm.AUTO_ARM | sm.IS_ARMED, sm.AUTO_ARM | sm.IS_ARMED | sm.IS_FLYING
+    assert m.state is State.READY
+    m.arm(True)
+    m.observe(sm.AUTO_ARM)  # its pre-flight check begins anew every 30 s: it is not armed for a moment
+    assert m.state is State.ARMED
+    m.observe(in_air)
+    m.land("down")
+    m.observe(in_air)
+    assert m.state is State.LANDING
+    m.observe(on_ground)
+    m.observe(on_ground)
+    assert m.state is State.READY
+    m.arm(True)
+    m.observe(on_ground)
+    m.arm(False)
+    m.observe(on_ground)
+    assert m.state is State.READY
+
+
+@pytest.mark.parametrize("bit", [sm.IS_LOCKED, sm.IS_TUMBLED, sm.IS_CRASHED])
+def test_trouble_in_the_air_is_an_emergency_until_reconnected(bit: int) -> None:
+    m = machine(sm.IS_ARMED | sm.IS_FLYING, bit)
+    assert m.state is State.EMERGENCY
+    m.observe(sm.CAN_BE_ARMED)
+    assert m.state is State.EMERGENCY
+    m.go(State.CONNECTING, "again")
+    m.go(State.READY, "")
+    assert m.state is State.READY
+
+
+def test_lost_and_heard_again() -> None:
+    m = machine(sm.IS_ARMED | sm.IS_FLYING)
+    m.silent("no log")
+    assert m.state is State.LOST
+    m.land("lost")
+    assert m.state is State.LOST
+    m.observe(sm.IS_ARMED | sm.IS_FLYING)
+    assert m.state is State.LANDING
+    m.observe(0)
+    assert m.state is State.READY
+
+
+def test_no_way_around_the_table() -> None:
+    m = StateMachine(lambda before, state, reason: None)
+    with pytest.raises(LocalProtocolError):
+        m.go(State.FLYING, "")
+
+
+@settings(deadline=None)
+@given(st.lists(st.one_of(st.integers(0, 2047), st.sampled_from(["land", "takeoff", "silent", "stop"])), max_size=30))
+def test_any_sequence_of_events_keeps_to_the_table(events: list[Any]) -> None:
+    m = machine()
+    stopped = False
+    for event in events:
+        if isinstance(event, int):
+            m.observe(event)
+        elif event == "land":
+            m.land("")
+        elif event == "takeoff":
+            m.takeoff("")
+        elif event == "silent":
+            m.silent("")
+        else:
+            m.emergency("")
+            stopped = True
+        if stopped:
+            assert m.state in (State.EMERGENCY, State.LOST)
+
+
+# -- outbox ----------------------------------------------------------------------------------------------------------
+def test_only_the_latest_command_is_sent_and_orders_go_first() -> None:
+    box = Outbox()
+    order = lambda: None  # noqa: E731
+    box.put_setpoint(Setpoint("position", (1,), 0.0))
+    box.put_setpoint(Setpoint("position", (2,), 0.0))
+    assert box.get().arguments == (2,)  # type: ignore[union-attr]
+    assert box.replaced == 1
+    box.put_background(order)
+    box.put_setpoint(Setpoint("position", (3,), 0.0))
+    assert box.get() is order
+    assert box.get().arguments == (3,)  # type: ignore[union-attr]
+
+
+def test_an_order_ends_the_stream_and_an_urgent_one_empties_the_box() -> None:
+    box = Outbox()
+    urgent = lambda: None  # noqa: E731
+    box.put_setpoint(Setpoint("position", (1,), 0.0))
+    box.put_order(lambda: None)
+    box.put_order(urgent, urgent=True)
+    box.close()
+    assert box.get() is urgent
+    assert box.get() is None
+
+
+def test_the_mailbox_wakes_its_worker() -> None:
+    box = Outbox()
+    got: list[object] = []
+    worker = threading.Thread(target=lambda: got.append(box.get()))
+    worker.start()
+    box.put_setpoint(Setpoint("position", (1,), 0.0))
+    worker.join(5)
+    assert got
+
+
+# -- safety rules -----------------------------------------------------------------------------------------------------
+def vehicle(name: str = "cf1", **changes: Any) -> Watched:
+    values: dict[str, Any] = {
+        "name": name,
+        "state": State.FLYING,
+        "position": (0.0, 0.0, 0.0),
+        "battery": 3.9,
+        "battery_warning": 3.4,
+        "battery_critical": 3.2,
+        "log_age": 0.02,
+        "command_age": 0.02,
+    }
+    return Watched(**(values | changes))
+
+
+def verdicts(*vehicles: Watched, heartbeat: float | None = None, now: float = 0.0, **settings: Any) -> list[tuple]:
+    monitor = SafetyMonitor(SafetySettings(**settings))
+    return [(v.name, v.action, v.rule) for v in monitor.check(now, vehicles, heartbeat)]
+
+
+def test_nothing_is_done_without_need() -> None:
+    assert verdicts(vehicle(), vehicle("cf2", position=(0.3, 0.0, 0.0)), heartbeat=0.9) == []
+
+
+@pytest.mark.parametrize(
+    ("where", "axis"), [((1.56, 0, 0), "x"), ((-1.56, 0, 0), "x"), ((0, 2.36, 0), "y"), ((0, 0, 1.01), "z")]
+)
+def test_geofence_lands(where: tuple[float, float, float], axis: str) -> None:
+    assert verdicts(vehicle(position=where)) == [("cf1", Action.LAND, "geofence")]
+    assert verdicts(vehicle(position=where), geofence=False) == []
+    assert verdicts(vehicle(position=where, state=State.READY)) == []
+    (verdict,) = SafetyMonitor(SafetySettings()).check(0.0, [vehicle(position=where)], None)
+    assert f"in {axis}" in verdict.reason
+
+
+def test_far_outside_the_fence_the_motors_stop() -> None:
+    found = verdicts(vehicle(position=(2.4, 0, 0)))
+    assert found == [("cf1", Action.LAND, "geofence"), ("cf1", Action.STOP, "geofence")]
+    assert verdicts(vehicle(position=(2.4, 0, 0), state=State.LANDING)) == [("cf1", Action.STOP, "geofence")]
+
+
+def test_battery_warns_then_lands_but_not_for_a_moment() -> None:
+    monitor = SafetyMonitor(SafetySettings())
+
+    def check(now: float, volts: float) -> list[Action]:
+        return [v.action for v in monitor.check(now, [vehicle(battery=volts)], None)]
+
+    assert check(0.0, 3.3) == []
+    assert check(0.9, 3.5) == []  # a dip: the clock starts again
+    assert check(1.0, 3.3) == []
+    assert check(2.0, 3.3) == [Action.WARN]
+    assert check(3.0, 3.3) == []  # said once
+    assert check(4.0, 3.1) == []
+    assert check(5.0, 3.1) == [Action.LAND]
+
+
+def test_silence_loses_a_vehicle() -> None:
+    assert verdicts(vehicle(log_age=0.51)) == [("cf1", Action.LOST, "link")]
+    assert verdicts(vehicle(log_age=math.inf, state=State.CONNECTING)) == []
+    assert verdicts(vehicle(log_age=0.51), link_age_s=0.0) == []
+
+
+def test_stale_commands_hold_then_land() -> None:
+    assert verdicts(vehicle(command_age=0.26)) == [("cf1", Action.HOLD, "commands")]
+    assert verdicts(vehicle(command_age=3.1))[1] == ("cf1", Action.LAND, "commands")
+    assert verdicts(vehicle(command_age=None)) == []
+    assert verdicts(vehicle(command_age=3.1), command_age_s=0.0) == []
+
+
+def test_a_wrong_estimate_holds_then_lands() -> None:
+    hold, land = ("cf1", Action.HOLD, "estimate"), ("cf1", Action.LAND, "estimate")
+    assert verdicts(vehicle(wrong="drifts", wrong_s=ESTIMATE_HOLD_S)) == [hold]
+    assert verdicts(vehicle(wrong="drifts", wrong_s=ESTIMATE_HOLD_S + 0.01)) == [hold, land]
+    assert verdicts(vehicle(wrong="drifts", state=State.LANDING)) == [land]
+    assert verdicts(vehicle(wrong="drifts", state=State.READY)) == verdicts(vehicle(wrong_s=9.0)) == []
+
+
+def test_a_lost_heartbeat_stops_all_that_could_move() -> None:
+    assert verdicts(vehicle(), heartbeat=1.01) == [("", Action.STOP_ALL, "heartbeat")]
+    assert verdicts(vehicle(state=State.READY), heartbeat=1.01) == []
+    assert verdicts(vehicle(), heartbeat=1.01, heartbeat_s=0.0) == []
+    assert verdicts(vehicle(), heartbeat=None) == []
+
+
+def test_two_too_close_both_land_and_the_third_flies_on() -> None:
+    close = [vehicle(), vehicle("cf2", position=(0.1, 0.1, 0.0)), vehicle("cf3", position=(0.0, 1.0, 0.0))]
+    assert verdicts(*close) == [("cf1", Action.LAND, "distance"), ("cf2", Action.LAND, "distance")]
+    assert verdicts(*close, min_distance_m=0.0) == []
+
+
+def test_a_rule_speaks_again_after_it_had_ceased() -> None:
+    monitor = SafetyMonitor(SafetySettings())
+    ages = [0.3, 0.4, 0.02, 0.3]
+    assert [len(monitor.check(t, [vehicle(command_age=a)], None)) for t, a in enumerate(ages)] == [1, 0, 0, 1]
+
+
+# -- limits of what is flown ------------------------------------------------------------------------------------------
+def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> None:
+    station = StationSettings()
+    assert outside_fence((1.5, 0.0, 1.0), station) == ""
+    assert outside_fence((1.95, 0.0, 0.95), station) == "(1.95, 0.00, 0.00) is 0.45 m outside the geofence in x"
+    assert outside_fence((0.0, 0.0, 2.5), station).endswith("0.60 m outside the geofence in z")
+    for axis in range(3):
+        for speed, allowed in ((station.max_stream_mps, True), (station.max_stream_mps + 0.01, False)):
+            velocity = tuple(speed if k == axis else 0.0 for k in range(3))
+            command = conversions.velocity_world(velocity, 0.0, 0.0)  # type: ignore[arg-type]
+            with nullcontext() if allowed else pytest.raises(ValueError, match="m/s is refused"):
+                check_stream(command, station)
+    open_air = dataclasses.replace(station, safety=SafetySettings(geofence=False))
+    assert outside_fence((9.0, 0.0, 1.0), open_air) == ""
+    still = (0.0, 0.0, 0.0)
+    for setpoint in (
+        conversions.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0),
+        conversions.position((1.0, 2.0, 1.0), 0.0, 0.0),
+        conversions.hover(1.0, 0.0, 0.0, 1.0, 0.0),
+        conversions.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0),
+    ):
+        check_stream(setpoint, station)
+    for setpoint, words in (
+        (conversions.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
+        (conversions.hover(0.0, -50.0, 0.0, 1.0, 0.0), "50.00 m/s"),
+        (conversions.hover(0.0, 0.0, 0.0, 3.0, 0.0), "outside the geofence in z"),
+        (conversions.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
+        (conversions.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
+        (conversions.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(words)):
+            check_stream(setpoint, station)
+
+
+def test_a_take_off_is_ordered_again_while_the_supervisor_lets_no_motor_run() -> None:
+    """A Crazyflie that arms itself refuses orders for a moment, three seconds after it has landed."""
+    takeoff: int = 7
+    sent: list[int] = []
+    order = Delivery()
+    order.begin(TAKEOFF, sent.append, None, 0.0)
+    for attempt in range(1, 4):
+        assert order.answered(takeoff, errno.EBUSY) == ""
+        send = order.due(attempt * 0.2)
+        assert send is not None
+        send(attempt)
+    assert "refuses the take-off (error 16)" in order.answered(takeoff, errno.EBUSY)
+    assert order.due(9.0) is None
+    order.begin(TAKEOFF, sent.append, None, 10.0)
+    assert order.answered(takeoff, errno.EBUSY) == order.answered(takeoff, 0) == ""
+    assert order.due(11.0) is None
+    order.begin(LAND, sent.append, None, 20.0)
+    assert "refuses the landing" in order.answered(8, errno.EBUSY)

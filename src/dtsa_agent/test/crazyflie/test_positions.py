@@ -1,0 +1,274 @@
+"""Positions from motion capture: what is believed, when an estimator has settled, and flights with a real publisher."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from metronome import flown_again_when_overloaded
+from waiting import wait_for
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.positions.estimates import EstimateWatch, Settling
+from dtsa_agent.crazyflie.positions.motion_capture import MOVED_AGAIN, PositionSettings, Tracker
+from dtsa_agent.crazyflie.settings.config import parse_swarm
+from dtsa_agent.crazyflie.state.conversions import VehicleState
+from dtsa_agent.crazyflie.vehicle.captured_poses import CapturedPoses
+
+ROOM = ((-1.5, -2.3, -0.95), (1.5, 2.3, 0.95))
+ORIGIN = (0.0, 0.0, 0.95)
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+# -- what is believed -------------------------------------------------------------------------------------------------
+def tracker(**changes: Any) -> Tracker:
+    return Tracker(PositionSettings(source="pose", **changes), ORIGIN, ROOM)
+
+
+def offer(t: Tracker, place: Any, at: float, *, q: Any = LEVEL, frame: str = "world", flying: bool = False) -> str:
+    return t.offer(place, q, frame, 1000.0 + at, at, flying=flying)
+
+
+@pytest.mark.parametrize(
+    ("pose", "kind", "words"),
+    [
+        ({"place": (math.nan, 0.0, 0.0)}, "not finite", "not finite"),
+        ({"place": (0.0, 0.0, math.inf)}, "not finite", "not finite"),
+        ({"place": (5.0, 0.0, 0.0)}, "outside", "3.50 m outside the room in x"),
+        ({"q": (0.0, 0.0, 0.0, 0.0)}, "quaternion", "length 0, not 1"),
+        ({"frame": "odom"}, "frame", "'odom' is neither world nor map"),
+        ({"at": 0.99}, "stamp", "0.010 s before"),
+        ({"at": 1.0}, "stamp", "0.000 s before"),
+        ({"place": (1.0, 0.0, 0.0)}, "jump", "jumps by 1.00 m"),
+    ],
+)
+def test_poses_that_cannot_be_are_refused_and_counted(pose: dict[str, Any], kind: str, words: str) -> None:
+    t = tracker()
+    assert offer(t, (0.0, 0.0, 0.0), 1.0) == ""
+    values = {"place": (0.0, 0.0, 0.0), "at": 1.01} | pose
+    assert words in offer(t, values.pop("place"), values.pop("at"), **values)
+    assert (dict(t.refused), t.numbers(1.01).reason) == ({kind: 1}, t.reason)
+    assert t.last is not None
+    assert (t.last.position, t.age(1.51)) == ((0.0, 0.0, 0.0), pytest.approx(0.51))
+
+
+def test_frames_quaternions_and_the_rate() -> None:
+    t = tracker(send="extpos", max_rate_hz=50)
+    assert offer(t, (0.5, 0.0, -0.95), 1.0, frame="map", q=(0.0, 0.0, 0.0, 0.0)) == ""  # extpos needs no attitude
+    assert t.last is not None
+    assert (t.last.position, t.last.orientation) == (pytest.approx((0.5, 0.0, 0.0)), None)
+    assert offer(t, (0.5, 0.0, 0.0), 1.01, q=(0.0, 0.0, 0.0, 1.04)) == ""
+    assert t.last.orientation == (0.0, 0.0, 0.0, 1.0)
+    assert sum(t.due(2.0 + 0.01 * k) for k in range(100)) == pytest.approx(50, abs=1)
+    full = tracker(max_rate_hz=100)
+    jitter = np.random.default_rng(1).uniform(-0.004, 0.004, 100)
+    assert sum(full.due(2.0 + 0.01 * k + jitter[k]) for k in range(100)) > 90
+
+
+def test_one_that_was_carried_is_believed_again_on_the_ground_only() -> None:
+    for flying in (False, True):
+        t = tracker()
+        offer(t, (0.0, 0.0, 0.0), 1.0)
+        answers = [offer(t, (1.2, 0.0, 0.0), 1.0 + 0.005 * k, flying=flying) for k in range(1, MOVED_AGAIN + 1)]
+        assert all(answers[:-1])
+        assert (answers[-1] == "") is not flying
+    # Two bodies that change names all the time never agree with each other.
+    t = tracker()
+    offer(t, (0.0, 0.0, 0.0), 1.0)
+    assert all(offer(t, (1.2, (-1) ** k, 0.0), 1.0 + 0.001 * k) for k in range(1, 60))
+
+
+def test_poses_that_come_late_are_not_believed() -> None:
+    t = tracker()
+
+    def at(stamp: float, arrival: float, *, flying: bool = True) -> str:
+        return t.offer((0.0, 0.0, 0.0), LEVEL, "world", 77000.0 + stamp, arrival, flying=flying)  # another clock
+
+    assert [at(0.01 * k, 5.004 + 0.01 * k) for k in range(20)] == [""] * 20
+    backlog = [at(0.2 + 0.01 * k, 5.5 + 0.0005 * k) for k in range(28)]  # nothing for 0.3 s, then all at once
+    assert "it comes 296 ms later than the fastest one" in backlog[0]
+    assert [bool(answer) for answer in backlog] == [True] * 25 + [False] * 3
+    assert t.refused == {"late": 25}
+    assert at(0.48, 5.484) == ""
+    # The clock of motion capture was set back: on the ground its poses are believed again, in flight they are not.
+    assert all(at(0.49 + 0.01 * k, 7.0 + 0.01 * k) for k in range(60))
+    answers = [at(1.2 + 0.01 * k, 8.0 + 0.01 * k, flying=False) for k in range(MOVED_AGAIN + 5)]
+    assert answers == [""] * len(answers)  # they have agreed with each other for long
+
+
+def test_latency_and_rate() -> None:
+    t = tracker()
+    for k in range(150):
+        offer(t, (0.0, 0.0, 0.0), 1.0 + 0.01 * k)
+        assert t.last is not None
+        t.was_sent(t.last, 1000.0 + 1.0 + 0.01 * k + 0.004)
+    numbers = t.numbers(2.495)
+    assert numbers.rate == pytest.approx(100, abs=1)
+    assert (numbers.latency_p50, numbers.latency_p99) == (pytest.approx(0.004), pytest.approx(0.004))
+    assert (numbers.sent, numbers.age) == (150, pytest.approx(0.005))
+
+
+def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None:
+    pytest.importorskip("cflib")
+    from dtsa_agent.crazyflie.links.radio_link import packets_of
+
+    for send, size, header in (("extpose", 29, 0x61), ("extpos", 12, 0x60)):
+        captured = CapturedPoses("cf1", PositionSettings(source="pose", send=send), ORIGIN, ROOM, lambda *line: None)
+        packet = captured.see((1.0, 2.0, 0.5), LEVEL, "world", 0.0, 5.0, flying=False)
+        assert packet is not None
+        (data,) = packets_of(SimpleNamespace(platform=None), packet.send) or []
+        assert (len(data) - 1, data[0] & 0xF3, captured.tracker.sent) == (size, header, 1)
+        assert captured.place(5.2) == (1.0, 2.0, 0.5)
+        assert captured.disagrees((1.0, 2.0, 0.45), 5.2) == ""
+        assert "0.30 m from where it believes to be" in captured.disagrees((1.0, 2.0, 0.8), 5.2)
+        assert "not seen by motion capture (no pose comes)" in captured.disagrees((1.0, 2.0, 0.5), 6.0)
+
+
+# -- estimates --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("place", "variance", "seen", "words"),
+    [
+        ((5.0, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), "motion capture sees it 5.00 m away"),
+        ((0.0, 0.0, 0.0), 1e-5, "not", "motion capture does not see it"),
+        ((0.05, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), ""),
+        ((0.0, 0.0, 0.0), 100.0, None, "variance 100 m^2, limit 0.01 m^2"),
+        ((5.0, 0.0, 0.0), 1e-5, None, "believes to be outside"),
+        ((math.nan, 0.0, 0.0), 1e-5, None, "not finite"),
+        ((0.0, 0.0, 0.0), 1e-5, None, ""),
+    ],
+)
+def test_settled_is_where_it_stands(place: Any, variance: float, seen: Any, words: str) -> None:
+    settling = Settling(0.01, ORIGIN, ROOM, None if seen is None else 0.1)
+    settling.restart()
+    for _ in range(10):
+        settled = settling.sample(place, (variance,) * 3, None if seen == "not" else seen)
+    assert settled is (words == "")
+    assert words in settling.problem
+
+
+def test_an_estimate_that_wanders_has_not_settled() -> None:
+    settling = Settling(0.01, ORIGIN, ROOM, None)
+    assert not any(settling.sample((0.03 * k, 0.0, 0.0), (1e-5,) * 3, None) for k in range(20))
+    assert "its place moves by" in settling.problem
+
+
+def flown(positions: Any, velocity: Any = (0.0, 0.0, 0.0), seen: Any = None, flying: bool = True) -> EstimateWatch:
+    watch = EstimateWatch(0.5, 0.5, 0.4)
+    for k, place in enumerate(positions):
+        watch.update(VehicleState(place, velocity, LEVEL, 4.0, 0), 0.02 * k, seen, flying=flying)
+    return watch
+
+
+def test_jumps_standstill_and_errors_in_flight_are_noticed() -> None:
+    still = [(0.0, 0.0, 1.0)] * 50
+    assert flown([*still[:10], *[(2.0, 0.0, 1.0)] * 2]).wrong == "the estimate jumps by 2.00 m within 0.02 s"
+    assert "has not changed for 0.5" in flown(still).wrong
+    assert "though it moved by 0.1" in flown(still[:20], (1.0, 0.0, 0.0)).wrong
+    moving = [(0.02 * k, 0.0, 1.0) for k in range(50)]
+    assert flown(moving, (1.0, 0.0, 0.0)).wrong == ""
+    assert "m from where motion capture sees it" in flown(moving, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)).wrong
+    assert flown(still, flying=False).wrong == ""
+    assert flown([(0.0, 0.0, 0.03)] * 50).wrong == ""  # it may be about to stand
+
+
+# -- settings ---------------------------------------------------------------------------------------------------------
+def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rclpy")
+    from dtsa_agent.crazyflie.node.position_inputs import _named, named_pose_array
+
+    assert PositionSettings(source="pose").topic_of("cf3") == "/cf3/pose"
+    assert PositionSettings(source="named_poses").topic_of("cf3") == "/poses"
+    assert PositionSettings(source="pose", topic="/vrpn/{name}/pose").topic_of("cf3") == "/vrpn/cf3/pose"
+    with pytest.raises(ConfigError) as error:
+        parse_swarm({"robots": {"cf1": {"uri": "udp://h:1"}}, "station": {"positions": {"source": "vicon"}}})
+    assert error.value.field == "station.positions.source"
+    monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces", None)
+    with pytest.raises(ConfigError, match="motion_capture_tracking_interfaces in the workspace"):
+        named_pose_array()
+    # By name; bodies that are no Crazyflies are of no concern.
+    got: list[Any] = []
+    stamp = SimpleNamespace(sec=5, nanosec=500_000_000)
+    poses = [
+        SimpleNamespace(
+            name=name,
+            pose=SimpleNamespace(
+                position=SimpleNamespace(x=1.0, y=2.0, z=3.0), orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+            ),
+        )
+        for name in ("wand", "cf2")
+    ]
+    message = SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id="world"), poses=poses)
+    _named({"cf2": SimpleNamespace(see=lambda *pose: got.append(pose))}, message, None)  # type: ignore[dict-item]
+    assert got == [((1.0, 2.0, 3.0), LEVEL, "world", 5.5)]
+
+
+# -- flights ----------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
+@pytest.mark.ros
+@flown_again_when_overloaded
+def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fails(tmp_path: Path) -> None:
+    """A publisher at 100 Hz; then an estimate jumps, one freezes, one vehicle is not seen any more; one flies on."""
+    pytest.importorskip("cflib")
+    pytest.importorskip("dtsa_msgs.srv")
+    from bridge_helpers import end_process, fake_fleet, settings
+    from builtin_interfaces.msg import Duration
+    from dtsa_msgs.srv import Arm, Takeoff
+    from graph_helpers import Graph
+
+    from dtsa_bench.crazyflies.simulated.truth import read_truth
+    from dtsa_bench.flights.domain import ros_domain
+
+    with ros_domain() as domain:
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
+        with fake_fleet(tmp_path, 4, "--motion-capture", environment=environment) as fleet:
+            station = {
+                "positions": {"source": "pose"},
+                "safety": {"link_age_s": 3.0, "command_age_s": 0, "estimate_error_m": 0},
+            }
+            config = tmp_path / "swarm.yaml"
+            config.write_text(yaml.safe_dump(settings(fleet, station)))
+            command = [sys.executable, "-m", "dtsa_agent.crazyflie.node.bridge_node"]
+            command += ["--ros-args", "-p", f"config:={config}"]
+            log = (tmp_path / "bridge.log").open("w+")
+            process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT, text=True)
+            graph = Graph(domain)
+            try:
+                assert graph.call(Arm, "/all/arm", arm=True).success
+                wait_for(lambda: all(graph.state(k) == "armed" for k in (1, 2, 3)))
+                assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=2)).success
+                wait_for(lambda: all(graph.state(k) == "flying" and abs(graph.place(k)[2]) < 0.1 for k in (1, 2, 3)))
+                values = {v.key: v.value for v in graph.last["/diagnostics"].status[0].values}
+                assert float(values["positions [Hz]"]) > 60
+                assert 0.0 < float(values["position latency, median [ms]"]) < 50.0
+                t = fleet.fault("estimate_jump", 1, distance=-2.0)
+                fleet.fault("estimate_freeze", 2)
+                fleet.fault("unseen", 3)
+                wait_for(lambda: all(graph.state(k) == "ready" for k in (1, 2, 3)))
+                times, track, events = read_truth(fleet.truth)
+                words = (tmp_path / "bridge.log").read_text()
+                for cf, reason in (
+                    (1, "estimate: the estimate jumps by 2.0. m"),
+                    (2, "estimate: the estimated? .*not cha"),
+                    (3, "positions: not seen by motion capture for"),
+                ):
+                    assert re.search(f"cf{cf}: {reason}.*: hold\n(.*\n)*.*cf{cf}: {reason}.*: land\n", words), words
+                after = times >= t
+                moved = np.linalg.norm(track[after][:, :2] - track[after][0, :2], axis=1).max(axis=0)
+                assert moved.max() < 0.3, moved
+                assert abs(track[-1, 2, 3] - 0.95) < 0.1  # the fourth one flies on
+                assert not [e for e in events if e["event"] in ("hard landing", "collision", "crash")]
+                assert not [e for e in events if e.get("state") == "locked"]
+            finally:
+                graph.close()
+                end_process(process)
+                log.close()

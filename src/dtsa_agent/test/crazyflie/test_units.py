@@ -1,0 +1,157 @@
+"""Conversions between ROS and the Crazyflie's firmware, against golden values."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dtsa_agent.crazyflie.state import conversions
+
+finite = st.floats(-1e6, 1e6)
+vectors = st.tuples(finite, finite, finite)
+component = st.floats(-1, 1)
+
+
+def log(**values: float) -> dict[str, float]:
+    return dict.fromkeys(conversions.LOG_VARIABLES, 0.0) | {"stateEstimateZ.quat": 0xC0000000} | values
+
+
+def test_log_block_fits_one_packet() -> None:
+    size = struct.calcsize("<6hIHH")
+    assert size == conversions.LOG_BYTES <= 26
+    assert len(conversions.LOG_VARIABLES) == 9
+
+
+def test_state_log_is_in_millimetres_and_millivolts() -> None:
+    state = conversions.decode_log(
+        log(
+            **{
+                "stateEstimateZ.x": 1234,
+                "stateEstimateZ.y": -2000,
+                "stateEstimateZ.z": 950,
+                "stateEstimateZ.vx": -1500,
+                "stateEstimateZ.vy": 20,
+                "stateEstimateZ.vz": 7,
+                "pm.vbatMV": 3712,
+                "supervisor.info": 0x1A,
+            }
+        )
+    )
+    assert state.position == pytest.approx((1.234, -2.0, 0.95))
+    assert state.velocity == pytest.approx((-1.5, 0.02, 0.007))
+    assert state.battery == pytest.approx(3.712)
+    assert state.info == 0x1A
+    assert state.orientation == (0.0, 0.0, 0.0, 1.0)
+
+
+# Worked out by hand: index of the largest in bits 31-30, then sign and 511 |q| sqrt(2) of the others, x first.
+GOLDEN_QUATERNIONS = [
+    (0xC0000000, (0.0, 0.0, 0.0, 1.0)),
+    (0x00000000, (1.0, 0.0, 0.0, 0.0)),
+    (0xC0000000 | 511, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))),  # heading +90 degrees
+    (0xC0000000 | 512 | 511, (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))),  # heading -90 degrees
+    (0xC0000000 | 256 << 10, (0.0, 256 / 511 * math.sqrt(0.5), 0.0, 0.93516)),  # nose down
+]
+
+
+@pytest.mark.parametrize(("bits", "expected"), GOLDEN_QUATERNIONS)
+def test_quaternion_golden_values(bits: int, expected: tuple[float, ...]) -> None:
+    assert conversions.decompress_quaternion(bits) == pytest.approx(expected, abs=1e-5)
+
+
+@settings(deadline=None)
+@given(st.tuples(component, component, component, component).filter(lambda q: sum(c * c for c in q) > 0.01))
+def test_quaternion_agrees_with_the_library(q: tuple[float, float, float, float]) -> None:
+    encoding = pytest.importorskip("cflib.utils.encoding")
+    bits = encoding.compress_quaternion(list(q))
+    ours = conversions.decompress_quaternion(bits)
+    assert ours == pytest.approx(tuple(encoding.decompress_quaternion(bits)), abs=1e-9)
+    norm = math.sqrt(sum(c * c for c in q))
+    same = abs(sum(a * b / norm for a, b in zip(ours, q, strict=True)))  # q and -q are the same attitude
+    assert same == pytest.approx(1.0, abs=1e-4)
+
+
+def test_pitch_is_inverted_and_roll_and_yaw_are_not() -> None:
+    assert conversions.euler_from_log(10.0, 20.0, -90.0) == pytest.approx(
+        (math.radians(10), -math.radians(20), -math.pi / 2)
+    )
+    assert conversions.rates_from_log(1000, 500, -250) == pytest.approx((1.0, -0.5, -0.25))
+
+
+def test_gyro_is_in_degrees_per_second() -> None:
+    assert conversions.rates_from_gyro(180.0, -90.0, 1.0) == pytest.approx((math.pi, -math.pi / 2, math.radians(1)))
+
+
+def test_yaw_of_streamed_commands_is_in_degrees() -> None:
+    assert conversions.velocity_world((0.5, -0.25, 0.125), math.pi / 2, 7.0).arguments == pytest.approx(
+        (0.5, -0.25, 0.125, 90.0)
+    )
+    assert conversions.position((1.0, 2.0, 3.0), -math.pi, 0.0).arguments == pytest.approx((1.0, 2.0, 3.0, -180.0))
+    assert conversions.hover(0.5, -0.5, math.pi, 0.4, 0.0).arguments == pytest.approx((0.5, -0.5, 180.0, 0.4))
+    assert conversions.velocity_world((0.0, 0.0, 0.0), 0.0, 7.0).stamp == 7.0
+
+
+def test_full_state_is_in_rad_per_second_and_never_overflows() -> None:
+    setpoint = conversions.full_state(
+        (40.0, -40.0, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0, 0, 2.0, 0), (0.1, 99.0, -0.2), 0
+    )
+    place, velocity, acceleration, orientation, roll, pitch, yaw = setpoint.arguments
+    assert place == (32.767, -32.767, 1.0)
+    assert velocity == (1.0, 2.0, 3.0)
+    assert acceleration == (0.0, 0.0, 9.0)
+    assert orientation == (0, 0, 1.0, 0)
+    assert (roll, pitch, yaw) == (0.1, 32.767, -0.2)
+
+
+def test_full_state_without_attitude_means_level() -> None:
+    zero = (0.0, 0.0, 0.0)
+    assert conversions.full_state(zero, zero, zero, (0.0, 0.0, 0.0, 0.0), zero, 0.0).arguments[3] == (
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )
+
+
+@settings(deadline=None)
+@given(vectors, vectors, vectors, vectors)
+def test_every_full_state_fits_its_packet(p, v, a, w) -> None:  # type: ignore[no-untyped-def]
+    commander = pytest.importorskip("cflib.crazyflie.commander")
+
+    class Radio:
+        packet = None
+
+        def send_packet(self, packet: object) -> None:
+            self.packet = packet
+
+    radio = Radio()
+    commander.Commander(radio).send_full_state_setpoint(
+        *conversions.full_state(p, v, a, (0.0, 0.0, 0.0, 1.0), w, 0.0).arguments
+    )
+    kind, x, y, z, *_ = struct.unpack("<B9hI3h", bytes(radio.packet.data))  # type: ignore[attr-defined]
+    assert kind == 6
+    for sent, wanted in zip((x, y, z), p, strict=True):
+        assert sent / 1000 == pytest.approx(max(-32.767, min(32.767, wanted)), abs=0.0011)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_not_finite_are_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        conversions.velocity_world((0.0, bad, 0.0), 0.0, 0.0)
+    with pytest.raises(ValueError, match="finite"):
+        conversions.position((0.0, 0.0, 0.0), bad, 0.0)
+
+
+def test_map_is_the_middle_of_the_room_and_world_is_the_floor() -> None:
+    assert conversions.to_map((0.3, 0.0, 0.0), (0.0, 0.0, 0.95)) == (0.3, 0.0, -0.95)
+    assert conversions.to_world((0.3, 0.0, -0.95), (0.0, 0.0, 0.95)) == (0.3, 0.0, 0.0)
+
+
+def test_rotation_into_the_body() -> None:
+    left = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # heading along y
+    assert conversions.rotate_inverse(left, (0.0, 1.0, 0.5)) == pytest.approx((1.0, 0.0, 0.5))
+    assert conversions.yaw_of(left) == pytest.approx(math.pi / 2)

@@ -1,0 +1,203 @@
+"""What may come in over the graph: each check takes what can be, and nothing else."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+from array import array
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from waiting import wait_for
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from dtsa_msgs.msg import Process, Slot
+from nav_msgs.msg import Odometry
+
+from dtsa_agent.ros.common.process.peers import ProcessName
+from dtsa_agent.ros.common.process.runs import Call, Run
+from dtsa_agent.ros.common.wire.checks import (
+    RANGE,
+    SIZES,
+    SLOT,
+    UNKNOWN,
+    OnePublisher,
+    Unusable,
+    check_odometry,
+    check_process,
+    check_slot,
+    check_start,
+    parse_json,
+    plain,
+)
+from dtsa_agent.ros.common.wire.intake import Intake
+
+HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1, 2, 3, 4]}
+
+
+def reason(check: Any, *arguments: Any) -> str:
+    """Why something is unusable; empty: it is not."""
+    try:
+        check(*arguments)
+    except Unusable as error:
+        return error.reason
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({}, ""),
+        ({"sender": [2, 13]}, UNKNOWN),
+        ({"sender": [0, 2]}, UNKNOWN),
+        ({"sender": [2, 2]}, UNKNOWN),
+        ({"sender": [2]}, SIZES),
+        ({"sender": []}, SIZES),
+        ({"length": []}, SIZES),
+        ({"length": [2, 2]}, SIZES),
+        ({"length": [3, 0]}, SIZES),
+        ({"length": [61, 1], "data": [0] * 62}, SIZES),
+        ({"data": []}, SIZES),
+        ({"received": []}, SIZES),
+        ({"received": [1, 2, 3]}, SIZES),
+        ({"slot": 4_000_000_000}, SLOT),
+        ({"heard_slot": 2**32 - 1}, SLOT),
+        ({"phase": 9}, RANGE),
+        ({"phase": Slot.END}, SIZES),
+    ],
+)
+def test_slot_messages(change: dict[str, Any], expected: str) -> None:
+    assert reason(check_slot, Slot(**{**HEARD, **change}), 12) == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({}, ""),
+        ({"agent": []}, UNKNOWN),
+        ({"agent": [2, 1]}, UNKNOWN),
+        ({"agent": [4]}, UNKNOWN),
+        ({"dropped": [1]}, SIZES),
+        ({"settings": "x" * 100_000}, SIZES),
+    ],
+)
+def test_process_messages(change: dict[str, Any], expected: str) -> None:
+    assert reason(check_process, Process(**{"agent": [1, 3], **change}), 3) == expected
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("position.x", 3.0, ""),
+        ("position.x", math.nan, RANGE),
+        ("position.z", 1e6, RANGE),
+        ("orientation.w", 0.0, RANGE),
+        ("orientation.x", math.inf, RANGE),
+    ],
+)
+def test_odometry(field: str, value: float, expected: str) -> None:
+    message = Odometry()
+    part, axis = field.split(".")
+    setattr(getattr(message.pose.pose, part), axis, value)
+    assert reason(check_odometry, message) == expected
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**50))
+def test_transmissions_start_about_now(start_ns: int, now_ns: int) -> None:
+    assert (reason(check_start, start_ns, now_ns) == "") == (-60e9 <= start_ns - now_ns <= 10e9)
+
+
+@given(st.lists(st.integers(1, 900), min_size=2, max_size=20), st.integers(-(10**6), 10**6))
+def test_numbers_of_one_publisher_are_taken_whatever_a_stranger_counts(steps: list[int], shift: int) -> None:
+    publisher, number, now_s = OnePublisher(), 5000, 10.0
+    for step in steps:
+        number, now_s = number + step, now_s + 0.01
+        assert publisher.admits(number, now_s)
+        stranger = number + shift
+        if stranger <= number or stranger > number + 1000:
+            assert publisher.admits(stranger, now_s) == (stranger <= 0 and not stranger)
+    assert publisher.admits(1, now_s + 1.0)  # after a silence, or a restart
+
+
+def test_the_sender_counts_more_than_its_numbers() -> None:
+    known, first = OnePublisher(b"one"), OnePublisher()
+    for publisher in (known, first):
+        assert publisher.admits(7, 1.0, b"one")
+        assert not publisher.admits(8, 1.1, b"two")
+        assert publisher.admits(5000, 1.2, b"one")
+    assert not known.admits(5001, 9.0, b"two")
+    assert first.admits(1, 9.0, b"two")  # where nobody is given, after a silence: a process started again
+
+
+def test_only_the_channel_can_end_its_run() -> None:
+    run = Run.draw()
+    call = Call.from_bytes(run.call("/swarm/channel"))
+    assert call.ended_by(run.proof)
+    assert not call.ended_by(Run.draw().proof)
+    assert not call.ended_by(b"")
+    assert not call.channel.gone
+    assert not ProcessName(call.channel.node, "elsewhere", 1, 1).gone
+    assert ProcessName(call.channel.node, call.channel.machine, call.channel.pid, call.channel.started + 1).gone
+
+
+def test_a_stopped_process_is_paused_and_not_gone() -> None:
+    with subprocess.Popen(["sleep", "60"]) as process:
+        fields = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").split()
+        name = ProcessName("/swarm/channel", ProcessName.own("").machine, process.pid, int(fields[21]))
+        try:
+            assert not name.paused
+            assert not name.gone
+            process.send_signal(signal.SIGSTOP)
+            wait_for(lambda: name.paused)
+            assert not name.gone
+            assert not ProcessName(name.node, name.machine, name.pid, name.started + 1).paused
+        finally:
+            process.kill()
+        wait_for(lambda: name.gone)
+        assert not name.paused
+    assert not ProcessName(name.node, "elsewhere", name.pid, name.started).paused
+
+
+@given(
+    st.one_of(
+        st.binary(),
+        st.text().map(str.encode),
+        st.sampled_from([b"[]", b"{}", b'{"node": 1}', b"1" * 5000, b"[" * 4000]),
+    )
+)
+def test_calls_of_nobody(data: bytes) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011
+        Call.from_bytes(data)
+
+
+def test_texts_from_outside_stand_in_one_line_and_are_never_too_deep() -> None:
+    assert plain("/cf1/agent\n\x1b[2J" + "x" * 5000) == "/cf1/agent??[2J" + "x" * 185
+    with pytest.raises(ValueError, match="nested"):
+        parse_json("[" * 60_000)
+
+
+class Log:
+    """A logger that keeps its lines."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def warning(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def test_what_is_dropped_is_counted_by_reason_and_said_once_in_a_while() -> None:
+    log = Log()
+    intake = Intake(log)
+    for _ in range(1000):
+        with intake.guard():
+            check_slot(Slot(phase=9), 3)
+    with intake.guard():
+        check_slot(Slot(sender=array("H", [1])), 3)
+    assert intake.counts == {RANGE: 1000, SIZES: 1}
+    assert log.lines == ["not taken in (range): slot message of phase 9; 1 so far"]

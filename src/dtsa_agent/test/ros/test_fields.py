@@ -1,0 +1,162 @@
+"""Messages that are packed and unpacked without rclpy say what rclpy says."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from dtsa_msgs.msg import Report, Slot, Transmission
+from rclpy.serialization import deserialize_message, serialize_message
+
+from dtsa_agent.ros.common.wire import report_fields
+from dtsa_agent.ros.common.wire.report_fields import ReportFields, pack_report, read_report
+from dtsa_agent.ros.common.wire.slot_fields import SlotFields, _fields, _read_usual, read_slot
+from dtsa_agent.ros.common.wire.stamps import header_of, ns_of
+from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, read_transmission, transmission_layout
+
+MOST, STEPS = 12, 2
+numbers = st.floats(allow_nan=False)
+words = st.integers(0, 2**32 - 1)
+
+
+def sequence(code: str, values: st.SearchStrategy[Any], count: int) -> st.SearchStrategy[array[Any]]:
+    return st.lists(values, min_size=count, max_size=count).map(lambda items: array(code, items))
+
+
+@st.composite
+def transmissions(draw: Any) -> Transmission:
+    """Answers as agents give them in lockstep."""
+    n = draw(st.integers(1, MOST))
+    lengths = draw(st.lists(st.integers(0, 9), min_size=n, max_size=n))
+    vector = sequence("d", numbers, 3 * n)
+    return Transmission(
+        header=header_of(draw(st.integers(0, 2**60))),
+        run=draw(words),
+        slot=draw(words),
+        agent=draw(sequence("H", st.integers(0, 2**16 - 1), n)),
+        length=array("B", lengths),
+        data=draw(sequence("B", st.integers(0, 255), sum(lengths))),
+        chosen=draw(sequence("H", st.integers(0, 2**16 - 1), n)),
+        reason=draw(sequence("B", st.integers(0, 255), n)),
+        digest=draw(sequence("I", words, n)),
+        score=draw(sequence("d", numbers, n)),
+        steps=STEPS,
+        track=draw(sequence("d", numbers, 3 * STEPS * n)),
+        velocity=draw(vector),
+        command=draw(vector),
+        goal=draw(vector | st.just(array("d"))),
+    )
+
+
+@st.composite
+def slots(draw: Any) -> Slot:
+    """Slot messages as channels send them."""
+    n = draw(st.integers(0, 4))
+    octets = st.binary(max_size=20)
+    return Slot(
+        header=header_of(draw(st.integers(-(2**60), 2**60))),
+        run=draw(words),
+        slot=draw(words),
+        phase=draw(st.integers(0, 9)),
+        heard_slot=draw(words),
+        sender=draw(sequence("H", st.integers(0, 2**16 - 1), n)),
+        length=draw(sequence("B", st.integers(0, 255), n)),
+        data=array("B", draw(octets)),
+        received=array("B", draw(octets)),
+    )
+
+
+@st.composite
+def reports(draw: Any) -> Report:
+    """Reports of any lengths of their fields, fitting or not."""
+    counts = st.integers(0, 4)
+    words_of = {"H": st.integers(0, 2**16 - 1), "I": words, "q": st.integers(-(2**63), 2**63 - 1), "d": numbers,
+                "B": st.integers(0, 255)}  # fmt: skip
+    kinds = {"agent": "H", "slot": "I", "offset_ns": "q", "length": "B", "chosen": "H", "reason": "B", "digest": "I",
+             "score": "d", "track": "d", "velocity": "d", "command": "d", "goal": "d", "heard_sender": "H",
+             "heard_slot": "I", "heard_in": "I", "heard_ns": "q", "heard_by": "B"}  # fmt: skip
+    fields = {name: draw(sequence(kind, words_of[kind], draw(counts))) for name, kind in kinds.items()}
+    stamp = draw(st.integers(-(2**60), 2**60))
+    return Report(header=header_of(stamp), run=draw(words), steps=draw(st.integers(0, 255)), **fields)
+
+
+def told_by(fields: ReportFields) -> list[Any]:
+    """All values of a report, as what can be compared: arrays may hold values that are no numbers."""
+    return [value if isinstance(value, int) else value.tobytes() for value in fields]
+
+
+def fields_of(message: Transmission) -> TransmissionFields:
+    """What a message says, by rclpy."""
+    values = {name: getattr(message, name) for name in TransmissionFields._fields[4:]}
+    told = {name: value.tobytes() for name, value in values.items()}
+    return TransmissionFields(ns_of(message.header.stamp), message.run, message.slot, message.agent, **told)
+
+
+def damaged(data: bytes, cut: int, at: int, value: int) -> bytes:
+    """A message with another byte somewhere, or cut short."""
+    changed = bytearray(data)
+    changed[at % len(data)] ^= value
+    return bytes(changed[: len(data) - cut])
+
+
+@given(transmissions())
+def test_transmissions(message: Transmission) -> None:
+    told = fields_of(message)
+    assert read_transmission(bytes(serialize_message(message)), MOST, STEPS) == told
+    packed = transmission_layout(len(message.agent), STEPS).pack(told)
+    assert deserialize_message(packed, Transmission) == message
+    assert read_transmission(packed, MOST, STEPS) == told
+
+
+@given(reports())
+def test_reports(message: Report) -> None:
+    found, by_rclpy = read_report(bytes(serialize_message(message))), report_fields._fields(message)
+    assert told_by(found) == told_by(by_rclpy)
+    rows = {name: value.tobytes() for name, value in found._asdict().items() if not isinstance(value, int)}
+    packed = pack_report(found.time_ns, found.run, found.steps, rows)
+    assert report_fields._read_usual(packed) is not None
+    assert deserialize_message(packed, Report) == message
+
+
+@given(slots())
+def test_slots(message: Slot) -> None:
+    data = bytes(serialize_message(message))
+    assert _read_usual(data) == read_slot(data) == _fields(message)
+
+
+places, bits = st.integers(0, 10_000), st.integers(0, 255)
+
+
+@given(transmissions() | slots() | reports(), st.integers(0, 40) | st.just(0), places, bits)
+def test_what_is_damaged_says_what_it_says_by_rclpy_or_is_left_to_it(
+    message: Transmission | Slot | Report, cut: int, at: int, value: int
+) -> None:
+    data = damaged(bytes(serialize_message(message)), cut, at, value)
+    found: TransmissionFields | SlotFields | None
+    if isinstance(message, Report):
+        report = report_fields._read_usual(data)
+        if report is not None:
+            assert told_by(report) == told_by(report_fields._fields(deserialize_message(data, Report)))
+    elif isinstance(message, Slot):
+        found = _read_usual(data)
+        assert found is None or found == _fields(deserialize_message(data, Slot))
+    else:
+        found = read_transmission(data, MOST, STEPS)
+        assert found is None or found == fields_of(deserialize_message(data, Transmission))
+
+
+def test_what_is_laid_out_in_another_way_is_left_to_rclpy() -> None:
+    message = Slot(slot=7, data=[1, 2])
+    message.header.frame_id = "elsewhere"
+    data = bytes(serialize_message(message))
+    assert _read_usual(data) is None
+    assert read_slot(data) == _fields(message)
+    assert read_transmission(data, MOST, STEPS) is None
+    with pytest.raises(Exception, match="deserialize"):
+        read_slot(data[:30])

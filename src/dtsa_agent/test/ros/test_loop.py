@@ -1,0 +1,75 @@
+"""Signals: a flag for loops, an exception for what looks at no flag."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from dtsa_agent.ros.common.process.loop import Stop
+
+
+def _signalled(stop: Stop) -> None:
+    with stop.at_once():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+
+
+def test_a_signal_ends_what_looks_at_no_flag_and_is_a_flag_elsewhere() -> None:
+    with Stop() as stop:
+        begun = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            _signalled(stop)
+        assert time.monotonic() - begun < 5
+        assert stop.signal == signal.SIGINT
+        os.kill(os.getpid(), signal.SIGTERM)  # a flag again
+        assert stop.count == 2
+        with pytest.raises(KeyboardInterrupt):  # there was a signal before
+            _signalled(stop)
+        assert stop.count == 2
+
+
+@pytest.mark.parametrize("before", [signal.SIG_IGN, signal.SIG_DFL])
+def test_a_hang_up_that_is_ignored_stays_ignored(before: signal.Handlers) -> None:
+    """As under nohup."""
+    usual = signal.signal(signal.SIGHUP, before)
+    try:
+        with Stop() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert bool(stop) is (before == signal.SIG_DFL)
+        assert signal.getsignal(signal.SIGHUP) == before
+    finally:
+        signal.signal(signal.SIGHUP, usual)
+
+
+def test_what_does_not_end_after_a_signal_says_where_it_stands_and_is_ended() -> None:
+    program = (
+        "import os, signal, time\nfrom dtsa_agent.stop import Stop\n"
+        "def stands_still():\n    time.sleep(60)\n"
+        "with Stop(0.3) as stop:\n    os.kill(os.getpid(), signal.SIGINT)\n{}"
+    )
+    for then, code, said in (("    stands_still()", 1, "in stands_still"), ("time.sleep(0.6)", 0, "")):
+        words = [sys.executable, "-c", program.format(then)]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=50, check=False)
+        assert done.returncode == code
+        assert said in done.stderr
+        assert bool(done.stderr) == bool(said)
+
+
+def test_a_call_that_stands_still_with_the_interpreters_lock_ends_the_process() -> None:
+    """Nobody sees a signal then, and no other thread runs."""
+    program = (
+        "import ctypes\nfrom dtsa_agent.stop import Stop\n"
+        "def stands_still(seconds):\n    ctypes.PyDLL(None).usleep(int(1e6 * seconds))\n"
+        "with Stop({limit}) as stop, stop.in_time():\n    stands_still({seconds})\n"
+    )
+    for limit, seconds, code, said in ((0.3, 50, 1, "in stands_still"), (30, 0.1, 0, ""), (0.0, 0.5, 0, "")):
+        words = [sys.executable, "-c", program.format(limit=limit, seconds=seconds)]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=40, check=False)
+        assert done.returncode == code
+        assert said in done.stderr
+        assert bool(done.stderr) == bool(said)

@@ -1,0 +1,416 @@
+"""The agents' nodes as real processes: parameters, answers, ends. The test plays the channel."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from array import array
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from node_helpers import Graph, end_of, ros_graph
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from builtin_interfaces.msg import Time
+from dtsa_msgs.msg import Decision, Frame, Process, Report, Slot, Transmission
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import DescribeParameters, GetParameters
+from std_msgs.msg import Header
+
+from dtsa_agent.core import REASONS, Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.settings.declaration import format_values, parse_values, settings_of
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.runs import Run
+from dtsa_agent.ros.common.wire.packing import pack_received, split_frames, unpack_received
+from dtsa_agent.ros.common.wire.stamps import time_of
+
+AGENT, HOST = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host"
+
+
+class Channel:
+    """The channel, played by the test."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.answers: list[Transmission] = []
+        self.run = Run.draw()
+        self.processes: list[Process] = []  # what processes have told about themselves
+        qos = names.lockstep_qos()
+        graph.node.create_subscription(Process, "/swarm/process", self.processes.append, qos)
+        self.publisher = graph.node.create_publisher(Slot, "/swarm/slot", qos)
+        graph.node.create_subscription(Transmission, "/swarm/transmission", self._put, qos)
+
+    def _put(self, message: Transmission) -> None:
+        self.answers.append(message)
+
+    def call(self) -> Process:
+        """Calls until a process tells about itself."""
+        self.graph.until(lambda: self.processes, self.publish_call)
+        return self.processes[-1]
+
+    def publish_call(self) -> None:
+        """Calls once."""
+        self.publisher.publish(Slot(run=self.run.number, phase=Slot.PREPARE, data=array("B", self.run.call("/test"))))
+
+    def end(self, slot: int) -> None:
+        """Ends the run."""
+        proof = array("B", self.run.proof)
+        self.publisher.publish(Slot(run=self.run.number, slot=slot, phase=Slot.END, data=proof))
+
+    def ask(self, slot: int, phase: int = Slot.RUN, **fields: object) -> Transmission:
+        """Opens a slot and waits for the answer; slot 0 is repeated until the node is there."""
+        if not slot:
+            self.call()
+        message = Slot(run=self.run.number, slot=slot, phase=phase, heard_slot=max(0, slot - 1), **fields)
+        before = len(self.answers)
+        if slot:
+            self.publisher.publish(message)
+        repeat = (lambda: None) if slot else (lambda: self.publisher.publish(message))
+        self.graph.until(lambda: len(self.answers) > before and self.answers[-1].slot == slot, repeat)
+        return self.answers[-1]
+
+
+@pytest.mark.ros
+def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3", "-p", "moving:=2", "-p", "seed:=5")
+        scenario = make_scenario(SwarmConfig(agents=3, moving=2, seed=5))
+        first = channel.ask(0)
+        assert list(first.agent) == [2]
+        assert list(first.chosen) == [1]
+        assert list(first.length) == [0]
+        assert np.array_equal(first.track, scenario.start[:, 1])
+        second = channel.ask(1)
+        assert list(second.chosen) == [2]
+        frame = decode_frame(bytes(second.data))
+        assert (frame.sender, frame.slot) == (2, 1)
+        count = len(channel.answers)
+        channel.publisher.publish(Slot(run=channel.run.number, slot=1, heard_slot=0))
+        graph.until(lambda: len(channel.answers) > count)
+        assert channel.answers[-1] == second  # asked again: the same answer, nothing has moved
+        channel.end(2)
+        assert end_of(agent) == (0, "")
+
+
+def ports_of(pid: int) -> list[Path]:
+    """The ports in shared memory on which a process listens."""
+    targets = (os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir())
+    return [Path(target[:-3]) for target in targets if "_port" in target and target.endswith("_el")]
+
+
+def forget_wait(port: Path) -> None:
+    """Marks a port's dead listener as one that was not waiting when it was killed, so that Fast DDS never misses it."""
+    with port.open("r+b", buffering=0) as file:
+        status = file.read().index(b"\x03", 20480)  # behind 512 semaphores: in use (1), and waiting (2)
+        file.seek(status)
+        file.write(b"\x01")
+
+
+@pytest.mark.ros
+def test_an_agent_started_again_after_kill_9_is_heard_from_whatever_the_dead_one_was_doing(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3")
+        first = channel.call()
+        ports = ports_of(agent.pid)
+        assert ports
+        agent.kill()
+        agent.communicate()
+        graph.processes.remove(agent)
+        for port in ports:
+            forget_wait(port)
+        locked_s = min(Path(f"{port}_el").stat().st_mtime for port in ports)
+        time.sleep(max(0.0, 1.1 - (time.time() - locked_s)))  # before, the locks might be those of a new process
+        graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3")
+        graph.until(lambda: channel.processes[-1].process != first.process, channel.publish_call)
+
+
+@pytest.mark.ros
+def test_odometry_is_sent_to_who_listens_reliably_like_rviz(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        heard: list[Odometry] = []
+        graph.node.create_subscription(Odometry, "/cf2/odom", heard.append, 5)
+        graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3", "-p", "moving:=2", "-p", "seed:=5")
+        answers: list[Transmission] = []
+        while not heard:
+            answers.append(channel.ask(len(answers), header=Header(stamp=Time(sec=len(answers)))))
+        first = heard[0]
+        slot = first.header.stamp.sec
+        assert (first.header.frame_id, first.child_frame_id) == ("map", "cf2/base_link")
+        place, speed = first.pose.pose.position, first.twist.twist.linear
+        assert [place.x, place.y, place.z] == list(answers[slot].track)
+        assert [speed.x, speed.y, speed.z] == list(answers[slot].velocity)
+
+
+@pytest.mark.ros
+def test_slots_that_cannot_be_under_way_and_forged_ends_change_nothing(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-p", "id:=1", "-p", "agents:=2")
+        channel.ask(0)
+        run = channel.run.number
+        for strange in (
+            Slot(run=run, slot=7, heard_slot=6),
+            Slot(run=run, slot=4_000_000_000),
+            Slot(run=run, slot=1, phase=Slot.END),
+            Slot(run=run, slot=1, phase=Slot.END, data=array("B", bytes(16))),
+            Slot(run=run, slot=1, sender=array("H", [1])),
+            Slot(run=run, slot=1, sender=[2], length=[3], data=[1, 2, 3], received=[0, 0]),
+            Slot(run=run, slot=1, phase=9),
+            Slot(run=run + 1, slot=1),
+            Slot(slot=1),
+        ):
+            channel.publisher.publish(strange)
+            graph.executor.spin_once(timeout_sec=0.05)
+        assert channel.ask(1).slot == 1
+        graph.until(lambda: sum(channel.processes[-1].dropped) >= 9)
+        channel.end(2)
+        assert end_of(agent)[0] == 0
+        told = channel.processes[-1]
+        counts = dict(zip(told.dropped_reason, told.dropped, strict=True))
+        assert counts == {"slot": 2, "forged end": 2, "sizes": 2, "range": 1, "other run": 2}
+
+
+@pytest.mark.ros
+def test_a_node_ends_when_its_channel_has_gone(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        agent = graph.start(AGENT, "-p", "id:=1", "-p", "agents:=2")
+        channel.ask(0)
+        channel.ask(1)
+        assert agent.poll() is None
+        graph.node.destroy_publisher(channel.publisher)
+        said = "agent: error: the channel has gone after slot 1 without ending the run\n"
+        assert end_of(agent) == (1, said)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number: int) -> None:
+    with ros_graph(tmp_path) as graph:
+        agent = graph.start(AGENT, "-p", "id:=3", "-p", "agents:=4", "-p", "slot_ms:=20")
+        describe = graph.node.create_client(DescribeParameters, "/cf3/agent/describe_parameters")
+        get = graph.node.create_client(GetParameters, "/cf3/agent/get_parameters")
+        graph.until(lambda: describe.service_is_ready() and get.service_is_ready())
+        fields = [setting for setting in settings_of(SwarmConfig) if setting.kind != "structure"]
+        described = graph.ask(describe, DescribeParameters.Request(names=[setting.name for setting in fields]))
+        values = graph.ask(get, GetParameters.Request(names=["slot_ms", "id"]))
+        for setting, found in zip(fields, described.descriptors, strict=True):
+            assert setting.help in found.description
+            assert found.read_only
+            if setting.kind == "int":
+                assert found.integer_range
+            if setting.kind == "float":
+                assert found.floating_point_range[0].from_value == setting.minimum
+            if setting.choices:
+                assert ", ".join(setting.choices) in found.additional_constraints
+        assert values.values[1].integer_value == 3
+        assert end_of(agent, number) == (0, "")
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("module", "arguments", "said"),
+    [
+        (AGENT, ["policy:=fifo"], "agent: error: policy: got 'fifo'; allowed: tdma, dtsa"),
+        (AGENT, ["agents:=0"], "agent: error: agents: got 0; allowed: a whole number, 1 to 1024"),
+        (AGENT, ["id:=13"], "agent: error: id: got 13; allowed: 1 to 12"),
+        (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
+        (HOST, ["policy:=aloha", "shared_table:=true"], "swarm_host: error: shared_table: got True; allowed: false"),
+    ],
+)
+def test_bad_parameters_are_one_line_and_exit_code_2(
+    tmp_path: Path, module: str, arguments: list[str], said: str
+) -> None:
+    with ros_graph(tmp_path) as graph:
+        code, error = end_of(graph.start(module, *[word for value in arguments for word in ("-p", value)]))
+        assert code == 2
+        assert error.startswith(said)
+        assert error.count("\n") == 1
+
+
+@pytest.mark.ros
+def test_a_host_answers_for_all_its_agents_in_one_message(tmp_path: Path) -> None:
+    with ros_graph(tmp_path) as graph:
+        channel = Channel(graph)
+        host = graph.start(HOST, "-p", "agents:=6", "-p", "ids:=[2, 4, 5]", "-p", "seed:=9")
+        config = SwarmConfig(agents=6, seed=9)
+        swarm = Swarm(config, local=[2, 4, 5])
+        frames: dict[int, bytes] = {}
+        for slot in range(12):
+            heard = {
+                "sender": array("H", frames),
+                "length": array("B", map(len, frames.values())),
+                "data": array("B", b"".join(frames.values())),
+            }
+            mask = np.array([[agent in (2, 5) for agent in range(1, 7)]] * len(frames), dtype=np.bool_).reshape(-1, 6)
+            if slot:
+                for frame in frames.values():
+                    swarm.hear(slot - 1, frame, np.array([1, 0, 1], dtype=np.uint8))
+                swarm.end(slot - 1)
+            swarm.begin(slot)
+            answer = channel.ask(slot, **heard, received=array("B", pack_received(mask) if frames else b""))
+            assert list(answer.agent) == [2, 4, 5]
+            assert list(answer.digest) == swarm.digest.tolist()
+            assert list(answer.chosen) == swarm.chosen.tolist()
+            assert np.array_equal(answer.track, swarm.track.ravel())
+            sent = split_frames(bytes(answer.data), answer.length)
+            frames = {agent: frame for agent, frame in zip(answer.agent, sent, strict=True) if frame}
+            swarm.fly(slot)
+        assert swarm.digest[0] != swarm.digest[1]  # agent 4 heard nothing
+        assert end_of(host, signal.SIGTERM)[0] == 0
+
+
+class RealtimeChannel(Channel):
+    """The channel in real time, played by the test: agents send when their own clock says so."""
+
+    def __init__(self, graph: Graph) -> None:
+        super().__init__(graph)
+        self.frames: list[Frame] = []
+        self.reports: list[Report] = []
+        qos = names.lockstep_qos(names.REALTIME_WAITING)
+        graph.node.create_subscription(Frame, f"/swarm/{names.AIR_FRAME}", self.frames.append, qos)
+        graph.node.create_subscription(Report, f"/swarm/{names.REPORT}", self.reports.append, qos)
+
+    def start(self, ahead_ns: int) -> None:
+        """Says when slot 0 starts, once the agent has been heard: so many ns from now."""
+        found = [f"/swarm/{name}" for name in (names.AIR_FRAME, names.REPORT)]
+        there = self.graph.node.count_publishers
+        self.graph.until(lambda: self.reports and all(map(there, found)), self.publish_call)
+        message = Slot(run=self.run.number, phase=Slot.START, data=array("B", self.run.call("/test")))
+        message.header.stamp = time_of(time.monotonic_ns() + ahead_ns)
+        self.publisher.publish(message)
+
+
+def realtime_agent(graph: Graph, *options: str) -> subprocess.Popen[str]:
+    """An agent with slots of 20 ms and a clock of its own."""
+    words = ("mode:=realtime", "slot_ms:=20.0", *options)
+    return graph.start(AGENT, *(word for option in words for word in ("-p", option)))
+
+
+@pytest.mark.ros
+def test_a_frame_whose_slot_is_over_stays_off_the_air(tmp_path: Path) -> None:
+    """Slot 0 began 50 slots ago: the agent goes through them all, and sends in none whose first half is over."""
+    slot_ns, late = 20_000_000, 50
+    with ros_graph(tmp_path) as graph:
+        channel = RealtimeChannel(graph)
+        agent = realtime_agent(graph, "agents:=2", "id:=1", "policy:=tdma")
+        channel.start(-late * slot_ns)
+        graph.until(lambda: channel.frames and len(channel.reports) > 1 and channel.reports[-1].slot[-1] > 2 * late)
+        channel.end(0)
+        assert end_of(agent)[0] == 0
+    told = {slot: length for report in channel.reports for slot, length in zip(report.slot, report.length, strict=True)}
+    assert set(range(late)) <= set(told)
+    assert not any(told[slot] for slot in range(late))
+    for frame in channel.frames:
+        began_ns = frame.header.stamp.sec * 1_000_000_000 + frame.header.stamp.nanosec
+        assert frame.slot >= late
+        assert began_ns - names.slot_time_ns(frame.slot, slot_ns) <= slot_ns // 2
+
+
+@pytest.mark.ros
+def test_an_agent_that_leaves_says_so_even_if_its_next_turn_is_k_m_rounds_away(tmp_path: Path) -> None:
+    """Agent 2 rests: after its first frame it has given away all its turns up to its next main anchor."""
+    config = SwarmConfig(agents=6, moving=1, policy="lease")
+    with ros_graph(tmp_path) as graph:
+        channel = RealtimeChannel(graph)
+        agent = realtime_agent(graph, "agents:=6", "moving:=1", "id:=2", "policy:=lease")
+        channel.start(5_000_000_000)  # on a busy machine, too, it hears of it before slot 0
+        graph.until(lambda: channel.frames)
+        agent.send_signal(signal.SIGTERM)
+        graph.until(lambda: agent.poll() is not None)
+        assert agent.returncode == 0
+        graph.until(lambda: decode_extended(bytes(channel.frames[-1].data)).leaving)
+    slots = [frame.slot for frame in channel.frames]
+    assert slots[0] == 1
+    assert slots[1] - slots[0] > (config.anchor_every + 1) * config.agents  # what it waited for, or would have
+
+
+@pytest.mark.parametrize(("policy", "scenario"), [("tdma", "exchange"), ("dtsa", "exchange"), ("age", "stop-and-go")])
+def test_agents_that_shared_a_table_go_on_alone_as_if_they_never_had(policy: str, scenario: str) -> None:
+    config = SwarmConfig(agents=6, policy=policy, scenario=scenario, seed=4)
+    shared, alone = Swarm(config, shared_table=True), Swarm(config)
+    random = np.random.default_rng(1)
+    for slot in range(300):
+        alone.scenario.advance(slot, alone)
+        shared.scenario.advance(slot, shared)
+        senders = alone.begin(slot)
+        assert shared.begin(slot) == senders
+        for name in ("chosen", "reason", "digest", "score", "position", "velocity", "command"):
+            assert np.array_equal(getattr(shared, name), getattr(alone, name)), (slot, name)
+        alone.fly(slot)
+        shared.fly(slot)
+        lossy = slot >= 97
+        if slot == 97:
+            shared = shared.with_own_tables(slot)
+        for index in senders:
+            mask = (random.random(6) < 0.6).astype(np.uint8) if lossy else np.ones(6, dtype=np.uint8)
+            mask[index] = 0
+            alone.hear(slot, alone.frame(index), mask)
+            shared.hear(slot, shared.frame(index), mask if lossy else None)
+        alone.end(slot)
+        shared.end(slot)
+    assert len(set(alone.digest.tolist())) > 1
+
+
+@given(st.integers(1, 70), st.integers(0, 5), st.randoms(use_true_random=False))
+def test_receiver_bits_survive_the_message(agents: int, frames: int, random: object) -> None:
+    mask = np.array([[random.random() < 0.5 for _ in range(agents)] for _ in range(frames)], dtype=np.bool_)  # type: ignore[attr-defined]
+    mask = mask.reshape(frames, agents)
+    data = pack_received(mask)
+    assert len(data) == frames * ((agents + 7) // 8)
+    assert np.array_equal(unpack_received(data, frames, agents), mask)
+
+
+@given(st.lists(st.binary(max_size=60), max_size=8))
+def test_frames_survive_the_message(frames: list[bytes]) -> None:
+    assert split_frames(b"".join(frames), [len(frame) for frame in frames]) == frames
+    with pytest.raises(ValueError, match="bytes of frames"):
+        split_frames(b"".join(frames) + b"x", [len(frame) for frame in frames])
+
+
+@given(st.dictionaries(st.from_regex(r"[a-z_]{1,8}", fullmatch=True), st.floats(allow_nan=False, allow_infinity=False)))
+def test_named_values_survive_their_text(values: dict[str, float]) -> None:
+    assert parse_values(format_values(values)) == values
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("agents", "1.5"), ("slot_ms", "fast"), ("boot_round", "maybe"), ("options", "tau")]
+)
+def test_texts_of_another_kind_are_refused_by_name(name: str, text: str) -> None:
+    setting = next(setting for setting in settings_of(SwarmConfig) if setting.name == name)
+    with pytest.raises(ConfigError, match=name):
+        setting.parse(text)
+
+
+def test_every_setting_says_what_it_is() -> None:
+    for setting in settings_of(SwarmConfig):
+        assert setting.help
+        assert setting.kind in ("int", "float", "bool", "text", "values", "structure")
+        if setting.kind in ("int", "float"):
+            assert setting.minimum is not None
+            assert setting.maximum is not None
+
+
+def test_a_scenario_is_handed_through() -> None:
+    """What a node flies is what the scenario says, also where it is not the configuration's own."""
+    config = SwarmConfig(agents=2, moving=2)
+    plain = make_scenario(config)
+    other = Scenario(plain.start, plain.start.copy(), plain.moving)
+    swarm = Swarm(config, other)
+    assert np.array_equal(swarm.goal, plain.start)
+
+
+def test_reasons_in_the_message_are_those_of_the_core() -> None:
+    named = {name: getattr(Decision, name) for name in dir(Decision) if name.startswith("REASON_")}
+    assert named == {f"REASON_{name.upper().replace('-', '_')}": code for code, name in enumerate(REASONS)}

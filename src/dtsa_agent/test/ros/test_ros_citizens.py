@@ -1,0 +1,170 @@
+"""Nodes among other nodes: logs, namespaces, ordinary executors, names of frames."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from node_helpers import Graph, end_of, ros_graph
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from dtsa_msgs.msg import Configuration, RunStatus, Slot, Transmission
+from rcl_interfaces.msg import Log
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from dtsa_agent.core import Swarm, SwarmConfig
+from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.process.waiting import Waiting
+from dtsa_agent.ros.swarm_node import SwarmNode
+
+AGENT, HOST, CHANNEL = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host", "dtsa_channel_sim.ros.channel_node"
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Iterator[Graph]:
+    with ros_graph(tmp_path) as made:
+        yield made
+
+
+class Recorder:
+    """A logger that keeps what it is told, with levels."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, str]] = []
+
+    def info(self, text: str) -> None:
+        self.lines.append(("info", text))
+
+    def warning(self, text: str) -> None:
+        self.lines.append(("warning", text))
+
+
+def test_waiting_is_said_at_once_and_then_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+    logger, now = Recorder(), 100.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    waiting, times = Waiting(logger), []
+    for tenth in range(6000):
+        now = 100.0 + 0.1 * tenth
+        before = len(logger.lines)
+        waiting.tell("waiting for cf3")
+        if len(logger.lines) > before:
+            times.append(round(now - 100.0))
+    assert logger.lines[0] == ("info", "waiting for cf3")
+    assert {level for level, _ in logger.lines[1:]} == {"warning"}
+    gaps = [later - sooner for sooner, later in pairwise(times)]
+    assert gaps == sorted(gaps)
+    assert gaps[0] < 10
+    assert max(gaps) <= 61
+    waiting.tell("waiting for cf4")
+    assert logger.lines[-1] == ("info", "waiting for cf4")
+
+
+@pytest.mark.parametrize(
+    ("agent", "swarm", "namespace", "frame", "clock"),
+    [
+        (3, "/swarm", "/cf3", "cf3/base_link", "/clock"),
+        (3, "/north", "/north/cf3", "north/cf3/base_link", "/north/clock"),
+    ],
+)
+def test_names_of_the_default_swarm_are_short(agent: int, swarm: str, namespace: str, frame: str, clock: str) -> None:
+    assert names.agent_namespace(agent, swarm) == namespace
+    assert names.body_frame(names.agent_namespace(agent, swarm)) == frame
+    assert names.clock_topic(swarm) == clock
+
+
+@pytest.mark.ros
+def test_an_agent_that_waits_says_for_whom_and_where_it_lives(graph: Graph) -> None:
+    heard: list[Log] = []
+    graph.node.create_subscription(Log, "/rosout", heard.append, 10)
+    agent = graph.start(AGENT, "-p", "id:=2", "-p", "agents:=3", "-p", "swarm_namespace:=/north", logs=True)
+    graph.until(lambda: any("waiting for a channel on /north/slot" in line.msg for line in heard))
+    line = next(line for line in heard if "waiting" in line.msg)
+    assert line.name == "north.cf2.agent"
+    assert line.level in (Log.INFO, Log.WARN)
+    code, said = end_of(agent, signal.SIGINT)
+    assert code == 0
+    assert "ends after slot -1: stopped by a signal" in said
+
+
+@pytest.mark.ros
+def test_late_subscribers_get_settings_and_status(graph: Graph) -> None:
+    channel = graph.start(CHANNEL, "-r", "__ns:=/north", "-p", "agents:=2", "-p", "loss:=0.25")
+    host = graph.start(HOST, "-r", "__ns:=/north", "-p", "agents:=2")
+    settings: list[Configuration] = []
+    status: list[RunStatus] = []
+    graph.until(lambda: graph.node.get_publishers_info_by_topic("/north/status"))
+    graph.node.create_subscription(Configuration, "/north/configuration", settings.append, names.latched_qos())
+    graph.node.create_subscription(RunStatus, "/north/status", status.append, names.latched_qos())
+    slots: list[Slot] = []
+    graph.node.create_subscription(Slot, "/north/slot", slots.append, names.lockstep_qos(64))
+    graph.until(lambda: settings and status and status[-1].phase == RunStatus.FLYING)
+    graph.until(lambda: slots and slots[-1].slot > 2)
+    channel.send_signal(signal.SIGINT)
+    graph.until(lambda: status[-1].phase == RunStatus.ENDED)
+    assert settings[0].run == status[-1].run != 0
+    assert '"loss": 0.25' in settings[0].settings
+    assert status[-1].reason == "stopped by a signal"
+    assert status[-1].slot > 0
+    assert end_of(channel)[0] == 0
+    assert end_of(host)[0] == 0
+
+
+def answers_in(graph: Graph, space: str, attached: bool) -> list[list[object]]:
+    """What two agents answer in a run of 30 slots: served by an ordinary executor, or in a process of their own."""
+    given: list[Transmission] = []
+    heard = graph.node.create_subscription(Transmission, f"{space}/transmission", given.append, names.lockstep_qos(64))
+    swarm = ["-r", f"__ns:={space}", "-p", "agents:=2"]
+
+    def start_channel() -> None:
+        graph.until(heard.get_publisher_count)  # or the test would miss the first answers
+        graph.start(CHANNEL, *swarm, "-p", "slots:=30", "-p", "loss:=0.3")
+
+    if not attached:
+        process = graph.start(HOST, *swarm)
+        start_channel()
+        graph.until(lambda: process.poll() is not None)
+    else:
+        node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
+        agents = SwarmNode(node, Swarm(SwarmConfig(agents=2)), space)
+        over = agents.attach()
+        executor = SingleThreadedExecutor(context=graph.node.context)
+        executor.add_node(node)
+        start_channel()
+        graph.until(over.done, lambda: executor.spin_once(timeout_sec=0.05))
+        assert over.exception() is None
+        executor.shutdown()
+        agents.loop.close()
+        node.destroy_node()
+    graph.until(lambda: given and given[-1].slot == 30)
+    by_slot = {m.slot: [m.slot, list(m.data), list(m.chosen), list(m.digest), list(m.track)] for m in given}
+    return [by_slot[slot] for slot in range(31)]
+
+
+@pytest.mark.ros
+def test_agents_in_an_ordinary_executor_answer_the_same(graph: Graph) -> None:
+    assert answers_in(graph, "/attached", True) == answers_in(graph, "/looped", False)
+
+
+@pytest.mark.ros
+def test_an_error_of_attached_agents_is_in_the_future(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
+    agents = SwarmNode(node, Swarm(SwarmConfig(agents=2)), "/attached")
+
+    def gone(*unused: object) -> None:
+        raise LocalProtocolError("the channel has gone")
+
+    monkeypatch.setattr(agents.membership, "idle", gone)
+    over = agents.attach()
+    executor = SingleThreadedExecutor(context=graph.node.context)
+    executor.add_node(node)
+    graph.until(over.done, lambda: executor.spin_once(timeout_sec=0.05))
+    assert isinstance(over.exception(), LocalProtocolError)
+    executor.shutdown()
+    agents.loop.close()
+    node.destroy_node()

@@ -1,0 +1,74 @@
+"""Examples of each command: they stand at the end of its help, and a test reads them as the command does."""
+
+from __future__ import annotations
+
+EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
+    "demo": (
+        ("", "everything, into runs/demo-1, and the page in a browser"),
+        ("--animation --no-open --out story", "with a moving picture; no browser"),
+    ),
+    "fly": (
+        ("--out runs/a", "twelve agents, a process each, as in the paper"),
+        ("--out runs/b --agents 18 --policy lease --loss 0.1 --processes 2", "lost frames, two processes"),
+        ("--out runs/c --mode realtime --policy lease --respawn 1", "clocks of their own; the dead come back"),
+        ("--out runs/e --mode realtime --policy lease --view --control", "in a browser, which may kill agents and jam"),
+        ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
+    ),
+    "agent": (
+        ("--id 3 --interface eth0", "the third of twelve; the key is in DTSA_AUTH_KEY"),
+        ("--id 1 --agents 4 --interface lo --no-seal --duration-s 10 --out runs/cf1", "ten seconds, with a bag"),
+    ),
+    "simulate": (
+        ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),
+        ("--moving 2 --policy lease --json", "the same as JSON"),
+    ),
+    "sweep": (
+        ("--list", "what comes with the package"),
+        ("--preset paper-12,paper-18 --seeds 30", "the paper's experiments"),
+        ("--preset loss --set slot_ms=20 --out runs/slow", "with a setting changed"),
+        ("--file own.yaml --json", "a sweep of your own, its groups as JSON"),
+    ),
+    "new-plugin": (("my-policy --out plugins/my-policy", "then as its README.md says"),),
+    "replay": (
+        ("runs/a", "in real time"),
+        ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),
+    ),
+    "verify": (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON")),
+    "sniff": (("--interface eth0 --out runs/sniffed", "twelve agents; until Ctrl-C"),),
+    "merge": (
+        ("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"),
+        ("runs/cf* --json", "all of them, as JSON"),
+        ("runs/cf* --out flight_1", "kept as one bag, for report, export and verify"),
+    ),
+    "recover": (("runs/a", "into runs/a/bag_recovered"),),
+    "view": (
+        ("runs/a", "a recorded run, played; one that is being recorded is followed"),
+        ("runs/a runs/b", "two side by side"),
+        ("--domain 7", "the swarm on a ROS domain"),
+        ("--air udp --interface eth0", "agents on a network, as one who listens; the key is in DTSA_AUTH_KEY"),
+    ),
+    "report": (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side")),
+    "export": (
+        ("runs/a", "all tables as Parquet"),
+        ("runs/a --to csv --tables slots frames --out tables", "two of them as CSV"),
+    ),
+    "bridge": (
+        ("--config swarm.yaml --check", "is everything there that a flight needs?"),
+        ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
+    ),
+    "fake-crazyflie": (("--count 12", "twelve vehicles for the official library"),),
+    "completion": (
+        ("bash > ~/.dtsa-completion.bash", "then, in ~/.bashrc: . ~/.dtsa-completion.bash"),
+        ("zsh > ~/.dtsa-completion.zsh", "then, in ~/.zshrc: . ~/.dtsa-completion.zsh"),
+    ),
+}
+
+
+def epilog(command: str, program: str = "tools/dtsa") -> str:
+    """The examples of a command as its help shows them; empty if it has none.
+
+    :param command: its name.
+    :param program: what stands in front.
+    """
+    lines = [f"  {program} {command} {words}".rstrip() + f"\n      {text}" for words, text in EXAMPLES.get(command, ())]
+    return "\n".join(["examples:", *lines]) if lines else ""

@@ -1,0 +1,50 @@
+"""Names of the commands. A module of its own: `tools/dtsa` reads it before anything is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+COMMANDS = {
+    "demo": "who speaks next, in nine recorded flights, a page and a picture; under a minute",
+    "fly": "one flight with real ROS 2 nodes, recorded to a bag",
+    "agent": "one agent on a real network: frames over UDP, no channel node, no ROS",
+    "simulate": "one or many flights without ROS, as fast as the machine allows",
+    "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
+    "new-plugin": "a package to begin with: a policy of your own, its test and a sweep",
+    "replay": "play a bag back into the ROS graph",
+    "verify": "check a bag: was every decision what the protocol says?",
+    "sniff": "listen to agents on a real network, record and judge what they send",
+    "merge": "the bags of agents on a real network as one flight: one time line, results, decisions made again",
+    "recover": "make a readable bag of what a killed recorder left behind",
+    "view": "a swarm in the browser: a recorded run, one that is being recorded, one on the ROS graph or a network",
+    "report": "one web page about one or several recorded runs",
+    "export": "a bag's contents as CSV or Parquet",
+    "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
+    "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
+    "completion": "a script that completes commands, options and their values in bash or zsh",
+}
+
+RECORDED_RUN = "run directory, bag directory or .mcap file"  # what commands take that read one
+
+
+_MODULES: dict[str, str] = {}  # of commands that do not belong to this package
+
+
+def add(package: str, commands: Mapping[str, str]) -> None:
+    """Adds commands of another package, for the command line of a checkout.
+
+    :param package: where their modules are.
+    :param commands: what each does, by name.
+    """
+    COMMANDS.update(commands)
+    _MODULES.update({name: f"{package}.{module_name(name)}" for name in commands})
+
+
+def module_name(command: str) -> str:
+    """Last part of the name of a command's module."""
+    return command.replace("-", "_")
+
+
+def module_of(command: str) -> str:
+    """Name of the module of a command."""
+    return _MODULES.get(command, f"dtsa_bench.commands.{module_name(command)}")

@@ -1,0 +1,355 @@
+"""The ground station of a mission with Crazyflies: it orders, watches, and is alive."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray
+from dtsa_msgs.msg import Status
+from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff
+from geometry_msgs.msg import Point
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
+from rclpy.node import Node
+from std_msgs.msg import Empty as EmptyMessage
+from std_srvs.srv import Empty, Trigger
+
+from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
+from dtsa_agent.crazyflie.motion.paths import shortest_s
+from dtsa_agent.crazyflie.node.agents_node import STOP_HERE
+from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
+from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.serving import Serving
+
+from .mission_log import MissionLog
+from .moves_to_places import plan_moves
+from .places import MissionError, assign_places, check_standing, crossings
+
+ARRIVED_M = 0.12  # m: at its start when this close
+CLIMB_MPS = 0.4
+SHIFT_MPS = 0.3
+BRING_MPS = 0.8  # of one that is brought to its place, at most
+KEEP_M = 0.3  # nobody comes closer to one that is brought to its place
+BRIDGE_SILENT_S = 3.0
+STOPPING_S = (1.2, 6.0)  # all come to rest within the first time; at the second they land wherever they are
+IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
+BRIDGE_S = 60.0  # s, for the connections
+
+
+@dataclass(slots=True)
+class Ended:
+    """True once the flight has to end: a signal, or a vehicle in trouble."""
+
+    stop: Stop
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.stop) or bool(self.reason)
+
+
+class Mission:
+    """What the ground station does: it calls the bridge's services, watches the vehicles, and is alive.
+
+    :param node: a node of its own.
+    :param settings: the swarm's YAML.
+    :param scenario: where everybody starts.
+    :param ended: is told why when something goes wrong.
+    :param say: prints a line.
+    """
+
+    def __init__(
+        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: Ended, say: Callable[[str], None]
+    ) -> None:
+        self.node, self.settings, self.scenario, self.ended, self.say = node, settings, scenario, ended, say
+        self.status: dict[str, Status] = {}
+        self.log = MissionLog()
+        self.place: dict[str, tuple[float, float, float]] = {}
+        self.crossing: list[str] = []  # whose ways to the starts cross: they are brought there one by one
+        self.heard = time.monotonic()  # s, monotonic, the last status of anybody
+        self.exchanging = False
+        self.bridge_alive: Callable[[], None] = lambda: None
+        self._odometry: list[Any] = []
+        for robot in settings.robots:
+            node.create_subscription(Status, f"/{robot.name}/status", self._keep_status(robot.name), 10)
+            subscription = node.create_subscription(Odometry, f"/{robot.name}/odom", self._keep_place(robot.name), 1)
+            self._odometry.append(subscription)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._keep_diagnostics, 10)
+        node.create_subscription(Log, EVENTS, self.log.event, EVENTS_QOS)
+        self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
+        self._stop_here = node.create_publisher(EmptyMessage, STOP_HERE, 1)
+        self._stopping: float | None = None  # s, monotonic, since when they are told to come to rest
+        self._landing: Any = None  # the answer to the order to land
+        self._beating = threading.Event()
+        self._over = threading.Event()
+        # Made long before they are used: a server drops the answer to a client that it has not discovered yet.
+        self._clients = {
+            name: node.create_client(kind, name)
+            for kind, name in (
+                (Arm, "/all/arm"),
+                (Takeoff, "/all/takeoff"),
+                (Land, "/all/land"),
+                (Empty, "/all/emergency"),
+                (Trigger, "/all/end_heartbeat"),
+                *((GoTo, f"/{robot.name}/go_to") for robot in settings.robots),
+            )
+        }
+        self._serving = Serving(node.context, "mission", node)
+        self._pulse = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def _keep_status(self, name: str) -> Callable[[Status], None]:
+        def keep(message: Status) -> None:
+            self.status[name] = message
+            self.heard = time.monotonic()
+            self.log.status(name, message)
+            if self.exchanging and message.state != Status.STATE_FLYING and not self.ended.reason:
+                self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
+
+        return keep
+
+    def _keep_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.startswith("crazyflie_bridge: "):
+                self.log.diagnostics[status.hardware_id] = {v.key: _number(v.value) for v in status.values}
+
+    def _keep_place(self, name: str) -> Callable[[Odometry], None]:
+        def keep(message: Odometry) -> None:
+            p = message.pose.pose.position
+            self.place[name] = p.x, p.y, p.z
+
+        return keep
+
+    def _beat(self) -> None:
+        while not self._over.wait(0.1):
+            if self._beating.is_set():
+                self._heartbeat.publish(EmptyMessage())
+            if self._stopping is not None:
+                self._stop_here.publish(EmptyMessage())
+
+    def check_bridge(self) -> None:
+        """For a bridge that is not a child of this process.
+
+        :raises MissionError: nothing is heard of it.
+        """
+        silent = time.monotonic() - self.heard
+        if self.status and silent > BRIDGE_SILENT_S:
+            raise MissionError(f"the bridge has been silent for {silent:.1f} s")
+
+    def start(self) -> None:
+        """Begin to listen."""
+        self._serving.start()
+        self._pulse.start()
+
+    def close(self) -> None:
+        """End of all threads."""
+        self._over.set()
+        self._serving.close()
+        self._pulse.join(2.0)
+
+    def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
+        """Call a service.
+
+        :raises MissionError: it does not answer or says no.
+        """
+        client = self._clients[name]
+        future = client.call_async(client.srv_type.Request(**fields))
+        end = time.monotonic() + timeout
+        while not future.done():
+            self.bridge_alive()
+            if time.monotonic() > end:
+                raise MissionError(f"service {name} does not answer")
+            time.sleep(0.005)
+        response = future.result()
+        if not getattr(response, "success", True):
+            raise MissionError(f"{name}: {response.message}")
+        return response
+
+    def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
+        """Wait until something is so.
+
+        :raises MissionError: it takes too long, or the user interrupts.
+        """
+        end = time.monotonic() + timeout
+        while not condition():
+            self.bridge_alive()
+            if self.ended:
+                raise MissionError(self.ended.reason or "interrupted")
+            if time.monotonic() > end:
+                missing = [f"{n} {s.state_name} ({s.reason})" for n, s in self.status.items()]
+                raise MissionError(f"{what} took longer than {timeout:g} s: {', '.join(missing)}")
+            time.sleep(0.02)
+
+    def _all(self, *states: int) -> bool:
+        return len(self.status) == len(self.settings.robots) and all(s.state in states for s in self.status.values())
+
+    def connect(self) -> None:
+        """Bridge up, everybody ready, and it is known where each stands."""
+        emergency = self._clients["/all/emergency"]
+        self.wait("the bridge's start", emergency.service_is_ready, BRIDGE_S)
+        self._beating.set()
+        self.wait("the connection", self._all_ready, 10.0)
+        self.wait("odometry", lambda: len(self.place) == len(self.settings.robots), 5.0)
+
+    def _all_ready(self) -> bool:
+        locked = [f"{n} ({s.reason})" for n, s in self.status.items() if s.state == Status.STATE_EMERGENCY]
+        if locked:
+            raise MissionError(f"switch off and on before the next flight: {', '.join(locked)}")
+        return self._all(Status.STATE_READY)
+
+    def find_places(self, config: SwarmConfig) -> SwarmConfig:
+        """The configuration in which everybody begins near where it stands.
+
+        :raises MissionError: it is not safe to begin.
+        """
+        vehicles = [robot.name for robot in self.settings.robots]
+        measured = np.array([self.place[name] for name in vehicles]).T
+        fence = self.settings.station.safety
+        check_standing(vehicles, measured, fence)
+        found = assign_places(config, measured)
+        self.scenario = make_scenario(found)
+        self.crossing = crossings(self.scenario, vehicles, measured)
+        if self.crossing:  # can it be done? Before motors turn.
+            plan_moves(vehicles, measured * [[1.0], [1.0], [0.0]], self.scenario.start, fence)
+        return found
+
+    def take_off(self) -> None:
+        """Arm, climb to the middle of the room, go to the start."""
+        self.say("arming")
+        self.call("/all/arm", arm=True)
+        self.wait("arming", lambda: self._all(Status.STATE_ARMED), 5.0)
+        height = self.settings.station.room_origin_in_world[2]
+        limit = self.settings.station.max_speed_mps
+        seconds = max(2.0, height / CLIMB_MPS, shortest_s(height, limit))
+        self.say("take-off")
+        self.call("/all/takeoff", height=height, duration=_duration(seconds))
+        time.sleep(seconds)
+        self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
+        if self.crossing:
+            self._bring()
+        starts = self.scenario.start.T.tolist()
+        way = max(math.dist(start, self.place[r.name]) for r, start in zip(self.settings.robots, starts, strict=True))
+        seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))  # for all: their ways keep apart if flown together
+        for robot, start in zip(self.settings.robots, starts, strict=True):
+            goal = Point(x=start[0], y=start[1], z=start[2])
+            self.call(f"/{robot.name}/go_to", goal=goal, duration=_duration(seconds))
+        self.wait("the way to the start", self._at_start, seconds + 15.0)
+        time.sleep(0.5)  # the last go_to is flown to its end before streamed commands count
+        # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
+        self._serving.executor.create_task(self._forget_odometry)
+        self.exchanging = True
+
+    def _bring(self) -> None:
+        """One after the other to its place: flown at the same time their straight ways would cross."""
+        vehicles = [robot.name for robot in self.settings.robots]
+        hover = np.array([self.place[name] for name in vehicles]).T
+        moves = plan_moves(vehicles, hover, self.scenario.start, self.settings.station.safety)
+        for number, move in enumerate(moves, 1):
+            name = vehicles[move.index]
+            self.say(f"bringing {name} to its place ({number} of {len(moves)})")
+            for waypoint in move.waypoints:
+                self._lead(name, waypoint)
+
+    def _lead(self, name: str, waypoint: tuple[float, float, float]) -> None:
+        """One flies to a place, all others hover.
+
+        :raises MissionError: it does not arrive, or somebody is in its way.
+        """
+        way = math.dist(self.place[name], waypoint)
+        seconds = 0.3 + max(way / BRING_MPS, shortest_s(way, self.settings.station.max_speed_mps))
+        x, y, z = waypoint
+        self.call(f"/{name}/go_to", goal=Point(x=x, y=y, z=z), duration=_duration(seconds))
+
+        def arrived() -> bool:
+            for other, place in self.place.items():
+                if other != name and (gap := math.dist(self.place[name], place)) < KEEP_M:
+                    raise MissionError(f"{name} comes within {gap:.2f} m of {other} on its way (limit {KEEP_M} m)")
+            return math.dist(self.place[name], waypoint) < ARRIVED_M
+
+        self.wait(f"the way of {name} to its place", arrived, seconds + 10.0)
+
+    def _forget_odometry(self) -> None:
+        while self._odometry:
+            self.node.destroy_subscription(self._odometry.pop())
+
+    def _at_start(self) -> bool:
+        away = [
+            np.linalg.norm(np.subtract(self.place[robot.name], start))
+            for robot, start in zip(self.settings.robots, self.scenario.start.T, strict=True)
+        ]
+        return max(away) < ARRIVED_M
+
+    @property
+    def flying(self) -> list[str]:
+        """Who was in the air, or may have been, when it was last heard of."""
+        return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
+
+    def at_rest(self, apart: Callable[[], bool]) -> bool:
+        """Tell all that fly to come to rest, nobody above another one; True once they have, or time is up.
+
+        :param apart: whether all are where they can land straight down.
+        """
+        now = time.monotonic()
+        if self._stopping is None:
+            self._stopping = now
+            self._stop_here.publish(EmptyMessage())
+        least, most = STOPPING_S
+        return now - self._stopping > most or (now - self._stopping > least and apart())
+
+    def order_landing(self) -> None:
+        """Have all land that are in the air; does not wait. They brake at once, all at the same time."""
+        self.exchanging = False
+        if self._landing is None:
+            height = self.settings.station.room_origin_in_world[2]
+            request = Land.Request(duration=_duration(max(2.0, height / CLIMB_MPS)))
+            self._landing = self._clients["/all/land"].call_async(request)
+
+    def land(self, urgent: Sequence[int]) -> None:
+        """Land whoever is in the air and wait until all stand.
+
+        :param urgent: once it is not empty, all motors are stopped at once.
+        """
+        self.exchanging = False
+        flying = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)
+        if any(s.state in flying for s in self.status.values()):
+            self.say("landing")
+            self.order_landing()
+            end = time.monotonic() + self.settings.station.landing_timeout_s
+            while time.monotonic() < end and any(s.state in flying for s in self.status.values()):
+                if time.monotonic() - self.heard > BRIDGE_SILENT_S:
+                    self.say("the bridge is silent: what flies is left to its own watchdogs")
+                    break
+                if urgent:
+                    self.say("EMERGENCY STOP")
+                    self._clients["/all/emergency"].call_async(Empty.Request())
+                    time.sleep(0.5)
+                    break
+                time.sleep(0.05)
+            self._landing.cancel()
+            self._landing = None
+        end_heartbeat = self._clients["/all/end_heartbeat"]
+        if end_heartbeat.service_is_ready():
+            future = end_heartbeat.call_async(Trigger.Request())
+            end = time.monotonic() + 2.0
+            while not future.done() and time.monotonic() < end:
+                time.sleep(0.01)
+        self._beating.clear()
+
+
+def _number(text: str) -> float | str:
+    """A number where it is one that JSON knows."""
+    with suppress(ValueError):
+        if math.isfinite(value := float(text)):
+            return value
+    return text
+
+
+def _duration(seconds: float) -> Duration:
+    return Duration(sec=int(seconds), nanosec=int((seconds % 1.0) * 1e9))

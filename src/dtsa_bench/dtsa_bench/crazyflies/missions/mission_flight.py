@@ -1,0 +1,286 @@
+"""A mission with Crazyflies: take-off, exchange of places in real time, landing; recorded like any other flight."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rclpy.context import Context
+from rclpy.node import Node
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.plugins.unslotted import check_slotted
+from dtsa_agent.crazyflie.links.link import require_cflib
+from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.keys import check_key
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.parameters import to_parameters
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.node_process import init_ros
+from dtsa_agent.ros.common.process.priority import give_way, take_priority
+from dtsa_bench.flights.children import Child, Children, NodeError, describe_end
+from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
+from dtsa_bench.flights.flight import END_S, QUIET, Flight, run_environment
+from dtsa_bench.flights.options import FlightOptions
+from dtsa_bench.flights.progress import FlightProgress, ProgressLine
+from dtsa_bench.flights.recorded_channel import BAG, RecordedFlight
+from dtsa_bench.flights.supervisor import RealtimeSupervisor
+from dtsa_bench.pages.view.mission import PageOptions, mission_page
+from dtsa_bench.runs.config import LOCKSTEP, RunConfig
+from dtsa_bench.runs.metrics import FlightMetrics
+from dtsa_bench.runs.options import new_directory, whole_number
+from dtsa_bench.runs.processes import end_process
+from dtsa_channel_sim.ros.channel_node import declare_channel
+from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+
+from .ground_station import Ended, Mission
+from .places import APART_M, MissionError, check_places
+
+RECORDER_END_S = 10.0
+MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange
+BRIDGE_END_S = 40.0  # s, to land by itself and close the links
+
+
+def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of the swarm that a mission chooses unless the user does.
+
+    The paper's room: an ellipse of half axes 1.2 m and 2.0 m, ids in order, so that everyone finds its place. More room
+    between two vehicles than in simulation, because they know where they are to a few centimetres only; and the policy
+    with which tables agree even where frames are lost.
+
+    :param settings: the swarm's YAML.
+    :param given: what the user has set, by name.
+    """
+    room = {"shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
+    defaults = {"agents": len(settings.robots), "avoider": "crazyflie", "policy": "lease"} | room
+    return {name: value for name, value in defaults.items() if given.get(name) is None}
+
+
+class _Rest:
+    """True once the exchange has to end and all have come to rest: they avoid each other until then.
+
+    :param ended: why it has to end.
+    :param mission: tells them.
+    :param channel: knows where they are.
+    """
+
+    def __init__(self, ended: Ended, mission: Mission, channel: RealtimeChannel) -> None:
+        self._ended, self._mission, self._channel = ended, mission, channel
+
+    def __bool__(self) -> bool:
+        return bool(self._ended) and (self._ended.stop.count > 1 or self._mission.at_rest(self._apart))
+
+    def _apart(self) -> bool:
+        places = np.array([self._channel.last_place(agent)[:2] for agent in range(1, self._channel.agents + 1)])
+        gaps = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(len(places), np.inf))
+        return bool(gaps.min() >= APART_M)
+
+
+class _BridgeWatch(ChannelObserver):
+    """Ends the exchange when the bridge has died."""
+
+    def __init__(self, mission: Mission) -> None:
+        self._mission = mission
+
+    def idle(self, status: ChannelStatus) -> None:
+        self._mission.bridge_alive()
+
+
+class CrashWatch(ChannelObserver):
+    """Ends the exchange when two are as near as in a crash. A run that ended by itself would not let all come to rest.
+
+    :param metrics: know where all are, by their own estimates.
+    :param ended: is told who and how near.
+    """
+
+    def __init__(self, metrics: FlightMetrics, ended: Ended) -> None:
+        self._metrics, self._ended = metrics, ended
+
+    def idle(self, status: ChannelStatus) -> None:
+        if self._metrics.collided_pair and not self._ended.reason:
+            a, b = self._metrics.collided_pair
+            distance, limit = self._metrics.closest()[0], self._metrics.run.limits.collision_m
+            self._ended.reason = (
+                f"cf{a} and cf{b} came within {distance:.2f} m of each other (collision_m is {limit:g})"
+            )
+
+
+def fly_crazyflies(
+    run: RunConfig,
+    settings: SwarmSettings,
+    swarm_yaml: Path,
+    out: str | Path,
+    options: FlightOptions,
+    stop: Stop,
+    *,
+    attach: bool = False,
+    page: PageOptions | None = None,
+) -> tuple[Flight, str]:
+    """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
+
+    :param run: what is flown; the number of agents is that of the robots.
+    :param settings: the swarm's YAML, read.
+    :param swarm_yaml: its path.
+    :param out: directory for the bag and the results.
+    :param options: domain, pictures.
+    :param stop: a flag that ends the mission early.
+    :param attach: by the bridge that runs already on this ROS domain, and goes on running.
+    :param page: shows the mission in a browser; None: nothing does.
+    :returns: the results, and why the exchange was cut short (empty: it was not).
+    :raises ConfigError: before anything has been started.
+    :raises DtsaError: something failed before the exchange began, or a node died.
+    """
+    if run.mode == LOCKSTEP:
+        raise ConfigError("mode", run.mode, "realtime: vehicles do not wait for the agents")
+    check_key(run.swarm)
+    check_slotted(run.swarm.policy)
+    require_cflib()
+    scenario = check_places(settings, run.swarm)
+    shared = attach or settings.station.positions.on
+    wanted = options.domain
+    if wanted is None and shared:  # that of the bridge, or of motion capture
+        wanted = whole_number(os.environ.get("ROS_DOMAIN_ID") or "0", "ROS_DOMAIN_ID", 0, LAST_DOMAIN)
+    with ros_domain(wanted, shared=shared) as domain, ExitStack() as shown:
+        directory = new_directory(out)
+        logs = directory / "log"
+        logs.mkdir()
+        environment = run_environment(domain, logs, shared_memory=False)
+        shown.enter_context(mission_page(domain, environment, page))
+        context = Context()
+        progress = ProgressLine("fly")
+        bridge, agents, recorder = (Children(logs, environment) for _ in range(3))
+        robots = [robot.name for robot in settings.robots]
+        arguments = ["--bag", str(directory / MISSION_BAG), "--names", *robots]
+        recorder.start("recorder", [], "dtsa_bench.crazyflies.missions.mission_recorder", arguments)
+        if not attach:
+            bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
+                         ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
+        ended = Ended(stop)
+        mission: Mission | None = None
+        try:
+            init_ros(QUIET, context, domain)
+            node = Node("mission", context=context, enable_rosout=False, start_parameter_services=False)
+            mission = Mission(node, settings, scenario, ended, progress.show)
+            mission.bridge_alive = mission.check_bridge if attach else bridge.check
+            mission.start()
+            take_priority(settings.station.priority)
+            mission.connect()
+            swarm = mission.find_places(run.swarm)
+            if swarm != run.swarm:
+                progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
+                run = dataclasses.replace(run, swarm=swarm)
+            if mission.crossing:
+                progress.say(f"brought to their places one by one: {', '.join(mission.crossing)} otherwise")
+            mission.take_off()
+            _start_agents(agents, run, settings, directory)
+            flight = _exchange(context, run, directory, agents, bridge, progress, options, ended, mission)
+            return flight, ended.reason
+        except DtsaError as error:
+            ended.reason = ended.reason or str(error)
+            raise
+        finally:
+            with _second_interrupt() as urgent:
+                agents.stop()
+                if mission is not None:
+                    mission.land(urgent)
+                    mission.close()
+                try:
+                    if not attach:
+                        _end_bridge(bridge.all[0])
+                finally:
+                    _end_recorder(recorder)
+                    if mission is not None:
+                        mission.log.write(directory, ended.reason)
+            progress.end()
+            context.try_shutdown()
+
+
+@contextmanager
+def _second_interrupt() -> Iterator[list[int]]:
+    """Once they land, one more Ctrl-C is the emergency stop: the list has its number then.
+
+    No `threading.Event`: a handler that interrupts another one would wait for ever for the lock that this one holds.
+    """
+    urgent: list[int] = []
+    old = signal.signal(signal.SIGINT, lambda number, _: urgent.append(number))
+    try:
+        yield urgent
+    finally:
+        signal.signal(signal.SIGINT, old)
+
+
+def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, directory: Path) -> None:
+    parameters = directory / "parameters.yaml"
+    content = {"/**": {"ros__parameters": to_parameters(run.swarm.to_dict(), SwarmConfig)}}
+    parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    rate = max(robot.command_rate_hz for robot in settings.robots)
+    ids = list(range(1, run.swarm.agents + 1))
+    agents.start("agents", ids, "dtsa_agent.crazyflie.node.agents_node",
+                 ["--ros-args", "--params-file", str(parameters), "-p", f"command_hz:={float(rate)}",
+                  "-p", f"priority:={settings.station.priority}",
+                  "--disable-external-lib-logs", "--disable-rosout-logs"])  # fmt: skip
+
+
+def _exchange(context: Context, run: RunConfig, directory: Path, agents: Children, bridge: Children,
+              progress: ProgressLine, options: FlightOptions, ended: Ended, mission: Mission) -> Flight:  # fmt: skip
+    node = Node("channel", namespace=names.SWARM, context=context)
+    try:
+        declare_channel(node, run.air)
+        stop_on_crash = run.limits.stop_on_crash
+        run = dataclasses.replace(run, limits=dataclasses.replace(run.limits, stop_on_crash=False))
+        flight = RecordedFlight(node, run, directory, options.startup_s, answer_s=2.0, end_s=END_S)
+        channel, measurement = flight.channel, flight.measurement
+        assert isinstance(channel, RealtimeChannel)
+        shown = FlightProgress(progress, measurement, channel)
+        channel.observe(_BridgeWatch(mission), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
+        if stop_on_crash:
+            channel.observe(CrashWatch(measurement.metrics, ended))
+        try:
+            channel.run(_Rest(ended, mission, channel))
+            ended.reason = ended.reason or channel.fell_behind
+            shown.show()
+        except (NodeError, MissionError) as error:  # the bridge has died: what was flown is there all the same
+            ended.reason = str(error)
+        finally:
+            channel.close()
+            progress.end()
+        mission.exchanging = False
+        with _second_interrupt() as urgent:  # first they land: what follows takes seconds
+            if ended.stop.count > 1:
+                urgent.append(signal.SIGINT)
+            if ended:
+                mission.order_landing()  # before the agents end: nobody flies on without them
+            agents.stop()
+            mission.land(urgent)
+        give_way()  # the bridge does not: it has to watch them
+        pictures = options.pictures and not ended
+        summary = flight.write_results(
+            pictures,
+            backend="cflib",
+            cut_short=ended.reason,
+            not_landed=mission.flying,
+            vehicles=mission.log.diagnostics,
+        )
+        return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
+    finally:
+        node.destroy_node()
+
+
+def _end_recorder(recorder: Children) -> None:
+    """It closes its bag; if it does not, the bag is recovered as any other."""
+    end_process(recorder.all[0].process, RECORDER_END_S)
+
+
+def _end_bridge(child: Child) -> None:
+    """The bridge lands whoever may still fly, then closes its links: it gets the time for that."""
+    if not end_process(child.process, BRIDGE_END_S):
+        raise MissionError(f"{describe_end(child)}: it did not end by itself")

@@ -1,0 +1,129 @@
+"""Before motors turn: where each vehicle stands, measured, and who begins where."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.state.conversions import to_map
+
+PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
+APART_M = 0.35  # m: closer than this to each other nobody takes off or is led to its start
+
+Array = NDArray[np.float64]
+
+
+class MissionError(DtsaError):
+    """The mission cannot go on; everybody is landed."""
+
+
+def check_places(settings: SwarmSettings, config: SwarmConfig) -> Scenario:
+    """The scenario, once it is sure that everybody stands where it begins.
+
+    :raises ConfigError: ids are missing, or a vehicle's place is not where the scenario wants it.
+    """
+    ids = [robot.id for robot in settings.robots]
+    if ids != list(range(1, config.agents + 1)):
+        raise ConfigError("robots", ids, f"the ids 1 to {config.agents}, one for each agent")
+    scenario = make_scenario(config)
+    origin = settings.station.room_origin_in_world
+    for robot, start in zip(settings.robots, scenario.start.T, strict=True):
+        x, y, _ = to_map(robot.initial_position, origin)
+        if np.hypot(x - start[0], y - start[1]) > PLACE_M:
+            raise ConfigError(
+                f"robots.{robot.name}.initial_position", list(robot.initial_position),
+                f"a place within {PLACE_M} m of ({start[0] + origin[0]:.2f}, {start[1] + origin[1]:.2f}), "
+                "where this scenario begins",
+            )  # fmt: skip
+    return scenario
+
+
+def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
+    """The configuration in which everybody begins near where it stands, if roles may be exchanged.
+
+    If somebody is not where it would begin, all exchange places: the sum of the squared ways is the smallest possible,
+    with which ways that are flown at the same time keep 0.7 times the distance of the starts or goals. Roles that
+    `places` gives are kept.
+
+    :param config: the swarm.
+    :param measured: (3, N), m, frame map: where they stand.
+    """
+    start = make_scenario(config).start
+    away = np.linalg.norm(measured[:2] - start[:2], axis=0)
+    if away.max() <= PLACE_M or config.places:
+        return config
+    from scipy.optimize import linear_sum_assignment  # comes with cflib
+
+    count = config.agents
+    places = make_scenario(dataclasses.replace(config, places=" ".join(map(str, range(1, count + 1))))).start
+    ways = measured[:2, :, None] - places[:2, None, :]
+    _, chosen = linear_sum_assignment((ways * ways).sum(axis=0))
+    return dataclasses.replace(config, places=" ".join(str(place + 1) for place in chosen.tolist()))
+
+
+def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings) -> None:
+    """Whether all can take off where they stand.
+
+    :param names: of the vehicles, by id.
+    :param measured: (3, N), m, frame map: where they stand.
+    :param fence: the room.
+    :raises MissionError: with names and distances.
+    """
+    problems = []
+    if fence.geofence:
+        low, high = np.array(fence.geofence_min)[:2], np.array(fence.geofence_max)[:2]
+        for name, (x, y) in zip(names, measured[:2].T.tolist(), strict=True):
+            outside = float(max((low - (x, y)).max(), ((x, y) - high).max()))
+            if outside > fence.geofence_tolerance_m:
+                problems.append(f"{name} stands {outside:.2f} m outside the geofence at ({x:.2f}, {y:.2f})")
+    problems += close_pairs(names, measured, "stand")
+    if problems:
+        raise MissionError(f"no take-off (at least {APART_M} m apart): {'; '.join(problems)}")
+
+
+def close_pairs(names: Sequence[str], place: Array, what: str) -> list[str]:
+    """Who is too close to whom, and how close.
+
+    :param names: of the vehicles.
+    :param place: (3, N), m.
+    :param what: what they do there.
+    """
+    found = []
+    for a in range(len(names)):
+        for b in range(a):
+            distance = float(np.linalg.norm(place[:2, a] - place[:2, b]))
+            if distance < APART_M:
+                found.append(f"{names[b]} and {names[a]} {what} {distance:.2f} m apart")
+    return found
+
+
+def crossings(scenario: Scenario, names: Sequence[str], measured: Array) -> list[str]:
+    """Who would come too close if all flew straight to their starts at the same time.
+
+    :param scenario: where they begin.
+    :param names: of the vehicles, by id.
+    :param measured: (3, N), m, frame map: where they are.
+    """
+    goal = scenario.start[:2]
+    found = []
+    for a in range(len(names)):
+        for b in range(a):
+            closest = _closest(measured[:2, a] - measured[:2, b], goal[:, a] - goal[:, b])
+            if closest < APART_M:
+                found.append(f"{names[b]} and {names[a]} at {closest:.2f} m")
+    return found
+
+
+def _closest(begin: Array, end: Array) -> float:
+    """Smallest distance of two that fly straight at the same time, m, from their differences at both ends, (2,)."""
+    change = end - begin
+    square = float(change @ change)
+    when = 0.0 if square == 0.0 else min(1.0, max(0.0, -float(begin @ change) / square))
+    return float(np.linalg.norm(begin + when * change))

@@ -1,0 +1,229 @@
+"""Command line of the simulated fleet: `dtsa fake-crazyflie`, and the executable `fake_crazyflie`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros.common.process.priority import take_priority
+from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+from dtsa_bench.runs.options import add_options, given, whole_number
+
+from . import layout
+from .control import FAULTS, send_fault
+from .fleet import NUMBERS, Fleet
+from .fleet_config import FleetConfig
+from .ports import free_port
+
+DESCRIPTION = """\
+Simulated Crazyflies over UDP: cflib, its client and the Crazyflie bridge connect to them as to real ones.
+They fly, drain their batteries and fail on command; Ctrl-C ends them."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    add_options(parser, FleetConfig, "fleet", skip=("host", "collision_m", "crash_m"))
+    parser.add_argument(
+        "--motion-capture",
+        action="store_true",
+        help="a process beside it publishes /cfN/pose at 100 Hz, as a motion capture system does, and they know no "
+        "other positions (--positions host)",
+    )
+    parser.add_argument("--config", type=Path, help="swarm.yaml: count, ports and start positions come from its robots")
+    parser.add_argument("--layout", choices=layout.LAYOUTS, default="ellipse", help="start positions (%(default)s)")
+    parser.add_argument(
+        "--half-axes", type=float, nargs=2, default=(1.2, 2.0), metavar=("X", "Y"), help="m, of the layout (1.2 2.0)"
+    )
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="record of what really happened (JSON lines)")
+    parser.add_argument(
+        "--priority", metavar="N", default="30", help="real-time priority, 0 to 90: the world waits for nobody [30]"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no status line")
+    parser.add_argument(
+        "--ignore-interrupt",
+        action="store_true",
+        help="Ctrl-C is for whoever flies them, who still has to land them; SIGTERM ends them",
+    )
+    radio = parser.add_argument_group("simulated radios", "Crazyradios in place of UDP; simulation only")
+    radio.add_argument(
+        "--simulated-radio",
+        type=Path,
+        metavar="SOCKET",
+        help="new Unix socket, for `bridge --simulated-radio SOCKET`",
+    )
+    add_options(radio, RadioSettings, "radio", prefix="radio-")
+    faults = parser.add_argument_group("faults", "sent to a fleet that is already running, instead of starting one")
+    faults.add_argument("--fault", choices=FAULTS, help="; ".join(f"{k}: {v}" for k, v in FAULTS.items()))
+    faults.add_argument("--cf", default="all", help="id of the vehicle (default: all)")
+    faults.add_argument("--rate", type=float, help="drop: share of the datagrams that is lost")
+    faults.add_argument("--direction", choices=("up", "down", "both"), help="drop: up is from the host")
+    faults.add_argument("--distance", type=float, help="estimate_jump: m")
+    faults.add_argument("--voltage", type=float, help="battery: V")
+    faults.add_argument("--seconds", type=float, help="heals by itself after that long")
+
+
+def fleet_config(args: argparse.Namespace) -> FleetConfig:
+    """Configuration from the command line.
+
+    :raises ConfigError: a value is out of range.
+    """
+    radio = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
+    options = {**given(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
+    if args.motion_capture:
+        options = {"positions": "host", "tracking_port": free_port()} | options
+    if args.config is not None:
+        return _from_swarm(args.config, options)
+    if radio.path is not None:
+        raise ConfigError("config", None, "--config FILE with --simulated-radio: its URIs say where they listen")
+    config = FleetConfig(**options)
+    start = layout.positions(args.layout, config.count, tuple(args.half_axes))
+    return dataclasses.replace(config, start=start)
+
+
+def _from_swarm(path: Path, options: dict[str, Any]) -> FleetConfig:
+    import numpy as np
+
+    from dtsa_agent.crazyflie.settings.config import load_swarm
+
+    robots = load_swarm(path).robots
+    start = np.array([robot.initial_position for robot in robots]).T
+    radio: RadioSettings = options["radio"]
+    if radio.path is not None:
+        radio = dataclasses.replace(radio, stations=tuple(Station.of(robot.uri) for robot in robots))
+        return FleetConfig(**{**options, "count": len(robots), "start": start, "radio": radio})
+    ports = []
+    for robot in robots:
+        if not robot.uri.startswith("udp://"):
+            raise ConfigError(f"robots.{robot.name}.uri", robot.uri, "udp://HOST:PORT for a simulated Crazyflie")
+        ports.append(int(robot.uri.rpartition(":")[2]))
+    if ports != list(range(ports[0], ports[0] + len(ports))):
+        raise ConfigError("robots", ports, "ports that follow each other, in the order of the robots")
+    if options.get("count") not in (None, len(ports)):
+        raise ConfigError("count", options["count"], f"{len(ports)}, as in {path}")
+    return FleetConfig(**{**options, "count": len(ports), "base_port": ports[0], "start": start})
+
+
+def request_fault(args: argparse.Namespace) -> None:
+    """Send a fault to a running fleet.
+
+    :raises ConfigError: nobody listens, or it was refused.
+    """
+    cf: object = args.cf
+    if args.cf != "all":
+        try:
+            cf = int(args.cf)
+        except ValueError:
+            raise ConfigError("cf", args.cf, "an id, or all") from None
+    names = NUMBERS
+    numbers = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    port = FleetConfig(**given(args, FleetConfig, "fleet")).control_port
+    send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **numbers)
+    print(f"{args.fault}: cf {args.cf}")
+
+
+def start_cameras(config: FleetConfig) -> subprocess.Popen[bytes]:
+    """The motion capture of a fleet: a process of its own, as in a laboratory. It ends with this one."""
+    from dtsa_agent.ros.common.process.node_process import SUPERVISOR  # the fleet itself needs no ROS
+
+    command = [
+        sys.executable,
+        "-m",
+        "dtsa_bench.crazyflies.simulated.motion_capture",
+        "--port",
+        str(config.tracking_port),
+    ]
+    return subprocess.Popen(command, env=os.environ | {SUPERVISOR: str(os.getpid())}, start_new_session=True)
+
+
+def status_line(fleet: Fleet) -> str:
+    """One line about the fleet."""
+    states: dict[str, int] = {}
+    for firmware in fleet.firmware:
+        states[firmware.supervisor.state] = states.get(firmware.supervisor.state, 0) + 1
+    lowest = min(firmware.battery.voltage for firmware in fleet.firmware)
+    text = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
+    return f"{fleet.time:7.1f} s  {text}; lowest battery {lowest:.2f} V"
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly the fleet until Ctrl-C; exit code."""
+    if args.fault is not None:
+        request_fault(args)
+        return 0
+    if "DTSA_SUPERVISOR" in os.environ:  # the bridge started this fleet for itself, and has rclpy
+        from dtsa_agent.ros.common.process.node_process import follow_supervisor
+
+        follow_supervisor()
+    priority = whole_number(args.priority, "priority", 0, 90)
+    fleet = Fleet(fleet_config(args))
+    cameras = start_cameras(fleet.config) if args.motion_capture else None
+    take_priority(priority)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: fleet.stop())
+    if args.ignore_interrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for uri in fleet.config.uris:
+        print(uri)
+    print(
+        f"{fleet.config.count} simulated Crazyflies, protocol {fleet.config.protocol}; faults: UDP port "
+        f"{fleet.config.control_port}; Ctrl-C ends",
+        flush=True,
+    )
+    if not args.quiet:
+        _show_status(fleet)
+    try:
+        fleet.run()
+    finally:
+        if cameras is not None:
+            cameras.terminate()
+            cameras.wait()
+    if not args.quiet:
+        print(status_line(fleet))
+    return 0
+
+
+def _show_status(fleet: Fleet) -> None:
+    """Refresh the status line every half second on a terminal, every ten seconds in a file."""
+    terminal = sys.stdout.isatty()
+    period = 0.5 if terminal else 10.0
+    last = [time.monotonic()]
+    step = fleet.step
+
+    def step_and_show() -> None:
+        step()
+        if time.monotonic() - last[0] >= period:
+            last[0] = time.monotonic()
+            print(
+                "\r" + status_line(fleet) + " " * 10 if terminal else status_line(fleet), end="" if terminal else "\n"
+            )
+            sys.stdout.flush()
+
+    fleet.step = step_and_show  # type: ignore[method-assign]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the executable."""
+    parser = argparse.ArgumentParser(
+        prog="fake_crazyflie",
+        description=DESCRIPTION,
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_arguments(parser)
+    try:
+        return run(parser.parse_args(argv))
+    except ConfigError as error:
+        print(f"fake_crazyflie: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

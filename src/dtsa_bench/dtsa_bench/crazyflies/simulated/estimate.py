@@ -1,0 +1,126 @@
+"""What the Crazyflie's estimator says about it: the true state with noise, as the values of its log variables."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .firmware import Firmware
+from .planner import IDLE, Triple
+from .position_filter import PositionFilter
+
+GRAVITY = 9.81
+VARIANCE_RESET = 1.0  # m^2, right after the estimator was reset
+VARIANCE_REST = 2e-5  # m^2, once it has converged
+CONVERGE_S = 0.08  # s, time constant
+
+
+@dataclass(slots=True)
+class Estimate:
+    """One vehicle's state as its own estimator sees it."""
+
+    position: Triple = (0.0, 0.0, 0.0)  # m, world (z = 0 is the floor)
+    velocity: Triple = (0.0, 0.0, 0.0)  # m/s
+    acceleration: Triple = (0.0, 0.0, 0.0)  # m/s^2
+    reset_time: float = -1e9  # s, when the estimator was reset
+    filter: PositionFilter | None = None  # None: decks measure the position
+    offset: Triple = (0.0, 0.0, 0.0)  # m: a fault, so far it is from the truth
+    frozen: bool = False  # a fault: it does not change any more
+
+    def tell(self, position: Triple, velocity: Triple, acceleration: Triple) -> None:
+        """What the filter says now, unless a fault is in the way.
+
+        :param position: m, world. :param velocity: m/s. :param acceleration: m/s^2.
+        """
+        if not self.frozen:
+            x, y, z = (p + o for p, o in zip(position, self.offset, strict=True))
+            self.position, self.velocity, self.acceleration = (x, y, z), velocity, acceleration
+
+    def variance(self, t: float) -> float:
+        """Variance of the position in m^2: large after a reset, then small."""
+        if self.filter is not None:
+            return self.filter.variance
+        return VARIANCE_REST + VARIANCE_RESET * math.exp(-(t - self.reset_time) / CONVERGE_S)
+
+
+def attitude(acceleration: Triple, yaw: float) -> tuple[float, float]:
+    """Roll and pitch (rad, REP-103) of a quadcopter that accelerates so.
+
+    :param acceleration: m/s^2, world. :param yaw: rad.
+    """
+    ax, ay, az = acceleration
+    c, s = math.cos(yaw), math.sin(yaw)
+    forward, left, up = c * ax + s * ay, -s * ax + c * ay, max(az + GRAVITY, 1.0)
+    return -math.atan2(left, math.hypot(up, forward)), math.atan2(forward, up)
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Quaternion (x, y, z, w) of Euler angles in rad (REP-103)."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def compress(q: tuple[float, float, float, float]) -> int:
+    """The firmware's 32 bits of a unit quaternion (x, y, z, w): index of the largest, then the others."""
+    largest = max(range(4), key=lambda i: abs(q[i]))
+    negate = q[largest] < 0
+    bits = largest
+    for i in range(4):
+        if i != largest:
+            size = min(511, int(511 * abs(q[i]) * math.sqrt(2) + 0.5))
+            bits = bits << 10 | ((q[i] < 0) != negate) << 9 | size
+    return bits
+
+
+def log_values(estimate: Estimate, firmware: Firmware, t: float) -> dict[str, float]:
+    """All log variables at time t, by their full names, in the firmware's units."""
+    x, y, z = estimate.position
+    vx, vy, vz = estimate.velocity
+    roll, pitch = attitude(estimate.acceleration, firmware.yaw)
+    supervisor, cell = firmware.supervisor, firmware.battery
+    variance = estimate.variance(t)
+    info = supervisor.info(
+        planner_active=firmware.planner.state != IDLE, trajectory_finished=firmware.planner.finished(t)
+    )
+    rate = firmware.setpoint.yaw_rate if firmware.setpoint is not None else 0.0
+    degrees = math.degrees
+    return {
+        "stateEstimateZ.x": x * 1000,
+        "stateEstimateZ.y": y * 1000,
+        "stateEstimateZ.z": z * 1000,
+        "stateEstimateZ.vx": vx * 1000,
+        "stateEstimateZ.vy": vy * 1000,
+        "stateEstimateZ.vz": vz * 1000,
+        "stateEstimateZ.quat": compress(quaternion(roll, pitch, firmware.yaw)),
+        "stateEstimateZ.rateRoll": 0.0,
+        "stateEstimateZ.ratePitch": 0.0,
+        "stateEstimateZ.rateYaw": rate * 1000,
+        "stateEstimate.x": x,
+        "stateEstimate.y": y,
+        "stateEstimate.z": z,
+        "stateEstimate.vx": vx,
+        "stateEstimate.vy": vy,
+        "stateEstimate.vz": vz,
+        "stateEstimate.roll": degrees(roll),
+        "stateEstimate.pitch": -degrees(pitch),  # the firmware's log shows pitch with the opposite sign
+        "stateEstimate.yaw": degrees(firmware.yaw),
+        "pm.vbatMV": cell.voltage * 1000,
+        "pm.vbat": cell.voltage,
+        "pm.state": 3 if cell.voltage < 3.2 else 0,
+        "pm.batteryLevel": min(100, max(0, cell.charge * 100)),
+        "supervisor.info": info,
+        "sys.canfly": supervisor.motors_allowed,
+        "sys.isFlying": supervisor.flying,
+        "sys.isTumbled": supervisor.tumbled,
+        "kalman.varPX": variance,
+        "kalman.varPY": variance,
+        "kalman.varPZ": variance,
+        "radio.rssi": 42,
+    }

@@ -1,0 +1,261 @@
+"""One Crazyflie's flight firmware: setpoints in, a velocity command for the vehicle model out.
+
+Everything that a person could do wrong with a real one goes wrong here, too: a high-level command while setpoints are
+streamed has no effect until the stream is declared over; a stream that is declared over while the high-level commander
+has nothing to fly stops the motors; old setpoints end in a fall, an emergency stop is for good. What is followed is the
+firmware of 2025.02 and later.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from .battery import Battery
+from .planner import Goal, Planner, Triple
+from .supervisor import LEVEL_OUT, Supervisor
+from .trajectories import Trajectory, TrajectoryMemory
+
+# What the vehicle does during a step.
+OFF = "off"  # motors stopped: it falls, or stands
+FLY = "fly"  # follows a velocity command
+LEVEL = "level"  # attitude level: drifts on, only drag slows it down; height is still controlled
+
+POSITION_GAIN = 2.0  # 1/s
+PRIORITY_NONE, PRIORITY_LOWEST, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 1, 2
+
+
+@dataclass(slots=True)
+class Setpoint:
+    """What a streamed command or the planner asks for; None: that axis is not controlled so."""
+
+    time: float
+    position: Triple | None = None
+    velocity: Triple | None = None
+    acceleration: Triple = (0.0, 0.0, 0.0)
+    body_velocity: tuple[float, float] | None = None  # m/s, forward and left
+    height: float | None = None  # m
+    yaw: float | None = None  # rad
+    yaw_rate: float = 0.0  # rad/s
+    motors: bool = True
+
+
+def _decode_position(data: bytes, t: float) -> Setpoint:
+    x, y, z, yaw = struct.unpack_from("<4f", data)
+    return Setpoint(t, position=(x, y, z), yaw=math.radians(yaw))
+
+
+def _decode_velocity(data: bytes, t: float) -> Setpoint:
+    x, y, z, rate = struct.unpack_from("<4f", data)
+    return Setpoint(t, velocity=(x, y, z), yaw_rate=math.radians(rate))
+
+
+def _decode_hover(data: bytes, t: float) -> Setpoint:
+    vx, vy, rate, height = struct.unpack_from("<4f", data)
+    return Setpoint(t, body_velocity=(vx, vy), height=height, yaw_rate=math.radians(rate))
+
+
+def _decode_full_state(data: bytes, t: float) -> Setpoint:
+    values = struct.unpack_from("<9hI3h", data)
+    position, velocity, acceleration = (
+        (values[i] / 1000, values[i + 1] / 1000, values[i + 2] / 1000) for i in (0, 3, 6)
+    )
+    return Setpoint(t, position, velocity, acceleration, yaw=yaw_of(values[9]), yaw_rate=values[12] / 1000)
+
+
+def yaw_of(compressed: int) -> float:
+    """Heading (rad) of a quaternion in the firmware's 32 bits: index of the largest component, then the others."""
+    largest = compressed >> 30
+    q = [0.0] * 4
+    rest = 1.0
+    for i in (3, 2, 1, 0):
+        if i != largest:
+            size = (compressed & 511) / 511 / math.sqrt(2)
+            q[i] = -size if compressed & 512 else size
+            rest -= q[i] * q[i]
+            compressed >>= 10
+    q[largest] = math.sqrt(max(rest, 0.0))
+    x, y, z, w = q
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+# Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as everybody does; the
+# older 1 and 5 have the opposite sign and are not sent to protocol version 9 and later.
+DECODERS: dict[int, tuple[int, Callable[[bytes, float], Setpoint]]] = {
+    6: (28, _decode_full_state),
+    7: (16, _decode_position),
+    8: (16, _decode_velocity),
+    10: (16, _decode_hover),
+}
+
+
+class Firmware:
+    """Commander, high-level commander, supervisor and battery of one Crazyflie.
+
+    :param report: called with the name of each event and details, for the record.
+    :param tau: s, lag of the vehicle's velocity, which wanted accelerations make up for.
+    :param auto_arming: it arms itself.
+    """
+
+    def __init__(self, report: Callable[..., None], tau: float, *, auto_arming: bool = False) -> None:
+        self._report = report
+        self._tau = tau
+        self._auto_arming = auto_arming
+        self.reset()
+
+    def reset(self) -> None:
+        """Power on."""
+        self.supervisor = Supervisor(self._report, auto_arming=self._auto_arming)
+        self.planner = Planner()
+        self.trajectories = TrajectoryMemory()
+        self.groups = 0  # a bit each
+        self.battery = Battery()
+        self.setpoint: Setpoint | None = None
+        self._priority = PRIORITY_NONE
+        self._streaming = False
+        self._here = Goal()  # where a path would begin: on the present path, or where the vehicle is
+        self.yaw = 0.0
+        self.setpoints_received = 0
+
+    # -- commands from the radio ------------------------------------------------------------------------------------
+    def stream(self, data: bytes, t: float) -> None:
+        """A packet of the generic commander: a streamed setpoint."""
+        self.setpoints_received += 1
+        kind = data[0] if data else -1
+        if kind == 0:
+            self._accept(Setpoint(t, motors=False))
+        elif kind in DECODERS and len(data) > DECODERS[kind][0]:
+            self._accept(DECODERS[kind][1](data[1:], t))
+
+    def manual(self, data: bytes, t: float) -> None:
+        """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled."""
+        if len(data) < 14:
+            return
+        *_, thrust = struct.unpack_from("<3fH", data)
+        self._accept(Setpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0))
+
+    def _accept(self, setpoint: Setpoint) -> None:
+        self._priority = PRIORITY_STREAM
+        self.setpoint = setpoint
+        self.planner.stop()
+        if not self._streaming:
+            self._streaming = True
+            self._report("streaming")
+
+    def notify_stop(self) -> None:
+        """The stream of setpoints is over: high-level commands count again."""
+        if self._priority == PRIORITY_STREAM:
+            self._priority = PRIORITY_LOWEST
+            self._streaming = False
+            self._report("stream ended")
+
+    def high_level(self, data: bytes, t: float) -> int:
+        """A packet of the high-level commander; 0, or an error number of the firmware's."""
+        kind = data[0] if data else -1
+        lengths = {3: 2, 6: 9, 7: 15, 8: 15, 12: 24, 13: 10}
+        if len(data) < lengths.get(kind, math.inf):
+            return errno.ENOEXEC
+        if kind == 6:
+            return self.trajectories.define(data[1:])
+        if kind != 3 and not self.supervisor.motors_allowed:
+            return errno.EBUSY
+        if data[1] and not data[1] & self.groups:
+            return 0
+        if kind == 3:
+            self.planner.stop()
+            self._report("high-level stop")
+            return 0
+        here = self._here
+        if kind == 13:
+            return self._start_trajectory(data, t, here)
+        if kind == 12:
+            _, relative, _, x, y, z, yaw, duration = struct.unpack_from("<B??5f", data, 1)
+            if relative:
+                x, y, z = (a + b for a, b in zip((x, y, z), here.position, strict=True))
+                yaw += self.yaw
+            self.planner.go_to(t, here, (x, y, z), yaw, duration)
+            self._report("go_to", goal=[round(v, 3) for v in (x, y, z)])
+            return 0
+        _, height, yaw, keep_yaw, duration = struct.unpack_from("<Bff?f", data, 1)
+        name, order = ("takeoff", self.planner.takeoff) if kind == 7 else ("land", self.planner.land)
+        if not order(t, here, height, self.yaw if keep_yaw else yaw, duration):
+            return 1
+        self._report(name, height=round(height, 3))
+        return 0
+
+    def _start_trajectory(self, data: bytes, t: float, here: Goal) -> int:
+        """Fly an uploaded trajectory; as in the firmware nothing happens, and nobody is told, if there is none."""
+        _, relative, _, reverse, number, timescale = struct.unpack_from("<B???Bf", data, 1)
+        if self.trajectories.compressed(number) and (reverse or timescale != 1.0):
+            return errno.ENOEXEC
+        pieces = self.trajectories.pieces(number)
+        if pieces is None or not timescale > 0.0:
+            return 0
+        way = Trajectory(t, pieces, timescale, reverse)
+        if relative:
+            x, y, z = (a - b for a, b in zip(here.position, way.goal(t).position, strict=True))
+            way = Trajectory(t, pieces, timescale, reverse, (x, y, z))
+        self.planner.follow(way)
+        self._report("trajectory", id=number, duration=round(way.duration, 3))
+        return 0
+
+    # -- one step of control ----------------------------------------------------------------------------------------
+    def step(self, t: float, dt: float, position: Triple, velocity: Triple) -> tuple[str, Triple]:
+        """What the vehicle does from t to t + dt.
+
+        :param position: m, what the estimator says. :param velocity: m/s, the same.
+        :return: OFF, FLY or LEVEL, and the velocity command in m/s.
+        """
+        allowed = self.supervisor.motors_allowed
+        if not allowed:
+            self.planner.stop()
+        goal = self.planner.goal(t)
+        self._here = goal or Goal(position, velocity, yaw=self.yaw)
+        if allowed and self._priority <= PRIORITY_HIGH_LEVEL:
+            self._follow_planner(t, goal)
+        setpoint = self.setpoint if allowed else None
+        thrust = setpoint is not None and setpoint.motors
+        age = math.inf if setpoint is None else t - setpoint.time
+        self.supervisor.update(t, setpoint_age=age, thrust=thrust)
+        self.battery.update(dt, motors=thrust)
+        if not (thrust and self.supervisor.motors_allowed) or setpoint is None:
+            return OFF, (0.0, 0.0, 0.0)
+        command = self._velocity(setpoint, position, dt)
+        if self.supervisor.state == LEVEL_OUT:
+            return LEVEL, command
+        return FLY, command
+
+    def _follow_planner(self, t: float, goal: Goal | None) -> None:
+        """The high-level commander's setpoint: where to be, or motors off if it has nothing to fly."""
+        self._priority = PRIORITY_HIGH_LEVEL
+        if goal is None:
+            self.setpoint = Setpoint(t, motors=False)
+        else:
+            self.setpoint = Setpoint(t, goal.position, goal.velocity, goal.acceleration, yaw=goal.yaw)
+
+    def _velocity(self, s: Setpoint, position: Triple, dt: float) -> Triple:
+        if s.yaw is not None:
+            self.yaw = s.yaw
+        else:
+            self.yaw += s.yaw_rate * dt
+            self.yaw = math.atan2(math.sin(self.yaw), math.cos(self.yaw))
+        if s.body_velocity is not None:
+            c, n = math.cos(self.yaw), math.sin(self.yaw)
+            vx, vy = s.body_velocity
+            height = s.height if s.height is not None else position[2]
+            return c * vx - n * vy, n * vx + c * vy, _limit(POSITION_GAIN * (height - position[2]))
+        if s.position is None:
+            return s.velocity or (0.0, 0.0, 0.0)
+        # With a speed of its own (planner, full state) the correction is added to it and not limited to 1 m/s.
+        error = [POSITION_GAIN * (s.position[i] - position[i]) for i in range(3)]
+        if s.velocity is None:
+            return _limit(error[0]), _limit(error[1]), _limit(error[2])
+        x, y, z = (error[i] + s.velocity[i] + self._tau * s.acceleration[i] for i in range(3))
+        return x, y, z
+
+
+def _limit(v: float) -> float:
+    return min(1.0, max(-1.0, v))

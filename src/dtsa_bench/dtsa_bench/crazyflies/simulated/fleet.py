@@ -1,0 +1,395 @@
+"""A fleet of simulated Crazyflies: one process and one thread for all of them.
+
+Each has a UDP port of its own, or all are reached by simulated radios.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import selectors
+import socket
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.flight_models import flight_model
+from dtsa_bench.crazyflies.simulated.radio.side import Host, RadioSide
+
+from .cameras import Cameras
+from .control import check_fault
+from .estimate import Estimate
+from .firmware import OFF, Firmware
+from .fleet_config import FleetConfig
+from .peer import Peer
+from .position_filter import PositionFilter
+from .truth import TruthLog
+from .vehicles import Vehicles
+
+TICK_S = 0.01
+NUMBERS = ("rate", "direction", "voltage", "distance", "seconds")
+MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record says so
+POSITION_NOISE_M = 0.002
+VELOCITY_NOISE_MPS = 0.01
+IMU_NOISE_MPS2 = 0.2  # with vibrations
+
+
+@dataclass(slots=True)
+class _Link:
+    """Socket and link faults of one vehicle."""
+
+    socket: socket.socket | None
+    host: tuple[str, int] | None = None  # who sent last
+    drop_up: float = 0.0
+    drop_down: float = 0.0
+    frozen: bool = False
+    heal_at: float | None = None
+
+
+class Fleet:
+    """The fleet. `run()` flies it until `stop()` is called from anywhere.
+
+    :raises ConfigError: a port is in use.
+    """
+
+    def __init__(self, config: FleetConfig) -> None:
+        self.config = config
+        # epoll waits in whole milliseconds, which are long on the air.
+        self._selector = selectors.SelectSelector() if config.radio.path is not None else selectors.DefaultSelector()
+        self.radio: RadioSide | None = None
+        self._links: list[_Link] = []
+        self._control: socket.socket | None = None
+        self._open_sockets()
+        header = {
+            "count": config.count,
+            "uris": config.uris,
+            "seed": config.seed,
+            "protocol": config.protocol,
+            "start": np.asarray(config.start).tolist(),
+            "unix_time": time.time(),
+        }
+        try:
+            self.truth = TruthLog(config.truth, header)
+        except OSError as error:
+            self.close()
+            raise ConfigError("truth", str(config.truth), f"a file that can be written ({error.strerror})") from error
+        self.tick = 0
+        vehicle = flight_model(config.model).vehicle
+        self.vehicles = Vehicles(config.start, vehicle)
+        self.firmware = [
+            Firmware(partial(self._report, k), vehicle.tau, auto_arming=config.arms_itself(k))
+            for k in range(config.count)
+        ]
+        host = config.positions == "host"
+        self.estimates = [Estimate(filter=PositionFilter() if host else None) for _ in range(config.count)]
+        self.peers = [
+            Peer(f, e, config.protocol, k)
+            for k, (f, e) in enumerate(zip(self.firmware, self.estimates, strict=True), 1)
+        ]
+        self.cameras = Cameras(config.tracking_port, config.count) if config.tracking_port else None
+        streams = np.random.SeedSequence(config.seed).spawn(3)
+        self._noise = np.random.default_rng(streams[0])
+        self._imu = np.random.default_rng(streams[2])
+        self._loss = np.random.default_rng(streams[1])
+        self._close_pairs: set[tuple[int, int]] = set()
+        self._running = True
+        self._estimate()
+
+    # -- life cycle -------------------------------------------------------------------------------------------------
+    def _bind(self, port: int) -> socket.socket:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        try:
+            sock.bind((self.config.host, port))
+        except OSError as error:
+            sock.close()
+            self.close()
+            raise ConfigError("port", port, f"a free UDP port ({error.strerror})") from error
+        return sock
+
+    def _open_sockets(self) -> None:
+        if self.config.radio.path is not None:
+            self.radio = RadioSide(self.config.radio, self._hear, self._passes)
+            self._selector.register(self.radio.listener, selectors.EVENT_READ, self.radio)
+            self._links = [_Link(None) for _ in range(self.config.count)]
+        for k in range(0 if self.radio else self.config.count):
+            sock = self._bind(self.config.base_port + k)
+            self._links.append(_Link(sock))
+            self._selector.register(sock, selectors.EVENT_READ, k)
+        self._control = self._bind(self.config.control_port)
+        self._selector.register(self._control, selectors.EVENT_READ, -1)
+
+    def close(self) -> None:
+        """Release the ports and end the record."""
+        for link in self._links:
+            if link.socket is not None:
+                link.socket.close()
+                link.socket = None
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+        if getattr(self, "cameras", None) is not None:
+            self.cameras.close()
+        if self.radio is not None:
+            self.radio.close()
+            self.radio = None
+        self._selector.close()
+        if hasattr(self, "truth"):
+            self.truth.close()
+
+    def stop(self) -> None:
+        """End `run()` soon. May be called from another thread or a signal handler."""
+        self._running = False
+
+    def run(self) -> None:
+        """Fly in real time until `stop()`; then release everything."""
+        origin = time.monotonic()
+        try:
+            while self._running:
+                now = time.monotonic() - origin
+                if now < (self.tick + 1) * TICK_S:
+                    self._serve((self.tick + 1) * TICK_S - now)
+                    continue
+                if now - self.tick * TICK_S > MAX_LAG_S:
+                    skipped = now - self.tick * TICK_S
+                    origin += skipped
+                    self.truth.event(self.time, 0, "machine too slow", skipped_s=round(skipped, 3))
+                self.step()
+        finally:
+            self.close()
+
+    @property
+    def time(self) -> float:
+        """Seconds that the fleet has lived."""
+        return self.tick * TICK_S
+
+    # -- motion -----------------------------------------------------------------------------------------------------
+    def step(self) -> None:
+        """Fly for one tick of 10 ms and send what is due."""
+        t = self.time
+        modes, command = [], np.zeros_like(self.vehicles.position)
+        for k, firmware in enumerate(self.firmware):
+            mode, wanted = firmware.step(t, TICK_S, self.estimates[k].position, self.estimates[k].velocity)
+            modes.append(mode)
+            command[:, k] = wanted
+        for k in self.vehicles.step(TICK_S, modes, command):
+            self._report(k, "hard landing")
+            self.firmware[k].supervisor.tumbled = True
+        self.tick += 1
+        self._estimate()
+        self._proximity(modes)
+        self.truth.positions(self.time, self.vehicles.position)
+        if self.cameras is not None:
+            self.cameras.look(self.vehicles.position, [f.yaw for f in self.firmware])
+        self._send_logs()
+        for k, link in enumerate(self._links):
+            if link.heal_at is not None and self.time >= link.heal_at:
+                self._apply("heal", k, {})
+
+    def _estimate(self) -> None:
+        state = np.concatenate([self.vehicles.position, self.vehicles.velocity])
+        if self.config.noise:
+            noise = self._noise.standard_normal(state.shape)
+            state[:3] += POSITION_NOISE_M * noise[:3]
+            state[3:] += VELOCITY_NOISE_MPS * noise[3:]
+        acceleration = self.vehicles.acceleration.T.tolist()
+        if self.config.positions == "host":
+            measured = self.vehicles.acceleration + IMU_NOISE_MPS2 * self._imu.standard_normal((3, self.config.count))
+            for estimate, row in zip(self.estimates, measured.T.tolist(), strict=True):
+                assert estimate.filter is not None
+                estimate.filter.predict(TICK_S, (row[0], row[1], row[2]))
+        for k, (row, a) in enumerate(zip(state.T.tolist(), acceleration, strict=True)):
+            estimate = self.estimates[k]
+            position, velocity = (row[0], row[1], row[2]), (row[3], row[4], row[5])
+            if estimate.filter is not None:
+                position, velocity = estimate.filter.position, estimate.filter.velocity
+            estimate.tell(position, velocity, (a[0], a[1], a[2]))
+
+    def _proximity(self, modes: list[str]) -> None:
+        """Two flying vehicles that come too close, and what that does to them."""
+        flying = [k for k, mode in enumerate(modes) if mode != OFF and self.vehicles.position[2, k] > 0.05]
+        p = self.vehicles.position[:, flying]
+        gap: NDArray[np.float64] = p[:, :, None] - p[:, None, :]
+        distance = np.sqrt((gap * gap).sum(axis=0))
+        near = set()
+        for i, j in np.argwhere(np.triu(distance < self.config.collision_m, 1)):
+            a, b, d = flying[i], flying[j], float(distance[i, j])
+            near.add((a, b))
+            if (a, b) not in self._close_pairs:
+                self._report(a, "collision", other=b + 1, distance=round(d, 3))
+            if d < self.config.crash_m:
+                for k in (a, b):
+                    self._report(k, "crash")
+                    self.firmware[k].supervisor.tumbled = True
+        self._close_pairs = near
+
+    def _report(self, index: int, name: str, **details: Any) -> None:
+        self.truth.event(self.time, index + 1, name, **details)
+
+    # -- links ------------------------------------------------------------------------------------------------------
+    def _serve(self, timeout: float) -> None:
+        if self.radio is not None:
+            due = self.radio.wait_s()
+            timeout = timeout if due is None else min(timeout, due)
+        for key, _ in self._selector.select(timeout):
+            if isinstance(key.data, (RadioSide, Host)):
+                self._serve_radio(key.data)
+                continue
+            if key.data < 0:
+                self._serve_control()
+                continue
+            sock = self._links[key.data].socket
+            while sock is not None:
+                try:
+                    datagram, host = sock.recvfrom(256)
+                except (BlockingIOError, ConnectionError):
+                    break
+                self._receive(key.data, datagram, host)
+        if self.radio is not None:
+            self.radio.run()
+
+    def _serve_radio(self, what: RadioSide | Host) -> None:
+        assert self.radio is not None
+        if isinstance(what, RadioSide):
+            if (host := self.radio.accept()) is not None:
+                self._selector.register(host.socket, selectors.EVENT_READ, host)
+            return
+        sock = what.socket
+        if not self.radio.serve(what):
+            self._selector.unregister(sock)
+
+    def _passes(self, index: int, up: bool) -> bool:
+        """Whether a packet on the air passes the faults of a vehicle's link."""
+        link = self._links[index]
+        rate = link.drop_up if up else link.drop_down
+        return not link.frozen and not (rate and self._loss.random() < rate)
+
+    def _hear(self, index: int, packet: bytes, t: float) -> None:
+        reply = self.peers[index].receive(packet, self.time)
+        if reply is not None and self.radio is not None:
+            self.radio.receivers[index].push(reply)
+
+    def _receive(self, index: int, datagram: bytes, host: tuple[str, int]) -> None:
+        link = self._links[index]
+        if link.frozen or (link.drop_up and self._loss.random() < link.drop_up):
+            return
+        link.host = host
+        reply = self.peers[index].receive(datagram, self.time)
+        if reply is not None:
+            self._send(link, reply)
+
+    def _send(self, link: _Link, datagram: bytes) -> None:
+        if link.socket is None or link.host is None or link.frozen:
+            return
+        if link.drop_down and self._loss.random() < link.drop_down:
+            return
+        # A host that has gone, or a full buffer: the packet is lost, as on the air.
+        with contextlib.suppress(OSError):
+            link.socket.sendto(datagram, link.host)
+
+    def _send_logs(self) -> None:
+        if self.radio is not None:
+            now = self.radio.now_ns() / 1e9
+            for peer, receiver in zip(self.peers, self.radio.receivers, strict=True):
+                packets = list(peer.log_packets(self.tick, self.time)) if peer.blocks else ()
+                if packets and not receiver.connected(now):  # nobody is there: the log ends
+                    peer.blocks.clear()
+                    receiver.silent()
+                else:
+                    for packet in packets:
+                        receiver.push(packet)
+            return
+        for peer, link in zip(self.peers, self._links, strict=True):
+            if peer.blocks and link.host is not None:
+                for datagram in peer.log_packets(self.tick, self.time):
+                    self._send(link, datagram)
+
+    # -- faults -----------------------------------------------------------------------------------------------------
+    def _serve_control(self) -> None:
+        if self._control is None:
+            return
+        try:
+            data, host = self._control.recvfrom(2048)
+        except (BlockingIOError, ConnectionError):
+            return
+        try:
+            request = json.loads(data)
+            if not isinstance(request, dict):
+                raise ConfigError("request", request, "a JSON object")
+            self.fault(request)
+            answer: dict[str, Any] = {"ok": True, "t": self.time}
+        except ConfigError as error:
+            answer = {"ok": False, "field": error.field, "value": error.value, "allowed": error.allowed}
+        except ValueError:
+            answer = {"ok": False, "field": "request", "value": data[:40].decode("ascii", "replace")}
+            answer["allowed"] = "a JSON object"
+        with contextlib.suppress(OSError):
+            self._control.sendto(json.dumps(answer, default=str).encode(), host)
+
+    def fault(self, request: dict[str, Any]) -> None:
+        """Let vehicles fail.
+
+        :param request: see `dtsa_bench.crazyflies.simulated.control.check_fault`.
+        :raises ConfigError: it is not understood.
+        """
+        name, indices = check_fault(request, self.config.count)
+        for k in indices:
+            self._apply(name, k, request)
+            if request.get("seconds") is not None:
+                self._links[k].heal_at = self.time + request["seconds"]
+
+    def _apply(self, name: str, index: int, request: dict[str, Any]) -> None:
+        link, firmware = self._links[index], self.firmware[index]
+        numbers = {key: value for key, value in request.items() if key in NUMBERS}
+        self._report(index, f"fault: {name}", **numbers)
+        if name == "drop":
+            rate, direction = request.get("rate", 1.0), request.get("direction", "both")
+            link.drop_up = rate if direction in ("up", "both") else link.drop_up
+            link.drop_down = rate if direction in ("down", "both") else link.drop_down
+        elif name == "freeze":
+            link.frozen = True
+        elif name == "close" and self.radio is not None:
+            link.frozen = True  # on the air nothing bounces
+        elif name == "close" and link.socket is not None:
+            self._selector.unregister(link.socket)
+            link.socket.close()
+            link.socket = None
+        elif name == "refuse_arming":
+            firmware.supervisor.refuse_arming = True
+        elif name == "tumble":
+            firmware.supervisor.tumbled = True
+        elif name == "estimate_jump":
+            self.estimates[index].offset = (request.get("distance", 2.0), 0.0, 0.0)
+        elif name == "estimate_freeze":
+            self.estimates[index].frozen = True
+        elif name == "unseen" and self.cameras is not None:
+            self.cameras.unseen.add(index)
+        elif name == "battery":
+            motors = firmware.supervisor.motors_allowed and firmware.supervisor.flying
+            firmware.battery.force(request.get("voltage", 3.0), motors=motors)
+        elif name in ("heal", "reboot"):
+            self._heal(index)
+            if name == "reboot":
+                firmware.reset()
+                self.peers[index].reset()
+                if self.radio is not None:
+                    self.radio.receivers[index].reset()
+
+    def _heal(self, index: int) -> None:
+        link = self._links[index]
+        link.drop_up = link.drop_down = 0.0
+        link.frozen = False
+        link.heal_at = None
+        if link.socket is None and self.radio is None:
+            link.socket = self._bind(self.config.base_port + index)
+            self._selector.register(link.socket, selectors.EVENT_READ, index)
+        self.estimates[index].offset, self.estimates[index].frozen = (0.0, 0.0, 0.0), False
+        if self.cameras is not None:
+            self.cameras.unseen.discard(index)
+        self.firmware[index].supervisor.refuse_arming = False
+        self.firmware[index].supervisor.tumbled = False

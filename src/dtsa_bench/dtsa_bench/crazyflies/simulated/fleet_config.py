@@ -1,0 +1,86 @@
+"""What a fleet of simulated Crazyflies is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.declaration import Settings, check, setting
+from dtsa_agent.core.settings.flight_models import AVOIDERS, flight_model
+from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
+
+from . import layout
+from .peer import PROTOCOLS
+
+MAX_COUNT = 200
+
+
+@dataclass(frozen=True, slots=True)
+class FleetConfig(Settings):
+    """What the fleet is made of.
+
+    :param start: start positions, (3, count), m, world; None: an ellipse.
+    :param truth: file for the record of what really happened; None: no record.
+    :param radio: simulated radios in place of UDP; without a path: UDP.
+    :raises ConfigError: a value is out of range.
+    """
+
+    count: int = setting(12, "number of vehicles", minimum=1, maximum=MAX_COUNT)
+    base_port: int = setting(19850, "UDP port of the first; vehicle k listens on base_port + k - 1", minimum=1024,
+                             maximum=65535)  # fmt: skip
+    control_port: int = setting(0, "UDP port for faults; 0: base_port - 1", minimum=0, maximum=65535)
+    host: str = setting("127.0.0.1", "address on which they listen")
+    start: Any = field(default=None, compare=False)
+    seed: int = setting(1, "seed of noise and loss", minimum=0, maximum=2**63 - 1)
+    protocol: int = setting(12, "version of the protocol told to the host", choices=PROTOCOLS)
+    arming: str = setting(
+        "auto",
+        "how they are armed: by themselves (Crazyflie 2.1, 2.1+), as required by the ground station (2.1 brushless, "
+        "Bolt), or every second one so",
+        choices=("auto", "required", "mixed"),
+    )
+    positions: str = setting(
+        "decks", "what tells them where they are: decks of their own, or positions that the host sends",
+        choices=("decks", "host"),
+    )  # fmt: skip
+    tracking_port: int = setting(
+        0, "UDP port on this machine that is told 100 times a second where everybody is; 0: nobody",
+        minimum=0, maximum=65535,
+    )  # fmt: skip
+    noise: bool = setting(True, "sensors have noise")
+    model: str = setting("orca", "flight model whose vehicle they are", choices=AVOIDERS.names, open_choices=True)
+    collision_m: float = setting(
+        0.2, "the record notes two flying vehicles closer than this", unit="m", minimum=0, maximum=10
+    )
+    crash_m: float = setting(0.12, "two flying vehicles closer than this fall", unit="m", minimum=0, maximum=10)
+    truth: Path | None = None
+    radio: RadioSettings = field(default_factory=RadioSettings)
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.base_port > 65536 - self.count:
+            raise ConfigError("base_port", self.base_port, f"1024 to {65536 - self.count} for {self.count} vehicles")
+        flight_model(self.model)
+        if self.start is None:
+            object.__setattr__(self, "start", layout.positions("ellipse", self.count))
+        elif np.shape(self.start) != (3, self.count):
+            raise ConfigError("start", np.shape(self.start), f"an array of shape (3, {self.count})")
+        if not self.control_port:
+            object.__setattr__(self, "control_port", self.base_port - 1)
+        if self.radio.path is not None and len(self.radio.stations) != self.count:
+            raise ConfigError("radio", len(self.radio.stations), f"a station for each of {self.count} vehicles")
+
+    def arms_itself(self, index: int) -> bool:
+        """Whether the vehicle with this index does not wait to be armed."""
+        return self.arming == "auto" or (self.arming == "mixed" and index % 2 == 0)
+
+    @property
+    def uris(self) -> list[str]:
+        """Where cflib finds them."""
+        if self.radio.path is not None:
+            return [station.uri for station in self.radio.stations]
+        return [f"udp://{self.host}:{self.base_port + k}" for k in range(self.count)]

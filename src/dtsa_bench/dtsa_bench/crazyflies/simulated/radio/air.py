@@ -1,0 +1,48 @@
+"""The air between dongles and Crazyflies: the channel model's medium, on each radio channel."""
+
+from __future__ import annotations
+
+from dtsa_channel_sim.model.config import ChannelConfig
+from dtsa_channel_sim.model.medium import Medium, OnAir
+
+from . import esb
+
+_FORGET_NS = 20_000_000  # longer than any packet
+
+
+class RadioAir:
+    """Transmissions on all channels, and who hears them.
+
+    Channels do not disturb each other.
+
+    :param radios: dongles and Crazyflies; their ids are 1 to this number.
+    :param loss: share of packets that a receiver loses to noise.
+    :param seed: of the losses.
+    """
+
+    def __init__(self, radios: int, loss: float, seed: int) -> None:
+        self._medium = Medium(ChannelConfig(agents=radios, loss=loss, seed=seed))
+        self._by_channel: dict[int, list[OnAir]] = {}
+        self._judged = 0  # each transmission has random numbers of its own
+
+    def send(self, channel: int, rate: str, sender: int, start_ns: int, length: int) -> OnAir:
+        """A transmission begins.
+
+        :param sender: id of the radio.
+        :param start_ns: when it turns to sending.
+        :param length: bytes of payload.
+        """
+        air = start_ns + esb.TURN_NS
+        frame = OnAir(sender, start_ns, air, air + esb.on_air_ns(length, rate))
+        frames = self._by_channel.setdefault(channel, [])
+        if frames and frames[0].end_ns < start_ns - _FORGET_NS:
+            frames[:] = [f for f in frames if f.end_ns >= start_ns - _FORGET_NS]
+        frames.append(frame)
+        return frame
+
+    def heard(self, channel: int, frame: OnAir) -> set[int]:
+        """Ids of the radios that can decode a transmission that has ended, if they listen."""
+        self._judged += 1
+        others = [f for f in self._by_channel[channel] if f is not frame and f.end_ns > frame.start_ns]
+        received = self._medium.judge(self._judged, frame, others).received
+        return {int(index) + 1 for index in received.nonzero()[0]}

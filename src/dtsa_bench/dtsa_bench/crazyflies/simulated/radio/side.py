@@ -1,0 +1,170 @@
+"""The radios of a fleet: dongles for the hosts that connect to a socket, receivers for the Crazyflies.
+
+A host connects with one socket a dongle. Messages are whole (SOCK_SEQPACKET); their first byte is their kind:
+
+| kind | from the host | answer |
+|---|---|---|
+| 0 list | | one pair of bytes a dongle: version of its firmware |
+| 1 claim | number of the dongle | 1, or 0: it is in use |
+| 2 request | number, value (2), index (2), data | |
+| 3 packet | the packet | status and payload; nothing without acknowledgements |
+| 4 scanned | | channels that answered |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dtsa_agent.core.errors import ConfigError
+
+from .air import RadioAir
+from .dongle import Agenda, Dongle
+from .receiver import Receiver
+from .settings import DEVICES, RadioSettings
+
+LIST, CLAIM, REQUEST, PACKET, SCANNED = range(5)
+_REQUEST = struct.Struct("<BBHH")
+_LONGEST = 128
+
+
+@dataclass(slots=True)
+class Host:
+    """A host's connection."""
+
+    socket: socket.socket
+    dongle: int | None = None
+
+
+class RadioSide:
+    """Dongles, air and receivers.
+
+    :param settings: what they are made of.
+    :param deliver: takes a vehicle's index, a packet for it and the time (s).
+    :param passes: index and direction (True: up): whether a packet passes the faults of a vehicle's link.
+    :raises ConfigError: the socket cannot be made.
+    """
+
+    def __init__(
+        self,
+        settings: RadioSettings,
+        deliver: Callable[[int, bytes, float], None],
+        passes: Callable[[int, bool], bool],
+    ) -> None:
+        self.settings = settings
+        self.origin_ns = time.monotonic_ns()
+        self.agenda = Agenda()
+        first = settings.dongles + 1
+        self.receivers = [
+            Receiver(station, lambda packet, t, index=index: deliver(index, packet, t))  # type: ignore[misc]
+            for index, station in enumerate(settings.stations)
+        ]
+        by_id = {first + index: receiver for index, receiver in enumerate(self.receivers)}
+        air = RadioAir(settings.dongles + len(by_id), settings.loss, settings.seed)
+        self.dongles = [
+            Dongle(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up))
+            for k in range(1, first)
+        ]
+        self._taken: set[int] = set()
+        self.listener = _listen(settings.path)
+
+    def now_ns(self) -> int:
+        """The fleet's time."""
+        return time.monotonic_ns() - self.origin_ns
+
+    def accept(self) -> Host | None:
+        """A host that has come."""
+        with contextlib.suppress(OSError):
+            connection = self.listener.accept()[0]
+            connection.setblocking(False)
+            return Host(connection)
+        return None
+
+    def serve(self, host: Host) -> bool:
+        """Take what a host has sent; False when it has gone."""
+        try:
+            message = host.socket.recv(_LONGEST)
+        except BlockingIOError:
+            return True
+        except OSError:
+            message = b""
+        if not message:
+            self.leave(host)
+            return False
+        kind = message[0]
+        if kind == LIST:
+            _send(host, struct.pack(">H", DEVICES[self.settings.device]) * len(self.dongles))
+        elif kind == CLAIM and len(message) == 2:
+            _send(host, bytes((self._claim(host, message[1]),)))
+        elif host.dongle is not None:
+            self._use(self.dongles[host.dongle], host, message)
+        return True
+
+    def _claim(self, host: Host, number: int) -> bool:
+        if number >= len(self.dongles) or number in self._taken:
+            return False
+        self._taken.add(number)
+        host.dongle = number
+        return True
+
+    def _use(self, dongle: Dongle, host: Host, message: bytes) -> None:
+        kind = message[0]
+        if kind == REQUEST and len(message) >= _REQUEST.size:
+            _, number, value, index = _REQUEST.unpack_from(message)
+            dongle.request(number, value, index, message[_REQUEST.size :], self.now_ns())
+        elif kind == PACKET and len(message) > 1:
+            dongle.transfer(message[1:], self.now_ns(), lambda data: _send(host, data))
+        elif kind == SCANNED:
+            _send(host, dongle.scanned or b"\xff")
+
+    def leave(self, host: Host) -> None:
+        """A host goes; its dongle is free again."""
+        host.socket.close()
+        if host.dongle is not None:
+            self._taken.discard(host.dongle)
+            self.dongles[host.dongle].reset()
+            host.dongle = None
+
+    def wait_s(self) -> float | None:
+        """How long until something is due; None: nothing is."""
+        due = self.agenda.next_ns
+        return None if due is None else max(0.0, (due - self.now_ns()) / 1e9)
+
+    def run(self) -> None:
+        """Do what is due."""
+        self.agenda.run(self.now_ns())
+
+    def close(self) -> None:
+        """The socket goes."""
+        self.listener.close()
+        if self.settings.path is not None:
+            self.settings.path.unlink(missing_ok=True)
+
+
+def _listen(path: Path | None) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    if path is not None and path.is_socket():  # of a fleet that was killed?
+        try:
+            listener.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink(missing_ok=True)
+        listener.close()
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        listener.bind(str(path))
+    except OSError as error:
+        listener.close()
+        raise ConfigError("simulated_radio", str(path), f"a path for a new socket ({error.strerror})") from error
+    listener.listen(32)
+    listener.setblocking(False)
+    return listener
+
+
+def _send(host: Host, data: bytes) -> None:
+    with contextlib.suppress(OSError):  # a host that has gone
+        host.socket.send(data)

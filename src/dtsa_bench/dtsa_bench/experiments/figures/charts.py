@@ -1,0 +1,236 @@
+"""Charts of a sweep: grouped bars, lines, matrices; all with intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import product
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
+
+from dtsa_bench.drawing.style import (
+    GRID,
+    INK,
+    MARKERS,
+    ON_DARK,
+    ON_LIGHT,
+    PAPER,
+    QUIET,
+    colours,
+    legend_above,
+    panels,
+)
+from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES, Group, Table
+
+Spec = Mapping[str, Any]
+_GOOD_TO_BAD = LinearSegmentedColormap.from_list("good-bad", ["#e8f4ee", "#f6e3b4", "#dd8a6f", "#a8402b"])
+_NEUTRAL = LinearSegmentedColormap.from_list("neutral", ["#eef3f9", "#9dbbdc", "#3d6fa8"])
+COLLISION_M = 0.2
+
+AXIS_LABELS = {
+    "agents": "quadcopters", "moving": "moving quadcopters", "slot_ms": "slot length [ms]", "loss": "loss",
+    "scheme": "", "policy": "", "scenario": "", "epsilon": "epsilon",
+}  # fmt: skip
+
+
+def label_of(measure: str) -> str:
+    """A measure with its unit."""
+    if measure == CRASHED:
+        return "flights that crashed"
+    spec = MEASURES[measure]
+    return f"{spec.label} [{spec.unit}]" if spec.unit else spec.label
+
+
+def point(group: Group, measure: str) -> tuple[float, float, float]:
+    """Value and interval of a measure of a group; shares in percent are 0 to 1."""
+    if measure == CRASHED:
+        share = group.crashed
+        return (share.value, share.low, share.high) if share.total else (math.nan, math.nan, math.nan)
+    mean = group.mean(measure)
+    return mean.value, mean.low, mean.high
+
+
+def one(table: Table, labels: Mapping[str, Any], measure: str) -> tuple[float, float, float]:
+    """The point of the only group with these labels; not a number if there is none or more than one."""
+    groups = table.select(labels, lambda group: bool(group.rows))
+    return point(groups[0], measure) if len(groups) == 1 else (math.nan, math.nan, math.nan)
+
+
+def _whiskers(points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Distances from the values to the ends of their intervals, (2, n)."""
+    value, low, high = points.T
+    return np.nan_to_num(np.maximum(np.stack((value - low, high - value)), 0.0))
+
+
+def bars(table: Table, spec: Spec) -> Figure:
+    """Grouped bars:
+
+    a panel for each measure, a group for each level of ``x``, a bar for each of ``series``.
+    """
+    measures, xs = list(spec["y"]), table.levels(spec["x"])
+    series = table.levels(spec["series"]) if "series" in spec else [None]
+    shades = colours(xs if series == [None] else series)
+    wide = max(3.3, 0.42 * len(xs) * len(series) + 1.2)
+    figure, axes = panels(len(measures), width=wide)
+    handles: list[Any] = []
+    for axis, measure in zip(axes, measures, strict=True):
+        width = 0.8 / len(series)
+        for number, name in enumerate(series):
+            labels = {} if name is None else {spec["series"]: name}
+            data = np.array([one(table, {spec["x"]: x, **labels}, measure) for x in xs])
+            places = np.arange(len(xs)) + (number - (len(series) - 1) / 2) * width
+            drawn = axis.bar(
+                places, data[:, 0], width * 0.9, color=shades if name is None else shades[number], linewidth=0
+            )
+            axis.errorbar(places, data[:, 0], _whiskers(data), fmt="none", ecolor=INK, elinewidth=1, capsize=2)
+            if axis is axes[0]:
+                handles.append(drawn)
+        _dress(axis, spec, measure, xs)
+    legend_above(figure, handles, series)
+    return figure
+
+
+def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
+    axis.set_title(label_of(measure))
+    crowded = any(len(str(x)) > 8 for x in xs)
+    axis.set_xticks(
+        range(len(xs)),
+        [str(x) for x in xs],
+        rotation=20 if crowded else 0,
+        ha="right" if crowded else "center",
+    )
+    axis.set_xlabel(AXIS_LABELS.get(spec["x"], spec["x"]))
+    axis.grid(axis="x", visible=False)
+    axis.tick_params(axis="x", length=0)
+    if measure == "min_distance_m":
+        axis.axhline(COLLISION_M, color=QUIET, linewidth=1, linestyle=":")
+    if measure in spec.get("log", ()):
+        _logarithmic(axis)
+    elif measure == "efficiency_mean":
+        # Bars of a ratio near 1 differ in the upper part alone; the axis says where it begins.
+        low = min((p.get_height() for p in axis.patches if math.isfinite(p.get_height())), default=0.0)
+        axis.set_ylim(max(0.0, math.floor(low * 10 - 1) / 10), 1.0)
+    if measure == CRASHED:
+        axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+
+
+def lines(table: Table, spec: Spec) -> Figure:
+    """A line for each of ``series`` over the numbers of ``x``; a panel for each of ``facets`` and measure."""
+    facets = table.levels(spec["facets"]) if "facets" in spec else [None]
+    series = table.levels(spec["series"]) if "series" in spec else [None]
+    xs = table.levels(spec["x"])
+    shades = colours(series)
+    shown = [(facet, measure) for measure in spec["y"] for facet in facets]
+    figure, axes = panels(len(shown), width=4.6, height=3.3, columns=2)
+    handles: list[Any] = []
+    for axis, (facet, measure) in zip(axes, shown, strict=True):
+        for number, name in enumerate(series):
+            labels = ({} if facet is None else {spec["facets"]: facet}) | (
+                {} if name is None else {spec["series"]: name}
+            )
+            data = np.array([one(table, {spec["x"]: x, **labels}, measure) for x in xs])
+            known = np.isfinite(data[:, 0])
+            place = np.array(xs, dtype=float)[known]
+            # Lines that lie on each other stay visible: later ones are thinner.
+            (line,) = axis.plot(
+                place,
+                data[known, 0],
+                color=shades[number],
+                marker=MARKERS[number % len(MARKERS)],
+                linewidth=2.6 - 0.35 * number,
+                markersize=5.5 - 0.5 * number,
+            )
+            axis.fill_between(place, data[known, 1], data[known, 2], color=shades[number], alpha=0.13, linewidth=0)
+            if axis is axes[0]:
+                handles.append(line)
+        title = label_of(measure)
+        axis.set_title(title if facet is None else f"{title}, {_facet(spec['facets'], facet)}")
+        axis.set_xlabel(AXIS_LABELS.get(spec["x"], spec["x"]))
+        axis.xaxis.set_major_locator(MaxNLocator(8, integer=all(isinstance(x, int) for x in xs)))
+        if measure == CRASHED:
+            axis.set_ylim(-0.03, 1.03)
+            axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+        if measure in spec.get("log", ()):
+            _logarithmic(axis)
+    legend_above(figure, handles, series)
+    return figure
+
+
+def _logarithmic(axis: Axes) -> None:
+    """A logarithmic axis with plain numbers."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _facet(axis: str, value: object) -> str:
+    return f"{value} ms slots" if axis == "slot_ms" else str(value)
+
+
+def matrix(table: Table, spec: Spec) -> Figure:
+    """A coloured cell with its number for each of ``rows`` and ``columns``; a panel for each of ``facets``."""
+    facets = table.levels(spec["facets"]) if "facets" in spec else [None]
+    rows, columns, measure = table.levels(spec["rows"]), table.levels(spec["columns"]), spec["y"][0]
+    longest = max(len(str(row)) for row in rows)
+    wide = max(0.95, 0.095 * max(len(str(column)) for column in columns))
+    figure, axes = panels(
+        len(facets),
+        width=1.5 + 0.075 * longest + wide * len(columns),
+        height=1.05 + 0.36 * len(rows),
+        columns=2,
+    )
+    finite = [value for g in table.groups if g.rows and math.isfinite(value := point(g, measure)[0])]
+    top = 1.0 if measure == CRASHED else max(finite, default=1.0)
+    bottom = 0.0 if measure == CRASHED else min(finite, default=0.0)
+    for axis, facet in zip(axes, facets, strict=True):
+        fixed = {} if facet is None else {spec["facets"]: facet}
+        values = np.full((len(rows), len(columns)), math.nan)
+        for (i, row), (j, column) in product(enumerate(rows), enumerate(columns)):
+            labels = {spec["rows"]: row, spec["columns"]: column, **fixed}
+            groups = table.select(labels, lambda group: bool(group.rows))
+            if len(groups) != 1:
+                continue
+            values[i, j] = point(groups[0], measure)[0]
+            dark = (values[i, j] - bottom) / ((top - bottom) or 1.0) > 0.62
+            text = _cell_text(groups[0], measure)
+            axis.text(j, i, text, ha="center", va="center", fontsize=8.5, color=ON_DARK if dark else ON_LIGHT)
+        axis.pcolormesh(
+            np.arange(len(columns) + 1) - 0.5,
+            np.arange(len(rows) + 1) - 0.5,
+            np.ma.masked_invalid(values),
+            cmap=_GOOD_TO_BAD if measure == CRASHED else _NEUTRAL,
+            vmin=bottom,
+            vmax=top or 1.0,
+            edgecolors=PAPER,
+            linewidth=2,
+        )
+        title = label_of(measure)
+        axis.set_title(title if facet is None else f"{title}: {_facet(spec['facets'], facet)}")
+        _dress_matrix(axis, rows, columns, spec)
+    return figure
+
+
+def _dress_matrix(axis: Axes, rows: list[Any], columns: list[Any], spec: Spec) -> None:
+    axis.invert_yaxis()
+    axis.set_xticks(range(len(columns)), [str(column) for column in columns])
+    axis.set_yticks(range(len(rows)), [str(row) for row in rows])
+    axis.tick_params(length=0)
+    axis.grid(visible=False)
+    axis.set_facecolor(GRID)
+    for side in ("left", "bottom"):
+        axis.spines[side].set_visible(False)
+    axis.set_xlabel(AXIS_LABELS.get(spec["columns"]) or spec["columns"])
+    axis.set_ylabel(AXIS_LABELS.get(spec["rows"]) or spec["rows"])
+
+
+def _cell_text(group: Group, measure: str) -> str:
+    if measure == CRASHED:
+        return str(group.crashed)
+    value = group.mean(measure).value
+    return f"{value:.{MEASURES[measure].digits}f}" if math.isfinite(value) else "–"

@@ -1,0 +1,126 @@
+"""Paths of single flights: true ones from above, and true against estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from dtsa_bench.drawing import palette
+from dtsa_bench.drawing.style import CYCLE, INK, QUIET, legend_above, panels
+from dtsa_bench.experiments.sweep.aggregate import Table
+from dtsa_bench.simulation.simulate import Flight, simulate
+
+Spec = Mapping[str, Any]
+TRUE, ESTIMATED, RECEIVED = palette.SERIES[2], INK, palette.SERIES[4]
+
+
+def _flights(table: Table, spec: Spec) -> list[tuple[str, Flight]]:
+    """One flight of the first seed for each level of ``facets``, flown again with a trace."""
+    facets = table.levels(spec["facets"])
+    groups = [table.where(**{spec["facets"]: facet})[0] for facet in facets]
+    seed = table.sweep.seeds[0]
+    return [
+        (str(facet), simulate(group.cell.run(seed), trace=True)) for facet, group in zip(facets, groups, strict=True)
+    ]
+
+
+def _movers(flight: Flight) -> NDArray[np.int64]:
+    return np.flatnonzero(flight.scenario.moving)
+
+
+def trajectories(table: Table, spec: Spec) -> Figure:
+    """Paths of the movers from above (fig:12_exp_traj): a panel a level of ``facets``, one seed in all."""
+    flights = _flights(table, spec)
+    figure, axes = panels(len(flights), width=3.3, height=3.6)
+    for axis, (name, flight) in zip(axes, flights, strict=True):
+        assert flight.trace is not None
+        draw_paths(axis, flight.trace.positions(), flight.scenario.moving, flight.scenario.start)
+        summary = flight.summary()
+        time = summary["completion_time_s"]
+        axis.set_title(name)
+        axis.set_xlabel(
+            f"x [m]\n{summary['min_distance_m']:.2f} m apart at least"
+            + (f", {time:.2f} s" if time is not None else f", {summary['end']}")
+        )
+    axes[0].set_ylabel("y [m]")
+    return figure
+
+
+def draw_paths(axis: Axes, path: NDArray[np.float64], moving: NDArray[np.bool_], start: NDArray[np.float64]) -> None:
+    """Paths of the movers from above, in the agents' colours; who hovers is a grey dot.
+
+    :param axis: where.
+    :param path: (T, 3, N) m, frame map; not a number where a position is not known.
+    :param moving: (N,) who moves.
+    :param start: (3, N) m, frame map.
+    """
+    hovering = np.flatnonzero(~moving)
+    axis.plot(*start[:2, hovering], "o", color=QUIET, alpha=0.45, markersize=6, markeredgewidth=0)
+    for k in np.flatnonzero(moving).tolist():
+        shade, dash = palette.agent_colour(k + 1), palette.DASHES[palette.agent_turn(k + 1)]
+        axis.plot(path[:, 0, k], path[:, 1, k], color=shade, linestyle=(0, dash) if dash else "-")
+        axis.plot(*path[0, :2, k], "o", color=shade, markersize=6)
+        axis.plot(*path[-1, :2, k], "x", color=shade, markersize=7, markeredgewidth=2)
+    axis.set_aspect("equal", "datalim")
+
+
+def estimate(table: Table, spec: Spec) -> Figure:
+    """A part of a path: flown, as another agent estimated it, and what that one received (fig:estimated)."""
+    flights = _flights(table, spec)
+    figure, axes = panels(len(flights) + 1, width=3.6, height=3.3, columns=2)
+    handles: list[Any] = []
+    first, last = _busiest(flights[0][1])
+    errors = axes[-1]
+    for number, (axis, (name, flight)) in enumerate(zip(axes[:-1], flights, strict=True)):
+        assert flight.trace is not None
+        seen = int(_movers(flight)[-1])
+        steps = flight.run.swarm.steps
+        window = slice(min(first, len(flight.trace.senders) - 2), last)
+        true = flight.trace.positions()[window.start * steps : window.stop * steps, :, seen]
+        believed = np.stack(flight.trace.estimates)[window, :, seen]
+        slots = np.stack(flight.trace.heard_slot)[window, seen]
+        received = np.stack(flight.trace.heard)[window, :, seen]
+        new = np.flatnonzero(np.diff(slots, prepend=slots[0]))
+        error = np.linalg.norm(believed - true[steps - 1 :: steps][: len(believed)], axis=1)
+        lines = [
+            axis.plot(true[:, 0], true[:, 1], color=TRUE, linewidth=3.2, alpha=0.75)[0],
+            axis.plot(believed[:, 0], believed[:, 1], color=ESTIMATED, linewidth=1.1)[0],
+            axis.plot(
+                received[new, 0],
+                received[new, 1],
+                "o",
+                color=RECEIVED,
+                markersize=5,
+                markeredgecolor=INK,
+                markeredgewidth=0.5,
+            )[0],
+        ]
+        handles = handles or lines
+        axis.set_title(f"estimator {name}")
+        axis.set_xlabel(f"x [m]\nerror {100 * error.mean():.1f} cm on average")
+        axis.set_aspect("equal", "datalim")
+        axis.set_ylabel("y [m]")
+        time_s = (window.start + 1 + np.arange(len(error))) * flight.run.swarm.slot_s
+        errors.plot(time_s, 100 * error, color=CYCLE[number % len(CYCLE)], linewidth=1.4, label=name)
+    errors.set_title("distance between the two [cm]")
+    errors.set_xlabel("time [s]")
+    errors.legend()
+    legend_above(figure, handles, ["flown", "estimated by another", "received"])
+    return figure
+
+
+def _busiest(flight: Flight, length: int = 160) -> tuple[int, int]:
+    """The slots in which the shown mover turns most."""
+    assert flight.trace is not None
+    seen = int(_movers(flight)[-1])
+    path = flight.trace.positions()[flight.run.swarm.steps - 1 :: flight.run.swarm.steps, :, seen]
+    bend = np.linalg.norm(np.diff(path, n=2, axis=0), axis=1)
+    length = min(length, len(bend))
+    sums = np.convolve(bend, np.ones(length), mode="valid")
+    start = int(np.argmax(sums))
+    return start, start + length

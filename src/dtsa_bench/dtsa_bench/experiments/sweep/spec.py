@@ -1,0 +1,252 @@
+"""What a sweep flies: a base, axes that are combined with each other, and seeds. Read from YAML; see docs/bench.md."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import POLICIES
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.settings.declaration import Settings, check, setting, settings_of
+from dtsa_agent.yaml_file import read_yaml
+from dtsa_bench.experiments.batch.task import Task, key_of
+from dtsa_bench.runs.config import FROM_SWARM, RunConfig, RunLimits, from_swarm
+from dtsa_channel_sim import ChannelConfig
+
+from .columns import RESERVED
+
+PRESETS = Path(__file__).resolve().parent.parent / "presets"
+FIGURE_KINDS = ("bars", "lines", "matrix", "trajectories", "estimate")
+#: Seeds of reports start here; those below are for tuning and tests.
+FIRST_SEED = 1001
+
+# Settings by section. Those of the channel that follow from the swarm's are left out.
+_SECTIONS = {
+    "swarm": tuple(spec.name for spec in settings_of(SwarmConfig)),
+    "channel": tuple(spec.name for spec in settings_of(ChannelConfig) if spec.name not in FROM_SWARM),
+    "limits": tuple(spec.name for spec in settings_of(RunLimits)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SweepSpec(Settings):
+    """What a sweep's YAML file says.
+
+    :raises ConfigError: naming what is not usable.
+    """
+
+    title: str = setting("", "heading of the report; empty: the sweep's name")
+    text: str = setting("", "what the report says before its tables")
+    seeds: int | list[int] = setting(30, "a number of seeds, or a list of whole numbers", kind="structure", custom=True)
+    base: Mapping[str, Any] = setting({}, "settings of all flights, by name", kind="structure", custom=True)
+    axes: Mapping[str, Any] = setting(
+        {}, "lists of values by the name of a setting, or settings by names by an axis", kind="structure", custom=True
+    )
+    figures: tuple[Mapping[str, Any], ...] = setting((), "figures of the report", kind="structure", custom=True)
+
+    def __post_init__(self) -> None:
+        check(self)
+        object.__setattr__(self, "base", _mapping(self.base, "base"))
+        axes = {axis: _levels(axis, values) for axis, values in _mapping(self.axes, "axes").items()}
+        object.__setattr__(self, "axes", axes)
+        if not isinstance(self.figures, (list, tuple)):
+            raise ConfigError("figures", self.figures, "a list")
+        figures = tuple(_figure(entry, index, list(axes)) for index, entry in enumerate(self.figures))
+        object.__setattr__(self, "figures", figures)
+        _seeds(self.seeds, None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One combination of the axes, flown with every seed."""
+
+    labels: dict[str, Any]  # axis -> value or name
+    settings: dict[str, Any]  # flat names -> values
+
+    def run(self, seed: int) -> RunConfig:
+        """The run with one seed.
+
+        :raises ConfigError: if the settings do not fit together.
+        """
+        return run_config({**self.settings, "seed": seed})
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """Cells, seeds, and what the report shows of them."""
+
+    name: str
+    title: str
+    text: str
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+    axes: tuple[str, ...]
+    figures: tuple[Mapping[str, Any], ...] = ()
+    spec: SweepSpec = field(default_factory=SweepSpec)  # as it was read, with what the command line changed
+
+    @property
+    def source(self) -> dict[str, Any]:
+        """The sweep's file as plain values, with what the command line changed."""
+        return self.spec.to_dict()
+
+    def tasks(self) -> Iterator[Task]:
+        """All runs, cell by cell."""
+        for index, cell in enumerate(self.cells):
+            for seed in self.seeds:
+                settings = {**cell.settings, "seed": seed}
+                yield Task(key_of(settings), index, seed, settings, cost_of(settings))
+
+
+def cost_of(settings: Mapping[str, Any]) -> float:
+    """A rough guess of the work in a run, see :class:`~dtsa_bench.experiments.batch.task.Task`."""
+    agents = float(settings.get("agents", 12))
+    slot_ms = float(settings.get("slot_ms", 10.0))
+    slots = min(float(settings.get("timeout_s", 60.0)), 3.0 + agents / 5) * 1000.0 / slot_ms
+    lossy = any(settings.get(name) for name in ("loss", "burst_length", "range_m", "loss_matrix", "schedule"))
+    policy = POLICIES.row(settings.get("policy", "dtsa"))
+    tables = 1.0 if policy.may_share and not lossy else agents
+    priority = 0.05 if policy.weighs_all else 0.002
+    return slots * (4.0 + 0.3 * agents + 0.006 * agents * agents + tables * priority * agents * (agents + 4) / 10)
+
+
+def run_config(settings: Mapping[str, Any]) -> RunConfig:
+    """A run from flat names: settings of the swarm, of the channel and of the limits side by side.
+
+    :param settings: values by name; ``seed`` is that of the swarm and of the channel.
+    :raises ConfigError: for names that do not exist and values that are not allowed.
+    """
+    parts: dict[str, dict[str, Any]] = {"swarm": {}, "channel": {}, "limits": {}}
+    for name, value in settings.items():
+        section = section_of(name)
+        if section is None:
+            raise ConfigError(name, value, "one of the settings " + ", ".join(sum(_SECTIONS.values(), ())))
+        parts[section][name] = value
+    swarm = SwarmConfig.from_dict(parts["swarm"])
+    channel = {**from_swarm(swarm), **parts["channel"]}
+    return RunConfig(swarm, ChannelConfig.from_dict(channel), RunLimits(**parts["limits"]))
+
+
+def section_of(name: str) -> str | None:
+    """The section of a flat name: swarm, channel or limits; None if there is no such setting."""
+    return next((section for section, names in _SECTIONS.items() if name in names), None)
+
+
+def preset_names() -> list[str]:
+    """Names of the sweeps that come with the package."""
+    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+
+
+def load_preset(name: str, **changes: Any) -> Sweep:
+    """A sweep that comes with the package.
+
+    :param name: one of :func:`preset_names`.
+    :param changes: as for :func:`make_sweep`.
+    :raises ConfigError: if there is none of that name.
+    """
+    if name not in preset_names():
+        raise ConfigError("preset", name, ", ".join(preset_names()))
+    return load_file(PRESETS / f"{name}.yaml", **changes)
+
+
+def load_file(path: str | Path, **changes: Any) -> Sweep:
+    """A sweep described in a YAML file.
+
+    :param path: the file.
+    :param changes: as for :func:`make_sweep`.
+    :raises ConfigError: if it cannot be read, or does not describe a sweep.
+    """
+    content = read_yaml(path, "file")
+    if not isinstance(content, dict):
+        raise ConfigError("file", str(path), "a mapping with axes, and base, seeds, title, text, figures as you like")
+    return make_sweep(content, Path(path).stem, **changes)
+
+
+def make_sweep(
+    content: Mapping[str, Any],
+    name: str,
+    *,
+    seeds: int | None = None,
+    first_seed: int | None = None,
+    base: Mapping[str, Any] | None = None,
+) -> Sweep:
+    """A sweep from the content of its YAML file. Every run is checked here, before anything flies.
+
+    :param content: what the file says.
+    :param name: of the sweep.
+    :param seeds: number of seeds, instead of the file's.
+    :param first_seed: first of them.
+    :param base: settings that win over the file's base.
+    :raises ConfigError: naming what is not usable.
+    """
+    spec = SweepSpec.from_dict(content)
+    chosen = _seeds(spec.seeds, seeds, first_seed)
+    spec = dataclasses.replace(spec, base={**spec.base, **(base or {})}, seeds=list(chosen))
+    levels = [_settings_of_levels(axis, values) for axis, values in spec.axes.items()]
+    cells = tuple(_cells(spec.base, list(spec.axes), levels))
+    for cell in cells:
+        cell.run(chosen[0])
+    return Sweep(name, spec.title or name, spec.text.strip(), cells, chosen, tuple(spec.axes), spec.figures, spec)
+
+
+def _cells(
+    common: Mapping[str, Any], axes: Sequence[str], levels: Sequence[dict[str, dict[str, Any]]]
+) -> Iterator[Cell]:
+    for combination in itertools.product(*(level.items() for level in levels)):
+        settings: dict[str, Any] = dict(common)
+        for _, values in combination:
+            settings.update(values)
+        yield Cell({axis: label for axis, (label, _) in zip(axes, combination, strict=True)}, settings)
+
+
+def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
+    """Levels of an axis: a list of values of the setting it is named after, or names with settings each."""
+    if axis in RESERVED:
+        raise ConfigError(f"axes.{axis}", values, "another name: results have one of this name")
+    if isinstance(values, Mapping) and values:
+        return {str(name): _mapping(settings, f"axes.{axis}.{name}") for name, settings in values.items()}
+    if isinstance(values, list) and values:
+        if section_of(axis) is None:
+            raise ConfigError(f"axes.{axis}", values, "names with settings, or an axis named after a setting")
+        return list(values)
+    raise ConfigError(f"axes.{axis}", values, "a list of values, or names with settings each")
+
+
+def _settings_of_levels(axis: str, levels: list[Any] | dict[str, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
+    """What each level of an axis sets."""
+    return levels if isinstance(levels, dict) else {value: {axis: value} for value in levels}
+
+
+def _seeds(value: object, count: int | None, first: int | None) -> tuple[int, ...]:
+    listed = isinstance(value, list)
+    if listed and count is None and first is None:
+        # type: ignore[union-attr]
+        if not value or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in value):
+            raise ConfigError("seeds", value, "a number of seeds, or a list of whole numbers")
+        return tuple(value)  # type: ignore[arg-type]
+    number = count if count is not None else (len(value) if listed else value)  # type: ignore[arg-type]
+    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= 1_000_000:
+        raise ConfigError("seeds", number, "1 to 1000000")
+    start = FIRST_SEED if first is None else first
+    return tuple(range(start, start + number))
+
+
+def _figure(entry: object, index: int, axes: list[str]) -> dict[str, Any]:
+    figure = _mapping(entry, f"figures[{index}]")
+    if figure.get("kind") not in FIGURE_KINDS:
+        raise ConfigError(f"figures[{index}].kind", figure.get("kind"), ", ".join(FIGURE_KINDS))
+    for role in ("x", "series", "rows", "columns", "facets"):
+        if role in figure and figure[role] not in axes:
+            raise ConfigError(f"figures[{index}].{role}", figure[role], "one of the axes " + ", ".join(axes))
+    figure.setdefault("name", figure["kind"] if index == 0 else f"{figure['kind']}-{index + 1}")
+    return figure
+
+
+def _mapping(value: object, name: str) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ConfigError(name, value, "names with values")
+    return {str(key): item for key, item in value.items()}

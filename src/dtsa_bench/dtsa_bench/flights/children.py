@@ -1,0 +1,134 @@
+"""The processes of a flight: started together, watched, ended together."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.ros.common.process.node_process import SUPERVISOR
+
+# A process group of its own; Python 3.10 cannot say so without a function that runs in the child.
+_OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
+_LEAVE_S = 3.0  # to end by themselves once the run is over; many on few cores take their time
+_TERM_S = 1.0  # and then after SIGTERM
+_HURRY_S = 0.3  # both, when the user has ended it
+
+
+class NodeError(DtsaError):
+    """A node of the flight ended when it should not have."""
+
+
+@dataclass(slots=True)
+class Child:
+    """One process."""
+
+    name: str  # as the user knows it, e.g. "cf3"
+    agents: Sequence[int]  # ids of the agents in it
+    process: subprocess.Popen[bytes]
+    log: Path
+    module: str
+    arguments: Sequence[str]
+
+
+class Children:
+    """The processes that one supervisor started.
+
+    :param logs: directory for what they print.
+    :param environment: their environment variables, on top of this process's.
+    """
+
+    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
+        self._logs = logs
+        self._environment = {**os.environ, **environment, SUPERVISOR: str(os.getpid())}
+        self.all: list[Child] = []
+        self._told: list[Child] = []
+
+    def start(self, name: str, agents: Sequence[int], module: str, arguments: Sequence[str]) -> None:
+        """Starts `python -m module arguments`.
+
+        It becomes a process group of its own, so that Ctrl-C in the terminal reaches the supervisor alone, which then
+        ends all in good order. It stays in the supervisor's session: Linux gives each session as much of the processor
+        as any other one, and a session an agent would leave next to nothing for the channel.
+
+        :param name: what errors call it.
+        :param agents: ids of the agents in it.
+        """
+        log = self._logs / f"{name.replace(' ', '')}.log"
+        with log.open("ab") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                **_OWN_GROUP,
+            )
+        self.all.append(Child(name, agents, process, log, module, arguments))
+
+    def again(self, child: Child, more: Sequence[str] = ()) -> None:
+        """Starts a process that has ended another time; the new one takes its place.
+
+        :param child: the process.
+        :param more: arguments on top of those it had.
+        """
+        self.all.remove(child)
+        self.start(child.name, child.agents, child.module, [*child.arguments, *more])
+        self.all[-1].arguments = child.arguments
+
+    def ended(self) -> list[Child]:
+        """Processes that have ended since this was asked last."""
+        fresh = [child for child in self.all if child.process.poll() is not None and child not in self._told]
+        self._told += fresh
+        return fresh
+
+    def check(self) -> None:
+        """Looks whether all are alive.
+
+        :raises NodeError: naming those that are not, and why.
+        """
+        ended = [child for child in self.all if child.process.poll() is not None]
+        if ended:
+            raise NodeError("; ".join(describe_end(child) for child in ended))
+
+    @property
+    def killed(self) -> bool:
+        """Whether a signal has ended one of them, in whatever it was doing."""
+        return any((child.process.returncode or 0) < 0 for child in self.all)
+
+    def stop(self, hurry: bool = False) -> list[str]:
+        """Waits until all have ended, and helps those that do not.
+
+        :param hurry: somebody waits for the end of it all.
+        :returns: names of those that had to be helped.
+        """
+        helped: dict[str, None] = {}
+        leave_s, term_s = (_HURRY_S, _HURRY_S) if hurry else (_LEAVE_S, _TERM_S)
+        for number, patience in ((None, leave_s), (signal.SIGTERM, term_s), (signal.SIGKILL, 10.0)):
+            alive = [child for child in self.all if child.process.poll() is None]
+            if number is not None:
+                for child in alive:
+                    helped[child.name] = None
+                    child.process.send_signal(number)
+            deadline = time.monotonic() + patience
+            while time.monotonic() < deadline and any(child.process.poll() is None for child in alive):
+                time.sleep(0.01)
+        return list(helped)
+
+
+def describe_end(child: Child) -> str:
+    """Why a process ended, in one line."""
+    code = child.process.returncode
+    who = f"{child.name} (process {child.process.pid})"
+    if code < 0:
+        return f"{who} was killed by {signal.Signals(-code).name}"
+    lines = child.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    said = f": {lines[-1]}" if lines else ""
+    return f"{who} ended with code {code}{said}"

@@ -1,0 +1,125 @@
+"""How well agents on their own clocks keep together: from the times that they report."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dtsa_agent.ros.common.wire.report_fields import ReportFields
+from dtsa_channel_sim.ros.observer import ChannelObserver
+
+ON_TIME_NS = 1_000_000  # a frame this far from the swarm's common time is not on time any more
+_END = 50  # slots
+_OPEN = 1000  # slots that are not summed up yet
+_KEPT = 4096  # frames of an agent for the median: all until there are more, then evenly spread ones
+
+
+class _Sends:
+    """How far an agent's frames left from the swarm's common time, in constant memory."""
+
+    def __init__(self) -> None:
+        self.count = self.on_time = 0
+        self.largest = 0.0  # ns, the one farthest away
+        self._kept: list[float] = []
+        self._every = 1
+
+    def add(self, away_ns: float) -> None:
+        if self.count % self._every == 0:
+            self._kept.append(away_ns)
+            if len(self._kept) > _KEPT:
+                del self._kept[1::2]
+                self._every *= 2
+        self.count += 1
+        self.on_time += abs(away_ns) <= ON_TIME_NS
+        self.largest = max(self.largest, away_ns, key=abs)
+
+    def median(self) -> float:
+        return float(np.median(self._kept))
+
+
+class ClockStatistics(ChannelObserver):
+    """Collects when slots start and frames leave, and sums it up.
+
+    :param agents: number of agents N.
+    :param slotted: frames leave when slots start; otherwise it says nothing of them.
+    """
+
+    def __init__(self, agents: int, slotted: bool = True) -> None:
+        self._slotted = slotted
+        self._slot = np.full(_OPEN, -1, dtype=np.int64)  # each in row slot % _OPEN, -1: none yet
+        self._starts = np.full((_OPEN, agents), np.nan)  # ns, own slot's start, nan: sent, or not known
+        self._sends = np.full((_OPEN, agents), np.nan)  # ns, of the transmission
+        self._spreads = 0  # slots that are summed up and of which two agents told their start
+        self._spread_sum = self._spread_max = 0.0  # ns, over those
+        self._last_spreads: deque[float] = deque(maxlen=_END)  # ns
+        self._away: dict[int, _Sends] = {}  # by agent
+
+    def report(self, message: ReportFields, data: bytes) -> None:
+        self.add(message.slot, message.agent, message.offset_ns, message.length)
+
+    def add(
+        self, slot: ArrayLike, ids: Sequence[int], offsets_ns: NDArray[np.int64], lengths: NDArray[np.uint8]
+    ) -> None:
+        """Takes in what one process says of some slots; nothing of slots that have been summed up.
+
+        :param slot: (m,) as its agents count, ascending.
+        :param ids: (n,) of the agents.
+        :param offsets_ns: (m n) ns, of each agent's slot from the channel's; of its transmission, if it sends.
+        :param lengths: (m n) bytes of each frame, 0: silent.
+        """
+        slots = np.asarray(slot, dtype=np.int64)
+        if not len(slots):
+            return  # a process that ends tells what it has heard since its last slot
+        rows = slots % _OPEN
+        for new in slots[self._slot[rows] < slots].tolist():
+            self._sum_up(new % _OPEN)
+            self._slot[new % _OPEN] = new
+        at = np.ix_(rows, np.asarray(ids, dtype=np.intp) - 1)
+        open_ = (self._slot[rows] == slots)[:, None]
+        silent, offsets = lengths.reshape(len(slots), -1) == 0, offsets_ns.reshape(len(slots), -1)
+        self._starts[at] = np.where(open_ & silent, offsets, self._starts[at])
+        if not self._slotted:
+            return
+        self._sends[at] = np.where(open_ & ~silent, offsets, self._sends[at])
+
+    def _sum_up(self, row: int) -> None:
+        """Nothing more will be told of a slot."""
+        starts, sends = self._starts[row], self._sends[row]
+        usable = np.sort(starts[~np.isnan(starts)])
+        count = len(usable)
+        if count > 1:
+            spread = float(usable[-1] - usable[0])
+            self._spreads += 1
+            self._spread_sum += spread
+            self._spread_max = max(self._spread_max, spread)
+            self._last_spreads.append(spread)
+        for index in np.flatnonzero(~np.isnan(sends)).tolist() if count else ():
+            median = (usable[(count - 1) // 2] + usable[count // 2]) / 2
+            self._away.setdefault(index + 1, _Sends()).add(float(sends[index] - median))
+        starts[:] = sends[:] = np.nan
+
+    def summary(self) -> dict[str, Any]:
+        """The results; None where nothing was reported.
+
+        ``clock_spread_*_ms``: between the first and the last agent's start of the same slot, over all slots, and the
+        largest of the last 50; ``send_offset_ms``: by agent, how far its frames left from the swarm's common time (the
+        median of the slot's starts; beyond 4096 frames the median is that of evenly spread ones);
+        ``sends_on_time_share``: frames within 1 ms of it.
+        """
+        for row in np.argsort(self._slot).tolist():
+            self._sum_up(row)
+        frames = sum(sends.count for sends in self._away.values())
+        return {
+            "clock_spread_max_ms": self._spread_max / 1e6 if self._spreads else None,
+            "clock_spread_mean_ms": self._spread_sum / self._spreads / 1e6 if self._spreads else None,
+            "clock_spread_end_ms": max(self._last_spreads) / 1e6 if self._spreads else None,
+            "sends_on_time_share": sum(sends.on_time for sends in self._away.values()) / frames if frames else None,
+            "send_offset_ms": {
+                str(agent): {"median": sends.median() / 1e6, "max": sends.largest / 1e6}
+                for agent, sends in sorted(self._away.items())
+            },
+        }

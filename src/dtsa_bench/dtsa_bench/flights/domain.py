@@ -1,0 +1,79 @@
+"""A ROS domain for one run alone: two runs on one machine never hear each other."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.ros.common.workarounds.dds import clean_shared_memory
+
+# Ports of RTPS: 7400 + 250 domain + 10 + 2 participant (+ 1). Beyond domain 101 they meet Linux's ephemeral ports.
+LAST_FREE_DOMAIN = 101
+LAST_DOMAIN = 232
+_PARTICIPANTS = 4
+_SPREAD = 37  # runs that start at the same time look at different domains first
+
+
+@contextmanager
+def ros_domain(wanted: int | None = None, *, shared: bool = False) -> Iterator[int]:
+    """Takes a domain for as long as the context lasts, and removes what dead processes have left in shared memory.
+
+    :param wanted: take this one; None: any that is free.
+    :param shared: others may be on the wanted one already, such as motion capture; but no other run.
+    :raises ConfigError: if the wanted one is in use.
+    :raises DtsaError: if all are in use.
+    """
+    if wanted is not None and not 0 <= wanted <= LAST_DOMAIN:
+        raise ConfigError("domain", wanted, f"0 to {LAST_DOMAIN}")
+    first = os.getpid() * _SPREAD
+    candidates = (
+        [wanted] if wanted is not None else [1 + (first + i) % LAST_FREE_DOMAIN for i in range(LAST_FREE_DOMAIN)]
+    )
+    for domain in candidates:
+        lock = _lock(domain)
+        if lock is None:
+            continue
+        try:
+            if shared or _ports_free(domain):
+                clean_shared_memory()
+                try:
+                    yield domain
+                finally:
+                    clean_shared_memory()
+                return
+        finally:
+            os.close(lock)
+    if wanted is not None:
+        raise ConfigError("domain", wanted, "a ROS domain that nobody on this machine uses (it is in use)")
+    raise DtsaError(f"all ROS domains from 1 to {LAST_FREE_DOMAIN} are in use on this machine")
+
+
+def _lock(domain: int) -> int | None:
+    """A lock that lasts until its file descriptor is closed, or its process ends however it ends."""
+    directory = Path(tempfile.gettempdir()) / f"dtsa-domains-{os.getuid()}"
+    with suppress(FileExistsError):
+        directory.mkdir(mode=0o700)
+    descriptor = os.open(directory / str(domain), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _ports_free(domain: int) -> bool:
+    """Whether the ports that a domain's first participants would have are free."""
+    for port in range(7400 + 250 * domain + 10, 7400 + 250 * domain + 10 + 2 * _PARTICIPANTS):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", port))
+            except OSError:
+                return False
+    return True

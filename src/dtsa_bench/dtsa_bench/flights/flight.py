@@ -1,0 +1,306 @@
+"""One flight with real nodes: the channel and the recorder in this process, the agents in others."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.node import Node
+
+from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
+from dtsa_agent.core.agents.joining import check_joinable
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.plugins.unslotted import check_carried
+from dtsa_agent.keys import check_key
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.parameters import to_parameters
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.node_process import init_ros, keep_node
+from dtsa_agent.ros.common.process.priority import give_way_by, take_place, take_priority
+from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_bench.runs.config import LOCKSTEP, RunConfig
+from dtsa_bench.runs.options import new_directory
+from dtsa_bench.simulation.simulate import may_share
+from dtsa_channel_sim.ros.answers import named
+from dtsa_channel_sim.ros.channel_node import declare_channel
+from dtsa_channel_sim.ros.lockstep import LockstepChannel
+from dtsa_channel_sim.ros.observer import ChannelObserver
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+
+from .agent_parameters import CHANNEL_NICE, clock_parameters
+from .children import Children
+from .domain import ros_domain
+from .ending import EarlyEnd, wall_limit_s
+from .options import FlightOptions
+from .progress import FlightProgress, ProgressLine
+from .recorded_channel import BAG, RecordedFlight
+from .supervisor import LateStart, RealtimeSupervisor, Supervisor
+
+Watch = Callable[
+    [RecordedFlight, object], None
+]  # of a flight that is about to begin, and what looks after its processes
+
+ENVIRONMENT = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    # A node needs no more threads than its own: NumPy's would cost start-up time and memory.
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+}
+
+# The log of this process's nodes goes to /rosout alone: the progress line tells the same here.
+QUIET = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
+MOST_SHARED = 32  # processes; where 70 share memory, they wait for each other's ports for minutes
+
+END_S = 1.0  # wall time in which the nodes are to hear of the end; those that have not are ended then
+
+
+def run_environment(domain: int, logs: Path, shared_memory: bool = True) -> dict[str, str]:
+    """Variables for the processes of a run; this process gets those that its own node needs.
+
+    :param domain: ROS domain.
+    :param logs: directory for ROS's logs.
+    :param shared_memory: whether this process and those that it starts use it: not in real time, nor if they are many.
+    """
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    limit_to_machine(os.environ, shared_memory)
+    os.environ["ROS_LOG_DIR"] = str(logs.resolve())
+    return {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs.resolve())}
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """What is left of a flight."""
+
+    summary: dict[str, Any]  # as in summary.json
+    scenario: Scenario
+    positions: NDArray[np.float64]  # (T, 3, N) m, frame map, at the start of each slot
+    bag: Path
+
+
+def split(agents: int, processes: int) -> list[list[int]]:
+    """Ids of the agents of each process, as evenly as possible."""
+    return [
+        list(range(agents * index // processes + 1, agents * (index + 1) // processes + 1))
+        for index in range(processes)
+    ]
+
+
+def check_options(run: RunConfig, options: FlightOptions) -> None:
+    """What can be known before anything is started.
+
+    :raises ConfigError: for options that do not fit the run.
+    """
+    check_key(run.swarm)
+    make_scenario(run.swarm)  # says so if the field is larger than frames can say
+    agents = run.swarm.agents
+    if options.processes is not None and options.processes > agents:
+        raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
+    if run.swarm.estimator_row.needs_everybody and (options.processes or agents) > 1:
+        raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
+    _check_policy(run, options)
+    late = dict(options.late)
+    for name, value in (("respawn", options.respawn), ("late", late or None)):
+        if value is not None and run.mode == LOCKSTEP:
+            raise ConfigError(name, value, "only with --mode realtime: in lockstep all wait for all")
+        if value is not None:
+            check_joinable(run.swarm.policy)
+    if late and not set(late) < set(range(1, agents + 1)):
+        raise ConfigError("late", late, f"some, not all, of the agents 1 to {agents}")
+    if late and options.processes is not None:
+        raise ConfigError("late", late, "only with --processes per-agent")
+
+
+def _check_policy(run: RunConfig, options: FlightOptions) -> None:
+    """What the policy asks of a flight of nodes."""
+    row = run.swarm.policy_row
+    check_carried(row.name)
+    if row.unslotted and run.mode == LOCKSTEP:
+        raise ConfigError("policy", row.name, "with --mode realtime: in lockstep all frames begin with their slot")
+    if row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or run.swarm.agents) > 1):
+        raise ConfigError("policy", row.name, "in lockstep with --processes 1 only: it looks into all agents")
+
+
+def fly(
+    run: RunConfig,
+    out: str | Path,
+    options: FlightOptions | None = None,
+    stop: Stop | None = None,
+    label: str = "fly",
+    started: Callable[[Children], None] | None = None,
+    observers: Sequence[ChannelObserver] = (),
+    progress: ProgressLine | None = None,
+    watch: Watch | None = None,
+) -> Flight:
+    """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
+
+    :param run: what is flown.
+    :param out: directory for the bag and the results; empty, or not there yet.
+    :param options: how.
+    :param stop: a flag that ends the flight early.
+    :param label: what stands in front of the progress line.
+    :param started: is told the processes once they are started.
+    :param observers: are told what happens on the channel, after all others.
+    :param progress: shows how it goes; None: a line on standard error.
+    :param watch: called before the flight begins, to observe it.
+    :returns: its results, which are also in ``out``.
+    :raises ConfigError: for options that are not usable; nothing has been started then.
+    :raises DtsaError: when a node dies, hangs or sends garbage; the message names it.
+    """
+    options = options or FlightOptions()
+    stop = stop if stop is not None else Stop()
+    check_options(run, options)
+    with ros_domain(options.domain) as domain:
+        directory = new_directory(out)
+        (directory / "log").mkdir()
+        context = Context()
+        few = (options.processes or run.swarm.agents) <= MOST_SHARED
+        environment = run_environment(domain, directory / "log", shared_memory=few and run.mode == LOCKSTEP)
+        children = Children(directory / "log", environment)
+        progress = progress or ProgressLine(label)
+        try:
+            # Started first: the interpreter of each process needs longer than all that follows here.
+            late = _start_agents(children, run, options, directory, stop)
+            try:
+                with stop.at_once():
+                    init_ros(QUIET, context, domain)
+                    if started:
+                        started(children)
+                    node = Node("channel", namespace=names.SWARM, context=context)
+                    declare_channel(node, run.air)
+                    flight = RecordedFlight(node, run, directory, options.startup_s, options.answer_s, END_S)
+            except KeyboardInterrupt:
+                rmtree(directory / BAG, ignore_errors=True)  # there is nothing in it yet
+                raise
+            return _fly(flight, node, directory, children, progress, options, stop, late, observers, watch)
+        finally:
+            children.stop(hurry=bool(stop))
+            with stop.in_time():
+                context.try_shutdown()
+
+
+def _fly(
+    flight: RecordedFlight,
+    node: Node,
+    directory: Path,
+    children: Children,
+    progress: ProgressLine,
+    options: FlightOptions,
+    stop: Stop,
+    late: Sequence[LateStart],
+    observers: Sequence[ChannelObserver],
+    watch: Watch | None,
+) -> Flight:
+    failure: DtsaError | None = None
+    try:
+        channel, measurement = flight.channel, flight.measurement
+        shown = FlightProgress(progress, measurement, channel)
+        supervisor: Supervisor | RealtimeSupervisor = Supervisor(children)
+        if isinstance(channel, RealtimeChannel):
+            supervisor = RealtimeSupervisor(children, channel, measurement, progress.say, options.respawn, late)
+        channel.observe(supervisor, shown, *observers)
+        if watch is not None:
+            watch(flight, supervisor)
+        limit_s = wall_limit_s(options.wall_timeout_s, flight.run_config.limits.timeout_s)
+        ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
+        try:
+            _run(channel, ended, shown, options.priority)
+        except DtsaError as error:
+            failure = error
+        progress.end()
+        children.stop(hurry=bool(stop))
+        try:
+            pictures = options.pictures and not ended and failure is None
+            summary = flight.write_results(pictures, **_cut_short(channel, ended, failure))
+        except OSError:
+            if failure is None:
+                raise
+        if failure is not None:
+            raise failure
+        return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
+    finally:
+        # Last of all: the middleware may stand still for ever if others leave in the same moment.
+        if failure is None and not children.killed:
+            with stop.in_time():
+                node.destroy_node()
+        else:
+            keep_node(node)  # who was killed may have left locks behind
+
+
+def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress, priority: int) -> None:
+    """The flight itself; the channel is closed afterwards."""
+    # Before its agents, and both before all else if that is allowed.
+    first = isinstance(channel, RealtimeChannel) and not take_place(priority and priority + 1, CHANNEL_NICE, False)
+    try:
+        channel.run(ended)
+        shown.show()
+    finally:
+        if ended.stop:
+            channel.hurry()
+        try:
+            channel.close()
+        finally:
+            if first and not ended.stop:  # who has been told to end does so before all else
+                take_priority(0)
+                give_way_by(0)
+
+
+def _cut_short(channel: Any, ended: EarlyEnd, failure: DtsaError | None) -> dict[str, str]:
+    """Why a flight ended before its time, as the summary has it; empty if it did not, or the user ended it."""
+    reason = str(failure or "") or ended.reason or getattr(channel, "fell_behind", "")
+    return {"cut_short": reason} if reason else {}
+
+
+def _start_agents(
+    children: Children, run: RunConfig, options: FlightOptions, directory: Path, stop: Stop
+) -> list[LateStart]:
+    """Starts the agents' processes, but for those that come late.
+
+    :raises KeyboardInterrupt: on a signal; not while a process is being started, so that none is forgotten.
+    """
+    swarm = run.swarm
+    parameters = directory / "parameters.yaml"
+    values = {**to_parameters(swarm.to_dict(), SwarmConfig), "mode": run.mode}
+    content = {"/**": {"ros__parameters": values}}
+    parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    common = ["--ros-args", "--params-file", str(parameters), "--disable-external-lib-logs", "--disable-rosout-logs"]
+    late: list[LateStart] = []
+    if options.processes is None:
+        for agent in range(1, swarm.agents + 1):
+            if stop:
+                raise KeyboardInterrupt
+            place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_arguments(run, [agent], options.priority)]
+            start = partial(children.start, f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
+            if agent in options.late:
+                late.append(LateStart(options.late[agent], agent, start))
+            else:
+                start()
+        return late
+    shared = str(run.mode == LOCKSTEP and may_share(run)).lower()
+    for number, ids in enumerate(split(swarm.agents, options.processes), 1):
+        if stop:
+            raise KeyboardInterrupt
+        own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_table:={shared}"]
+        name = f"swarm_host_{number} with {named(ids)}"
+        children.start(
+            name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_arguments(run, ids, options.priority)]
+        )
+    return late
+
+
+def _clock_arguments(run: RunConfig, ids: list[int], priority: int) -> list[str]:
+    values = clock_parameters(run, ids, priority)
+    return [word for name, value in values.items() for word in ("-p", f"{name}:={_plain(value)}")]
+
+
+def _plain(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)

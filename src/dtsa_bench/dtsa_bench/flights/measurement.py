@@ -1,0 +1,105 @@
+"""Measures a flight of nodes and knows when it is over."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import AbstractSwarm, Scenario
+from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.runs.hearing import Hearing
+from dtsa_bench.runs.metrics import FlightMetrics, metrics_tables
+from dtsa_channel_sim.model.verdict import Verdict
+from dtsa_channel_sim.ros.answers import Answers
+from dtsa_channel_sim.ros.observer import ChannelObserver, Referee
+
+from .position_log import PositionLog
+
+
+class FlightMeasurement(ChannelObserver, Referee):
+    """Follows a flight with the metrics; as its referee, ends it when they say so.
+
+    :param run: the run.
+    :param scenario: its scenario.
+    """
+
+    def __init__(self, run: RunConfig, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.metrics = FlightMetrics(run, scenario)
+        self.hearing = Hearing(run.swarm.agents)
+        self.positions = PositionLog(run.swarm.agents)
+        self.begin_s = self.end_s = 0.0  # wall clock: slot 0 answered by all, flight over; 0: not yet
+        self._tables = metrics_tables(run, scenario, everyone=True)
+        self._agents = run.swarm.agents
+        self._oracle = run.swarm.estimator_row.needs_everybody
+        self._outcome = 0
+        self._lengths: list[int] = []  # of the frames of the slot that is being flown
+        self._compared = self._tables.digest, self._tables.chosen  # of the slot that is being flown
+
+    @property
+    def tables(self) -> AbstractSwarm:
+        """What each agent knows by what it has received: one table an agent."""
+        return self._tables
+
+    @property
+    def wall_time_s(self) -> float:
+        """Wall-clock time of the flight so far, s."""
+        return max(0.0, (self.end_s or time.monotonic()) - self.begin_s) if self.begin_s else 0.0
+
+    def begun(self, at_s: float) -> None:
+        self.begin_s = at_s
+
+    def all_answered(self, slot: int, answers: Answers) -> None:
+        self.positions.append(answers.position)
+        if not slot:
+            self.begin_s = self.begin_s or time.monotonic()
+            return
+        self.metrics.compare_tables(slot - 1, *self._compared)
+        if self._oracle:
+            self._tables.estimate_position[:] = answers.position
+        if self.metrics.update(slot - 1, answers.track, self._tables, self._outcome, self._lengths):
+            self.end_s = time.monotonic()
+
+    def over(self, slot: int, answers: Answers) -> bool:
+        return bool(self.metrics.end)
+
+    @property
+    def reason(self) -> str:
+        return str(self.metrics.end or "")
+
+    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        self._outcome = verdict.outcome
+        self._compared = answers.digest.copy(), answers.chosen.copy()
+        self._lengths = [len(frames[sender]) for sender in verdict.senders]
+        self.scenario.advance(slot, self._tables)  # what all know about each other's goals
+        mask = verdict.mask(self._agents)
+        self.hearing.slot(len(verdict.senders), mask)
+        if answers.taken_in is not None:  # in real time the receivers themselves know best
+            for taken in answers.taken_in:
+                self._hear(taken.slot, taken.data, taken.mask)
+        else:
+            for row, sender in enumerate(verdict.senders):
+                if mask[row].any():
+                    self._hear(slot, frames[sender], mask[row])
+        self._tables.end(slot)
+
+    def _hear(self, slot: int, data: bytes, mask: NDArray[np.bool_]) -> None:
+        if self._tables.hear(slot, data, mask):
+            self.hearing.take_in(mask)
+
+    def agent_silent(self, agent: int) -> None:
+        self.metrics.lose(agent)
+
+    def agents_back(self, agents: list[int]) -> None:
+        for agent in agents:
+            self.metrics.regain(agent)
+
+    def close(self) -> None:
+        self.end_s = self.end_s or (time.monotonic() if self.begin_s else 0.0)
+
+    def summary(self) -> dict[str, Any]:
+        """The results so far, with the keys of ``summary.json``."""
+        return self.metrics.summary(self.wall_time_s)

@@ -1,0 +1,185 @@
+"""The channel with a recorder and the metrics in one process: what makes a run of nodes a recorded flight."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+
+from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core.settings.agreement import agreed_settings
+from dtsa_agent.core.settings.declaration import Setting, settings_of
+from dtsa_agent.keys import check_key
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
+from dtsa_agent.ros.common.graph.parameters import declare_setting, declare_settings
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_agent.ros.common.process.node_process import ending, run_node
+from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
+from dtsa_agent.ros.common.process.runs import Run
+from dtsa_bench.runs.config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
+from dtsa_bench.runs.options import new_directory
+from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig
+from dtsa_channel_sim.ros.answer_limits import AnswerLimits
+from dtsa_channel_sim.ros.channel_node import follow_parameters, watch
+from dtsa_channel_sim.ros.lockstep import LockstepChannel
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
+
+from .clock_statistics import ClockStatistics
+from .live_topics import LiveTopics
+from .machine import DeliveryStatistics, channel_summary, warning
+from .measurement import FlightMeasurement
+from .memory import keep_heap_small
+from .recorder import FlightRecorder
+
+BAG = "bag"  # the bag's directory within a flight's directory
+
+
+class RecordedFlight:
+    """A channel, and those that observe it in a recorded flight.
+
+    :param node: the ROS node; the channel's settings are its parameters.
+    :param run: the run.
+    :param directory: the flight's directory; the bag becomes a directory in it.
+    :param startup_s: s of wall time that all agents have to answer for the first time.
+    :param answer_s: s of wall time that all agents have to answer any later slot, in lockstep.
+    :param end_s: s of wall time that the nodes have to hear of the end.
+    :param space: namespace of the swarm's topics; those in the bag have the default one.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        run: RunConfig,
+        directory: Path,
+        startup_s: float,
+        answer_s: float,
+        end_s: float = 4.0,
+        space: str = names.SWARM,
+    ) -> None:
+        keep_heap_small()
+        identity = Run.draw(run.swarm.auth_session)
+        agreed = agreed_settings(run.swarm, run.mode)
+        if run.swarm.auth:  # the bag says in which session its frames are authentic
+            run = replace(run, swarm=replace(run.swarm, auth_session=identity.session))
+        self.run_config, self.directory = run, directory
+        self.scenario = make_scenario(run.swarm)
+        self.measurement = FlightMeasurement(run, self.scenario)
+        model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
+        slotted = not run.swarm.policy_row.unslotted
+        self.run_id = identity.number
+        limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed}
+        limits["swarm_namespace"] = space
+        self.channel: LockstepChannel | RealtimeChannel
+        if run.mode == LOCKSTEP:
+            self.channel = LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
+        else:
+            self.channel = RealtimeChannel(node, model, steps, referee=referee, slotted=slotted, **limits)
+        # The recorder comes first: whatever happens to the others, the bag is complete.
+        self.channel.observe(
+            FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
+            self.measurement,
+            LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
+        )
+        watch(self.channel, node, run.to_dict(), space)
+        self._clocks, self._delivery = ClockStatistics(run.swarm.agents, slotted), DeliveryStatistics(run.swarm.agents)
+        if run.mode != LOCKSTEP:
+            self.channel.observe(self._clocks, self._delivery)
+        follow_parameters(node, model, self.channel.change_settings)
+
+    def summary(self) -> dict[str, Any]:
+        """The flight's results."""
+        channel = self.channel
+        result = {**self.measurement.summary(), "unusable_messages": channel.unusable}
+        result["not_taken_in"] = kept_out = dict(sorted(channel.dropped().items()))
+        hearing = self.measurement.hearing
+        hearing.settle(kept_out)
+        result["receptions"] = {"delivered": hearing.delivered, "taken_in": hearing.taken_in}
+        result["unheard"] = hearing.problem(kept_out) or None
+        if isinstance(channel, RealtimeChannel):
+            result |= {
+                "mode": self.run_config.mode,
+                "returned_agents": sorted(channel.returned),
+                **channel_summary(channel),
+                **self._delivery.summary(),
+                **self._clocks.summary(),
+            }
+            result["warning"] = warning(channel, result)
+        return result
+
+    def write_results(self, pictures: bool = True, **more: Any) -> dict[str, Any]:
+        """Writes ``summary.json`` and ``trajectories.png``; the channel is closed.
+
+        :param pictures: whether the picture is drawn.
+        :param more: further results.
+        :returns: the summary.
+        """
+        summary = {**self.summary(), **more}
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        (self.directory / "summary.json").write_text(text, encoding="utf-8")
+        positions = self.measurement.positions
+        if positions and pictures:
+            from dtsa_bench.drawing.flight_paths import draw_flight
+
+            picture = self.directory / "trajectories.png"
+            draw_flight(picture, self.run_config, self.scenario, positions.array(), summary)
+        return summary
+
+
+def declare_run(node: Node) -> RunConfig:
+    """Declares all settings of a run as parameters and reads them.
+
+    :raises ConfigError: for settings that are not usable.
+    """
+    swarm = SwarmConfig.from_dict(declare_settings(node, SwarmConfig))
+    channel = declare_settings(node, ChannelConfig, skip=FROM_SWARM, changeable=True)
+    file = declare_setting(node, Setting("channel_file", "text", "", "YAML file with further settings of the channel"))
+    derived = from_swarm(swarm)
+    if file:
+        defaults = {spec.name: spec.default for spec in settings_of(ChannelConfig)}
+        given = {name: value for name, value in channel.items() if value != defaults[name]}
+        air = ChannelConfig.from_yaml(file, **given, **derived)
+    else:
+        air = ChannelConfig.from_dict({**channel, **derived})
+    limits = RunLimits(**declare_settings(node, RunLimits))
+    clocks = ClockConfig(**declare_settings(node, ClockConfig, prefix="clocks."))
+    plain = {
+        spec.name: declare_setting(node, spec) for spec in settings_of(RunConfig) if spec.name in ("mode", "align")
+    }
+    return RunConfig(swarm, air, limits, clocks=clocks, **plain)
+
+
+def _body(stop: Stop, supervised: bool) -> None:
+    node, space = swarm_wide_node("channel")
+    with ending(node):
+        run = declare_run(node)
+        check_key(run.swarm)
+        directory = new_directory(declare_setting(node, Setting("out", "text", "flight", "directory for the results")))
+        wait = AnswerLimits(**declare_settings(node, AnswerLimits))
+        first = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
+        flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s, space=space)
+        try:
+            if run.mode != LOCKSTEP:
+                take_priority(first)
+            flight.channel.run(stop)
+        finally:
+            flight.channel.close()
+        summary = flight.write_results()
+        node.get_logger().info(f"flight {summary['end']}; results in {directory}")
+        if summary["unheard"] and not stop:
+            raise DtsaError(summary["unheard"])
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node ``recorded_channel``."""
+    return run_node("recorded_channel", _body, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

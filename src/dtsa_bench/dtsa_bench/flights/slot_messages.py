@@ -1,0 +1,154 @@
+"""What follows from a slot, as messages: decisions, receptions, and a picture of the swarm."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass
+from functools import lru_cache
+from struct import Struct
+
+import numpy as np
+from dtsa_msgs.msg import Transmission
+from numpy.typing import NDArray
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Header
+
+from dtsa_agent.core import REASONS, Scenario
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.cdr import FRAME, REPRESENTATION, Layout
+from dtsa_agent.ros.common.wire.packing import pack_received
+from dtsa_agent.ros.common.wire.stamps import header_of
+from dtsa_bench.recordings.bag.cdr import COLLIDED, QUIET, SECOND, SENDING, WAITING, MarkerPacker
+from dtsa_channel_sim.model.verdict import COLLISION, Verdict
+from dtsa_channel_sim.ros.answers import Answers
+
+_KNOWN = 256  # combinations of reasons whose texts are kept
+
+
+@dataclass(frozen=True, slots=True)
+class _Reasons:
+    """A decision message of agents with certain reasons: its layout, and what is the same in all of them."""
+
+    layout: Struct
+    names: tuple[int | bytes, ...]  # number of names, then length and text of each
+    index: bytes
+
+
+@lru_cache(256)
+def _decision_layout(n: int, sizes: tuple[int, ...]) -> Struct:
+    """Of a decision message of n agents and names of these lengths."""
+    layout = Layout().header().numbers("II").sequence(n, 2).sequence(n, 2).numbers("I")
+    for size in sizes:
+        layout.sequence(size, 1)
+    return layout.sequence(n, 1).sequence(n, 1).sequence(n, 4).sequence(n, 8).struct()
+
+
+@lru_cache(256)
+def _reception_layout(senders: int, width: int) -> Struct:
+    """Of a reception message with this many senders and bytes of receivers for each."""
+    layout = Layout().header().numbers("IIB").sequence(senders, 2).sequence(senders * width, 1)
+    return layout.sequence(senders, 2).sequence(senders, 2).struct()
+
+
+class SlotMessages:
+    """Packs what the agents of a swarm decided in a slot, who received what, and where everybody was.
+
+    :param scenario: the scenario.
+    :param slot_ns: ns, length of a slot.
+    :param run_id: the run's id.
+    """
+
+    def __init__(self, scenario: Scenario, slot_ns: int, run_id: int) -> None:
+        self._scenario, self._slot_ns, self._run_id = scenario, slot_ns, run_id
+        self._agents = scenario.start.shape[1]
+        self._ids = array("H", range(1, self._agents + 1)).tobytes()
+        self._reasons: dict[bytes, _Reasons] = {}
+        self._markers = MarkerPacker([f"cf{agent}" for agent in range(1, self._agents + 1)])
+
+    def _header(self, slot: int) -> Header:
+        return header_of(names.slot_time_ns(slot, self._slot_ns))
+
+    def transmission(self, slot: int, answers: Answers) -> bytes:
+        """A dtsa_msgs/Transmission as CDR, of all agents that have reported for a slot in real time.
+
+        :param slot: the slot.
+        :param answers: what they reported, and their frames.
+        """
+        here = np.flatnonzero(answers.answered)
+        frames = [answers.frames.get(int(index) + 1, b"") for index in here]
+        planes = {name: getattr(answers, name)[..., here] for name in ("track", "velocity", "command", "goal")}
+        message = Transmission(
+            header=self._header(slot),
+            run=self._run_id,
+            slot=slot,
+            agent=array("H", (here + 1).astype(np.uint16).tobytes()),
+            length=array("B", [len(frame) for frame in frames]),
+            data=array("B", b"".join(frames)),
+            offset_ns=array("q", answers.offset_ns[here].tobytes()),
+            chosen=array("H", answers.chosen[here].tobytes()),
+            reason=array("B", answers.reason[here].tobytes()),
+            digest=array("I", answers.digest[here].tobytes()),
+            score=array("d", answers.score[here].tobytes()),
+            steps=answers.steps,
+            **{name: array("d", values.tobytes()) for name, values in planes.items()},
+        )
+        return bytes(serialize_message(message))
+
+    def decision(self, slot: int, answers: Answers) -> bytes:
+        """A dtsa_msgs/Decision as CDR.
+
+        :param slot: the slot.
+        :param answers: what the agents answered to it.
+        """
+        key, n = answers.reason.tobytes(), self._agents
+        known = self._reasons.get(key)
+        if known is None:
+            if len(self._reasons) >= _KNOWN:  # in a long flight agents that disagree decide in ever new combinations
+                self._reasons.clear()
+            known = self._reasons[key] = self._describe(answers.reason)
+        return known.layout.pack(
+            *self._begin(slot), slot, n, self._ids, n, answers.chosen.tobytes(), *known.names, n, known.index, n, key,
+            n, answers.digest.tobytes(), n, answers.score.tobytes(),
+        )  # fmt: skip
+
+    def _begin(self, slot: int) -> tuple[bytes | int, ...]:
+        """What stands before all else in a message about the start of a slot, and the run's id."""
+        seconds, ns = divmod(names.slot_time_ns(slot, self._slot_ns), SECOND)
+        return REPRESENTATION, seconds, ns, *FRAME, self._run_id
+
+    def _describe(self, reason: NDArray[np.uint8]) -> _Reasons:
+        n, used = self._agents, np.unique(reason)
+        texts = [(REASONS[code] if code < len(REASONS) else str(code)).encode() + b"\0" for code in used]
+        layout = _decision_layout(n, tuple(len(text) for text in texts))
+        told = (item for text in texts for item in (len(text), text))
+        return _Reasons(layout, (len(texts), *told), np.searchsorted(used, reason).astype(np.uint8).tobytes())
+
+    def reception(self, slot: int, verdict: Verdict) -> bytes:
+        """A dtsa_msgs/Reception as CDR.
+
+        :param slot: the slot.
+        :param verdict: the channel's verdict on it.
+        """
+        count, width = len(verdict.senders), (self._agents + 7) // 8
+        nothing = (0,) * count
+        received = pack_received(verdict.mask(self._agents)) if count else b""
+        sent, lost, collided = (
+            array("H", numbers).tobytes()
+            for numbers in (verdict.senders, verdict.lost or nothing, verdict.collided or nothing)
+        )
+        return _reception_layout(count, width).pack(
+            *self._begin(slot + 1), slot, verdict.outcome,
+            count, sent, count * width, received, count, lost, count, collided,
+        )  # fmt: skip
+
+    def markers(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
+        """A visualization_msgs/MarkerArray as CDR: the swarm at the start of a slot.
+
+        :param slot: the slot.
+        :param answers: what the agents answered to it.
+        :param verdict: the channel's verdict on it.
+        """
+        state = np.where(self._scenario.moving, WAITING, QUIET).astype(np.uint8)
+        state[[sender - 1 for sender in verdict.senders]] = COLLIDED if verdict.outcome == COLLISION else SENDING
+        time_ns = names.slot_time_ns(slot, self._slot_ns)
+        return self._markers.pack(time_ns, answers.position, state, answers.goal)

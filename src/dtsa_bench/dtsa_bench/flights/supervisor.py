@@ -1,0 +1,149 @@
+"""Looks after the processes of a flight while it is under way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from dtsa_agent.core.agents.joining import check_joinable
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros.common.workarounds.dds import clean_shared_memory
+from dtsa_channel_sim.ros.answers import named
+from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
+from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S, RealtimeChannel
+
+from .children import Child, Children, NodeError, describe_end
+from .machine import tight
+from .measurement import FlightMeasurement
+
+
+class Supervisor(ChannelObserver):
+    """Ends the run when a process has ended: in lockstep a flight cannot go on without one of them.
+
+    :param children: the processes.
+    """
+
+    def __init__(self, children: Children) -> None:
+        self._children = children
+
+    def idle(self, status: ChannelStatus) -> None:
+        self._children.check()
+
+
+@dataclass(frozen=True, slots=True)
+class LateStart:
+    """An agent whose process is started while the flight is under way."""
+
+    after_s: float  # s after slot 0
+    agent: int
+    start: Callable[[], None]
+
+
+class RealtimeSupervisor(ChannelObserver):
+    """In real time the others fly on when a process ends, and it may be started again.
+
+    :param children: the processes.
+    :param channel: the channel, which is told who is gone.
+    :param measurement: the flight so far, which is told who will come back.
+    :param say: prints a line that stays.
+    :param respawn_s: s of wall time after which a process that died is started again; None: it is not.
+    :param late: agents that are started while the flight is under way.
+    """
+
+    def __init__(
+        self,
+        children: Children,
+        channel: RealtimeChannel,
+        measurement: FlightMeasurement,
+        say: Callable[[str], None],
+        respawn_s: float | None = None,
+        late: Sequence[LateStart] = (),
+    ) -> None:
+        self._children, self._channel, self._measurement, self._say = children, channel, measurement, say
+        self._respawn_s = respawn_s
+        self._late = sorted(late, key=lambda start: start.after_s)
+        self._dead: list[tuple[float, Child]] = []  # time.monotonic() at which each is started again
+        self._new = {start.agent for start in late}  # those that have never taken part
+        for start in late:
+            measurement.metrics.awaited.add(start.agent)
+            channel.expect_later(start.agent, measurement.scenario.start[:, start.agent - 1])
+
+    def begun(self, at_s: float) -> None:
+        if text := tight(self._channel):
+            self._say(text)
+
+    def idle(self, status: ChannelStatus) -> None:
+        begin_s = self._measurement.begin_s
+        for child in self._children.ended():
+            if not begin_s:
+                self._children.check()
+            self._miss(child)
+        while self._dead and time.monotonic() >= self._dead[0][0]:
+            self._start_again(self._dead.pop(0)[1])
+        while self._late and begin_s and time.monotonic() - begin_s >= self._late[0].after_s:
+            start = self._late.pop(0)
+            start.start()
+            self._say(f"{named([start.agent])} is started")
+
+    def _miss(self, child: Child) -> None:
+        """Takes note that a process has ended.
+
+        :raises NodeError: when nobody is left.
+        """
+        left = not child.process.returncode
+        clean_shared_memory()  # before anybody takes the dead one's port for a living one's
+        self._say(f"{f'{child.name} has left' if left else describe_end(child)}; the others fly on")
+        for agent in child.agents:
+            self._channel.lose(agent)
+        if self._respawn_s is not None and not left:
+            self._dead.append((time.monotonic() + self._respawn_s, child))
+            self._measurement.metrics.awaited.update(child.agents)
+        if len(self._channel.lost) == self._channel.agents and not self._dead and not self._late:
+            raise NodeError(f"nobody is left: {describe_end(child)}")
+
+    def _start_again(self, child: Child) -> None:
+        """Starts the program of some agents again; their vehicles have gone on hovering where they were."""
+        places = [value for agent in child.agents for value in self._channel.last_place(agent)]
+        self._children.again(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
+        self._say(f"{child.name} is started again")
+
+    def kill(self, agent: int) -> str:
+        """Kills the process of an agent, as a fault would; says what was done.
+
+        :param agent: its id.
+        :raises ConfigError: if it has none that runs.
+        """
+        child = self._child(agent)
+        if child is None or child.process.poll() is not None:
+            raise ConfigError("agent", f"cf{agent}", "one whose process runs")
+        child.process.kill()
+        return f"{child.name} is killed"
+
+    def start(self, agent: int) -> str:
+        """Starts the process of an agent that has ended; says what was done.
+
+        :param agent: its id.
+        :raises ConfigError: if it runs, or its policy lets nobody come late.
+        """
+        child = self._child(agent)
+        if child is None or child.process.poll() is None:
+            raise ConfigError("agent", f"cf{agent}", "one whose process has ended")
+        check_joinable(self._measurement.metrics.run.swarm.policy)
+        self._dead = [entry for entry in self._dead if entry[1] is not child]
+        self._measurement.metrics.awaited.update(child.agents)
+        self._start_again(child)
+        return f"{child.name} is started"
+
+    def _child(self, agent: int) -> Child | None:
+        return next((child for child in self._children.all if agent in child.agents), None)
+
+    def agents_back(self, agents: list[int]) -> None:
+        again = "" if self._new.issuperset(agents) else " again"
+        self._new.difference_update(agents)
+        self._say(f"{named(agents)} {'takes' if len(agents) == 1 else 'take'} part{again}")
+
+    def agent_silent(self, agent: int) -> None:
+        known = {agent for child in self._children.all if child.process.poll() is not None for agent in child.agents}
+        if agent not in known | {start.agent for start in self._late}:
+            self._say(f"{named([agent])} has not been heard of for {LOST_AFTER_S:g} s; the others fly on")

@@ -1,0 +1,108 @@
+"""An agent in flight, without what only its command line needed.
+
+`tools/dtsa agent` reads its options, finds out what takes more than an agent in flight has, and then
+`commands.agent_process` takes its place: the same process with less memory. What it needs before or after a flight it
+imports there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+    from dtsa_agent.air.udp.prepared import Prepared
+    from dtsa_agent.core import SwarmConfig
+    from dtsa_agent.stop import Stop
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """A flight of one agent."""
+
+    own: AgentSettings
+    config: SwarmConfig
+    udp: UdpSettings
+    prepared: Prepared
+    out: str | None  # directory for its bag and summary; None: there are none
+    as_json: bool  # print the summary as JSON
+
+
+def become(order: Order, program: str) -> None:
+    """This process becomes one that only flies; returns where that is not possible.
+
+    :param order: what it flies.
+    :param program: name of the module that it becomes; its first word is the file descriptor of the pickled order.
+    """
+    with suppress(OSError):
+        given = os.memfd_create("order", 0)  # it is inherited
+        with os.fdopen(os.dup(given), "wb") as file:
+            pickle.dump(order, file)
+        os.lseek(given, 0, os.SEEK_SET)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        paths = os.pathsep.join(path for path in sys.path if path)
+        # -S: what is on the path is known, and to find it out again takes memory.
+        words = [sys.executable, "-S", "-m", program, str(given), *sys.argv[1:]]
+        os.execve(sys.executable, words, {**os.environ, "PYTHONPATH": paths})
+
+
+def fly(order: Order) -> int:
+    """Flies until a signal comes, and prints what came of it.
+
+    :param order: what to fly.
+    :returns: exit code.
+    :raises ConfigError: for a network, a directory or an id that cannot be used.
+    :raises BagError: if the record is not whole.
+    """
+    from dtsa_agent.air.udp import UdpAgent
+    from dtsa_agent.stop import Stop
+
+    failure, directory = "", None
+    with Stop() as stop, UdpAgent(order.own, order.config, order.udp, prepared=order.prepared) as agent:
+        if order.out is None:
+            agent.run(stop)
+        else:
+            from dtsa_bench.runs.options import new_directory
+
+            directory = new_directory(order.out)
+            failure = _run_recorded(agent, stop, directory)
+    summary = agent.summary()
+    text = json.dumps(summary, indent=2) + "\n"
+    if directory is not None:
+        (directory / "summary.json").write_text(text, encoding="utf-8")
+    from dtsa_bench.runs.hearing import of_datagrams
+    from dtsa_bench.runs.summary_text import describe  # what is needed afterwards only takes no memory in flight
+
+    print(text if order.as_json else describe(summary), end="")
+    not_taken_in = summary["not_taken_in"]
+    hearing = of_datagrams(
+        2, *(summary[key] for key in ("slots", "sent", "heard")), not_taken_in
+    )  # this agent and the others
+    problem = hearing.problem(not_taken_in) if hearing.delivered else ""  # who is alone hears nobody
+    if problem:
+        print(f"dtsa: cf{summary['id']}: {problem}", file=sys.stderr)
+    if failure:
+        from dtsa_bench.recordings.bag.errors import BagError
+
+        raise BagError(failure)
+    return int(bool(problem))
+
+
+def _run_recorded(agent: UdpAgent, stop: Stop, directory: Path) -> str:
+    """Flies, and records it; why the record is not whole, or an empty text."""
+    from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
+
+    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, agent.udp) as recorder:
+        agent.watcher = recorder
+        agent.run(stop)
+        recorder.finish(agent.summary())
+    return recorder.failure

@@ -1,0 +1,114 @@
+"""Listens to the frames of a swarm without taking part: records them, and judges what the air alone can tell."""
+
+from __future__ import annotations
+
+import json
+import select
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.air.udp import MulticastSocket, UdpSettings
+from dtsa_agent.air.udp.datagram import HEADER, Wrapping
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.keys import authenticator
+from dtsa_agent.stop import Stop
+from dtsa_bench.recordings.merge.json_bag import JsonBag, described
+from dtsa_bench.recordings.rules.judge import Judge
+
+FRAME, METADATA = "frame", "dtsa_sniffer"
+FRAME_SCHEMA = described(
+    "dtsa.SniffedFrame",
+    arrival_ns=("integer", "when it arrived, ns, CLOCK_MONOTONIC"),
+    sender=("integer", "id that it names; 0: it was no frame of this swarm"),
+    slot=("integer", "slot that it names"),
+    data=("string", "the datagram, hexadecimal"),
+    reason=("string", "why it is no frame of this swarm; empty: it is one"),
+)
+_PATIENCE_S = 0.05
+_BURST = 64
+_WAITS = 2  # slots that are kept open for frames that come late
+_MOST_REFUSED = 50  # recorded from one flush to the next
+
+
+class Sniffer:
+    """One who listens.
+
+    :param config: the settings that all agents share.
+    :param udp: the network.
+    :param path: file for what was heard; None: it is only judged.
+    :raises ConfigError: for a network that cannot be used, or without the key of sealed frames.
+    """
+
+    def __init__(self, config: SwarmConfig, udp: UdpSettings, path: Path | None = None) -> None:
+        self._wrapping, self._judge = Wrapping(config, authenticator(config)), Judge(config)
+        self._slots: dict[int, dict[int, bytes]] = {}  # not judged yet
+        self._judged = -1  # last slot
+        self.refused: Counter[str] = Counter()
+        self.heard: Counter[int] = Counter()  # frames, by sender
+        self._kept = 0  # refused datagrams since the last flush
+        self._socket = MulticastSocket(udp)
+        about = {"swarm": json.dumps(config.to_dict(), sort_keys=True), "udp": json.dumps(udp.to_dict())}
+        self.bag = None if path is None else JsonBag(path, {FRAME: FRAME_SCHEMA}, METADATA, about)
+
+    def run(self, stop: Stop, seconds: float = 0.0) -> None:
+        """Listens until a signal comes, or for a time.
+
+        :param stop: the signal flag.
+        :param seconds: how long; 0: without end.
+        """
+        end = time.monotonic() + seconds
+        while not stop and not (seconds and time.monotonic() >= end):
+            select.select([self._socket], [], [], _PATIENCE_S)
+            for datagram in self._socket.receive(_BURST):
+                self._take(datagram.data, datagram.arrival_ns)
+            if self.bag is not None and self.bag.flush_if_due():
+                self._kept = 0
+        for slot in sorted(self._slots):
+            self._judge.slot(slot, self._slots[slot])
+        self._slots.clear()
+
+    def _take(self, data: bytes, arrival_ns: int) -> None:
+        sender, slot, reason = self._read(data)
+        if self.bag is not None and (not reason or self._kept < _MOST_REFUSED):
+            self._kept += bool(reason)
+            said = {"arrival_ns": arrival_ns, "sender": sender, "slot": slot, "data": data.hex(), "reason": reason}
+            self.bag.write(FRAME, arrival_ns, said)
+        if reason:
+            self.refused[reason] += 1
+            return
+        self.heard[sender] += 1
+        self._slots.setdefault(slot, {})[sender] = data[HEADER:]
+        for over in sorted(s for s in self._slots if s <= max(self._slots) - _WAITS):
+            self._judge.slot(over, self._slots.pop(over))
+            self._judged = over
+
+    def _read(self, data: bytes) -> tuple[int, int, str]:
+        fault, sender, slot, *_ = self._wrapping.read(data)
+        if fault:
+            return 0, 0, fault
+        # Of a group that lies behind, or the same frame once more.
+        if slot <= self._judged:
+            return sender, slot, "other time"
+        return sender, slot, "repeated" if sender in self._slots.get(slot, {}) else ""
+
+    def summary(self) -> dict[str, Any]:
+        """What was heard, and what was found."""
+        return {
+            "heard": {f"cf{agent}": count for agent, count in sorted(self.heard.items())},
+            "not_taken_in": dict(sorted(self.refused.items())),
+            **self._judge.summary(),
+        }
+
+    def close(self) -> None:
+        """Ends the record, and leaves the network."""
+        self._socket.close()
+        if self.bag is not None:
+            self.bag.__exit__()
+
+    def __enter__(self) -> Sniffer:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()

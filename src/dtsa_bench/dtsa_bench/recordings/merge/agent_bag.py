@@ -1,0 +1,131 @@
+"""Reads the bag that an agent on a network has made of its own flight."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+from zstandard import ZstdError
+
+from dtsa_agent.air.udp import Heard, SlotRecord
+from dtsa_agent.air.udp.datagram import flight_ns
+from dtsa_agent.core import SwarmConfig
+from dtsa_bench.recordings.bag.errors import UnusableBag
+
+from .agent_recorder import METADATA, REFUSED, SLOT, SUMMARY
+
+_LONGEST_RECORD = 1 << 24  # bytes
+_DAMAGE = (McapError, ZstdError, struct.error, EOFError, ValueError, KeyError, TypeError, AttributeError)
+
+
+@dataclass(slots=True)
+class AgentBag:
+    """What one agent said about itself."""
+
+    path: Path
+    agent: int  # id
+    swarm: SwarmConfig
+    udp: dict[str, Any]
+    started_ns: int  # own clock, when its process began
+    slots: list[SlotRecord] = field(default_factory=list)  # ascending
+    refused: Counter[str] = field(default_factory=Counter)  # datagrams not taken in, by reason
+    summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
+    broken_off: bool = False  # the file was not finished
+    unsent_kept: bool = True  # frames that were too late to be sent are in it
+
+    @property
+    def flight_ns(self) -> int:
+        """From the order to send a frame to its arrival as the agents take it to be, ns."""
+        return flight_ns(self.swarm, int(self.udp["flight_time_ns"]), int(self.udp["byte_time_ns"]))
+
+
+def find(path: str | Path) -> Path:
+    """The file of what was given as an agent's bag.
+
+    :param path: the file, or a directory with one in it.
+    :raises UnusableBag: if there is none, or several.
+    """
+    given = Path(path)
+    if not given.is_dir():
+        if not given.is_file():
+            raise UnusableBag(given, "there is no such file or directory")
+        return given
+    found = sorted(given.glob("*.mcap"))
+    if len(found) != 1:
+        raise UnusableBag(given, f"holds {len(found)} .mcap files; name one")
+    return found[0]
+
+
+def read(path: str | Path) -> AgentBag:
+    """The bag of an agent; of a file that was not finished, what is whole.
+
+    :param path: see :func:`find`.
+    :raises UnusableBag: if it is no bag of an agent on a network.
+    """
+    file = find(path)
+    bag: AgentBag | None = None
+    topics: dict[int, str] = {}
+    finished = False
+    try:
+        with file.open("rb") as stream:
+            try:
+                for record in StreamReader(stream, validate_crcs=True, record_size_limit=_LONGEST_RECORD).records:
+                    if isinstance(record, Channel):
+                        topics[record.id] = record.topic
+                    elif isinstance(record, Metadata):
+                        bag = _metadata(file, record, bag)
+                    elif isinstance(record, Message) and bag is not None:
+                        _message(bag, topics.get(record.channel_id, ""), json.loads(record.data))
+                finished = True
+            except UnusableBag:
+                raise
+            except _DAMAGE as error:
+                if bag is None:
+                    raise UnusableBag(file, f"not readable ({error})") from None
+    except OSError as error:
+        raise UnusableBag(file, error.strerror or str(error)) from None
+    if bag is None:
+        raise UnusableBag(file, "no bag of an agent on a network, as `tools/dtsa agent --out` makes them")
+    bag.broken_off = not finished
+    return bag
+
+
+def _metadata(file: Path, record: Metadata, bag: AgentBag | None) -> AgentBag | None:
+    values = record.metadata
+    if record.name == METADATA:
+        try:
+            swarm = SwarmConfig.from_dict(json.loads(values["swarm"]))
+            return AgentBag(file, int(values["id"]), swarm, json.loads(values["udp"]), int(values["started_ns"]))
+        except (KeyError, ValueError) as error:
+            raise UnusableBag(file, f"its settings cannot be read ({error})") from None
+    if record.name == SUMMARY and bag is not None:
+        bag.summary = json.loads(values.get("summary", "{}"))
+    return bag
+
+
+def _message(bag: AgentBag, topic: str, said: dict[str, Any]) -> None:
+    if topic == REFUSED:
+        bag.refused[str(said["reason"])] += 1
+    elif topic == SLOT:
+        arrays = {name: np.array(said.pop(name), dtype=np.float64) for name in _ARRAYS}
+        heard = {name: [_heard(one) for one in said.pop(name)] for name in ("before", "heard")}
+        data = {name: bytes.fromhex(said.pop(name)) for name in ("frame", "datagram")}
+        record = SlotRecord(**said, **arrays, **heard, **data)
+        if bag.slots and record.slot <= bag.slots[-1].slot:
+            raise UnusableBag(bag.path, f"slot {record.slot} comes after slot {bag.slots[-1].slot}")
+        bag.slots.append(record)
+
+
+_ARRAYS = ("track", "velocity", "command", "goal")
+
+
+def _heard(said: dict[str, Any]) -> Heard:
+    return Heard(said["sender"], said["slot"], said["arrival_ns"], bytes.fromhex(said["datagram"]), said["accepted"])

@@ -1,0 +1,259 @@
+"""The bags of the agents of one flight on one time line: what no single one of them could know."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dtsa_agent.air.udp import SlotRecord
+from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.recordings.rules.judge import Judge
+from dtsa_bench.runs.hearing import of_datagrams
+
+from .agent_bag import AgentBag
+from .merged_flight import ended, fly
+from .replay import Replay
+from .timeline import Crossing, Life, TimeLine, fit, named
+
+_END = 50  # slots
+
+
+class Sent(NamedTuple):
+    """A frame that was handed to the network."""
+
+    life: Life
+    record: SlotRecord
+
+
+class Merge:
+    """Bags of one flight on one time line.
+
+    :param bags: one a process, in any order; an agent that came back has several.
+    :raises ConfigError: for bags of different swarms, two of one agent at one time, or none with a slot in it.
+    """
+
+    def __init__(self, bags: Sequence[AgentBag]) -> None:
+        self.lives = _lives(bags)
+        self.config = bags[0].swarm
+        self.sent = sent_of(self.lives)
+        self.strange, self._crossings = _crossings(self.lives, self.sent)
+        self.line = fit(self._crossings, bags[0].flight_ns)
+        self.turns = _Turns(self.lives, self.line, self.config.slot_ns)
+
+    def judge(self, air_ns: int = 0) -> dict[str, Any]:
+        """Judges the flight; once.
+
+        :param air_ns: ns that a frame is on the air, to tell which overlapped there; 0: only turns are compared.
+        :returns: the results, plain values.
+        """
+        lives, line, common_slot = self.lives, self.line, self.turns.common_slot
+        replays = {life: Replay(bag) for life, bag in lives.items()}
+        on_line = {life: lives[life] for life in line.clocks}
+        flown = ended(fly(on_line, replays, senders_of(lives, self.sent), common_slot))
+        for life in lives.keys() - line.clocks.keys():  # slots of its own, which are nobody else's
+            for record in lives[life].slots:
+                replays[life].fly(record)
+        here = {agent for agent, _ in lives}
+        refused: Counter[str] = sum((bag.refused for bag in lives.values()), Counter())
+        slots = max(len(bag.slots) for bag in lives.values())
+        heard = sum(len(record.before) + len(record.heard) for bag in lives.values() for record in bag.slots)
+        hearing = of_datagrams(len(here), slots, len(self.sent), heard, refused)
+        return {
+            "bags": len(lives),
+            "missing": [agent for agent in range(1, self.config.agents + 1) if agent not in here],
+            "broken_off": [named(life) for life, bag in lives.items() if bag.broken_off],
+            "not_on_the_time_line": [named(life) for life in lives if life not in line.clocks],
+            "time_line": line.summary(),
+            **self.turns.summary(),
+            **_air(self.sent, line, air_ns, common_slot),
+            "frames_unsent": sum(bool(r.frame and not r.datagram) for bag in lives.values() for r in bag.slots),
+            "unheard": hearing.problem(refused) or None,
+            "frames_heard": len(self._crossings),
+            "frames_heard_not_as_sent": self.strange,
+            "turns": judged(lives, self.sent, common_slot),
+            "decisions_again": again(lives, replays),
+            "not_taken_in": {named(life): dict(bag.refused) for life, bag in lives.items() if bag.refused},
+            "flight": flown,
+        }
+
+
+def merge(bags: Sequence[AgentBag], air_ns: int = 0) -> dict[str, Any]:
+    """Lays bags of one flight on one time line and judges the flight; see :class:`Merge`.
+
+    :param bags: one a process, in any order.
+    :param air_ns: ns that a frame is on the air; see :meth:`Merge.judge`.
+    :returns: the results, plain values.
+    """
+    return Merge(bags).judge(air_ns)
+
+
+def verified(summary: Mapping[str, Any]) -> bool:
+    """Whether nothing in a merged flight contradicts the protocol or another bag.
+
+    :param summary: of :func:`merge`.
+    """
+    again = summary["decisions_again"]
+    # Of frames that nobody else heard nothing is known if their sender's bag was not finished.
+    kept = summary["broken_off"] or summary["missing"] or not summary["turns"]["rules_broken"]
+    return bool(again["equal"] == again["of"] and not summary["frames_heard_not_as_sent"] and kept)
+
+
+def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
+    """The bags by agent and process."""
+    if not any(bag.slots for bag in bags):
+        raise ConfigError("bags", str(bags[0].path) if bags else "", "bags with a slot in them")
+    found: dict[Life, AgentBag] = {}
+    for bag in sorted(bags, key=lambda bag: (bag.agent, bag.slots[0].slot if bag.slots else -1)):
+        if bag.swarm != bags[0].swarm:
+            theirs, ours = bag.swarm.to_dict(), bags[0].swarm.to_dict()
+            other = ", ".join(
+                f"{name} {theirs[name]}, there {ours[name]}" for name in ours if theirs[name] != ours[name]
+            )
+            raise ConfigError("bag", str(bag.path), f"one of the same flight as {bags[0].path}: {other}")
+        number = sum(agent == bag.agent for agent, _ in found)
+        before = found.get((bag.agent, number - 1))
+        if before is not None and before.slots and (not bag.slots or bag.slots[0].slot <= before.slots[-1].slot):
+            raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
+        found[(bag.agent, number)] = bag
+    return found
+
+
+def sent_of(lives: Mapping[Life, AgentBag]) -> dict[tuple[int, int], Sent]:
+    """All frames that were sent, by slot and sender.
+
+    :param lives: the bags.
+    """
+    return {
+        (record.slot, life[0]): Sent(life, record)
+        for life, bag in lives.items()
+        for record in bag.slots
+        if record.datagram
+    }
+
+
+def senders_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> Counter[int]:
+    """How many are known to have sent, by slot: by their own bags, or, where these are missing, by those of others.
+
+    :param lives: the bags.
+    :param sent: all frames of their bags.
+    """
+    heard = {(h.slot, h.sender) for bag in lives.values() for r in bag.slots for h in (*r.before, *r.heard)}
+    return Counter(slot for slot, _ in heard | sent.keys())
+
+
+def again(lives: Mapping[Life, AgentBag], replays: Mapping[Life, Replay]) -> dict[str, Any]:
+    """What came of making all decisions again.
+
+    :param lives: the bags.
+    :param replays: of each of them, flown.
+    """
+    return {
+        "equal": sum(replay.equal for replay in replays.values()),
+        "of": sum(len(bag.slots) for bag in lives.values()),
+        "differences": [one for replay in replays.values() for one in replay.differences],
+    }
+
+
+def strange_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> int:
+    """How many frames were heard that their sender's bag does not have, or has otherwise.
+
+    :param lives: the bags.
+    :param sent: all frames of their bags.
+    """
+    return _crossings(lives, sent)[0]
+
+
+def _crossings(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> tuple[int, list[Crossing]]:
+    """How many frames were heard that their sender's bag does not have, and all others."""
+    strange, found = 0, []
+    whole = {agent for agent, _ in lives} - {agent for (agent, _), bag in lives.items() if bag.broken_off}
+    for receiver, bag in lives.items():
+        for record in bag.slots:
+            for heard in (*record.before, *record.heard):
+                origin = sent.get((heard.slot, heard.sender))
+                if origin is not None and origin.record.datagram == heard.datagram:
+                    found.append(Crossing(origin.life, receiver, origin.record.sent_ns, heard.arrival_ns))
+                elif origin is not None or heard.sender in whole:
+                    strange += 1
+    return strange, found
+
+
+def judged(
+    lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], common_slot: int | None
+) -> dict[str, Any]:
+    """What the protocol says of the frames that were sent, or heard, from when on all counted alike.
+
+    :param lives: the bags.
+    :param sent: all frames of their bags.
+    :param common_slot: from which all counted alike; None: never.
+    """
+    frames: dict[int, dict[int, bytes]] = {}
+    unsent: dict[int, dict[int, bytes]] = {}
+    for (agent, _), bag in lives.items():
+        for record in bag.slots:
+            if record.frame and not record.datagram:
+                unsent.setdefault(record.slot, {})[agent] = record.frame
+            for heard in (*record.before, *record.heard):
+                frames.setdefault(heard.slot, {})[heard.sender] = heard.datagram[HEADER:]
+    for (slot, agent), origin in sent.items():
+        frames.setdefault(slot, {})[agent] = origin.record.datagram[HEADER:]
+    judge = Judge(next(iter(lives.values())).swarm)
+    for slot in sorted({*frames, *unsent}):
+        if common_slot is not None and slot >= common_slot:
+            judge.slot(slot, frames.get(slot, {}), unsent.get(slot))
+    return judge.summary()
+
+
+class _Turns:
+    """When slots started on the common time line."""
+
+    def __init__(self, lives: Mapping[Life, AgentBag], line: TimeLine, slot_ns: int) -> None:
+        self._started = [line.clocks[life].common_ns(bag.started_ns) for life, bag in lives.items()
+                         if life in line.clocks and life[1] == 0]  # fmt: skip
+        on_line = {life: bag for life, bag in lives.items() if life in line.clocks and bag.slots}
+        starts: dict[int, list[int]] = {}
+        for life, bag in on_line.items():
+            for record in bag.slots:
+                starts.setdefault(record.slot, []).append(line.clocks[life].common_ns(record.start_ns))
+        count = max((len(at) for at in starts.values()), default=0)  # the most that were ever there together
+        spread = {slot: max(at) - min(at) for slot, at in sorted(starts.items())}
+        #: First slot in which as many as ever are there and count alike.
+        self.common_slot: int | None = next(
+            (slot for slot, apart in spread.items() if len(starts[slot]) == count and apart < slot_ns // 2), None
+        )
+        self._common_ns = min(starts[self.common_slot]) if self.common_slot is not None else None
+        after = [slot for slot in spread if self.common_slot is not None and slot >= self.common_slot]
+        self._spread = [spread[slot] for slot in after if len(starts[slot]) > 1]
+        self._torn = sum(apart >= slot_ns // 2 for apart in self._spread)
+
+    def summary(self) -> dict[str, Any]:
+        """When all counted alike, and how far apart slots started then."""
+        after = None if self._common_ns is None else (self._common_ns - max(self._started)) / 1e9
+        return {
+            "common_slot": self.common_slot,
+            "common_after_last_start_s": after,
+            "slots_apart": self._torn,  # later ones that began half a slot apart or more
+            "clock_spread_ms": {
+                "mean": float(np.mean(self._spread)) / 1e6 if self._spread else None,
+                "max": max(self._spread) / 1e6 if self._spread else None,
+                "end": max(self._spread[-_END:]) / 1e6 if self._spread else None,
+            },
+        }
+
+
+def _air(sent: Mapping[tuple[int, int], Sent], line: TimeLine, air_ns: int, common_slot: int | None) -> dict[str, Any]:
+    """Two senders in a slot, and frames that were on the air together."""
+    double = [slot for slot, count in Counter(slot for slot, _ in sent).items() if count > 1]
+    after = sum(common_slot is not None and slot >= common_slot for slot in double)
+    at = sorted(line.clocks[s.life].common_ns(s.record.sent_ns) for s in sent.values() if s.life in line.clocks)
+    return {
+        "frames_sent": len(sent),
+        "slots_with_two_senders": after,
+        "slots_with_two_senders_before": len(double) - after,
+        "overlapping_frames": sum(b - a < air_ns for a, b in pairwise(at)) if air_ns else None,
+    }

@@ -1,0 +1,169 @@
+"""An outside observer that reads every frame of policy ``lease`` and holds the agents to the protocol's rules.
+
+It knows what was sent, not what was heard, and shares no code with the agents that run: what an anchor is, and which
+turns a frame's lease bytes speak of, it asks the specification.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dtsa_agent.core.errors import RemoteProtocolError
+from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.reference.lease.memory import Memory
+from dtsa_agent.core.reference.rules import Rules
+
+OPEN = 255
+
+
+@dataclass(slots=True)
+class Ledger:
+    """Who gave which turn to whom, and whether all kept to it.
+
+    :param agents: number of agents N.
+    :param anchor_every: M.
+    :param main_every: K M; 0: M.
+    """
+
+    agents: int
+    anchor_every: int
+    main_every: int = 0
+    issued: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # turn -> (issuer, lessee)
+    handed: dict[int, dict[int, tuple[int, int]]] = field(default_factory=dict)  # turn -> lessee -> (next one, slot)
+    quiet: dict[int, int] = field(default_factory=dict)  # last slot in which each was in probation
+    open_collisions: int = 0  # slots with two senders that had been given to all who wake
+    adopted_collisions: int = 0  # slots with two senders, given away by somebody other than their owner
+    anchor_collisions: int = 0  # ... in an anchor that its owner gave away before it restarted
+    handed_collisions: int = 0  # ... in a turn that a lessee handed on before it restarted
+    plain_collisions: int = 0  # any other slot with two senders
+    open_slots: int = 0
+    adopted_slots: int = 0
+    leased_slots: int = 0
+    broken: list[str] = field(default_factory=list)  # rules that were broken, in words
+    _rules: Memory = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        main = self.main_every or self.anchor_every
+        self._rules = Memory(Rules(agents=self.agents, slot_s=1.0, anchor_every=self.anchor_every, main_every=main))
+
+    def slot(self, slot: int, frames: dict[int, bytes]) -> None:
+        """Takes in one slot.
+
+        :param slot: its number; slots come in order.
+        :param frames: the frames of all senders, by id.
+        """
+        given, handed = self.issued.pop(slot, []), self.handed.pop(slot, {})
+        owner = slot % self.agents + 1
+        is_open = any(lessee == OPEN for _, lessee in given)
+        adopted = any(issuer != owner for issuer, _ in given)
+        self.open_slots += is_open
+        self.adopted_slots += adopted and not is_open
+        self.leased_slots += bool(given) and not is_open and not adopted
+        if len(frames) > 1:
+            self.open_collisions += is_open
+            self.adopted_collisions += adopted and not is_open
+            taken_back = not is_open and not adopted and self._taken_back(slot, frames.get(owner))
+            forgotten = not is_open and not adopted and any(self._forgotten(handed, sender) for sender in frames)
+            self.anchor_collisions += taken_back
+            self.handed_collisions += forgotten and not taken_back
+            if not (is_open or adopted or taken_back or forgotten):
+                self.plain_collisions += 1
+                self.broken.append(f"slot {slot}: senders {sorted(frames)}, given {given}, handed on {handed}")
+        for sender, data in frames.items():
+            self._check_sender(slot, sender, owner, given, data, handed)
+            self.read(slot, sender, data)
+
+    def _taken_back(self, slot: int, data: bytes | None) -> bool:
+        """Whether the owner sends in an anchor, no main one, in probation: it may have given it away before."""
+        if data is None or not self._rules.is_anchor(slot) or self._rules.is_main(slot):
+            return False
+        return decode_extended(data).probation
+
+    def _forgotten(self, handed: dict[int, tuple[int, int]], sender: int) -> bool:
+        """Whether a sender handed the turn on before it began anew: what others relay may be all that it knows."""
+        return sender in handed and self.quiet.get(sender, -1) > handed[sender][1]
+
+    def _check_sender(
+        self,
+        slot: int,
+        sender: int,
+        owner: int,
+        given: list[tuple[int, int]],
+        data: bytes,
+        handed: dict[int, tuple[int, int]],
+    ) -> None:
+        last = {last_lessee(handed, lessee) for _, lessee in given}
+        if sender in last or OPEN in last or self._forgotten(handed, sender):
+            return
+        if sender != owner:
+            self.broken.append(f"slot {slot}: agent {sender} sends in a turn of {owner} given to {sorted(last)}")
+        elif any(issuer == owner for issuer, _ in given) and not self._taken_back(slot, data):
+            self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(last)}")
+
+    def read(self, slot: int, sender: int, data: bytes) -> None:
+        """Takes note of what a frame gives away, whether or not it got on the air.
+
+        :param slot: in which it was made.
+        :param sender: id.
+        :param data: the frame.
+        """
+        try:
+            frame = decode_extended(data)
+        except RemoteProtocolError as error:
+            self.broken.append(f"slot {slot}: agent {sender} sent a frame that is none: {error}")
+            return
+        if frame.probation:
+            self.quiet[sender] = slot
+        if frame.c_s and (frame.probation or frame.leaving):
+            self.broken.append(f"slot {slot}: agent {sender} claims others dead in probation, or as it leaves")
+        leases = frame.leases
+        if leases and slot % self.agents != sender - 1:
+            self.broken.append(f"slot {slot}: agent {sender} gives turns away in somebody else's turn")
+        for turn, lessee in zip(self._rules.turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
+            if not lessee:
+                continue
+            owner = turn % self.agents + 1
+            if self._rules.is_main(turn) or turn <= slot:
+                self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
+            entries, handed = self.issued.setdefault(turn, []), self.handed.get(turn, {})
+            if any(issuer == sender and lessee in lessees(handed, first) for issuer, first in entries):
+                continue  # said again
+            if sender == owner and any(issuer == owner for issuer, _ in entries):
+                self.broken.append(f"slot {slot}: agent {sender} gives turn {turn} away a second time")
+            if (sender, lessee) not in entries:
+                entries.append((sender, lessee))
+        for ahead, lessee in (*frame.relay, *((far, frame.far_lessee) for far in frame.far)):
+            self._hand_on(slot, sender, slot + ahead, lessee)
+
+    def _hand_on(self, slot: int, sender: int, turn: int, lessee: int) -> None:
+        """Whose turn it is names another one for it; everybody else only relays."""
+        chain = self.handed.get(turn, {})
+        given = [first for _, first in self.issued.get(turn, [])]
+        before = {sender, *given, *chain}  # who was given it and does not know it yet, relays one of these
+        if lessee in before or all(last_lessee(chain, first) != sender for first in given):
+            return
+        if lessee in (OPEN, turn % self.agents + 1) or self._rules.is_main(turn):
+            self.broken.append(f"slot {slot}: agent {sender} hands turn {turn} on to {lessee}")
+        elif sender not in chain:
+            self.handed.setdefault(turn, {})[sender] = (lessee, slot)
+
+
+def last_lessee(handed: dict[int, tuple[int, int]], lessee: int) -> int:
+    """Whose turn it is after it has been handed on, each agent once.
+
+    :param handed: to whom each handed it on, and when.
+    :param lessee: whose it was at first.
+    """
+    return lessees(handed, lessee)[-1]
+
+
+def lessees(handed: dict[int, tuple[int, int]], first: int) -> list[int]:
+    """Whose a turn was, one after the other.
+
+    :param handed: to whom each handed it on, and when.
+    :param first: whose it was at first.
+    """
+    chain = [first]
+    while chain[-1] in handed and len(chain) <= len(handed):
+        chain.append(handed[chain[-1]][0])
+    return chain

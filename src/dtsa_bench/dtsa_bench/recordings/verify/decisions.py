@@ -1,0 +1,139 @@
+"""Decisions of agents on their own clocks, made again from what they say to have taken in, and when."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dtsa_agent.core import AgentGroup, make_scenario
+from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.plugins.entry_points import make_swarm, plug_ins_of
+from dtsa_agent.keys import with_key
+from dtsa_bench.runs.config import RunConfig
+
+from .frames import SentFrames
+from .result import Difference, Mismatch
+
+_DECIDED = ("chosen", "reason", "digest")
+
+
+class _Heard(NamedTuple):
+    slot: int
+    sender: int
+    mask: Any  # (N,)
+
+
+class Decisions:
+    """All agents of a run, who fly where they reported to be, and hear what they reported to have taken in.
+
+    :param run: the run.
+    :param frames: all its frames.
+    """
+
+    def __init__(self, run: RunConfig, frames: SentFrames) -> None:
+        self._frames, self._config, self._agents = frames, run.swarm, run.swarm.agents
+        self._steps = run.swarm.steps
+        self._group = AgentGroup(with_key(make_swarm(run.swarm, make_scenario(run.swarm))))
+        # Radios that listen say when a frame began; an agent takes that in as if it heard its own frame.
+        self._parts = plug_ins_of(self._group.swarm) if run.swarm.policy_row.listens else None
+        self._handed: dict[tuple[int, int], int] = {}  # ns, when frames were handed over, by slot and id
+        self._told: dict[int, list[tuple[int, int]]] = {}  # slot and id of own frames, by the slot that was under way
+        self._rows: dict[int, list[tuple[Any, dict[str, Any]]]] = {}
+        self._heard: dict[int, list[_Heard]] = {}
+
+    def report(self, said: Any) -> None:
+        """Takes in one report.
+
+        :param said: a dtsa_msgs/Report.
+        """
+        count, index = len(said.agent), np.asarray(said.agent, dtype=np.intp) - 1
+        slots = said.slot.tolist()
+        for row, slot in enumerate(slots):
+            part = slice(row * count, (row + 1) * count)
+            fields = {name: getattr(said, name)[part] for name in (*_DECIDED, "length", "offset_ns")}
+            for name, planes in (("track", 3 * self._steps), ("velocity", 3), ("command", 3)):
+                at = slice(row * planes * count, (row + 1) * planes * count)
+                fields[name] = getattr(said, name)[at].reshape(-1, 3, count)
+            self._rows.setdefault(slot, []).append((index, fields))
+        rows = np.asarray(said.heard_by, dtype=np.uint8).reshape(-1, -(-count // 8))
+        masks = np.unpackbits(rows, axis=1, count=count, bitorder="little") if len(rows) else ()
+        entries = zip(said.heard_in.tolist(), said.heard_slot.tolist(), said.heard_sender.tolist(), masks, strict=True)
+        own = set(said.agent.tolist()) if self._parts is not None else set()
+        for here, slot, sender, mask in entries:
+            if sender in own:
+                self._told.setdefault(here, []).append((slot, sender))
+            everybody = np.zeros(self._agents, dtype=np.uint8)
+            everybody[index] = mask
+            self._heard.setdefault(here, []).append(_Heard(slot, sender, everybody))
+
+    def check(self, slots: int) -> int:
+        """Makes all decisions again.
+
+        :param slots: number of slots.
+        :returns: how many are equal.
+        :raises Mismatch: at the first that is not.
+        """
+        swarm = self._group.swarm
+        equal = 0
+        for slot in range(slots):
+            rows = self._rows.pop(slot, [])
+            if sum(len(index) for index, _ in rows) != self._agents:
+                return equal  # an agent is silent from here on
+            for index, fields in rows:
+                swarm.track[:, :, index] = fields["track"]
+                swarm.position[:, index] = fields["track"][-1]
+                swarm.velocity[:, index] = fields["velocity"][0]
+                swarm.command[:, index] = fields["command"][0]
+                for agent in index[fields["length"] > 0]:
+                    if self._leaves(slot, int(agent) + 1):
+                        swarm.leave(int(agent))
+            self._group.on_slot(slot)
+            for index, fields in rows:
+                for name in _DECIDED:
+                    self._compare(slot, name, index, getattr(swarm, name)[index], fields[name])
+                equal += len(index)
+                for late in index[fields["length"] == 0]:
+                    swarm.drop(int(late))  # it was too late to send
+                self._hand_over(slot, index, fields)
+            for told_slot, sender in self._told.pop(slot, []):
+                self._tell(told_slot, sender)
+            for heard in self._heard.pop(slot, []):
+                sent = self._frames.get(heard.slot, heard.sender)
+                if sent is not None:
+                    swarm.hear(heard.slot, sent.data, heard.mask)
+            self._group.on_slot_end()
+        return equal
+
+    def _hand_over(self, slot: int, index: Any, fields: dict[str, Any]) -> None:
+        """Takes note of the frames that radios which listen were handed, and of those that came too late for that."""
+        if self._parts is None:
+            return
+        begin_ns = slot * self._config.slot_ns
+        for k in np.flatnonzero(self._parts.sends[index]):
+            if fields["length"][k]:
+                self._handed[slot, int(index[k]) + 1] = begin_ns + int(fields["offset_ns"][k])
+            else:
+                self._parts.radio_told(int(index[k]), slot, None)
+
+    def _tell(self, slot: int, agent: int) -> None:
+        sent, handed_ns = self._frames.get(slot, agent), self._handed.pop((slot, agent), None)
+        if self._parts is not None and sent is not None and handed_ns is not None:
+            self._parts.radio_told(agent - 1, slot, sent.on_air.start_ns - handed_ns)
+
+    def _leaves(self, slot: int, agent: int) -> bool:
+        """Whether an agent says in a frame that it leaves: what made it leave came from outside."""
+        sent = self._frames.get(slot, agent)
+        if sent is None or not self._config.policy_row.says_leaving:
+            return False
+        return decode_extended(self._config.protocol_part(sent.data, sealed=True)).leaving
+
+    @staticmethod
+    def _compare(slot: int, name: str, index: Any, expected: Any, recorded: Any) -> None:
+        wrong = np.flatnonzero(expected != recorded)
+        if len(wrong):
+            at = wrong[0]
+            why = "follows from what the agent says to have taken in"
+            raise Mismatch(
+                Difference(f"report.{name}", str(expected[at]), str(recorded[at]), why, slot, int(index[at]) + 1)
+            )

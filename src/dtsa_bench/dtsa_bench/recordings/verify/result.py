@@ -1,0 +1,107 @@
+"""What a verification found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from dtsa_bench.recordings.rules.judge import Judge
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first place where a bag is not what the protocol gives."""
+
+    what: str  # what was compared, e.g. "transmission.chosen"
+    expected: str
+    recorded: str
+    reason: str  # why the expected value is what it is
+    slot: int | None = None
+    agent: int | None = None  # id
+
+    def __str__(self) -> str:
+        place = ", ".join(
+            text
+            for text in (
+                "" if self.slot is None else f"slot {self.slot}",
+                "" if self.agent is None else f"agent {self.agent}",
+            )
+            if text
+        )
+        where = f"{place}: " if place else ""
+        return f"{where}{self.what}: expected {self.expected}, recorded {self.recorded} ({self.reason})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {
+            "slot": self.slot,
+            "agent": self.agent,
+            "what": self.what,
+            "expected": self.expected,
+            "recorded": self.recorded,
+            "reason": self.reason,
+        }
+
+
+class Mismatch(Exception):
+    """Carries the first difference out of nested checks."""
+
+    def __init__(self, difference: Difference) -> None:
+        super().__init__(str(difference))
+        self.difference = difference
+
+
+@dataclass(slots=True)
+class Result:
+    """What was checked, how often, what was not and why, and the first difference if there is one."""
+
+    bag: str
+    mode: str
+    slots: int = 0
+    simulated_s: float = 0.0
+    wall_time_s: float = 0.0
+    checked: dict[str, int] = field(default_factory=dict)  # what was compared and found equal -> how often
+    skipped: dict[str, str] = field(default_factory=dict)  # what was not checked -> why
+    safety: dict[str, Any] = field(default_factory=dict)
+    broken_off: bool = False  # the recorder was stopped before it had finished: checked up to there
+    unheard: str = ""  # why the agents did not hear each other; empty: they did
+    difference: Difference | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Nothing differs."""
+        return self.difference is None
+
+    def count(self, what: str, times: int = 1) -> None:
+        """Notes checks that passed."""
+        self.checked[what] = self.checked.get(what, 0) + times
+
+    def take_judgement(self, judge: Judge) -> None:
+        """Notes whether the frames kept to the policy's rules.
+
+        :param judge: it has read the frames of all slots.
+        :raises Mismatch: at the first rules that were broken.
+        """
+        if not judge.knows_rules:
+            return
+        if judge.broken:
+            why = "a turn is its owner's, or of the last one to whom it was given (docs/protocol.md)"
+            raise Mismatch(Difference("frames", "none against the rules", "; ".join(judge.broken[:3]), why))
+        self.count("slots whose frames keep to the rules", judge.slots)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {
+            "bag": self.bag,
+            "mode": self.mode,
+            "ok": self.ok,
+            "slots": self.slots,
+            "broken_off": self.broken_off,
+            "simulated_s": self.simulated_s,
+            "wall_time_s": self.wall_time_s,
+            "checked": self.checked,
+            "skipped": self.skipped,
+            "safety": self.safety,
+            "unheard": self.unheard or None,
+            "difference": self.difference.to_dict() if self.difference else None,
+        }

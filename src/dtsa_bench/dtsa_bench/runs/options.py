@@ -1,0 +1,155 @@
+"""Command-line options made from the configuration dataclasses: the same words for `fly`, `simulate` and `sweep`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.declaration import Setting, Settings, settings_of
+from dtsa_channel_sim import ChannelConfig, ClockConfig
+
+from .config import FROM_SWARM, RunConfig, RunLimits, from_swarm
+
+_SECTIONS: tuple[tuple[str, type[Settings], tuple[str, ...]], ...] = (
+    ("swarm", SwarmConfig, ()),
+    ("channel", ChannelConfig, FROM_SWARM),
+    ("limits", RunLimits, ()),
+)
+_TITLES = {"swarm": "the swarm", "channel": "the radio channel", "limits": "the end of a run"}
+
+
+def add_run_options(parser: argparse.ArgumentParser, skip: Iterable[str] = ()) -> None:
+    """Adds an option for every setting of a run, and `--channel FILE` for what does not fit into one option.
+
+    :param parser: the command's parser.
+    :param skip: settings that the command does not offer.
+    """
+    left_out = tuple(skip)
+    for section, cls, derived in _SECTIONS:
+        groups: dict[str, Any] = {}
+        for setting in settings_of(cls):
+            title = setting.group.lower() or _TITLES[section]
+            group = groups.get(title) or groups.setdefault(title, parser.add_argument_group(title))
+            _offer(group, setting, section, "", (*derived, *left_out))
+        if section == "channel":
+            group.add_argument(
+                "--channel",
+                metavar="FILE",
+                default=None,
+                help="YAML file with settings of the "
+                "channel, those too that have no option: loss_matrix, link_loss, schedule",
+            )
+
+
+def add_mode_options(parser: argparse.ArgumentParser) -> Any:
+    """Adds the options of flights in real time.
+
+    :param parser: the command's parser.
+    :returns: their group, for further options.
+    """
+    group = parser.add_argument_group("real time")
+    add_options(group, RunConfig, "run")
+    add_options(group, ClockConfig, "clocks", "clock-", skip=("seed",))
+    return group
+
+
+def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "", skip: Iterable[str] = ()) -> None:
+    """Adds an option for every setting of a settings class that fits into one.
+
+    :param group: parser, or group of its options.
+    :param cls: the settings class.
+    :param section: what :func:`given` calls these options.
+    :param prefix: stands before the setting's name in the option's.
+    :param skip: settings that become no option.
+    """
+    left_out = tuple(skip)
+    for setting in settings_of(cls):
+        _offer(group, setting, section, prefix, left_out)
+
+
+def _offer(group: Any, setting: Setting, section: str, prefix: str, skip: tuple[str, ...]) -> None:
+    """Adds an option for a setting that fits into one and is not left out."""
+    if setting.kind not in ("structure", "vector") and setting.name not in skip:
+        _add(group, setting, section, prefix)
+
+
+def given(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
+    """The values of those options of :func:`add_options` that were given, by name.
+
+    :param args: parsed options.
+    :param cls: the settings class.
+    :param section: as for :func:`add_options`.
+    :raises ConfigError: for a text that is no value of its setting's kind.
+    """
+    found = {}
+    for setting in settings_of(cls):
+        value = getattr(args, f"{section}.{setting.name}", None)
+        if value is not None:
+            found[setting.name] = setting.parse(value) if isinstance(value, str) else value
+    return found
+
+
+def _add(group: Any, setting: Setting, section: str, prefix: str) -> None:
+    option = f"--{prefix}" + setting.name.replace("_", "-")
+    where = f"{section}.{setting.name}"
+    text = setting.description.replace("%", "%%")
+    if setting.default not in (None, {}, ""):
+        text += f" [{_shown(setting.default)}]"
+    if setting.kind == "bool":
+        group.add_argument(option, dest=where, action=argparse.BooleanOptionalAction, default=None, help=text)
+        return
+    metavar = {"int": "N", "float": "X", "values": "NAME=X,..."}.get(
+        setting.kind, "NAME" if setting.choices else "TEXT"
+    )
+    action = group.add_argument(option, dest=where, metavar=metavar, default=None, help=text)
+    action.words = tuple(str(word) for word in setting.choices)  # for completion; plug-ins have names of their own
+
+
+def _shown(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
+    """The run that the options describe.
+
+    :param args: parsed options.
+    :param fixed: settings of the swarm that win over the options.
+    :raises ConfigError: naming the option, the value and what is allowed.
+    """
+    values = {section: given(args, cls, section) for section, cls, _ in _SECTIONS}
+    swarm = SwarmConfig.from_dict({**values["swarm"], **fixed})
+    derived = from_swarm(swarm)
+    if getattr(args, "channel", None):
+        channel = ChannelConfig.from_yaml(args.channel, **values["channel"], **derived)
+    else:
+        channel = ChannelConfig.from_dict({**values["channel"], **derived})
+    clocks = ClockConfig(seed=swarm.seed, **given(args, ClockConfig, "clocks"))
+    limits = RunLimits(**values["limits"])
+    return RunConfig(swarm, channel, limits, clocks=clocks, **given(args, RunConfig, "run"))
+
+
+def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:
+    """A number given to an option of a single command.
+
+    :raises ConfigError: if it is none, or out of range.
+    """
+    return int(Setting(name, "int", None, name, minimum=minimum, maximum=maximum).read(text))
+
+
+def new_directory(path: str | Path, name: str = "out") -> Path:
+    """The directory for results: it does not exist yet, or is empty.
+
+    :raises ConfigError: if it is in use or cannot be made.
+    """
+    directory = Path(path)
+    try:
+        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+            raise ConfigError(name, str(path), "a directory that is empty or does not exist yet")
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(name, str(path), f"a directory that can be written to ({error.strerror})") from None
+    return directory

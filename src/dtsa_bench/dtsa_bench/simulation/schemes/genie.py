@@ -1,0 +1,75 @@
+"""Bounds: who sends is chosen with what all agents know and where all are. No real scheme can know that."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig
+
+from .knowledge import ages, counts, moves, squared_errors, whittle_index
+
+
+class GenieAge:
+    """The agent with the largest sum of true ages at all receivers, over pairs that count as movers.
+
+    Greedy. For one base station and equal links greedy is optimal (Kadota and others, arXiv 1801.01803); here, where
+    all send to all, it is a reference and no proven optimum: :mod:`.optimum` compares them for three agents.
+    """
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del config, agent
+
+    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        weight = np.where(counts(swarm), ages(swarm, slot), 0.0).sum(axis=0)
+        best = int(weight.argmax())
+        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+
+
+class Whittle:
+    """The agent with the largest sum of Whittle's indices of the true ages at all receivers.
+
+    The index is that of one link; a frame that reaches several receivers counts the sum of theirs. Option:
+    ``whittle.loss`` (0): the probability that a receiver loses a frame, which has to be known.
+
+    :raises ConfigError: for a probability that is none.
+    """
+
+    options = ("loss",)
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del agent
+        self._loss = config.options.get("whittle.loss", 0.0)
+        if not 0.0 <= self._loss < 1.0:
+            raise ConfigError("whittle.loss", self._loss, "0 to below 1")
+
+    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        index = whittle_index(ages(swarm, slot) + 1.0, self._loss)
+        weight = np.where(counts(swarm), index, 0.0).sum(axis=0)
+        best = int(weight.argmax())
+        return [best + 1 if weight[best] > 0 else slot % swarm.config.agents + 1]
+
+
+class GenieError:
+    """The agent about whose position the others err most: the largest sum of squared errors (try-once-discard).
+
+    An agent that has just woken is waiting to be heard, and nobody errs about it yet: it comes first. Among agents
+    about whom nobody errs the longest silent comes first.
+    """
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del config, agent
+
+    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+        """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
+        pairs = counts(swarm)
+        if not pairs.any():
+            return [slot % swarm.config.agents + 1]
+        unknown = moves(swarm) & (pairs & (swarm.in_ap == 0)).any(axis=0)
+        age = np.where(pairs, ages(swarm, slot), 0.0).sum(axis=0)
+        if unknown.any():
+            return [int(np.where(unknown, age, -1.0).argmax()) + 1]
+        error = np.where(pairs, squared_errors(swarm, slot), 0.0).sum(axis=0)
+        worst = np.flatnonzero(error >= error.max())
+        return [int(worst[age[worst].argmax()]) + 1]

@@ -1,0 +1,85 @@
+"""SOTDMA, the self-organised TDMA of ships (AIS)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_agent.core.swarms.outcome import SlotOutcome
+
+_TIMEOUTS = (3, 8)  # frames of reports a slot is kept for: drawn from 3 to 7
+_LEAST = 4  # slots to choose from, even if some are in use
+_SELECTION = 0.2  # of the nominal increment
+
+
+class Sotdma:
+    """Each frame announces when its sender comes next and for how long it will keep that rhythm (ITU-R M.1371).
+
+    Time has frames of L slots, one report of each agent in each. An agent listens to one frame, then enters with a slot
+    drawn from those it has not heard taken, near its nominal one. It keeps the slot for 3 to 7 frames; the last report
+    in it announces another one, drawn within 0.2 L around it from at least four that are free. Three own bytes: reports
+    left, and offset to the next one. Collisions are not noticed; they end with the slot's time-out.
+
+    Option: ``sotdma.load`` (0.5), N / L: with more, less is free to choose from; with less, reports are rare.
+    """
+
+    options = ("load",)
+    own_bytes = 3
+    may_join = True
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        load = min(1.0, max(0.01, config.options.get("sotdma.load", 0.5)))
+        self._frame = max(2, math.ceil(config.agents / load))  # L, slots
+        self._agent = agent
+        self._random = np.random.default_rng([config.seed, 1371, agent])
+        self._taken: dict[int, int] = {}  # slot number -> id that has announced it
+        self._next = -1  # own next slot; -1: not entered yet
+        self._left = 0  # reports left in it
+        self._offset = 0  # announced in the present frame: slots to the next report
+
+    def choose(self, table: Table, slot: int) -> int:
+        """Itself in its own slots; else who has announced this one."""
+        if self._agent and self._next < 0 and slot >= self._frame:
+            self._next = self._draw(slot + (self._agent * self._frame) // table.config.agents, slot)
+            self._left = int(self._random.integers(*_TIMEOUTS))
+        if slot == self._next and self._agent:
+            return self._agent
+        return self._taken.get(slot, 0)
+
+    def _draw(self, nominal: int, now: int) -> int:
+        """A slot around a nominal one, free if there are free ones."""
+        reach = max(1, round(_SELECTION * self._frame / 2))
+        while True:
+            around = list(range(max(now + 1, nominal - reach), nominal + reach + 1))
+            free = [slot for slot in around if slot not in self._taken]
+            if len(free) >= _LEAST or 2 * reach >= self._frame:
+                return int(self._random.choice(free or around))
+            reach += 1
+
+    def say(self, table: Table, slot: int) -> bytes:
+        """Frames left, and the offset to the next report."""
+        if self._left:
+            self._offset = self._frame
+        else:
+            self._offset = self._draw(slot + self._frame, slot) - slot
+        return bytes((self._left, *self._offset.to_bytes(2, "little")))
+
+    def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
+        """Notes when the sender comes again, as far as it has said."""
+        left, offset = data[0], int.from_bytes(data[1:], "little")
+        if not 1 <= offset <= 2 * self._frame or left >= _TIMEOUTS[1]:
+            return
+        self._taken[slot + offset] = sender
+        for report in range(2, left + 1):
+            self._taken[slot + report * offset] = sender
+
+    def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
+        """Goes on to the next own slot; what is over is forgotten."""
+        self._taken.pop(slot, None)
+        if slot != self._next:
+            return
+        self._next = slot + self._offset
+        self._left = self._left - 1 if self._left else int(self._random.integers(*_TIMEOUTS))

@@ -1,0 +1,228 @@
+"""Flights in which agents send at any instant: what is on the air in a slot, and who hears it.
+
+Slots are the ticks of the flight: frames carry the state at the start of the slot in which they begin, and are heard in
+the slot in which they arrive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core.errors import PluginError
+from dtsa_agent.core.plugins.entry_points import plug_ins_of
+from dtsa_agent.core.plugins.unslotted import next_wake
+from dtsa_channel_sim import Channel
+from dtsa_channel_sim.model.air import Air
+from dtsa_channel_sim.model.airtime import LONGEST_FRAME
+from dtsa_channel_sim.model.radios import NEVER, Radios
+from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
+
+
+@dataclass(slots=True)
+class Carried:
+    """What the air carried in one slot."""
+
+    senders: tuple[int, ...] = ()  # ids that began to send a frame in it, each once
+    lengths: list[int] = field(default_factory=list)  # bytes of the packets that began in it
+    heard: list[tuple[bytes, NDArray[np.bool_]]] = field(default_factory=list)  # frames that arrived, and (N,) by whom
+    outcome: int = IDLE  # SUCCESS: packets ended in it and none was disturbed; COLLISION: one was
+
+
+class _Packet(NamedTuple):
+    """What a radio sends: a frame, bytes of the policy's own before it, or both."""
+
+    sender: int
+    frame: bytes
+    note: bytes = b""
+    to: int = 0  # id of the one agent that takes the frame in; 0: all
+
+
+class UnslottedTraffic:
+    """Lets the policies of all agents act, on one medium.
+
+    At one instant arrivals come first, then what agents and radios do, in the order of their ids.
+
+    :param swarm: all agents, with an unslotted policy; each has a table of its own.
+    :param channel: the medium.
+    """
+
+    def __init__(self, swarm: AbstractSwarm, channel: Channel) -> None:
+        inside = plug_ins_of(swarm)
+        assert inside is not None
+        self._swarm, self._parts = swarm, inside
+        self._slot_ns = swarm.config.slot_ns
+        self._airtime = channel.config.airtime
+        self._air: Air[int] = Air(channel)
+        row = swarm.config.policy_row
+        # In the simulator an agent and its radio share one instance of the policy.
+        self._radios = Radios(self._air, inside.policies) if row.listens else None
+        self._reacts = row.reacts
+        self._wakes = [(0, index) for index in range(len(swarm.ids))]
+        heapify(self._wakes)
+        self._due_ns = [0] * len(swarm.ids)  # the entry of each agent in that heap that counts
+        self._free_ns = [0] * len(swarm.ids)  # when each radio has done with its last packet
+        self._count = 0
+        self._on_air: dict[int, _Packet] = {}
+        self._ends: list[int] = []  # ns, when packets that have no verdict yet leave the air, if agents react: a heap
+        self._arriving: list[tuple[int, int, _Packet, NDArray[np.bool_]]] = []  # heap by arrival
+        self._frames: list[bytes] = []
+        self._carried = Carried()
+        self._began: set[int] = set()
+
+    def slot(self, slot: int) -> Carried:
+        """Everything that happens on the air in a slot; tables are as they were when it began.
+
+        :param slot: its number; slots come one after the other.
+        """
+        swarm, end_ns = self._swarm, (slot + 1) * self._slot_ns
+        self._carried, self._began = Carried(), set()
+        swarm.sends[:] = swarm.present > 0
+        swarm.emit(slot)
+        self._frames = [swarm.frame(index) for index in range(len(swarm.ids))]
+        self._act(end_ns)
+        self._settle(end_ns)
+        self._take_in(end_ns)
+        self._carried.senders = tuple(swarm.ids[index] for index in sorted(self._began))
+        swarm.sends[:] = 0
+        swarm.sends[sorted(self._began)] = 1
+        swarm.emit(slot)
+        return self._carried
+
+    def _act(self, end_ns: int) -> None:
+        """Lets policies and radios act until the end of a slot."""
+        while True:
+            wake = self._wakes[0] if self._wakes else (NEVER, 0)
+            heard = self._radios.next if self._radios is not None else (NEVER, 0)
+            next_ns = min(wake, heard)[0]
+            if self._ends and self._ends[0] <= min(next_ns, end_ns):
+                self._settle(heappop(self._ends))
+            elif self._reacts and self._arriving and self._arriving[0][0] <= min(next_ns, end_ns - 1):
+                self._take_in(self._arriving[0][0])
+            elif next_ns >= end_ns:
+                return
+            elif heard[0] < NEVER and (heard[0], heard[1] - 1) < wake:
+                self._listen(*heard, end_ns)
+            else:
+                heappop(self._wakes)
+                if self._due_ns[wake[1]] == wake[0]:
+                    self._wake(wake[1], wake[0], end_ns)
+
+    def _call_at(self, index: int, at_ns: int) -> None:
+        self._due_ns[index] = at_ns
+        heappush(self._wakes, (at_ns, index))
+
+    def _wake(self, index: int, now_ns: int, end_ns: int) -> None:
+        """Lets a policy act, unless its agent is switched off."""
+        if self._swarm.present[index]:
+            policy, table = self._parts.policies[index], self._parts.tables[index]
+            answer = policy.wake(table, now_ns, _Radio(self, index, now_ns))
+            if self._radios is not None and self._radios.holds(self._swarm.ids[index]):
+                return
+            end_ns = next_wake(policy, answer, now_ns)
+        self._call_at(index, end_ns)
+
+    def _listen(self, now_ns: int, agent: int, end_ns: int) -> None:
+        """Lets a radio listen, and its policy know if it has begun to send the agent's frame of this slot."""
+        assert self._radios is not None
+        index = agent - 1
+        if not self._swarm.present[index]:
+            self._radios.drop(agent)
+            self._call_at(index, end_ns)
+        elif self._radios.listen(self._swarm.position) is not None:
+            self._begin(_Packet(agent, self._frames[index]), now_ns)
+            policy, table = self._parts.policies[index], self._parts.tables[index]
+            answer = policy.sent(table, now_ns, True)
+            self._call_at(index, next_wake(policy, answer, now_ns, "sent"))
+
+    def send(self, index: int, now_ns: int, note: bytes = b"", to: int = 0) -> bool:
+        """An agent begins to send its frame of this slot, or its radio listens first; False: it still sends another.
+
+        :param index: its position in ``ids``.
+        :param now_ns: ns, now.
+        :param note: bytes that precede the frame.
+        :param to: id of the one agent that takes it in; 0: all do.
+        """
+        if not self._frames[index]:
+            return False
+        if self._radios is not None:
+            self._radios.hand_over(self._swarm.ids[index], now_ns)
+            return True
+        return self.transmit(_Packet(self._swarm.ids[index], self._frames[index], note, to), now_ns)
+
+    def transmit(self, packet: _Packet, now_ns: int) -> bool:
+        """A radio begins to send a packet; False: it still sends another.
+
+        :param packet: the packet.
+        :param now_ns: ns, now.
+        """
+        if not isinstance(packet.note, bytes) or packet.to not in range(len(self._frames) + 1):
+            policy, given = self._parts.policies[packet.sender - 1].name, (packet.note, packet.to)
+            raise PluginError(f"{policy}, wake", f"sent {given!r}; allowed: bytes, to 0 (all) to {len(self._frames)}")
+        if now_ns < self._free_ns[packet.sender - 1]:
+            return False
+        self._begin(packet, now_ns)
+        return True
+
+    def _begin(self, packet: _Packet, now_ns: int) -> None:
+        index, length = packet.sender - 1, len(packet.note) + len(packet.frame)
+        if not 1 <= length <= LONGEST_FRAME:
+            policy = self._parts.policies[index].name
+            raise PluginError(f"{policy}, wake", f"sent {length} bytes; allowed: 1 to {LONGEST_FRAME}")
+        self._settle(now_ns)
+        self._count += 1
+        self._air.begin(self._count, packet.sender, now_ns, length)
+        self._free_ns[index] = now_ns + self._airtime.total_ns(length)
+        if self._reacts:
+            heappush(self._ends, self._free_ns[index])
+        self._on_air[self._count] = packet
+        if packet.frame:
+            self._began.add(index)
+        self._carried.lengths.append(length)
+
+    def _settle(self, until_ns: int) -> None:
+        for verdict in self._air.settle(until_ns, self._swarm.position):
+            packet = self._on_air.pop(verdict.frame_id)
+            if verdict.received.any():
+                heappush(self._arriving, (verdict.arrival_ns, verdict.frame_id, packet, verdict.received))
+            if verdict.collided or self._carried.outcome == COLLISION:
+                self._carried.outcome = COLLISION
+            else:
+                self._carried.outcome = SUCCESS
+
+    def _take_in(self, until_ns: int) -> None:
+        """What has arrived is heard; policies that react do so."""
+        while self._arriving and self._arriving[0][0] <= until_ns:
+            now_ns, _, packet, received = heappop(self._arriving)
+            if packet.frame:
+                mask = received
+                if packet.to:
+                    mask = np.zeros_like(received)
+                    mask[packet.to - 1] = received[packet.to - 1]
+                self._carried.heard.append((packet.frame, mask))
+            if not self._reacts:
+                continue
+            for index in np.flatnonzero(received & (self._swarm.present > 0)).tolist():
+                policy, table = self._parts.policies[index], self._parts.tables[index]
+                answer = policy.received(table, now_ns, packet.sender, packet.note)
+                self._call_at(index, next_wake(policy, answer, now_ns, "received"))
+
+
+class _Radio:
+    """What a policy has of the radio while it acts; see :class:`~dtsa_agent.core.plugins.kinds.PacketRadio`."""
+
+    __slots__ = ("_index", "_now_ns", "_traffic")
+
+    def __init__(self, traffic: UnslottedTraffic, index: int, now_ns: int) -> None:
+        self._traffic, self._index, self._now_ns = traffic, index, now_ns
+
+    def send(self, note: bytes = b"", to: int = 0) -> bool:
+        return self._traffic.send(self._index, self._now_ns, note, to)
+
+    def say(self, note: bytes) -> bool:
+        return self._traffic.transmit(_Packet(self._index + 1, b"", note), self._now_ns)

@@ -1,0 +1,165 @@
+"""The command line as people use it: help with examples, misspelt words, completion; and nothing half done is left."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+from dtsa_dev.registry import add_commands
+
+from dtsa_bench.commands import cli, registry
+from dtsa_bench.commands.cli import build_parser, command_parser
+from dtsa_bench.commands.completion import OF_THE_TOOL, script
+from dtsa_bench.commands.examples import EXAMPLES
+from dtsa_bench.flights.progress import flight_text
+from machine.main import OWN_COMMANDS
+
+add_commands()
+COMMANDS = list(registry.COMMANDS)
+
+
+def said(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The error of a command line that is refused."""
+    try:
+        code = cli.main(words)
+    except SystemExit as stopped:
+        code = stopped.code  # type: ignore[assignment]
+    text = capsys.readouterr().err
+    assert code == 2
+    assert text.count("\n") == 1
+    return text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_ends_with_examples_that_the_command_takes(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    parser, _ = build_parser(command)
+    assert EXAMPLES[command]
+    for words, text in EXAMPLES[command]:
+        given = shlex.split(words.partition(" >")[0])
+        parser.parse_args([command, *given])
+        with pytest.raises(SystemExit):
+            parser.parse_args([command, "--help"])
+        shown = capsys.readouterr().out
+        assert f"tools/dtsa {command} {words}".rstrip() + f"\n      {text}\n" in shown
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_command_takes_abbreviations(command: str) -> None:
+    parser = command_parser(build_parser(command)[0], command)
+    assert parser.prog.split()[-1] == command
+    assert not parser.allow_abbrev
+    assert not build_parser(command)[0].allow_abbrev
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["simulate", "--agnets", "3"], "option --agnets: unknown; did you mean --agents?"),
+        (["simulate", "--polic", "tdma"], "option --polic: unknown; did you mean --policy?"),
+        (["simulate", "--sed=3"], "option --sed=3: unknown; did you mean --seed?"),
+        (["simulate", "--policy", "dsta"], "; did you mean dtsa?"),
+        (["simulate", "--scenario", "way-points"], "did you mean waypoints?"),
+        (["fly", "--ot", "a"], "required: --out; option --ot: unknown; did you mean --out?"),
+        (["bridge", "--config", "a", "--backend", "cflb"], "did you mean cflib?"),
+        (["sweep", "--preset", "papr-12"], "did you mean paper-12?"),
+        (["simulat"], "did you mean simulate?"),
+    ],
+)
+def test_the_nearest_word_is_named(words: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert meant in said(words, capsys)
+
+
+@pytest.mark.parametrize("words", [["simulate", "--xyzzy", "3"], ["simulate", "--agents", "many"], ["quux"]])
+def test_nothing_is_guessed_where_nothing_is_near(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert "did you mean" not in said(words, capsys)
+
+
+def test_the_options_of_fly_are_in_groups() -> None:
+    parser = command_parser(build_parser("fly")[0], "fly")
+    sizes = {str(group.title): len(group._group_actions) for group in parser._action_groups}
+    assert sum(sizes.values()) > 60
+    assert max(sizes.values()) < 16, sizes
+    assert [action.dest for action in parser._optionals._group_actions] == ["help"]
+
+
+def test_the_tool_names_the_nearest_command(capsys: pytest.CaptureFixture[str]) -> None:
+    from machine.main import main
+
+    assert main(["flyy"]) == 2
+    assert "did you mean fly?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        ("dtsa ex", {"export"}),
+        ("dtsa se", {"setup"}),
+        ("dtsa fly --poli", {"--policy"}),
+        ("dtsa fly --policy ls", set()),
+        ("dtsa fly --policy l", {"lease"}),
+        ("dtsa bridge --backend ", {"cflib", "sim"}),
+        ("dtsa completion z", {"zsh"}),
+    ],
+)
+def test_bash_completes(line: str, wanted: set[str], completions: Path) -> None:
+    words = line.split(" ")
+    test = (
+        f". {completions}; COMP_WORDS=({' '.join(map(shlex.quote, words))}); COMP_CWORD={len(words) - 1}; _dtsa; "
+        'printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", test], capture_output=True, text=True, check=True)
+    assert not done.stderr
+    assert set(done.stdout.split()) == wanted
+
+
+@pytest.fixture(scope="module")
+def completions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("completion") / "dtsa.bash"
+    path.write_text(script("bash"), encoding="utf-8")
+    return path
+
+
+def test_completion_knows_every_command_and_option() -> None:
+    text = script("zsh")
+    assert text.startswith("autoload -U +X bashcompinit")
+    assert set(OF_THE_TOOL) == set(OWN_COMMANDS)
+    for command in COMMANDS:
+        parser = command_parser(build_parser(command)[0], command)
+        line = re.search(rf"^ +{command}\) words='(.*)' ;;$", text, re.MULTILINE)
+        assert line, command
+        options = {o for action in parser._actions for o in action.option_strings if o.startswith("--")}
+        assert set(line[1].split()) == options
+
+
+def test_progress_says_nothing_of_a_distance_that_was_not_measured() -> None:
+    """Before the first slot is over there is no pair, however many agents there are."""
+    assert "closest" not in flight_text(0, 0.0, 0.1, 0.0, (0, 0))
+    assert "alone" not in flight_text(0, 0.0, 0.1, 0.0, (0, 0))
+    assert flight_text(3, 0.03, 0.1, 0.5, (1, 4)).endswith("closest cf1 cf4 0.500 m")
+
+
+@pytest.mark.parametrize("command", ["fly", "simulate"])
+def test_auth_without_a_key_leaves_nothing_behind(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DTSA_AUTH_KEY", raising=False)
+    assert "DTSA_AUTH_KEY" in said([command, "--auth", "--agents", "3", "--out", str(tmp_path / "a")], capsys)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_argument_that_is_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "argument surplus: unknown" in said(["simulate", "surplus"], capsys)
+
+
+def test_every_parser_is_of_the_kind_that_is_checked_here() -> None:
+    for command in COMMANDS:
+        assert type(command_parser(build_parser(command)[0], command)) is cli.OneLineParser
+
+
+def test_what_prints_results_prints_them_as_json() -> None:
+    for command in ("demo", "fly", "simulate", "sweep", "soak", "benchmark", "verify", "recover", "export"):
+        parser = command_parser(build_parser(command)[0], command)
+        assert any("--json" in action.option_strings for action in parser._actions), command

@@ -1,0 +1,284 @@
+"""The simulated Crazyflies without a network: protocol, firmware, flight."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from craft import Craft
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.crazyflies.simulated import Fleet, FleetConfig, cli, crtp, layout, toc
+from dtsa_bench.crazyflies.simulated.ports import free_base_port
+from dtsa_bench.crazyflies.simulated.position_filter import PositionFilter
+from dtsa_bench.crazyflies.simulated.truth import read_truth
+
+
+# -- packets and tables -----------------------------------------------------------------------------------------------
+@settings(deadline=None)
+@given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
+def test_packets_round_trip(port: int, channel: int, data: bytes) -> None:
+    assert crtp.unpack(crtp.pack(port, channel, data)) == (port, channel, data)
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=40))
+def test_nothing_from_the_air_stops_a_peer(datagram: bytes) -> None:
+    reply = Craft().peer.receive(datagram, 0.0)
+    assert reply is None or 1 <= len(reply) <= 31
+
+
+def test_tables_fit_and_their_checksum_comes_from_their_contents() -> None:
+    for table, log in ((toc.LOG_TABLE, True), (toc.PARAM_TABLE, False)):
+        answers = [table.answer(struct.pack("<BH", 2, k)) for k in range(len(table.entries))]
+        assert all(a is not None and len(a) <= crtp.MAX_DATA for a in answers)
+        assert table.checksum == zlib.crc32(b"".join(a[3:] for a in answers if a))
+        assert table.answer(b"\x03")[:7] == struct.pack("<BHI", 3, len(answers), table.checksum)  # type: ignore[index]
+        assert toc.Table(table.entries[1:], log=log).checksum != table.checksum
+        assert not any(a[3] & 0x10 for a in answers if a)  # extended types are not offered
+    float_codes = toc.LOG_TYPES["float"][0], toc.PARAM_TYPES["float"][0]
+    assert float_codes == (7, 6)
+
+
+def test_answers_of_the_connection() -> None:
+    craft = Craft()
+    assert craft.peer.receive(b"\xff", 0.0) is not None  # the scan's probe
+    assert craft.ask(15, 1, b"\x00").startswith(b"Bitcraze Crazyflie")  # type: ignore[union-attr]
+    assert craft.ask(15, 0, b"echo") == b"echo"
+    assert craft.ask(13, 1, b"\x00") == b"\x00\x0c"
+    assert Craft(10).ask(13, 1, b"\x00") == b"\x00\x0a"
+    assert craft.ask(4, 0, b"\x01") == b"\x01\x01"  # one memory, that of trajectories
+    assert craft.ask(4, 0, b"\x02\x00") == struct.pack("<BBBI8x", 2, 0, 0x12, 4096)
+    assert craft.ask(4, 2, b"\x00" + struct.pack("<I", 4095) + b"ab") == b"\x00" + struct.pack("<IB", 4095, 5)
+    assert craft.ask(4, 2, b"\x00" + struct.pack("<I", 4094) + b"ab") == b"\x00" + struct.pack("<IB", 4094, 0)
+    assert craft.ask(4, 1, b"\x00" + struct.pack("<IB", 4093, 3)) == b"\x00" + struct.pack("<IB", 4093, 0) + b"\x00ab"
+    assert Craft(10).ask(9, 1, b"\x01\x01") is None  # the supervisor's port came with protocol 12
+    assert Craft(10).ask(13, 0, b"\x01\x01") == b"\x01\x01\x01"
+
+
+def test_log_blocks() -> None:
+    craft = Craft()
+    names = [entry.full_name for entry in toc.LOG_ENTRIES]
+    craft.estimate.position = (1.5, -40.0, 0.25)
+    block = b"".join(struct.pack("<BH", 5, names.index(f"stateEstimateZ.{axis}")) for axis in "xyz")
+    assert craft.ask(5, 1, b"\x06\x01" + block) == b"\x06\x01\x00"
+    assert craft.ask(5, 1, b"\x06\x01" + block) == b"\x06\x01\x11"  # there already
+    assert craft.ask(5, 1, b"\x03\x02\x02") == b"\x03\x02\x02"  # no such block
+    assert craft.ask(5, 1, b"\x07\x01" + block * 3) == b"\x07\x01\x00"
+    assert craft.ask(5, 1, b"\x07\x01" + block) == b"\x07\x01\x07"  # 30 bytes are too many
+    assert craft.ask(5, 1, b"\x03\x01\x02") == b"\x03\x01\x00"
+    packets = [p for tick in range(10) for p in craft.peer.log_packets(tick, 70.0)]
+    assert len(packets) == 5  # every 20 ms
+    port, channel, data = crtp.unpack(packets[0])  # type: ignore[misc]
+    assert (port, channel, data[0]) == (5, 2, 1)
+    assert int.from_bytes(data[1:4], "little") == 70000
+    assert struct.unpack("<12h", data[4:]) == (1500, -32768, 250) * 4  # mm, kept within 16 bits
+    assert craft.ask(5, 1, b"\x05") == b"\x05\x00\x00"
+    assert not craft.peer.blocks
+
+
+def test_parameters() -> None:
+    craft = Craft()
+    index = toc.PARAM_ID["ring.effect"]
+    head = struct.pack("<H", index)
+    assert craft.ask(2, 1, head) == head + b"\x00\x06"
+    assert craft.ask(2, 2, head + b"\x09") == head + b"\x09"
+    assert craft.ask(2, 1, head) == head + b"\x00\x09"
+    assert craft.ask(2, 3, b"\x08" + head) == b"\x08" + head + b"\x00\x06"
+    assert craft.ask(2, 3, b"\x00ring\x00effect\x00\x08\x03") == b"\x00ring\x00effect\x00\x00"
+    assert craft.ask(2, 1, head) == head + b"\x00\x03"
+    assert craft.ask(2, 1, b"\xff\x00") == b"\xff\x00\x02"
+    fixed = struct.pack("<H", toc.PARAM_ID["deck.bcLighthouse4"])
+    assert craft.ask(2, 2, fixed + b"\x00") == fixed + b"\x01"
+
+
+# -- fleet ------------------------------------------------------------------------------------------------------------
+def hop(seed: int, truth: Path | None = None, **fault: Any) -> Fleet:
+    """Two Crazyflies take off and land again, driven tick by tick."""
+    fleet = Fleet(FleetConfig(count=2, base_port=free_base_port(2), seed=seed, truth=truth))
+    for firmware in fleet.firmware:
+        firmware.supervisor.request_arming(True)
+    for tick in range(500):
+        for firmware in fleet.firmware:
+            if tick == 10:
+                data = struct.pack("<BBff?f", 7, 0, 0.8, 0.0, True, 1.5)
+                firmware.high_level(data, fleet.time)
+            if tick == 250:
+                data = struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 2.0)
+                firmware.high_level(data, fleet.time)
+        if tick == 220 and fault:
+            fleet.fault(fault)
+        fleet.step()
+    fleet.close()
+    return fleet
+
+
+def test_same_seed_same_flight_and_its_record(tmp_path: Path) -> None:
+    hop(3, tmp_path / "a.jsonl")
+    hop(3, tmp_path / "b.jsonl")
+    hop(4, tmp_path / "c.jsonl")
+    (times, a, events), (_, b, _), (_, c, _) = (read_truth(tmp_path / f"{name}.jsonl") for name in "abc")
+    assert a.shape == (500, 3, 2)
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+    assert np.allclose(np.diff(times), 0.01)
+    assert a[225, 2] == pytest.approx([0.8, 0.8], abs=0.03)
+    assert a[-1, 2] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert [e["event"] for e in events if e["cf"] == 1 and e["event"] != "state"][:2] == ["takeoff", "land"]
+    with (tmp_path / "a.jsonl").open("a") as record:
+        record.write('{"t": 5.0')  # cut off by a crash
+    assert len(read_truth(tmp_path / "a.jsonl")[0]) == 500
+
+
+def test_tumbling_falls_and_the_other_one_does_not() -> None:
+    fleet = hop(1, fault="tumble", cf=1)
+    names = [e["event"] for e in fleet.truth.events if e["cf"] == 1]
+    assert "hard landing" in names
+    assert fleet.firmware[0].supervisor.state == "crashed"
+    assert "hard landing" not in [e["event"] for e in fleet.truth.events if e["cf"] == 2]
+
+
+def test_two_that_meet_fall() -> None:
+    start = np.array([[0.0, 0.4], [0.0, 0.0], [0.0, 0.0]])
+    fleet = Fleet(FleetConfig(count=2, base_port=free_base_port(2), start=start))
+    for firmware in fleet.firmware:
+        firmware.supervisor.request_arming(True)
+    for tick in range(400):
+        for k, firmware in enumerate(fleet.firmware):
+            speed = (0.0, 0.0, 1.0) if tick < 100 else ((0.5, 0.0, 0.0) if k == 0 else (-0.5, 0.0, 0.0))
+            firmware.stream(struct.pack("<B4f", 8, *speed, 0.0), fleet.time)
+        fleet.step()
+    fleet.close()
+    names = [e["event"] for e in fleet.truth.events]
+    assert names.index("collision") < names.index("crash")
+    assert all(f.supervisor.state == "crashed" for f in fleet.firmware)
+
+
+@pytest.mark.parametrize(
+    ("request_", "field"),
+    [
+        ({"fault": "explode"}, "fault"),
+        ({"fault": "drop", "cf": 3}, "cf"),
+        ({"fault": "drop", "cf": "one"}, "cf"),
+        ({"fault": "drop", "rate": 1.5}, "rate"),
+        ({"fault": "drop", "direction": "left"}, "direction"),
+        ({"fault": "battery", "voltage": 9}, "voltage"),
+    ],
+)
+def test_bad_faults_are_refused(request_: dict[str, Any], field: str) -> None:
+    fleet = Fleet(FleetConfig(count=2, base_port=free_base_port(2)))
+    try:
+        with pytest.raises(ConfigError) as error:
+            fleet.fault(request_)
+        assert error.value.field == field
+    finally:
+        fleet.close()
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [({"count": 0}, "count"), ({"count": 201}, "count"), ({"base_port": 80}, "base_port"),
+     ({"protocol": 11}, "protocol"), ({"model": "kite"}, "avoider"), ({"start": np.zeros((3, 2))}, "start")],
+)  # fmt: skip
+def test_bad_fleets_are_refused(values: dict[str, Any], field: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        FleetConfig(**values)
+    assert error.value.field == field
+
+
+@pytest.mark.parametrize("name", layout.LAYOUTS)
+def test_layouts_keep_their_distance(name: str) -> None:
+    p = layout.positions(name, 12)
+    assert p.shape == (3, 12)
+    assert np.abs(p[0]).max() <= 1.2 + 1e-12
+    assert np.abs(p[1]).max() <= 2.0 + 1e-12
+    gap = np.linalg.norm(p[:, :, None] - p[:, None, :], axis=0) + 10 * np.eye(12)
+    assert gap.min() > 0.3
+
+
+def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    port = free_base_port(1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
+        busy.bind(("127.0.0.1", port))
+        assert cli.main(["--count", "1", "--base-port", str(port)]) == 2
+    assert "port: got" in capsys.readouterr().err
+    assert cli.main(["--count", "0"]) == 2
+    assert cli.main(["--fault", "drop", "--base-port", str(port)]) == 2
+    assert "control port of a running fleet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ignores", [False, True])
+def test_a_running_fleet_answers_and_ends_with_ctrl_c_unless_others_still_have_to_land_it(
+    ignores: bool, tmp_path: Path
+) -> None:
+    port, truth = free_base_port(2), tmp_path / "truth.jsonl"
+    command = [sys.executable, "-m", "dtsa_bench.crazyflies.simulated.cli", "--count", "2", "--base-port", str(port)]
+    command += ["--ignore-interrupt"] if ignores else []
+    with subprocess.Popen([*command, "--truth", str(truth)], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            lines = [process.stdout.readline() for _ in range(3)]  # type: ignore[union-attr]
+            assert lines[:2] == [f"udp://127.0.0.1:{port}\n", f"udp://127.0.0.1:{port + 1}\n"]
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as host:
+                host.settimeout(5)
+                host.connect(("127.0.0.1", port))
+                host.send(b"\xff")
+                assert host.recv(64)
+                host.connect(("127.0.0.1", port - 1))
+                host.send(b"nonsense")
+                assert json.loads(host.recv(512))["ok"] is False
+            if ignores:
+                process.send_signal(signal.SIGINT)
+                time.sleep(0.1)
+            assert cli.main(["--fault", "freeze", "--cf", "2", "--seconds", "0.2", "--base-port", str(port)]) == 0
+            process.send_signal(signal.SIGTERM if ignores else signal.SIGINT)
+            assert process.wait(10) == 0
+        finally:
+            process.kill()
+    (fault,) = (event for event in read_truth(truth)[2] if event["event"] == "fault: freeze")
+    assert set(fault) == {"t", "cf", "event", "seconds"}
+
+
+def test_external_positions_reach_the_filter_of_the_one_that_they_are_for() -> None:
+    def restarted() -> Craft:
+        craft = Craft()
+        craft.estimate.filter = PositionFilter()
+        for name, value in (("initialX", 0.3), ("resetEstimation", 1)):
+            index = toc.PARAM_ID[f"kalman.{name}"]
+            form = "<H" + toc.PARAM_TYPES[toc.PARAM_ENTRIES[index].type][1]
+            craft.ask(2, 2, struct.pack(form, index, value))
+        assert craft.estimate.filter.position == (pytest.approx(0.3), 0.0, 0.0)
+        return craft
+
+    packets = (
+        (0, struct.pack("<3f", 1.0, 2.0, 0.5)),
+        (1, struct.pack("<B7f", 8, 1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 1.0)),
+        (1, b"\x09" + struct.pack("<B3hI", 2, 9, 9, 9, 0) + struct.pack("<B3hI", 1, 1000, 2000, 500, 0)),
+        (2, struct.pack("<B3h", 7, 9, 9, 9) + struct.pack("<B3h", 1, 1000, 2000, 500)),
+    )
+    for channel, data in packets:
+        craft = restarted()
+        assert craft.estimate.filter is not None
+        assert craft.estimate.variance(0.0) == pytest.approx(100.0)
+        for _ in range(30):
+            craft.estimate.filter.predict(0.01, (0.0, 0.0, 0.0))
+            assert craft.ask(crtp.LOCALIZATION, channel, data) is None
+        assert craft.estimate.filter.position == pytest.approx((1.0, 2.0, 0.5), abs=0.002)
+        assert craft.estimate.variance(0.0) < 1e-4
+        assert craft.peer.positions_received == 30
+    for _ in range(100_000):
+        craft.estimate.filter.predict(0.01, (0.0, 0.0, 0.0))
+    assert craft.estimate.variance(0.0) == 100.0  # nothing comes any more
+    craft.ask(crtp.LOCALIZATION, 0, struct.pack("<3f", float("nan"), 0.0, 0.0))
+    assert craft.estimate.filter.position == pytest.approx((1.0, 2.0, 0.5), abs=0.5)

@@ -1,0 +1,402 @@
+"""Missions: the agents' nodes, the bridge, the real cflib and simulated Crazyflies, from take-off to landing."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("cflib")
+pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs.srv")
+
+import aiohttp
+from bridge_helpers import FakeFleet, fake_fleet, settings
+from metronome import flown_again_when_overloaded
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from waiting import wait_for
+
+from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.crazyflie.links.link import require_cflib
+from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_bench.commands.fly import mission_problem
+from dtsa_bench.crazyflies.missions.ground_station import Ended
+from dtsa_bench.crazyflies.missions.mission_flight import CrashWatch
+from dtsa_bench.crazyflies.missions.moves_to_places import plan_moves
+from dtsa_bench.crazyflies.missions.places import MissionError, assign_places, check_standing, crossings
+from dtsa_bench.crazyflies.simulated.truth import read_truth
+from dtsa_bench.flights.domain import ros_domain
+from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
+from dtsa_bench.runs.metrics import FlightMetrics
+from dtsa_channel_sim import ChannelConfig
+from dtsa_channel_sim.ros.observer import ChannelStatus
+
+pytestmark = [pytest.mark.slow, pytest.mark.ros]
+COUNT = 4
+FLY = [sys.executable, "-m", "dtsa_bench", "fly", "--backend", "cflib", "--no-picture", "--slot-ms", "20"]
+
+
+MIXED = ("--arming", "mixed")  # stock ones, which arm themselves, beside those that wait to be told
+
+
+def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
+    """The swarm's YAML, everybody on its place of the ellipse."""
+    return written(settings(fleet, {"safety": safety}), folder)
+
+
+def radio_yaml(folder: Path, **safety: float) -> Path:
+    """The same over two dongles."""
+    robots = {f"cf{k}": {"uri": f"radio://{k % 2}/{40 + 40 * (k % 2)}/2M/E7E7E7E7{k:02X}"} for k in range(1, COUNT + 1)}
+    return written({"robots": robots, "station": {"toc_cache": str(folder / "cache"), "safety": safety}}, folder)
+
+
+def written(data: dict[str, Any], folder: Path) -> Path:
+    """The YAML's file."""
+    for k, robot in enumerate(data["robots"].values()):
+        angle = 2 * math.pi * k / COUNT
+        robot["initial_position"] = [round(1.2 * math.cos(angle), 3), round(2.0 * math.sin(angle), 3), 0.0]
+    path = folder / "swarm.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
+    config = SwarmConfig(agents=12, permute=False, shape="ellipse", axis_x_m=1.2, axis_y_m=2.0)
+    names = [f"cf{k}" for k in range(1, 13)]
+    fence = SafetySettings()
+    start = make_scenario(config).start
+    assert assign_places(config, start) is config
+    measured = np.roll(start, 5, axis=1) + np.random.default_rng(1).uniform(-0.15, 0.15, (3, 12))
+    found = assign_places(config, measured)
+    assert found.place_numbers == np.roll(np.arange(1, 13), 5).tolist()
+    check_standing(names, measured, fence)
+    assert not crossings(make_scenario(found), names, measured)
+    across = crossings(make_scenario(config), names, np.roll(start, 6, axis=1))  # all through the middle
+    assert "cf1 and cf7 at 0.0" in ", ".join(across)
+    assert assign_places(found, start) is found  # roles that the user has given are kept
+    measured = start.copy()
+    measured[:2, 3] = measured[:2, 4] + (0.1, 0.0)
+    measured[0, 0] = 2.5
+    with pytest.raises(MissionError, match=r"cf1 stands 1\.00 m outside .*; cf4 and cf5 stand 0\.10 m apart"):
+        check_standing(names, measured, fence)
+
+
+def test_a_mission_after_which_somebody_may_still_fly_has_failed() -> None:
+    assert mission_problem("", []) == ""
+    assert mission_problem("", ["cf2"]) == "the exchange is complete; not known to have landed: cf2"
+    assert mission_problem("a reason", []) == "the exchange was cut short: a reason; all have landed"
+
+
+def test_two_as_near_as_in_a_crash_cut_the_exchange_short() -> None:
+    """A run that ended by itself was taken for complete, and nobody came to rest before they landed."""
+    swarm = SwarmConfig(agents=3)
+    run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
+    metrics, ended = FlightMetrics(run, make_scenario(swarm)), Ended(MagicMock())
+    watch, status = CrashWatch(metrics, ended), ChannelStatus(0, {}, [])
+    watch.idle(status)
+    assert not ended.reason
+    metrics.update(0, np.array([[[0.0, 0.19, 2.0], [0.0] * 3, [0.0] * 3]]), None, 0)
+    watch.idle(status)
+    assert ended.reason == "cf1 and cf2 came within 0.19 m of each other (collision_m is 0.2)"
+
+
+def check_records(out: Path) -> None:
+    """The whole mission is in its own bag, in mission.json, and in the report."""
+    mission = json.loads((out / "mission.json").read_text())
+    texts = [event["text"] for event in mission["events"]]
+    assert mission["cut_short"] == ""
+    for words in ("order /all/arm (arm True): done", "order /all/takeoff (", "order /cf1/go_to (", "order /all/land ("):
+        assert any(text.startswith(words) for text in texts), texts
+    one = mission["vehicles"]["cf1"]
+    assert [s["state"] for s in one["states"]][-4:] == ["armed", "flying", "landing", "ready"]
+    assert 3.0 < one["battery_least_v"] <= one["battery_first_v"] < 4.3
+    assert "commands [Hz]" in one["last"]
+    with AnyReader([out / "mission_bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        counts = {name: topic.msgcount for name, topic in bag.topics.items()}
+    assert set(counts) >= {"/all/events", "/diagnostics"}
+    for cf in range(1, COUNT + 1):
+        assert counts[f"/cf{cf}/status"] > 20
+        assert counts[f"/cf{cf}/odom"] > 50
+        assert counts[f"/cf{cf}/cmd_velocity_world"] > 20
+    assert counts["/all/events"] >= len(texts) > 20
+    data = run_data(out)
+    assert data["mission"]["vehicles"][0][0] == "cf1"
+    assert any("order /all/takeoff" in text for _, _, text in data["mission"]["events"])
+
+
+async def told_in_flight(url: str) -> set[str]:
+    """Waits until a mission's page is told of an exchange under way; who it says is flying then."""
+    flying: set[str] = set()
+    moments = 0
+    async with aiohttp.ClientSession() as client, client.ws_connect(url + "stream", max_msg_size=0) as stream:
+        while len(flying) < COUNT or moments < 10:
+            content = await stream.receive_json(timeout=60)
+            moments += len(content.get("moments", ()))
+            flying |= {told[0] for told in content.get("told", ()) if told[1] == "flying"}
+    return flying
+
+
+@flown_again_when_overloaded
+def test_a_bridge_that_dies_leaves_records_and_a_summary(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
+        out = tmp_path / "out"
+        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(out), "--tail-s", "60", "--view"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            assert process.stderr is not None
+            page = asyncio.run(told_in_flight(process.stderr.readline().split()[1]))
+            wait_for(lambda: len(fleet.events(name="streaming")) == COUNT, 60)
+            (bridge,) = (
+                int(child)
+                for task in Path(f"/proc/{process.pid}/task").iterdir()
+                for child in (task / "children").read_text().split()
+                if b"bridge_node" in Path(f"/proc/{child}/cmdline").read_bytes()
+            )
+            os.kill(bridge, signal.SIGKILL)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.wait()
+        assert process.returncode == 1
+        assert page == {"cf1", "cf2", "cf3", "cf4"}
+        assert "bridge" in errors
+        assert "not known to have landed: cf1, cf2, cf3, cf4" in errors
+        summary = json.loads((out / "summary.json").read_text())
+        mission = json.loads((out / "mission.json").read_text())
+        assert "bridge" in summary["cut_short"] == mission["cut_short"]
+        assert summary["slots"]["total"] > 10
+        assert mission["vehicles"]["cf1"]["states"][-1]["state"] == "flying"
+        assert (out / "bag" / "metadata.yaml").is_file()
+        assert (out / "mission_bag" / "metadata.yaml").is_file()
+        assert run_data(out)["mission"]["cut_short"] == mission["cut_short"]
+
+
+@flown_again_when_overloaded
+def test_take_off_exchange_landing(tmp_path: Path) -> None:
+    """Over simulated radios, on which a twentieth of all packets is lost."""
+    patient = {"link_age_s": 3.0, "command_age_s": 0.45, "emergency_watchdog": False}  # it would lock them
+    config, out, radio = (
+        radio_yaml(tmp_path, **patient),
+        tmp_path / "out",
+        ("--simulated-radio", str(tmp_path / "radio")),
+    )
+    with fake_fleet(tmp_path, COUNT, "--config", str(config), *radio, "--radio-loss", "0.05", *MIXED) as fleet:
+        command = [*FLY, "--config", str(config), "--out", str(out), *radio]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert result.returncode == 0, result.stderr
+        summary = json.loads((out / "summary.json").read_text())
+        assert (summary["end"], summary["backend"], summary["cut_short"]) == ("completed", "cflib", "")
+        assert summary["policy"] == "lease"  # the safe one, unless told otherwise
+        assert 1.0 < summary["completion_time_s"] < 30.0
+        last_landed = max(e["t"] for e in fleet.events(name="state") if e["state"] == "landed")
+        begun = json.loads(fleet.truth.read_text().partition("\n")[0])["fleet"]["unix_time"]
+        assert (out / "summary.json").stat().st_mtime > begun + last_landed  # drawn and written once all stood
+        assert (out / "bag" / "metadata.yaml").is_file()
+        check_records(out)
+        times, track, events = read_truth(fleet.truth)
+        assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
+        # Who stood opposite each other have changed places, and everybody stands on the floor.
+        assert track[-1, 2] == pytest.approx([0.0] * COUNT)
+        goal = track[0][:2, [2, 3, 0, 1]]
+        assert np.linalg.norm(track[-1][:2] - goal, axis=0).max() < 0.5
+        for k in range(1, COUNT + 1):
+            assert fleet.flown(k)[:3] == ["ready to fly", "flying", "landed"]
+        # What the bag's metrics say about the closest approach is what truly happened, within the sensors' noise.
+        begin = max(
+            next(e["t"] for e in events if e["cf"] == k and e["event"] == "streaming") for k in range(1, COUNT + 1)
+        )
+        end = min(e["t"] for e in events if e["event"] == "land")
+        during = track[(times >= begin) & (times <= end)]
+        gap = np.linalg.norm(during[:, :, :, None] - during[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
+        assert summary["min_distance_m"] == pytest.approx(gap.min(), abs=0.05)
+
+
+def test_whoever_may_not_exchange_roles_is_brought_over_the_others() -> None:
+    config = SwarmConfig(agents=12, permute=False, shape="ellipse", axis_x_m=1.2, axis_y_m=2.0)
+    names = [f"cf{k}" for k in range(1, 13)]
+    goal, fence, random = make_scenario(config).start, SafetySettings(), np.random.default_rng(3)
+    for order in (np.roll(np.arange(12), 1), np.roll(np.arange(12), 6), *(random.permutation(12) for _ in range(20))):
+        here = goal[:, order] + np.array([[0.08], [0.08], [0.0]]) * random.uniform(-1, 1, (3, 12))
+        for move in plan_moves(names, here, goal, fence):
+            for waypoint in move.waypoints:
+                begin = here[:, move.index, None]
+                steps = begin + (np.array(waypoint)[:, None] - begin) * np.linspace(0, 1, 50)
+                assert (np.abs(steps) <= np.array(fence.geofence_max)[:, None]).all()
+                others = np.delete(here, move.index, axis=1)
+                gap = np.linalg.norm(steps[:2, :, None] - others[:2, None], axis=0)
+                below = steps[2, :, None] - others[2, None] < 0.5
+                assert gap[below].min(initial=1.0) > 0.34
+                here[:, move.index] = waypoint
+        assert np.abs(here - goal).max() < 0.06
+    crowded = goal.copy()
+    crowded[:2, 1] = crowded[:2, 0] - (0.1, 0.0)
+    with pytest.raises(MissionError, match=r"cf1 and cf2 hover 0\.10 m apart"):
+        plan_moves(names, crowded, goal, fence)
+    low = SafetySettings(geofence_max=(1.5, 2.3, 0.4))
+    with pytest.raises(MissionError, match=r"is above the geofence's 0\.4 m"):
+        plan_moves(names, np.roll(goal, 1, axis=1), goal, low)
+    pair = np.array([[-0.3, 0.3], [0.0, 0.0], [0.0, 0.0]])
+    narrow = SafetySettings(geofence_min=(-0.5, -0.3, -0.95), geofence_max=(0.5, 0.3, 0.95))
+    with pytest.raises(MissionError, match=r"cf1, cf2 stand at each other's places, and no place aside"):
+        plan_moves(names[:2], pair, pair[:, ::-1], narrow)
+
+
+@flown_again_when_overloaded
+def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> None:
+    """The first one finds two at each other's places and may not exchange roles; the second one exchanges them."""
+    with ros_domain() as domain:
+        pass  # free: the bridge's now
+    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
+        config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
+        data = yaml.safe_load(config.read_text())
+        robots = list(data["robots"].values())  # cf1 is the agent of the third place's vehicle, and the other way round
+        robots[0]["uri"], robots[2]["uri"] = robots[2]["uri"], robots[0]["uri"]
+        config.write_text(yaml.safe_dump(data))
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        log = (tmp_path / "bridge.log").open("w+")
+        command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config)]
+        bridge = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        try:
+            for number, (options, words) in enumerate((
+                (["--places", "1 2 3 4"], "brought to their places one by one: cf1 and cf3 at 0.0"),
+                ([], "exchange of roles, places 3 4 1 2"),
+            )):  # fmt: skip
+                command = [*FLY, "--config", str(config), "--attach", "--out", str(tmp_path / str(number)), *options]
+                result = subprocess.run(
+                    command, env=environment, capture_output=True, text=True, timeout=150, check=False
+                )
+                assert result.returncode == 0, result.stderr + (tmp_path / "bridge.log").read_text()
+                assert words in result.stderr
+            bridge.send_signal(signal.SIGINT)
+            assert bridge.wait(60) == 0
+        finally:
+            bridge.kill()
+            bridge.wait()
+            log.close()
+        _, track, events = read_truth(fleet.truth)
+        assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
+        assert [e["event"] for e in events].count("takeoff") == 2 * COUNT
+        flown = track[track[:, 2].min(axis=1) > 0.5]
+        gap = np.linalg.norm(flown[:, :, :, None] - flown[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
+        assert gap.min() > 0.25
+
+
+@flown_again_when_overloaded
+def test_a_dry_run_flies_from_where_they_stand_and_nobody_moves(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2, *MIXED) as fleet:
+        data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
+        for cf, x in (("cf1", -1.2), ("cf2", 1.2)):  # at each other's places
+            data["robots"][cf]["initial_position"] = [-x, 0.0, 0.0]
+            data["robots"][cf]["uri"] = fleet.uri(1 if x > 0 else 2)
+        config, out = tmp_path / "swarm.yaml", tmp_path / "out"
+        config.write_text(yaml.safe_dump(data))
+        command = [*FLY, "--config", str(config), "--out", str(out), "--dry-run"]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+        assert result.returncode == 0, result.stderr
+        assert "exchange of roles, places 2 1" in result.stderr
+        assert json.loads((out / "summary.json").read_text())["end"] == "completed"
+        assert not [e for e in fleet.events(name="state") if e["state"] in ("flying", "locked")]
+        # Somebody who cannot be asked is named, and nothing is flown.
+        fleet.fault("close", 1)
+        data["all"] |= {"connect_attempts": 1, "connect_timeout_s": 2.0}
+        config.write_text(yaml.safe_dump(data))
+        command[command.index(str(out))] = str(tmp_path / "again")
+        result = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+        assert (result.returncode, "where cf2 stand is not known" in result.stderr) == (1, True)
+
+
+@flown_again_when_overloaded
+def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
+        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out"), "--tail-s", "60"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            end = time.monotonic() + 60
+            while len(fleet.events(name="streaming")) < COUNT and time.monotonic() < end:
+                time.sleep(0.1)
+            time.sleep(1.0)
+            fleet.fault("freeze", 2)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.wait()
+        assert process.returncode == 1
+        assert "cut short: cf2 is lost" in errors
+        for k in (1, 3, 4):
+            assert fleet.flown(k)[:3] == ["ready to fly", "flying", "landed"]
+        assert fleet.state_event(2, "level out")
+        assert not [e for e in fleet.events() if e["event"] in ("collision", "crash") and e["cf"] != 2]
+        # They come to rest before they land, out of each other's way.
+        _, track, _ = read_truth(fleet.truth)
+        others = track[:, :, [0, 2, 3]]
+        others = others[others[:, 2].min(axis=1) > 0.5]
+        gap = np.linalg.norm(others[:, :, :, None] - others[:, :, None, :], axis=1) + 10 * np.eye(3)
+        assert gap.min() > 0.25
+
+
+def fly(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*FLY, *arguments], capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_bad_input_starts_nothing(tmp_path: Path) -> None:
+    out = str(tmp_path / "out")
+    robots = {f"cf{k}": {"uri": f"udp://127.0.0.1:{9000 + k}"} for k in range(1, 5)}
+    config = tmp_path / "swarm.yaml"
+    config.write_text(yaml.safe_dump({"robots": robots}))
+    for arguments, words in (
+        (["--out", out], "--config FILE"),
+        (["--out", out, "--config", str(config)], "within 0.25 m of (1."),
+        (["--out", out, "--config", str(config), "--agents", "3", "--moving", "2"], "the ids 1 to 3"),
+    ):
+        result = fly(*arguments)
+        assert result.returncode == 2
+        assert words in result.stderr
+        assert len(result.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="pip install cflib"):
+        require_cflib()
+
+
+@flown_again_when_overloaded
+def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
+    with fake_fleet(tmp_path, 2, *MIXED) as fleet:
+        data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
+        data["robots"]["cf1"]["initial_position"] = [1.2, 0.0, 0.0]
+        data["robots"]["cf2"]["initial_position"] = [-1.2, 0.0, 0.0]
+        config = tmp_path / "swarm.yaml"
+        config.write_text(yaml.safe_dump(data))
+        command = [*FLY, "--config", str(config), "--out", str(tmp_path / "out"), "--tail-s", "60"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            wait_for(lambda: len(fleet.events(name="streaming")) == 2, 60)
+            process.send_signal(signal.SIGINT)
+            wait_for(lambda: len(fleet.events(name="land")) == 2, 20)
+            assert not any(e["state"] == "locked" for e in fleet.events(name="state"))
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=60)
+        finally:
+            process.kill()
+            process.wait()
+        assert process.returncode == 130
+        for k in (1, 2):
+            assert fleet.state_event(k, "locked")["reason"] == "emergency stop"

@@ -1,0 +1,180 @@
+"""The simulated radio by itself: dongle, air and receivers in simulated time, without cflib."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from dtsa_agent.crazyflie.settings import radio_budget as budget
+from dtsa_bench.crazyflies.simulated.radio import esb
+from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
+from dtsa_bench.crazyflies.simulated.radio.dongle import (
+    ACK_ENABLE,
+    SCAN_CHANNELS,
+    SET_ADDRESS,
+    SET_CHANNEL,
+    SET_RATE,
+    Agenda,
+    Dongle,
+)
+from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, Receiver
+from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+
+NULL, SAFELINK = b"\xff", b"\xff\x05\x01"
+PACKET = b"\x3c" + bytes(14)
+US = 1000
+TWO = RadioSettings(dongles=2, request_ms=0.0)
+
+
+def station(number: int, channel: int = 80, rate: str = "2M") -> Station:
+    return Station.of(f"radio://0/{channel}/{rate}/E7E7E7E7{number:02X}")
+
+
+@dataclass
+class Room:
+    """Dongles and Crazyflies on one air."""
+
+    settings: RadioSettings = TWO
+    stations: tuple[Station, ...] = (station(1), station(2))
+    heard: list[tuple[int, bytes]] = field(default_factory=list)
+    deaf: set[tuple[int, bool]] = field(default_factory=set)  # index, up: what a fault stops
+    agenda: Agenda = field(default_factory=Agenda)
+
+    def __post_init__(self) -> None:
+        first = self.settings.dongles + 1
+        self.receivers = [
+            Receiver(s, lambda packet, t, k=k: self.heard.append((k, packet))) for k, s in enumerate(self.stations)
+        ]
+        by_id = {first + k: receiver for k, receiver in enumerate(self.receivers)}
+        air = RadioAir(first - 1 + len(by_id), self.settings.loss, self.settings.seed)
+        self.dongles = [
+            Dongle(k, self.settings, air, self.agenda, by_id, lambda radio, up: (radio - first, up) not in self.deaf)
+            for k in range(1, first)
+        ]
+
+    def tune(self, dongle: int, to: Station) -> None:
+        d = self.dongles[dongle]
+        d.request(SET_CHANNEL, to.channel, 0, b"", 0)
+        d.request(SET_ADDRESS, 0, 0, to.address, 0)
+        d.request(SET_RATE, esb.RATE_NAMES.index(to.rate), 0, b"", 0)
+
+    def exchange(self, packet: bytes, at_ns: int = 0, dongle: int = 0) -> list[tuple[int, bytes]]:
+        """When the answer to a packet came (ns), and the answer."""
+        answers: list[tuple[int, bytes]] = []
+        self.dongles[dongle].transfer(packet, at_ns, lambda data: answers.append((self.now, data)))
+        self.run()
+        return answers
+
+    def run(self) -> None:
+        while (due := self.agenda.next_ns) is not None:
+            self.now = due
+            self.agenda.run(due)
+
+
+def test_a_packet_takes_its_time_on_the_air() -> None:
+    room = Room()
+    room.tune(0, room.stations[0])
+    ((when, answer),) = room.exchange(PACKET)
+    assert answer == bytes((0x03, 0xF3, 0x01, 45)), "acknowledged, no retry, an empty packet with the signal's strength"
+    bits = 2 * 73 + 8 * (15 + 3)
+    assert when == 200 * US + 2 * 130 * US + bits * 500
+    assert room.heard == [(0, PACKET)]
+    room.tune(0, station(9))
+    ((missed, answer),) = room.exchange(PACKET, at_ns=when)
+    assert answer == b"\0"
+    assert missed - when == 200 * US + 4 * (130 + (73 + 120) / 2 + 500) * US, "once and three times more"
+
+
+def test_acknowledgements_carry_what_waits_and_safelink_repeats_what_was_lost() -> None:
+    room = Room()
+    room.tune(0, room.stations[0])
+    receiver = room.receivers[0]
+    assert room.exchange(SAFELINK)[0][1] == b"\x03" + SAFELINK
+    for k in range(QUEUE + 5):
+        receiver.push(bytes((0x50, k % 256)))
+    assert receiver.waiting == QUEUE
+    up = down = 0
+    fetched: list[int] = []
+    lost = 0
+    for number in range(40):
+        header = 0xF3 & 0x3C | up << 3 | down << 2
+        room.deaf = {(0, False)} if number % 5 == 2 else set()  # these acknowledgements are lost, all four of them
+        ((_, answer),) = room.exchange(bytes((header, number)))
+        if answer == b"\0":
+            lost += 1
+            continue  # cflib sends the same packet again
+        if len(answer) > 1 and bool(answer[1] & 4) == bool(down):
+            down = 1 - down
+        up = 1 - up
+        if answer[1] >> 4 == 5:
+            fetched.append(answer[2])
+    assert lost == 8
+    numbers = [packet[1] for _, packet in room.heard]
+    assert numbers == sorted(set(numbers)), "nothing was delivered twice"
+    assert fetched == list(range(len(fetched)))
+    assert len(fetched) > 20, "nothing got lost on the way down"
+
+
+def test_two_dongles_on_one_channel_collide_and_on_two_channels_do_not() -> None:
+    for channel, retries in ((80, {1, 2, 3}), (60, {0})):
+        room = Room(RadioSettings(dongles=2, device="pa"), (station(1), station(2, channel)))
+        answers: list[bytes] = []
+        for dongle in (0, 1):
+            room.tune(dongle, room.stations[dongle])
+            # the second one begins while the first one's packet is on the air
+            room.dongles[dongle].transfer(PACKET, 50 * US * dongle, answers.append)
+        room.run()
+        assert len(answers) == 2
+        assert {answer[0] >> 4 for answer in answers if answer != b"\0"} <= retries
+        assert (b"\0" in answers) == (channel == 80), "with equal delays two PAs disturb each other every time"
+
+
+def test_a_broadcast_reaches_all_on_its_channel_and_is_not_answered() -> None:
+    room = Room(stations=(station(1), station(2), station(3, 60), station(4, 80, "1M")))
+    room.tune(0, Station("", 80, "2M", esb.BROADCAST))
+    room.dongles[0].request(ACK_ENABLE, 0, 0, b"", 0)
+    assert room.exchange(PACKET) == []
+    assert room.exchange(PACKET[:16] * 2 + bytes(10)) == [], "more than 32 bytes: two packets"
+    assert [k for k, _ in room.heard] == [0, 1, 0, 1, 0, 1]
+
+
+def test_losses_come_from_the_seed_and_are_as_many_as_were_ordered() -> None:
+    def acknowledged(seed: int) -> list[bool]:
+        room = Room(RadioSettings(dongles=1, request_ms=0.0, loss=0.3, seed=seed), (station(1),))
+        room.tune(0, room.stations[0])
+        room.dongles[0].request(6, 0, 0, b"", 0)  # no retries
+        return [room.exchange(NULL, at_ns=k * 10_000 * US)[0][1] != b"\0" for k in range(400)]
+
+    first = acknowledged(7)
+    assert first == acknowledged(7) != acknowledged(8)
+    assert sum(first) / 400 == pytest.approx(0.7 * 0.7, abs=0.08)
+
+
+@pytest.mark.parametrize("rate", list(esb.BITRATES))
+@pytest.mark.parametrize("count", [1, 4])
+def test_the_bridges_budget_is_what_a_dongle_carries(rate: str, count: int) -> None:
+    """One exchange after the other, as cflib does it, for half a second."""
+    stations = tuple(station(k, 80, rate) for k in range(1, count + 1))
+    room = Room(RadioSettings(dongles=1, device="pa"), stations)
+    now = exchanges = 0
+    room.tune(0, stations[0])
+    now = 3_000 * US
+    while now < 503_000 * US:
+        to = exchanges % count
+        if count > 1:
+            room.dongles[0].request(SET_ADDRESS, 0, 0, stations[to].address, now)
+        room.receivers[to].push(bytes((0x5C,)) + bytes(budget.DOWN_BYTES - 1))
+        ((now, answer),) = room.exchange(bytes((0x7C,)) + bytes(budget.UP_BYTES - 1), now)
+        assert answer[0] & 1
+        exchanges += 1
+    assert exchanges / 0.5 == pytest.approx(1 / budget.exchange_s(rate, shared=count > 1), rel=0.03)
+
+
+def test_what_the_devices_cannot_do() -> None:
+    for device, rate, channel, there in (("2", "250K", 80, False), ("pa", "250K", 80, True), ("2", "1M", 110, False)):
+        room = Room(RadioSettings(dongles=1, device=device), (station(1, channel, rate),))
+        room.tune(0, room.stations[0])
+        assert (room.exchange(PACKET)[0][1] != b"\0") is there, (device, rate, channel)
+        room.dongles[0].request(SCAN_CHANNELS, 0, 125, NULL, 0)
+        assert room.dongles[0].scanned == (bytes((channel,)) if there else b"")

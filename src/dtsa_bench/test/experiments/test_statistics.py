@@ -1,0 +1,79 @@
+"""Intervals: against published values, and by whether they hold the truth as often as they say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dtsa_bench.experiments.statistics import bootstrap_mean, median_interval, paired_difference, wilson
+
+
+@pytest.mark.parametrize(
+    ("count", "total", "low", "high"),
+    # Newcombe (1998), table I, method 3.
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_wilson_as_published(count: int, total: int, low: float, high: float) -> None:
+    share = wilson(count, total)
+    assert (share.low, share.high) == (pytest.approx(low, abs=6e-5), pytest.approx(high, abs=6e-5))
+    assert str(share) == f"{count}/{total}"
+
+
+# With fewer than six values no interval holds the median with probability 0.95; the widest is given.
+@pytest.mark.parametrize(("count", "rank"), [(1, 1), (5, 1), (6, 1), (9, 2), (12, 3), (20, 6), (24, 7), (50, 18)])
+def test_the_interval_of_a_median_has_the_ranks_of_the_sign_test(count: int, rank: int) -> None:
+    assert median_interval(list(range(count, 0, -1))) == (rank, count + 1 - rank)
+
+
+@given(st.integers(1, 500), st.data())
+def test_wilson_holds_the_share_and_is_symmetric(total: int, data: st.DataObject) -> None:
+    count = data.draw(st.integers(0, total))
+    share, other = wilson(count, total), wilson(total - count, total)
+    assert 0.0 <= share.low <= share.value <= share.high <= 1.0
+    assert (share.low, share.high) == (pytest.approx(1 - other.high), pytest.approx(1 - other.low))
+    assert wilson(count, total, 0.5).high <= share.high
+
+
+def test_no_runs_say_nothing_and_wrong_counts_are_refused() -> None:
+    assert (wilson(0, 0).low, wilson(0, 0).high) == (0.0, 1.0)
+    assert math.isnan(wilson(0, 0).value)
+    for count, total, level in ((-1, 3, 0.95), (4, 3, 0.95), (1, 3, 1.0)):
+        with pytest.raises(ValueError, match="allowed"):
+            wilson(count, total, level)
+
+
+def test_the_bootstrap_holds_the_true_mean_about_as_often_as_it_says() -> None:
+    random = np.random.default_rng(1)
+    hits = 0
+    for _ in range(200):
+        mean = bootstrap_mean(random.exponential(2.0, 30), resamples=500)
+        hits += mean.low <= 2.0 <= mean.high
+    assert 0.86 <= hits / 200 <= 0.99
+
+
+def test_the_bootstrap_is_seeded_and_leaves_out_what_is_no_number() -> None:
+    values = [1.0, 2.0, math.nan, 4.0, math.inf]
+    first, second = bootstrap_mean(values), bootstrap_mean([1.0, 2.0, 4.0])
+    assert first == second
+    assert first.count == 3
+    assert first.value == pytest.approx(7 / 3)
+    assert first.low < first.value < first.high
+    assert bootstrap_mean([]).count == 0
+    assert math.isnan(bootstrap_mean([]).value)
+    assert bootstrap_mean([3.0]).low == bootstrap_mean([3.0]).high == 3.0
+
+
+def test_pairs_tell_what_means_hide() -> None:
+    random = np.random.default_rng(2)
+    scenario = random.normal(10.0, 5.0, 30)
+    first, second = scenario, scenario + random.normal(0.3, 0.1, 30)
+    difference = paired_difference(first.tolist(), second.tolist())
+    assert 0.2 < difference.low < 0.3 < difference.high < 0.4
+    assert bootstrap_mean(first).high > bootstrap_mean(second).low
+    assert paired_difference([1.0, math.nan], [2.0, 5.0]).count == 1
+    with pytest.raises(ValueError, match="as many"):
+        paired_difference([1.0], [1.0, 2.0])

@@ -1,0 +1,459 @@
+"""Sweeps: read, flown on cores and clusters, interrupted and resumed, counted honestly."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_bench.commands.cli import main
+from dtsa_bench.drawing.style import INK
+from dtsa_bench.experiments.batch import cluster as dask
+from dtsa_bench.experiments.batch import journal, pool
+from dtsa_bench.experiments.batch.code import PROJECT
+from dtsa_bench.experiments.sweep import spec
+from dtsa_bench.experiments.sweep.aggregate import Table, collected
+from dtsa_bench.experiments.sweep.work import work_of
+
+CONTENT: dict[str, Any] = {
+    "title": "small",
+    "seeds": 6,
+    "base": {"agents": 6, "timeout_s": 0.6},
+    "axes": {"policy": ["tdma", "dtsa"], "channel": {"clear": {}, "lossy": {"loss": 0.2}}},
+    "figures": [{"kind": "matrix", "rows": "policy", "columns": "channel", "y": ["crashed"]}],
+}
+
+
+def sweep(**changes: Any) -> spec.Sweep:
+    content = {**CONTENT, **changes}
+    if "axes" in changes and "figures" not in changes:
+        del content["figures"]
+    return spec.make_sweep(content, "small")
+
+
+def stable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{key: value for key, value in row.items() if key != "wall_time_s"} for row in rows]
+
+
+def fly(directory: Path, plan: spec.Sweep, **options: Any) -> list[dict[str, Any]]:
+    work = work_of(plan)
+    book = journal.Journal(directory, plan, work.code())
+    try:
+        return collected(plan, pool.run_all(plan, work, book, **options))
+    finally:
+        book.close()
+
+
+def test_axes_are_combined_and_names_may_be_of_any_section() -> None:
+    plan = sweep(base={"agents": 6, "timeout_s": 0.6, "burst_length": 4.0, "epsilon": 0.25})
+    assert [cell.labels for cell in plan.cells] == [
+        {"policy": p, "channel": c} for p in ("tdma", "dtsa") for c in ("clear", "lossy")
+    ]
+    run = plan.cells[3].run(5)
+    assert (run.swarm.policy, run.air.loss, run.air.burst_length) == ("dtsa", 0.2, 4.0)
+    assert run.limits.timeout_s == 0.6
+    assert (run.swarm.seed, run.air.seed, run.swarm.epsilon) == (5, 5, 0.25)
+    assert plan.seeds == tuple(range(1001, 1007))
+    assert sweep(seeds=[3, 9]).seeds == (3, 9)
+    assert spec.make_sweep(CONTENT, "s", seeds=2, first_seed=50).seeds == (50, 51)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"axes": {"color": ["red"]}}, "axes.color"),
+        ({"axes": {"cell": {"a": {}}}}, "axes.cell"),
+        ({"axes": {"status": {"a": {}}}}, "axes.status"),
+        ({"axes": {"seed": [1, 2]}}, "axes.seed"),
+        ({"axes": {"policy": []}}, "axes.policy"),
+        ({"axes": {"agents": [6, -3]}}, "agents"),
+        ({"axes": {"x": {"a": {"nothing": 1}}}}, "nothing"),
+        ({"axes": {"channel": {"a": {"loss": 1.5}}}}, "loss"),
+        ({"base": {"timeout": 3}}, "timeout"),
+        ({"base": []}, "base"),
+        ({"seeds": 0}, "seeds"),
+        ({"seeds": ["a"]}, "seeds"),
+        ({"figures": [{"kind": "pie"}]}, "figures[0].kind"),
+        ({"figures": [{"kind": "bars", "x": "moving", "y": []}]}, "figures[0].x"),
+        ({"color": "red"}, "color"),
+    ],
+)
+def test_what_is_wrong_is_named_before_anything_flies(changes: dict[str, Any], field: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        sweep(**changes)
+    assert caught.value.field == field
+
+
+def test_files_that_are_no_sweeps_are_refused(tmp_path: Path) -> None:
+    for text in ("- 1\n- 2\n", "a: [", "\x00"):
+        path = tmp_path / "sweep.yaml"
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ConfigError, match="file"):
+            spec.load_file(path)
+    with pytest.raises(ConfigError, match="readable"):
+        spec.load_file(tmp_path / "missing.yaml")
+    with pytest.raises(ConfigError, match="paper-12"):
+        spec.load_preset("nothing")
+
+
+def test_cores_change_nothing(tmp_path: Path) -> None:
+    plan = sweep()
+    here, cores = fly(tmp_path / "a", plan), fly(tmp_path / "b", plan, jobs=2)
+    assert len(here) == 24
+    assert stable(here) == stable(cores)
+    assert [row["seed"] for row in here[:6]] == list(plan.seeds)
+
+
+def test_chunks_hold_every_run_once_and_keep_all_workers_busy() -> None:
+    tasks = list(sweep(axes={"agents": [4, 8, 60]}, seeds=30).tasks())
+    chunks = pool.chunks_of(tasks, 3)
+    assert [task for chunk in chunks for task in chunk] == tasks
+    assert len(chunks) >= 12
+    single = max(task.cost for task in tasks)
+    assert all(sum(task.cost for task in chunk) <= max(pool.CHUNK_COST, single) for chunk in chunks)
+    assert pool.chunks_of([], 2) == []
+
+
+def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = sweep()
+    whole = fly(tmp_path / "whole", plan)
+    monkeypatch.setattr(pool, "CHUNK_COST", 1.0)
+
+    def stop(runs: int, cost: float) -> None:
+        seen.append(runs)
+        if len(seen) == 7:
+            raise KeyboardInterrupt
+
+    seen: list[int] = []
+    with pytest.raises(KeyboardInterrupt):
+        fly(tmp_path / "parts", plan, progress=stop)
+    path = tmp_path / "parts" / "runs.jsonl"
+    assert len(path.read_text().splitlines()) == 7
+    with path.open("a") as file:
+        file.write('{"key": "torn')  # a kill in the middle of a line
+    flown: list[int] = []
+    again = fly(tmp_path / "parts", plan, progress=lambda runs, cost: flown.append(runs))
+    assert sum(flown) == 24 - 7
+    assert stable(again) == stable(whole)
+    flown.clear()
+    assert fly(tmp_path / "parts", plan, progress=lambda runs, cost: flown.append(runs)) == again
+    assert not flown
+
+
+def test_rows_of_other_code_and_of_other_sweeps_are_never_mixed_in(tmp_path: Path) -> None:
+    plan = sweep(seeds=1)
+    fly(tmp_path, plan)
+    book = journal.Journal(tmp_path, plan, "other")
+    assert book.put_aside == 4
+    assert not book.rows()
+    assert list(tmp_path.glob("runs-of-code-*.jsonl"))
+    with pytest.raises(DtsaError, match="other"):
+        pool.run_all(plan, work_of(plan), book)
+    book.close()
+    with pytest.raises(ConfigError, match="small"):
+        journal.Journal(tmp_path, spec.make_sweep(CONTENT, "big"), "other")
+
+
+def test_rows_that_are_put_aside_again_join_those_from_before(tmp_path: Path) -> None:
+    plan = sweep(seeds=1)
+    row = {"key": "a", "status": "completed", "seed": 1, "summary": {}}
+    for code in ("old", "new", "old", "new"):
+        with closing(journal.Journal(tmp_path, plan, code)) as book:
+            book.append([{**row, "code": code}])
+    assert len(list(journal.read_rows(tmp_path / "runs-of-code-old.jsonl"))) == 2
+    (tmp_path / "sweep.json").unlink()  # whose rows these are is not known
+    with closing(journal.Journal(tmp_path, plan, "new")) as book:
+        assert book.put_aside == 1
+    assert (tmp_path / "runs-of-code-unknown.jsonl").exists()
+
+
+def test_all_code_that_flies_is_in_the_digest() -> None:
+    """What a run imports of this project is in its packages."""
+    text = f"""
+import sys
+from dtsa_bench.experiments.sweep import spec, work
+plan = spec.make_sweep({CONTENT!r}, "small")
+assert work.fly_one(next(plan.tasks()))["status"] != "failed"
+print(*sorted({{name.partition(".")[0] for name in sys.modules if name.startswith("dtsa")}}))
+"""
+    ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120, check=True)
+    assert set(ended.stdout.split()) == set(PROJECT)
+
+
+def test_changed_settings_are_flown_anew_and_equal_ones_are_kept(tmp_path: Path) -> None:
+    fly(tmp_path, sweep(seeds=2))
+    flown: list[int] = []
+    fly(tmp_path, sweep(seeds=3), progress=lambda runs, cost: flown.append(runs))
+    assert sum(flown) == 4
+    flown.clear()
+    fly(tmp_path, sweep(seeds=2, base={"agents": 8, "timeout_s": 0.6}), progress=lambda r, c: flown.append(r))
+    assert sum(flown) == 8
+
+
+def test_failures_are_rows_with_a_reason_and_are_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dtsa_bench.simulation import simulate
+
+    real = simulate.simulate
+
+    def sometimes(run: Any) -> Any:
+        if run.swarm.policy == "dtsa" and run.swarm.seed % 2 == 0:
+            raise RuntimeError("out of\nluck")
+        return real(run)
+
+    monkeypatch.setattr(simulate, "simulate", sometimes)
+    plan = sweep()
+    rows = fly(tmp_path, plan)
+    table = Table(plan, rows)
+    group = table.where(policy="dtsa", channel="clear")[0]
+    assert (len(group.rows), group.flown, group.failed, group.crashed.total) == (6, 3, 3, 3)
+    assert group.left_out()["failed (RuntimeError: out of luck)"] == 3
+    monkeypatch.setattr(simulate, "simulate", real)
+    assert all(row["status"] != "failed" for row in fly(tmp_path, plan))
+
+
+def test_crashes_and_timeouts_are_left_out_of_means_and_counted(tmp_path: Path) -> None:
+    plan = sweep(
+        base={"agents": 12, "slot_ms": 20.0, "estimator": "hold", "timeout_s": 20.0},
+        seeds=12,
+        axes={"agents": [8, 14], "timeout_s": [0.5, 20.0]},
+    )
+    table = Table(plan, fly(tmp_path, plan))
+    late = table.where(agents=8, timeout_s=0.5)[0]
+    assert late.left_out() == {"timed out": 12}
+    assert late.mean("min_distance_m").count == 0
+    assert late.mean("age_mean_slots").count == 12
+    risky = table.where(agents=14, timeout_s=20.0)[0]
+    crashed = sum(row["collided"] for row in risky.rows)
+    assert crashed > 0
+    assert risky.left_out().get("crashed", 0) == crashed == risky.crashed.count
+    assert risky.mean("min_distance_m").count == 12 - crashed
+    kept = [row["min_distance_m"] for row in risky.rows if not row["collided"]]
+    assert not kept or risky.mean("min_distance_m").value == pytest.approx(sum(kept) / len(kept))
+
+
+def test_the_command_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(CONTENT), encoding="utf-8")
+    out = tmp_path / "out"
+    words = ["sweep", "--file", str(path), "--out", str(out), "--seeds", "2"]
+    words += ["--set", "timeout_s=0.4", "--jobs", "1"]
+    assert main(words) == 0
+    assert "8 runs" in capsys.readouterr().out
+    with (out / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 8
+    assert {row["policy"] for row in rows} == {"tdma", "dtsa"}
+    assert {float(row["flight_time_s"]) for row in rows} <= {0.4}
+    content = json.loads((out / "results.json").read_text())
+    assert len(content["runs"]) == 8
+    assert len(content["groups"]) == 4
+    assert content["groups"][0]["crashed"]["of"] == 2
+    assert content["sweep"]["base"]["timeout_s"] == 0.4
+    assert "<svg" in (out / "report.html").read_text()
+    # In the colours of the page, so that a dark one has light lines; files of their own keep theirs.
+    assert "var(--ink)" in (out / "report.html").read_text()
+    assert INK not in (out / "report.html").read_text().split("<figure>", 1)[1]
+    assert (out / "figures" / "matrix.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    ("words", "field"),
+    [
+        (["--preset", "nothing"], "preset"),
+        (["--preset", "idle", "--seeds", "0"], "seeds"),
+        (["--preset", "idle", "--jobs", "many"], "jobs"),
+        (["--preset", "idle", "--set", "loss"], "set"),
+        (["--preset", "idle", "--set", "loss=2"], "loss"),
+        (["--preset", "estimate", "--cluster", "tcp://127.0.0.1:1"], "cluster"),
+        ([], ""),
+    ],
+)
+def test_wrong_words_end_with_one_line_and_code_2(
+    words: list[str], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask, "PATIENCE_S", 1.0)
+    if field == "cluster":
+        pytest.importorskip("distributed")
+    try:
+        code = main(["sweep", *words, "--out", str(tmp_path)])
+    except SystemExit as ended:
+        code = int(str(ended.code))
+    error = capsys.readouterr().err
+    assert code == 2
+    assert error.count("\n") == 1
+    assert f"error: {field}" in error
+
+
+def start(out: Path, *words: str) -> subprocess.Popen[bytes]:
+    """A sweep that takes long, in a process group of its own."""
+    command = [sys.executable, "-m", "dtsa_bench", "sweep", "--preset", "limits", "--out", str(out)]
+    return subprocess.Popen(
+        [*command, *words],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+
+
+def wait_for_rows(path: Path, count: int, process: subprocess.Popen[bytes]) -> None:
+    end = time.monotonic() + 60
+    while time.monotonic() < end and process.poll() is None:
+        if path.exists() and path.read_bytes().count(b"\n") >= count:
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"no {count} rows in {path}")
+
+
+def group_members(group: int) -> list[int]:
+    """Processes of a process group."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                state, _, pgrp = entry.joinpath("stat").read_text().rpartition(")")[2].split()[:3]
+            except OSError:
+                continue
+            if int(pgrp) == group and state != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+@pytest.mark.parametrize("how", ["ctrl-c", "terminated", "killed"])
+def test_however_a_sweep_ends_nothing_runs_on_and_its_rows_stay(how: str, tmp_path: Path) -> None:
+    process = start(tmp_path, "--jobs", "2")
+    try:
+        wait_for_rows(tmp_path / "runs.jsonl", 5, process)
+        if how == "ctrl-c":
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.send_signal(signal.SIGTERM if how == "terminated" else signal.SIGKILL)
+        error = process.communicate(timeout=60)[1].decode()
+        assert process.returncode == (-signal.SIGKILL if how == "killed" else 130)
+        end = time.monotonic() + 20
+        while (left := group_members(process.pid)) and time.monotonic() < end:
+            time.sleep(0.1)
+        assert not left
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    if how != "killed":
+        assert "goes on from there" in error
+        assert "Traceback" not in error
+    assert len(list(journal.read_rows(tmp_path / "runs.jsonl"))) >= 5
+
+
+def test_a_worker_process_that_dies_costs_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = sweep(seeds=200)
+    victims: list[int] = []
+
+    def kill_one(runs: int, cost: float) -> None:
+        if not victims:
+            children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+            names = {int(pid): Path(f"/proc/{pid}/cmdline").read_text() for pid in children}
+            victims.append(next(pid for pid, name in names.items() if "LokyProcess" in name))
+            os.kill(victims[0], signal.SIGKILL)
+
+    monkeypatch.setattr(pool, "CHUNK_COST", 20_000.0)
+    rows = fly(tmp_path, plan, jobs=2, progress=kill_one)
+    assert victims
+    assert len(rows) == 800
+    assert all(row["status"] != "failed" for row in rows)
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A real Dask scheduler with two worker processes."""
+    pytest.importorskip("distributed")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    file = tmp_path / "scheduler.json"
+    dask = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+        "--scheduler-file",
+        str(file),
+    ]
+    worker = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_worker",
+        "--scheduler-file",
+        str(file),
+        "--nworkers",
+        "1",
+        "--nthreads",
+        "1",
+        "--no-dashboard",
+        "--no-nanny",
+        "--local-directory",
+        str(tmp_path),
+    ]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
+    processes = [subprocess.Popen(dask, **quiet)]  # type: ignore[call-overload]
+    try:
+        processes += [subprocess.Popen(worker, **quiet) for _ in range(2)]  # type: ignore[call-overload]
+        end = time.monotonic() + 60
+        while not (file.exists() and file.read_text().rstrip().endswith("}")) and time.monotonic() < end:
+            time.sleep(0.05)
+        yield json.loads(file.read_text())["address"], processes[1:]
+    finally:
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.wait()
+
+
+def test_a_worker_of_a_cluster_that_dies_costs_no_result(
+    cluster: tuple[str, list[subprocess.Popen[bytes]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from distributed import Client
+
+    address, workers = cluster
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=60)
+    plan = sweep(seeds=100)
+    monkeypatch.setattr(pool, "CHUNK_COST", 20_000.0)
+    done: list[int] = []
+
+    def kill_one(runs: int, cost: float) -> None:
+        done.append(runs)
+        if len(done) == 3:
+            workers[0].kill()
+
+    rows = fly(tmp_path / "cluster", plan, cluster=address, progress=kill_one)
+    assert len(done) > 3
+    assert workers[0].wait() == -signal.SIGKILL
+    assert len(rows) == 400
+    here = fly(tmp_path / "here", sweep(seeds=5))
+    picked = [row for row in stable(rows) if row["seed"] < 1006]
+    assert picked == stable(here)
+
+
+def test_rows_that_cannot_be_written_end_in_one_line(tmp_path: Path) -> None:
+    limit = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000));"
+    words = ["sweep", "--preset", "trajectories", "--seeds", "9", "--jobs", "1", "--out", str(tmp_path)]
+    code = f"{limit} from dtsa_bench.commands.cli import main; sys.exit(main({words!r}))"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert ended.stderr.count("\n") == 1
+    assert "runs.jsonl cannot be written (File too large)" in ended.stderr
+    assert 0 < len(list(journal.read_rows(tmp_path / "runs.jsonl"))) < 27

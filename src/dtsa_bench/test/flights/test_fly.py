@@ -1,0 +1,234 @@
+"""Flights of real nodes from the command line: what they record, how they end, and who is named when a node fails."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fly_helpers import fly, frames, readable
+from node_helpers import end_of, ros_graph
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_bench.flights.domain import ros_domain
+from dtsa_bench.flights.flight import fly as fly_here
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.runs.config import RunConfig, RunLimits
+from dtsa_bench.simulation.simulate import simulate
+from dtsa_channel_sim import ChannelConfig, ClockConfig, make_clocks
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.mark.parametrize(("loss", "splits"), [("0", ["per-agent", "1"]), ("0.25", ["per-agent", "2"])])
+def test_same_seed_same_flight_whatever_the_processes(tmp_path: Path, loss: str, splits: list[str]) -> None:
+    words = ("--agents", "4", "--loss", loss, "--seed", "7", "--tail-s", "0.2", "--no-picture")
+    summaries = [fly(tmp_path / split, *words, "--processes", split) for split in splits]
+    first, second = (frames(tmp_path / split) for split in splits)
+    assert first == second
+    assert len(first) > 100
+    for summary in summaries:
+        del summary["wall_time_s"], summary["realtime_factor"]
+    assert summaries[0] == summaries[1]
+    swarm = SwarmConfig(agents=4, seed=7)
+    air = ChannelConfig(agents=4, slot_ns=swarm.slot_ns, seed=7, loss=float(loss))
+    simulated = simulate(RunConfig(swarm, air, RunLimits(tail_s=0.2))).summary()
+    for key in ("slots", "min_distance_m", "completion_time_s", "efficiency_mean", "age_max_slots"):
+        assert simulated[key] == summaries[0][key], key
+
+
+def test_nodes_agree_on_the_sender_and_never_send_together(tmp_path: Path) -> None:
+    words = ("--agents", "12", "--policy", "dtsa", "--processes", "3", "--timeout-s", "3", "--no-picture")
+    summary = fly(tmp_path / "out", *words)
+    assert summary["slots"]["collision"] == 0
+    with Bag(tmp_path / "out" / "bag") as bag:
+        decisions = [message for _, message in bag.typed(["/swarm/decision"])]
+        receptions = [message for _, message in bag.typed(["/swarm/reception"])]
+    assert len(decisions) == len(receptions) == summary["slots"]["total"]
+    assert all(len(np.unique(message.chosen)) == 1 for message in decisions)
+    assert all(len(message.sender) <= 1 for message in receptions)
+    assert sum(len(message.sender) for message in receptions) == summary["slots"]["success"]
+    readable(tmp_path / "out")
+
+
+def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+
+    out = tmp_path / "out"
+    summary = fly(out, "--agents", "5", "--moving", "4", "--tail-s", "0.1")
+    wanted = {
+        "agents",
+        "moving",
+        "policy",
+        "estimator",
+        "avoider",
+        "slot_ms",
+        "loss",
+        "seed",
+        "slots",
+        "collided",
+        "min_distance_m",
+        "efficiency_mean",
+        "completion_time_s",
+        "age_mean_slots",
+        "age_max_slots",
+        "estimate_error_mean_m",
+        "wall_time_s",
+        "realtime_factor",
+    }
+    assert wanted <= summary.keys()
+    assert summary["end"] == "completed"
+    total = summary["slots"]["total"]
+    with AnyReader([out / "bag"]) as reader:
+        counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+        stamps = [time_ns for _, time_ns, _ in reader.messages()]
+        last = [
+            reader.deserialize(data, c.msgtype) for c, _, data in reader.messages() if c.topic == "/swarm/transmission"
+        ][-5:]
+    assert counts == {
+        "/swarm/slot": total + 1,
+        "/swarm/transmission": 5 * (total + 1),
+        "/swarm/reception": total,
+        "/swarm/decision": total,
+        "/swarm/markers": -(-total // 10),
+        "/swarm/configuration": 1,
+        "/swarm/status": 2,  # it flies, it has ended
+        **{f"/cf{k}/odom": total for k in range(1, 6)},
+    }
+    assert stamps[0] == 1_000_000_000
+    assert stamps[-1] == 1_000_000_000 + total * 10_000_000
+    target = {int(message.agent[0]): message for message in last}
+    assert sorted(target) == [1, 2, 3, 4, 5]
+    assert (out / "trajectories.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert (out / "trajectories.png").stat().st_size > 20_000
+
+
+def test_slots_of_a_clock_start_when_that_clock_says_so() -> None:
+    from dtsa_agent.ros.realtime import slot_starts
+
+    config = ClockConfig(offset_ns=2_000_000, drift_ppm=50.0, seed=3)
+    clocks = make_clocks(config, 6)
+    offset = np.array([clock.offset_ns for clock in clocks])
+    drift = np.array([clock.drift_ppb for clock in clocks])
+    for slot in (0, 1, 777, 60_000):
+        local = slot * 10_000_000
+        expected = [clock.to_channel(local) - local for clock in clocks]
+        assert slot_starts(local, offset, drift).tolist() == expected
+
+
+def test_the_channel_changes_in_flight_and_the_bag_still_verifies(tmp_path: Path) -> None:
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    out = tmp_path / "out"
+    with ros_graph(tmp_path) as graph:
+        parameters = ["agents:=4", "seed:=3", "tail_s:=3600.0", f"out:={out}"]
+        channel = graph.start("dtsa_bench.flights.recorded_channel", *[w for p in parameters for w in ("-p", p)])
+        host = graph.start("dtsa_agent.ros.swarm_host", "-p", "agents:=4", "-p", "seed:=3", "-p", "shared_table:=true")
+        bag = out / "bag" / "bag_0.mcap"
+        graph.until(lambda: bag.exists() and bag.stat().st_size > 20_000)
+        change = graph.node.create_client(SetParameters, "/swarm/channel/set_parameters")
+        graph.until(change.service_is_ready)
+        for values, good in (({"loss": 0.5}, True), ({"loss": 1.5}, False), ({"partition": "1-2 | 3-4"}, True)):
+            request = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+            done = change.call_async(SetParameters.Request(parameters=request))
+            graph.until(done.done)
+            assert done.result().results[0].successful is good
+            size = bag.stat().st_size
+            graph.until(lambda size=size: bag.stat().st_size > size + 10_000)
+        assert end_of(channel, signal.SIGINT)[0] == 0
+        assert end_of(host) == (0, "")
+    readable(out)
+    with Bag(out / "bag") as recorded:
+        events = [message for _, message in recorded.typed(["/parameter_events"])]
+        lost = [int(np.sum(message.lost)) for _, message in recorded.typed(["/swarm/reception"])]
+        divided = [len(np.unique(message.digest)) for _, message in recorded.typed(["/swarm/decision"])]
+    assert [event.changed_parameters[0].name for event in events] == ["loss", "partition"]
+    assert lost[0] == 0
+    assert max(lost) > 0
+    assert divided[0] == 1
+    assert max(divided) > 1  # what was one table for all became one an agent
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--policy", "fifo"], "policy: got 'fifo'; allowed: tdma, dtsa"),
+        (["--agents", "0"], "agents: got 0; allowed: 1 to 1024"),
+        (["--agents", "4", "--moving", "6"], "moving: got 6; allowed: 0 to 4, the number of agents"),
+        (["--axis-x-m", "64"], "extent_m: got 65.534; allowed: 66.1 m or more: starts and goals are up to 64.0"),
+        (["--slot-ms", "-5"], "slot_ms: got -5.0; allowed: 0.3 to 1000 ms"),
+        (["--loss", "1.2"], "loss: got 1.2; allowed: a number from 0 to 1"),
+        (["--processes", "13"], "processes: got '13'; allowed: per-agent, or a whole number, 1 to 12"),
+        (["--domain", "233"], "domain: got '233'; allowed: a whole number, 0 to 232"),
+        (["--mode", "turbo"], "mode: got 'turbo'; allowed: lockstep, realtime"),
+        (["--estimator", "oracle"], "estimator: got 'oracle'; allowed: hold, linear or intent"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    from dtsa_bench.commands.cli import main
+
+    assert main(["fly", "--out", str(tmp_path / "out"), *words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"dtsa: error: {said}")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_directory_or_a_domain_in_use_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dtsa_bench.commands.cli import main
+
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    assert main(["fly", "--out", str(tmp_path / "full")]) == 2
+    assert capsys.readouterr().err.startswith("dtsa: error: out: got")
+    with ros_domain() as taken:
+        assert main(["fly", "--out", str(tmp_path / "out"), "--domain", str(taken)]) == 2
+        assert "in use" in capsys.readouterr().err
+        with ros_domain() as other:
+            assert other != taken
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+        somebody.bind(("", 7400 + 250 * taken + 10))
+        assert main(["fly", "--out", str(tmp_path / "out"), "--domain", str(taken)]) == 2
+        assert "in use" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_large_blocks_of_a_recorder_stay_out_of_its_heap() -> None:
+    program = """
+import ctypes
+from dtsa_bench.flights.memory import keep_heap_small
+libc = ctypes.CDLL(None)
+class Blocks(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_size_t) for name in "arena free small mapped bytes a b c d e".split()]
+libc.mallinfo2.restype = Blocks
+def taken():
+    before = libc.mallinfo2().mapped
+    kept = [bytearray(1 << 17) for _ in range(64)]
+    return libc.mallinfo2().mapped - before
+bytearray(1 << 20)  # freed at once: from now on glibc puts such blocks into the heap
+print(taken(), keep_heap_small(), taken() > 0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0", "True", "True"]
+
+
+def test_after_a_signal_no_process_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_LOG_DIR", "")  # put back afterwards
+    swarm, stop = SwarmConfig(agents=4), Stop()
+    stop.signal = signal.SIGINT
+    run = RunConfig(swarm, ChannelConfig(agents=4, slot_ns=swarm.slot_ns))
+    with pytest.raises(KeyboardInterrupt):
+        fly_here(run, tmp_path / "out", stop=stop)
+    assert list((tmp_path / "out" / "log").iterdir()) == []

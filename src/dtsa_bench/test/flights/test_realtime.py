@@ -1,0 +1,263 @@
+"""Flights in real time, agents on their own clocks."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fly_helpers import PATIENCE_S, fly, flying, pid_of, readable
+from metronome import flown_again_when_overloaded
+
+pytest.importorskip("dtsa_msgs.msg")
+
+from dtsa_dev.soak.flights import children, process_with
+
+from dtsa_agent.core import AgentGroup, SwarmConfig
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.stamps import ns_of
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.verify import verify_bag
+from dtsa_channel_sim import ClockConfig, make_clocks
+
+pytestmark = pytest.mark.ros
+
+DRIFT_PPM = 1000.0  # much more than a crystal's, to see in seconds what else takes minutes
+AGENTS = 4
+# A frame is on the air for 7.8 of 10 ms, so that agents that are 2.2 ms apart disturb each other.
+TIGHT = (
+    "--agents", str(AGENTS), "--moving", "2", "--policy", "tdma", "--processes", "2", "--seed", "9",
+    "--bitrate", "31250",
+    "--mode", "realtime", "--clock-drift-ppm", str(DRIFT_PPM), "--timeout-s", "3", "--no-picture",
+)  # fmt: skip
+
+
+def drifts(seconds: float) -> list[float]:
+    """ms that each clock gains in a time."""
+    clocks = make_clocks(ClockConfig(drift_ppm=DRIFT_PPM, seed=9), AGENTS)
+    return [clock.drift_ppb * seconds * 1e-6 for clock in clocks]
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path: Path) -> None:
+    aligned = tmp_path / "aligned"
+    together, apart = fly(aligned, *TIGHT, "--loss", "0.2"), fly(tmp_path / "apart", *TIGHT, "--no-align")
+    # Left alone the clocks drift apart, each at its own rate: 5 ms by the end, far more than the 2.2 ms between frames.
+    gained = drifts(apart["flight_time_s"])
+    assert apart["clock_spread_end_ms"] == pytest.approx(max(gained) - min(gained), abs=0.5)
+    assert apart["clock_spread_end_ms"] > 3.0
+    assert together["clock_spread_end_ms"] < 1.0
+    results = {path: verify_bag(path) for path in (aligned, tmp_path / "apart")}
+    for result in results.values():
+        assert result.ok, result.difference
+    assert results[tmp_path / "apart"].safety["frames_collided"] > 20
+    # A busy machine may make a frame late now and then; clocks do not.
+    assert results[aligned].safety["frames_collided"] < results[tmp_path / "apart"].safety["frames_collided"] / 4
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_beacons_begin_when_their_own_timers_say_and_overlap_by_time_on_the_air(tmp_path: Path) -> None:
+    words = ("--agents", "4", "--policy", "beacons", "--processes", "2", "--mode", "realtime", "--seed", "5")
+    summary = fly(tmp_path / "out", *words, "--bitrate", "40000", "--timeout-s", "1", "--no-picture")
+    assert summary["sends_on_time_share"] is None
+    result = verify_bag(tmp_path / "out")
+    assert result.ok, result.difference
+    assert result.safety["frames_collided"] > 10
+    agents = AgentGroup(make_swarm(SwarmConfig(agents=4, policy="beacons", seed=5)))
+    due, late = {}, []
+    for slot in range(100):
+        for index in agents.on_slot(slot):  # two of them begin 0.6 ms apart
+            due[slot, index + 1] = int(agents.swarm.send_offset_ns[index])
+        agents.on_slot_end()
+    with Bag(tmp_path / "out" / "bag") as bag:
+        for _, said in bag.typed([f"{names.SWARM}/{names.AIR_FRAME}"]):
+            begin = said.header.stamp.sec * 1_000_000_000 + said.header.stamp.nanosec - names.TIME_ZERO_NS
+            late.append(begin - int(said.slot) * 10_000_000 - due[int(said.slot), int(said.agent)])
+    assert len(late) > 30
+    assert 0 == min(late) <= max(late) <= 5_000_000  # who is later than half a slot is silent
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_radios_that_listen_begin_in_free_air_and_tell_their_agents(tmp_path: Path) -> None:
+    words = ("--agents", "4", "--policy", "csma", "--processes", "2", "--mode", "realtime", "--seed", "5")
+    more = ("--options", "csma.window_ms=10", "--bitrate", "40000", "--timeout-s", "1.5", "--no-picture")
+    summary = fly(tmp_path / "out", *words, *more)
+    result = verify_bag(tmp_path / "out")
+    assert result.ok, result.difference
+    frames = result.checked["frames that began in free air"]
+    assert frames == result.safety["frames"] > 60  # two of five of them on the air, which beacons lose
+    assert result.safety["frames_collided"] < 0.2 * frames
+    assert 0 <= result.safety["frames_not_begun"] - summary["frames_given_up"] <= 4  # what radios held at the end
+    with Bag(tmp_path / "out" / "bag") as bag:
+        begun = {
+            (int(m.slot), int(m.agent)): m.header.stamp for _, m in bag.typed([f"{names.SWARM}/{names.AIR_FRAME}"])
+        }
+        handed = handed_over(bag)
+    assert sum(ns_of(begun[key]) > at_ns for key, at_ns in handed if key in begun) > 10
+    # A policy hears when its frame began: the next one is half a period later at least.
+    times = sorted((agent, ns_of(stamp) / 1e6) for (_, agent), stamp in begun.items())
+    gaps = [after - before for (one, before), (other, after) in itertools.pairwise(times) if one == other]
+    assert min(gaps) >= 20.0
+
+
+def handed_over(bag: Bag) -> list[tuple[tuple[int, int], int]]:
+    """Slot and agent of each frame that was handed to a radio, and when, ns."""
+    return [
+        ((int(slot), int(agent)), names.slot_time_ns(int(slot), 10_000_000) + int(message.offset_ns[entry]))
+        for _, message in bag.typed([f"{names.SWARM}/{names.REPORT}"])
+        for row, slot in enumerate(message.slot)
+        for entry, agent in enumerate(message.agent, row * len(message.agent))
+        if message.length[entry]
+    ]
+
+
+def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path: Path) -> None:
+    words = ("--agents", "3", "--moving", "2", "--policy", "tdma", "--processes", "1", "--mode", "realtime")
+    more = ("--no-align", "--clock-offset-ns", "4000000", "--timeout-s", "1", "--no-picture")
+    fly(tmp_path / "fast", *words, *more)
+    with Bag(tmp_path / "fast" / "bag") as bag:
+        times = {(m.topic, int(v.slot)): m.log_time_ns for m, v in bag.typed(["/swarm/transmission", "/swarm/slot"])}
+    early = [slot for topic, slot in times if times.get(("/swarm/slot", slot), 2**63) < times[topic, slot]]
+    assert early
+    result = verify_bag(tmp_path / "fast")
+    assert result.ok, result.difference
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
+    """All that agents report is recorded, and a frame that one of them had not taken in would show in its view."""
+    out, agents = tmp_path / "flight", 70
+    words = ("--agents", str(agents), "--policy", "tdma", "--processes", "2", "--mode", "realtime", "--timeout-s", "2")
+    fly(out, *words, "--no-picture")
+    slots: dict[int, list[int]] = {agent: [] for agent in range(1, agents + 1)}
+    views: dict[int, dict[int, int]] = {}
+    frames = heard = 0
+    excused = set()  # those whose frame was not ready in time, or met another: only they think that it was heard
+    with Bag(out / "bag") as bag:
+        for _, message in bag.typed(["/swarm/transmission", "/swarm/slot"]):
+            if hasattr(message, "heard_slot"):
+                heard += len(message.sender)
+                bits = np.unpackbits(message.received).sum()
+                excused |= set(message.sender.tolist()) if bits < agents - 1 else set()
+                continue
+            frames += int((message.length > 0).sum())
+            excused |= set(message.agent[(message.chosen == message.agent) & (message.length == 0)].tolist())
+            for agent, digest in zip(message.agent.tolist(), message.digest.tolist(), strict=True):
+                slots[agent].append(int(message.slot))
+                views.setdefault(int(message.slot), {})[agent] = digest
+    last = min(max(reported) for reported in slots.values())
+    assert last > 150
+    for reported in slots.values():
+        assert reported[: last + 1] == list(range(last + 1))
+    assert frames - heard <= 3  # those that were still on the air at the end
+    # Without loss all views become equal; who misses a frame differs from the others until its sender's next turn.
+    assert len(excused) < agents / 2
+    odd = dict.fromkeys(set(slots) - excused, 0)
+    for slot in range(last + 1):
+        digests = list(views[slot].values())
+        usual = max(set(digests), key=digests.count)
+        for agent in odd:
+            odd[agent] = odd[agent] + 1 if views[slot][agent] != usual else 0
+            assert odd[agent] < agents - 5, f"cf{agent} has missed a frame"
+
+
+@flown_again_when_overloaded
+def test_an_agent_that_hangs_is_named_and_the_others_fly_on(tmp_path: Path) -> None:
+    out = tmp_path / "flight"
+    # Its vehicle hovers where it was, and somebody may fly into it: that is not what this is about.
+    words = ("--agents", "3", "--policy", "lease", "--processes", "3", "--mode", "realtime", "--tail-s", "0.5",
+             "--no-stop-on-crash", "--no-picture")  # fmt: skip
+    with flying(out, *words) as flight:
+        os.kill(process_with(flight.pid, "ids:=[2]"), signal.SIGSTOP)
+        _, said = flight.communicate(timeout=60)
+    assert flight.returncode == 0, said
+    assert "cf2 has not been heard of for 2 s; the others fly on" in said
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["lost_agents"] == [2]
+    assert summary["end"] == "completed"
+    result = verify_bag(out)
+    assert result.ok, result.difference
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_in_real_time_agents_keep_their_own_clocks(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = (
+        "--agents",
+        "4",
+        "--policy",
+        "tdma",
+        "--mode",
+        "realtime",
+        "--clock-offset-ns",
+        "300000",
+        "--tail-s",
+        "0.1",
+        "--clock-drift-ppm",
+        "50",
+        "--clock-jitter-ns",
+        "20000",
+        "--no-picture",
+        "--processes",
+        "2",
+    )
+    summary = fly(out, *words)
+    assert summary["mode"] == "realtime"
+    assert summary["end"] == "completed"
+    assert summary["lost_agents"] == []
+    assert summary["slots"]["success"] > summary["slots"]["total"] // 2
+    assert summary["realtime_factor"] == pytest.approx(1.0, abs=0.2)
+    with Bag(out / "bag") as bag:
+        sent = [message for _, message in bag.typed(["/swarm/transmission"])]
+    first = {
+        int(agent): int(offset)
+        for message in sent[:2]
+        for agent, offset in zip(message.agent, message.offset_ns, strict=True)
+    }
+    assert len(set(first.values())) == 4  # four clocks, none like another
+    readable(out)
+
+
+@pytest.mark.alone
+@flown_again_when_overloaded
+def test_in_real_time_the_others_fly_on_when_one_is_killed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = (
+        "--agents",
+        "5",
+        "--moving",
+        "4",
+        "--policy",
+        "lease",
+        "--mode",
+        "realtime",
+        "--tail-s",
+        "0.2",
+        "--no-picture",
+    )
+    with flying(out, *words) as process:
+        victim = pid_of(process.pid, 3)
+        os.kill(victim, signal.SIGKILL)
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, said
+        assert f"cf3 (process {victim}) was killed by SIGKILL; the others fly on" in said
+        assert children(process.pid) == []
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["lost_agents"] == [3]
+    assert summary["end"] == "completed"
+    assert summary["collided"] is False
+    with Bag(out / "bag") as bag:
+        assert bag.topic("/swarm/decision").count == summary["slots"]["total"]
+        silent = [message.slot for _, message in bag.typed(["/swarm/transmission"]) if 3 in message.agent]
+        others = [message.slot for _, message in bag.typed(["/swarm/transmission"]) if 3 not in message.agent]
+    assert max(silent) + 100 < max(others)  # it flew, and long after it the others did

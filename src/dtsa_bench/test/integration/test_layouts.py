@@ -1,0 +1,187 @@
+"""The layouts for Foxglove and PlotJuggler name topics and fields that our bags really have."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from bag_helpers import typestore
+from rosbags.interfaces import Nodetype
+
+LAYOUTS = Path(__file__).resolve().parents[4] / "layouts"
+TYPES = {
+    "/swarm/slot": "dtsa_msgs/msg/Slot",
+    "/swarm/transmission": "dtsa_msgs/msg/Transmission",
+    "/swarm/reception": "dtsa_msgs/msg/Reception",
+    "/swarm/decision": "dtsa_msgs/msg/Decision",
+    "/swarm/markers": "visualization_msgs/msg/MarkerArray",
+    **{f"/cf{k}/odom": "nav_msgs/msg/Odometry" for k in range(1, 13)},
+}
+
+pytestmark = pytest.mark.skipif(not LAYOUTS.is_dir(), reason="the layouts are part of the source tree only")
+
+
+@pytest.fixture(scope="module")
+def make() -> ModuleType:
+    """The script that writes the layouts."""
+    spec = importlib.util.spec_from_file_location("make_layouts", LAYOUTS / "make.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def has_field(topic: str, path: str) -> bool:
+    """Whether messages of a topic have a field; arrays may be indexed."""
+    kind = TYPES[topic]
+    for part in re.sub(r"\[[^\]]*\]", "", path).split("."):
+        fields = dict(typestore().fielddefs[kind][1])
+        if part not in fields:
+            return False
+        node, detail = fields[part]
+        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            node, detail = detail[0]
+        kind = detail if node == Nodetype.NAME else ""
+        if not kind:
+            return path.endswith(part) or "[" in path.rsplit(part, 1)[1]
+    return True
+
+
+def numbers(kind: str) -> set[str]:
+    """Types of all numbers and texts in a message type."""
+    found: set[str] = set()
+    fields: Any = typestore().fielddefs[kind][1]
+    for _, (node, detail) in fields:
+        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            node, detail = detail[0]
+        found |= numbers(detail) if node == Nodetype.NAME else {detail[0]}
+    return found
+
+
+def panels(node: Any) -> list[str]:
+    """All panels in a layout's tree."""
+    return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
+
+
+def test_files_are_what_the_script_writes(make: ModuleType) -> None:
+    assert json.loads((LAYOUTS / "foxglove_swarm.json").read_text(encoding="utf-8")) == make.foxglove()
+    assert (LAYOUTS / "plotjuggler_swarm.xml").read_text(encoding="utf-8") == make.plotjuggler()
+
+
+def test_every_foxglove_panel_is_shown_and_every_path_exists(make: ModuleType) -> None:
+    layout = make.foxglove()
+    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
+    fields: dict[str, set[str]] = {}  # that the scripts make, by topic
+    for script in layout["userNodes"].values():
+        source = script["sourceCode"]
+        produced = re.search(r'^export const output = "([^"]+)"', source, re.M)
+        inputs = re.search(r"^export const inputs = (\[[^\]]+\])", source, re.M)
+        assert produced is not None
+        assert inputs is not None
+        assert set(json.loads(inputs[1])) <= TYPES.keys()
+        assert "return undefined" not in source
+        assert produced[1] not in fields
+        fields[produced[1]] = set(re.findall(r"^  (\w+): [\w\[\]]+;", source, re.M))
+    shown = set()
+    checked = 0
+    for config in layout["configById"].values():
+        for topic in config.get("topics", {}):
+            assert topic in TYPES or topic in fields
+            shown.add(topic)
+        for path in [entry["value"] for entry in config.get("paths", [])] + [config.get("topicPath", "0")]:
+            if re.fullmatch(r"[\d.]+", path):
+                continue  # a line at a value
+            topic, _, field = path.partition(".")
+            if topic in fields:
+                assert field in fields[topic]
+            else:
+                assert not field or has_field(topic, field), path
+            shown.add(topic)
+            checked += 1
+    assert checked > 12
+    assert fields.keys() <= shown
+
+
+def test_no_limit_of_an_axis_is_text(make: ModuleType) -> None:
+    for config in make.foxglove()["configById"].values():
+        for limit in ("minXValue", "maxXValue", "minYValue", "maxYValue"):
+            assert isinstance(config.get(limit, 0), (int, float)), limit  # Lichtblick takes "" for 0
+
+
+def test_arrows_of_all_agents(make: ModuleType) -> None:
+    for agents in (1, 3, 12):
+        assert [f'"/cf{k}/odom"' in make.user_script("swarm_odometry", agents) for k in range(1, 14)] == [
+            k <= agents for k in range(1, 14)
+        ]
+
+
+def test_the_check_of_fields_can_fail() -> None:
+    assert has_field("/cf1/odom", "pose.pose.position.x")
+    for path in ("nothing", "pose.pose.position.w", "pose.position.x", "header.stamp.sec.more"):
+        assert not has_field("/cf1/odom", path), path
+
+
+def test_every_plotjuggler_curve_exists(make: ModuleType) -> None:
+    root = ElementTree.fromstring(make.plotjuggler())
+    made = {snippet.get("name") for snippet in root.iter("snippet")}
+    sources = [
+        entry.text for snippet in root.iter("snippet") for entry in snippet.iter() if (entry.text or "").startswith("/")
+    ]
+    curves = [curve.get("name") for curve in root.iter("curve")]
+    assert len(curves) > 12
+    assert sources
+    for name in [curve for curve in curves if curve not in made] + sources:
+        assert name is not None
+        match = re.match(r"(/swarm/\w+|/cf\d+/odom)/(.+)", name)
+        assert match is not None
+        assert has_field(match[1], match[2].replace("/", ".")), name
+    for splitter in root.iter("DockSplitter"):
+        sizes = [float(size) for size in splitter.get("sizes", "").split(";")]
+        assert len(splitter) == int(splitter.get("count", 0)) == len(sizes)
+        assert sum(sizes) == pytest.approx(1)
+    for line in root.iter("curve"):
+        for change in line.iter("transform"):
+            assert change.get("alias")  # the legend shows an empty text otherwise
+            assert change.find("options") is not None
+
+
+def test_plotjuggler_equations_name_all_their_sources(make: ModuleType) -> None:
+    for snippet in ElementTree.fromstring(make.plotjuggler()).iter("snippet"):
+        used = set(re.findall(r"\bv\d+\b", snippet.findtext("function", "")))
+        sources = snippet.find("additional_sources")
+        assert sources is not None
+        assert {source.tag for source in sources} == used
+        assert len(used) <= 8  # more are too many for PlotJuggler 3.9
+        if "age of" in snippet.get("name", ""):
+            assert (snippet.findtext("linked_source"), sources[0].text) == (
+                "/swarm/reception/outcome",
+                "/swarm/reception/sender[0]",
+            )
+
+
+def test_no_topic_has_numbers_that_plotjuggler_refuses() -> None:
+    """It loads nothing of a bag with a number that a double cannot hold, such as a digest of 64 bits."""
+    assert [topic for topic, kind in TYPES.items() if "uint64" in numbers(kind)] == []
+    assert "int64" in numbers(TYPES["/swarm/transmission"])  # the check sees them; nanoseconds within a slot are small
+
+
+def test_other_numbers_of_agents(make: ModuleType) -> None:
+    assert "/cf70/odom" in json.dumps(make.foxglove(70))
+    assert "/cf3/odom" not in json.dumps(make.foxglove(2))
+    assert ElementTree.fromstring(make.plotjuggler(1)) is not None
+
+
+def test_nonsense_is_refused() -> None:
+    for words in (["many"], ["0"], ["3", "4"]):
+        result = subprocess.run([sys.executable, str(LAYOUTS / "make.py"), *words], capture_output=True, text=True)
+        assert result.returncode == 2
+        assert "allowed: one number" in result.stderr

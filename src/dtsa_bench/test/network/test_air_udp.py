@@ -1,0 +1,450 @@
+"""Agents over UDP: real sockets on the loopback interface, bags of their own, merged and judged."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import air_helpers as helpers
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader
+from waiting import wait_for
+
+import dtsa
+from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.stop import Stop
+from dtsa_bench.commands.cli import main
+from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.pages.view.air import AirSource
+from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_bench.recordings.merge.agent_bag import read
+from dtsa_bench.recordings.merge.merge import Merge, merge, verified
+from dtsa_bench.recordings.merge.merged_messages import MergedMessages
+from dtsa_bench.recordings.merge.merged_run import MergedRun, lay
+from dtsa_bench.recordings.merge.merged_writer import write
+from dtsa_bench.recordings.merge.timeline import Crossing, fit
+from dtsa_bench.recordings.verify import verify_bag
+
+KEY = "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4"
+# Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
+CONFIG = SwarmConfig(agents=4, policy="lease", slot_ms=20.0, open_every=0, adoption=False, auth=True, auth_session=7)
+OFFSET_NS = 700_000_000
+
+
+@dataclass
+class Flight:
+    """Three of four agents, strangers among them."""
+
+    bags: list[Path]
+    summaries: dict[int, dict[str, Any]]
+    merged: dict[str, Any]
+    run: MergedRun
+    whole: Path  # directory with the merged bag
+    sniffed: dict[str, Any]  # by who has listened since they count alike
+    told: list[dict[str, Any]]  # what a page gets of one who listens
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Agents start one after the other, with clocks that differ; a stranger talks in between; one leaves early."""
+    helpers.need_multicast()
+    old = os.environ.get("DTSA_AUTH_KEY")
+    os.environ["DTSA_AUTH_KEY"] = KEY
+    directory, group = tmp_path_factory.mktemp("udp"), helpers.own_group()
+    udp = UdpSettings(interface="lo", group=group)
+    paths = [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
+    flying: list[helpers.Flying] = []
+    sniffing = helpers.Sniffing(CONFIG, udp)
+    stranger, track = helpers.Stranger(group), Track("listener")
+    source = AirSource(track, CONFIG, udp)
+    listening = threading.Thread(target=source.run)
+    listening.start()
+
+    def told() -> list[dict[str, Any]]:
+        return [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+
+    try:
+        for agent, path in enumerate(paths, 1):
+            own = AgentSettings(id=agent, clock_offset_ns=OFFSET_NS * agent, clock_drift_ppb=40_000 * (agent - 2))
+            flying.append(helpers.Flying(own, CONFIG, udp, path))
+        wait_for(lambda: all(len(one.heard) == 2 and min(one.heard.values()) > 10 for one in flying))
+        sniffing.start()
+        _disturb(stranger, flying)
+        seen = [len(one.slots) for one in flying]
+        wait_for(lambda: all(len(one.slots) > before + 60 for one, before in zip(flying, seen, strict=True)))
+        for one in flying:
+            one.end()
+        wait_for(lambda: told()[-1]["absent"] == [1, 2, 3, 4])
+    finally:
+        for one in flying:
+            one.end()
+        source.stopped = True
+        listening.join()
+        stranger.close()
+        sniffed = sniffing.end()
+        if old is None:
+            del os.environ["DTSA_AUTH_KEY"]
+        else:
+            os.environ["DTSA_AUTH_KEY"] = old
+    together = Merge([read(path) for path in reversed(paths)])
+    merged, whole = together.judge(), directory / "whole"
+    run = lay(together, merged)
+    write(whole, run, merged)
+    summaries = {one.agent.own.id: one.agent.summary() for one in flying}
+    return Flight(paths, summaries, merged, run, whole, sniffed, told())
+
+
+def _disturb(stranger: helpers.Stranger, flying: list[helpers.Flying]) -> None:
+    """Noise, frames of another swarm, changed frames, the same ones again at once and much later."""
+
+    def repeats() -> bool:
+        stranger.socket.send(stranger.hear(1)[-1])
+        return all(one.agent.tally.refused["repeated"] for one in flying)
+
+    wait_for(repeats)
+    kept = stranger.hear(6)  # of two at least: to its sender an old datagram is a repeated one
+    first = kept[0]
+    for data in (b"", b"noise" * 50, b"x" * 2000, first[:30], first[:4] + b"abcd" + first[8:], first[:26] + bytes(60)):
+        stranger.socket.send(data)
+    stranger.socket.send(first[:20] + bytes([first[20] ^ 1]) + first[21:])
+    time.sleep(3 * CONFIG.slot_s)
+    for data in kept:
+        stranger.socket.send(data)
+
+
+def test_who_only_listens_finds_that_all_keep_the_rules(flight: Flight) -> None:
+    found = flight.sniffed
+    assert found["heard"].keys() == {"cf1", "cf2", "cf3"}
+    assert found["frames_judged"] > 10
+    assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]
+    assert {"not ours", "other settings", "rejected", "repeated"} <= found["not_taken_in"].keys()
+
+
+def test_groups_become_one(flight: Flight) -> None:
+    assert flight.merged["common_slot"] is not None
+    assert flight.merged["clock_spread_ms"]["end"] < CONFIG.slot_ms / 2
+    for agent, summary in flight.summaries.items():
+        assert summary["state"] == "joined"
+        assert summary["heard_of"] == [other for other in (1, 2, 3) if other != agent]
+
+
+def test_nobody_speaks_in_the_turn_of_another(flight: Flight) -> None:
+    assert flight.merged["slots_with_two_senders"] == 0
+    assert flight.merged["frames_sent"] > 60
+
+
+def test_what_is_not_ours_is_counted_by_reason(flight: Flight) -> None:
+    for summary in flight.summaries.values():
+        found = summary["not_taken_in"]
+        assert found["not ours"] >= 2
+        assert {"length", "other settings", "no frame", "rejected", "repeated", "other time"} <= found.keys()
+
+
+def test_a_page_is_told_what_a_listener_heard(flight: Flight) -> None:
+    """Who sends in which slot, where the frames say that all are, who comes and who leaves; and nothing more."""
+
+    def numbers(text: str, kind: str) -> Any:
+        return np.frombuffer(base64.b64decode(text), kind)
+
+    records = {agent: {r.slot: r for r in read(path).slots} for agent, path in enumerate(flight.bags, 1)}
+    heard = [
+        pair
+        for moment in flight.told
+        for pair in zip(
+            numbers(moment["frames"]["slot"], "<u4").tolist(),
+            numbers(moment["frames"]["sender"], "<u2").tolist(),
+            strict=True,
+        )
+    ]
+    assert len(heard) > 60
+    sent = {(slot, agent) for agent, found in records.items() for slot, r in found.items() if r.sent_ns >= 0}
+    assert set(heard) <= sent
+    assert len(set(heard)) == len(heard)
+    first = heard[0][0]
+    assert len(heard) > 0.9 * len([slot for slot, _ in sent if slot >= first])
+    middle = flight.told[len(flight.told) // 2]
+    slot = numbers(middle["at"], "<u4")[-1]
+    place = numbers(middle["place"], "<f4").reshape(-1, 3, CONFIG.agents)[-1]
+    for agent in (1, 2, 3):
+        assert np.linalg.norm(place[:, agent - 1] - records[agent][slot].track[-1]) < 0.1
+    words = "\n".join(event[2] for moment in flight.told for event in moment["events"])
+    assert all(f"cf{agent} is heard" in words and f"cf{agent} leaves" in words for agent in (1, 2, 3))
+    assert "cf4" not in words
+    last = flight.told[-1]
+    assert last["refused"] >= 8  # what the stranger said
+    assert (last["tables"], last["agree"]) == (0, [0, 0])
+
+
+def test_bags_lie_on_one_time_line(flight: Flight) -> None:
+    line = flight.merged["time_line"]
+    assert flight.merged["not_on_the_time_line"] == []
+    assert flight.merged["missing"] == [4]
+    for agent in (2, 3):
+        assert line["clocks"][f"cf{agent}"]["offset_ms"] == pytest.approx(OFFSET_NS / 1e6 * (agent - 1), abs=2.0)
+    assert line["residual_us"]["p50"] < 1000
+
+
+def test_the_same_receptions_give_the_same_decisions(flight: Flight) -> None:
+    again = flight.merged["decisions_again"]
+    assert again["differences"] == []
+    assert again["equal"] == again["of"] > 150
+    assert flight.merged["frames_heard_not_as_sent"] == 0
+    assert verified(flight.merged)
+
+
+def test_a_merged_flight_has_the_results_of_a_flight(flight: Flight) -> None:
+    found = flight.merged["flight"]
+    assert found["slots"]["success"] > 20
+    assert found["slots"]["collision"] == 0
+    assert found["min_distance_m"] > 0.2
+    assert 0 < found["age_mean_slots"] < 4 * CONFIG.agents * CONFIG.anchor_every
+
+
+def test_a_bag_that_lies_is_found(flight: Flight) -> None:
+    bags = [read(path) for path in flight.bags]
+    said = bags[0].slots[-20]
+    said.chosen = 4 if said.chosen != 4 else 1
+    found = merge(bags)
+    assert not verified(found)
+    assert [(one["agent"], one["slot"], one["field"]) for one in found["decisions_again"]["differences"]] == [
+        (1, said.slot, "chosen")
+    ]
+    bags = [read(path) for path in flight.bags]
+    spoken = next(record for record in bags[1].slots[-60:] if record.datagram)
+    spoken.datagram = spoken.datagram[:-5] + bytes([spoken.datagram[-5] ^ 1]) + spoken.datagram[-4:]
+    assert merge(bags)["frames_heard_not_as_sent"] > 0
+
+
+def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> None:
+    whole = flight.bags[0].read_bytes()
+    cut = tmp_path / "cf1.mcap"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    bag = read(cut)
+    assert bag.broken_off
+    assert 0 < len(bag.slots) < len(read(flight.bags[0]).slots)
+    found = merge([bag, *(read(path) for path in flight.bags[1:])])
+    assert found["broken_off"] == ["cf1"]
+    assert verified(found)
+    for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
+        cut.write_bytes(bad)
+        with pytest.raises(DtsaError):
+            merge([read(cut)])
+
+
+def test_a_merged_flight_is_kept_as_a_bag_like_others(flight: Flight) -> None:
+    found, run = flight.merged["flight"], dtsa.read_bag(flight.whole)
+    assert json.loads((flight.whole / "summary.json").read_text())["flight"] == found
+    assert verify_bag(flight.whole).to_dict()["difference"] is None
+    assert run.summary == found
+    seen = run.ages_by_observer[run.ages_by_observer.counted]
+    assert seen.age_slots.mean() == pytest.approx(found["age_mean_slots"], rel=1e-12)
+    assert seen.error_m.max() == found["estimate_error_max_m"]
+    page = run_data(flight.whole)
+    assert page["summary"]["age_mean_slots"] == found["age_mean_slots"]
+    assert page["slots"]["count"] == len(run.slots)
+    assert page["distances"]["time"]
+    with Reader(flight.whole / "bag") as foreign:  # rosbag2's metadata, and every message, by an independent reader
+        assert foreign.message_count == sum(1 for _ in foreign.messages())
+        assert {"/swarm/frame", "/swarm/reception", "/cf1/odom"} <= foreign.topics.keys()
+    with Bag(flight.whole) as bag:
+        said: dict[str, list[Any]] = {}
+        for message, decoded in bag.typed():
+            said.setdefault(message.topic, []).append(decoded)
+    pictures = [[(one.action, one.id) for one in picture.markers] for picture in said["/swarm/markers"]]
+    assert pictures[0] == [(3, 0)]  # DELETEALL: who vanishes is not left standing
+    assert {agent for picture in pictures for action, agent in picture if action == 0} == {1, 2, 3}
+    assert said["/swarm/status"][0].lost.tolist() == [4]
+    assert said["/swarm/status"][-1].reason == "merged from 3 agents' bags"
+
+
+def test_of_an_agent_without_a_bag_nothing_is_known(flight: Flight) -> None:
+    run = dtsa.read_bag(flight.whole)
+    assert set(run.states.agent) == set(run.decisions.agent) == {1, 2, 3}
+    assert run.receptions.received[run.receptions.receiver == 4].isna().all()
+    whole = run.receptions[(run.receptions.receiver < 4) & (run.receptions.slot < run.slots.slot.max() // 2)]
+    assert whole.received.notna().all()
+    assert (run.slots.outcome.isna() == run.slots.sender.isna()).all()
+    assert set(run.slots.outcome.dropna()) == {"success"}  # whether cf4 has sent in the others nobody knows
+    assert run.frames.collided.isna().all()
+    page = run_data(flight.whole)
+    assert any("no bag of cf4" in note for note in page["notes"])
+    assert page["slots"]["unknown"] == run.slots.slot[run.slots.outcome.isna()].tolist()
+    assert page["summary"]["slots"]["idle"] == 0
+    assert page["table"][3].keys() & {"path", "heard"} == {"heard"}
+    assert page["table"][3]["heard"] is None
+
+
+def test_verify_finds_what_was_changed_in_a_merged_bag(flight: Flight, tmp_path: Path) -> None:
+    topics = ("/swarm/decision", "/cf2/odom")
+    with Bag(flight.whole) as bag:
+        for number, topic in enumerate(topics):
+            with BagWriter(tmp_path / f"{number}", None, custom_data=bag.custom_data) as copy:
+                channels = {name: copy.add_topic(name, info.type, info.profiles) for name, info in bag.topics.items()}
+                for message in bag.messages():
+                    last = message.topic == topic and message.sequence == bag.topics[topic].count - 1
+                    data = (
+                        message.data[:-5] + bytes([message.data[-5] ^ 1]) + message.data[-4:] if last else message.data
+                    )
+                    copy.write(channels[message.topic], data, message.log_time_ns, message.publish_time_ns)
+            difference = verify_bag(tmp_path / f"{number}").difference
+            assert difference is not None
+            assert difference.what == topic
+    liar = flight.run.lives[(2, 0)].slots[-20]
+    said, liar.chosen = liar.chosen, 4 if liar.chosen != 4 else 1
+    try:
+        write(tmp_path / "lie", flight.run, {})
+    finally:
+        liar.chosen = said
+    difference = verify_bag(tmp_path / "lie").difference
+    assert difference is not None
+    assert (difference.what, difference.slot, difference.agent) == ("report.chosen", liar.slot, 2)
+
+
+def test_merge_keeps_the_whole_flight_or_nothing(
+    flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a bag that breaks off what is whole is kept, and nothing is made up for the rest."""
+    cut = tmp_path / "cf1.mcap"
+    cut.write_bytes(flight.bags[0].read_bytes()[: flight.bags[0].stat().st_size * 2 // 3])
+    out, words = tmp_path / "out", ["merge", str(cut), *map(str, flight.bags[1:]), "--out", str(tmp_path / "out")]
+
+    def interrupted(self: MergedMessages) -> Any:
+        yield self._configuration()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MergedMessages, "__iter__", interrupted)
+        assert main(words) == 130
+        assert not out.exists()
+    assert main([*words, "--json"]) == 0
+    states = dtsa.read_bag(out).states
+    ends = states.groupby("agent").time_s.max()
+    assert ends[1] < ends[2] - 0.1
+    assert verify_bag(out).ok
+    assert any("cf1 break off" in note for note in run_data(out)["notes"])
+    capsys.readouterr()
+    assert main(words) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["verify", "report", "export"])
+def test_commands_for_other_bags_say_what_is_meant_for_these(
+    flight: Flight, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(flight.bags[0])]) == 2
+    said = capsys.readouterr().err
+    assert "`tools/dtsa merge`" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_bags_that_do_not_belong_together_are_refused(flight: Flight) -> None:
+    one = read(flight.bags[0])
+    with pytest.raises(ConfigError, match="one process of cf1 at a time"):
+        merge([one, read(flight.bags[0])])
+    other = read(flight.bags[1])
+    other.swarm = dataclasses.replace(CONFIG, auth_session=8)
+    with pytest.raises(ConfigError, match="auth_session 8, there 7"):
+        merge([one, other])
+    with pytest.raises(ConfigError, match="bags"):
+        merge([])
+    alone = Merge([one])
+    with pytest.raises(ConfigError, match="hear each other"):
+        lay(alone, alone.judge())
+
+
+def test_offsets_and_drifts_are_found_among_frames_that_were_held_up() -> None:
+    draw = np.random.default_rng(3)
+    offset, drift = {1: 0, 2: 5 * 10**15, 3: -3_000_000}, {1: 0.0, 2: 60e-6, 3: -40e-6}
+
+    def shown(agent: int, at_ns: float) -> int:
+        return round(offset[agent] + at_ns * (1 + drift[agent]))
+
+    crossings = []
+    for at in range(0, 20_000_000_000, 10_000_000):
+        sender = int(draw.integers(1, 4))
+        for receiver in {1, 2, 3} - {sender}:
+            under_way = 250_000 + draw.normal(0, 5_000) + (draw.random() < 0.1) * 4_000_000
+            crossings.append(
+                Crossing((sender, 0), (receiver, 0), shown(sender, at + 10**9), shown(receiver, at + 10**9 + under_way))
+            )
+    line = fit(crossings, 30_000)
+    found = line.summary()
+    assert found["clocks"]["cf2"]["drift_ppm"] - found["clocks"]["cf1"]["drift_ppm"] == pytest.approx(60, abs=0.2)
+    assert found["clocks"]["cf3"]["drift_ppm"] == pytest.approx(-40, abs=0.2)
+    assert found["flight_time_us"] == pytest.approx(250, abs=2)
+    assert found["frames_left_out"] == pytest.approx(len(crossings) / 10, rel=0.2)
+    at = 10**10
+    here = [line.clocks[(agent, 0)].common_ns(shown(agent, at)) for agent in (1, 2, 3)]
+    assert max(here) - min(here) < 3_000
+
+
+def test_a_second_agent_of_the_same_id_does_not_begin(tmp_path: Path) -> None:
+    helpers.need_multicast()
+    config = SwarmConfig(agents=2, policy="tdma")
+    udp = UdpSettings(interface="lo", group=helpers.own_group())
+    first = helpers.Flying(AgentSettings(id=1), config, udp, tmp_path / "cf1.mcap")
+    other = helpers.Flying(AgentSettings(id=2), config, udp, tmp_path / "cf2.mcap")
+    try:
+        wait_for(lambda: len(first.slots) > 5 and len(other.slots) > 5)
+        other.end()
+        other = helpers.Flying(AgentSettings(id=2), config, udp, tmp_path / "again.mcap")
+        wait_for(lambda: len(other.slots) > 5)  # who comes back is welcome
+        with pytest.raises(ConfigError, match="id: got 1"), UdpAgent(AgentSettings(id=1), config, udp) as twin:
+            twin.run(Stop())
+    finally:
+        other.end()
+        first.end()
+
+
+def _command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "dtsa_bench", *words]
+
+
+def test_the_command_flies_until_a_signal_and_merges(tmp_path: Path) -> None:
+    helpers.need_multicast()
+    out = tmp_path / "cf2"
+    words = ["agent", "--id", "2", "--agents", "2", "--interface", "lo", "--group", helpers.own_group(), "--no-seal"]
+    with subprocess.Popen(_command(*words, "--json", "--out", str(out)), stdout=subprocess.PIPE, text=True) as process:
+        wait_for(lambda: (out / "cf2.mcap").exists() and (out / "cf2.mcap").stat().st_size > 4000)
+        maps = Path(f"/proc/{process.pid}/maps").read_text()
+        process.send_signal(signal.SIGTERM)
+        said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    summary = json.loads(said)
+    assert summary == json.loads((out / "summary.json").read_text())
+    assert (summary["state"], summary["sealed"], summary["heard_of"]) == ("alone", False, [])
+    # In flight it has no memory for what its command line needed: random numbers, hashes.
+    assert "_hearing" in maps
+    assert not any(name in maps for name in ("numpy/random", "libcrypto"))
+    merged = subprocess.run(_command("merge", str(out), "--json"), capture_output=True, text=True, timeout=60)
+    assert merged.returncode == 0, merged.stderr
+    found = json.loads(merged.stdout)
+    assert found["missing"] == [1]
+    assert found["decisions_again"]["equal"] == found["decisions_again"]["of"] > 0
+
+
+def test_an_agent_needs_no_ros(tmp_path: Path) -> None:
+    helpers.need_multicast()
+    words = ["agent", "--id", "1", "--interface", "lo", "--group", helpers.own_group(), "--no-seal"]
+    words += ["--duration-s", "0.1", "--out", str(tmp_path / "cf1")]
+    known = "sorted({name.partition('.')[0] for name in sys.modules} & {'rclpy', 'dtsa_msgs', 'matplotlib', 'pandas'})"
+    program = (
+        f"import sys; from dtsa_bench.commands import cli; code = cli.main({words!r}); print({known}); sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "[]"), done.stderr

@@ -1,0 +1,392 @@
+"""The report: its numbers, that it is self-contained, and that a real browser draws it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flight_helpers import flight_bag
+
+from dtsa_agent.core import REASONS
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.registry import REASON_TEXTS
+from dtsa_bench.commands.cli import main
+from dtsa_bench.pages.report.data import pair_distances, run_data
+from dtsa_bench.pages.report.page import render, write_report
+from dtsa_bench.recordings.bag.errors import UnusableBag
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.bag.recover import recover
+from dtsa_bench.recordings.bag.run import load_run
+from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.simulation.simulate import simulate
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+
+SLOTS = 429  # until a second after all have arrived, as in a simulated flight
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A clean flight and one on a lossy channel with collisions."""
+    root = tmp_path_factory.mktemp("bags")
+    flight_bag(root / "clean", slots=SLOTS, agents=6, moving=4, policy="dtsa", seed=2)
+    flight_bag(root / "lossy", slots=200, loss=0.2, agents=6, policy="aloha", seed=3)
+    return {"clean": root / "clean", "lossy": root / "lossy"}
+
+
+@pytest.fixture(scope="module")
+def data(flights: dict[str, Path]) -> dict[str, Any]:
+    """What the report shows of both."""
+    return {name: run_data(path) for name, path in flights.items()}
+
+
+def numbers(text: str, kind: str) -> np.ndarray:
+    """A packed array."""
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(
+    flights: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(flights["clean"], tmp_path / "a" / "bag")
+    file = next((tmp_path / "a" / "bag").glob("*.mcap"))
+    known = load_run(file)
+    with Bag(file) as bag:
+        assert load_run(bag).slots.tolist() == known.slots.tolist()
+    for given in (tmp_path / "a", tmp_path / "a" / "bag", file):
+        for path in (given, str(given)):
+            assert load_run(path).slots.tolist() == known.slots.tolist()
+            assert run_data(path)["agents"] == 6
+            assert verify_bag(path).mode == "lockstep"
+        assert recover(given, tmp_path / f"saved-{given.name}").count > 0
+        assert main(["export", str(given), "--to", "csv", "--out", str(tmp_path / f"csv-{given.name}")]) == 0
+    capsys.readouterr()
+
+
+def test_results_of_a_run_directory_stay_in_it(
+    flights: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "a"
+    shutil.copytree(flights["clean"], run / "bag")
+    assert main(["report", str(run)]) == main(["export", str(run)]) == main(["recover", str(run)]) == 0
+    capsys.readouterr()
+    assert {path.name for path in run.iterdir()} == {"bag", "report.html", "bag_tables", "bag_recovered"}
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_results_are_those_of_the_simulator(data: dict[str, Any], flights: dict[str, Path]) -> None:
+    with Bag(flights["clean"]) as bag:
+        config = RunConfig.from_dict(bag.config)
+    summary = simulate(config).summary()
+    found = data["clean"]["summary"]
+    assert found["slots"]["total"] == SLOTS
+    for key, value in summary.items():
+        if key in ("wall_time_s", "realtime_factor", "malformed", "foreign"):
+            continue
+        if isinstance(value, float):
+            assert found[key] == pytest.approx(value, rel=1e-12), key
+        else:
+            assert found[key] == value, key
+
+
+def test_slots_carry_sender_outcome_and_reason(data: dict[str, Any], flights: dict[str, Path]) -> None:
+    for name, path in flights.items():
+        slots = data[name]["slots"]
+        with Bag(path) as bag:
+            receptions = [typed for _, typed in bag.typed(["/swarm/reception"])]
+            decisions = {typed.slot: typed for _, typed in bag.typed(["/swarm/decision"])}
+        rows = [(one.slot, int(k), one.outcome) for one in receptions for k in one.sender]
+        kinds = [
+            numbers(slots[key], kind).tolist() for key, kind in (("slot", "<u4"), ("sender", "<u2"), ("outcome", "u1"))
+        ]
+        assert list(zip(*kinds, strict=True)) == rows
+        names = data[name]["decisions"]["names"]
+        for (slot, sender, _), code in zip(rows, numbers(slots["reason"], "u1"), strict=True):
+            decision = decisions[slot]
+            assert names[code] == decision.reason_name[decision.reason_index[sender - 1]]
+        assert slots["count"] == len(receptions)
+
+
+def test_shares_of_the_channel_and_of_reasons_add_up(data: dict[str, Any]) -> None:
+    for run in data.values():
+        assert np.allclose(np.sum(list(run["channel"]["share"].values()), axis=0), 1, atol=2e-4)
+        assert np.allclose(np.sum(run["decisions"]["share"], axis=0), 1, atol=2e-3)
+        assert sum(run["decisions"]["total"]) == run["agents"] * run["slots"]["count"]
+    assert data["lossy"]["summary"]["lost_fraction"] > 0
+    assert data["clean"]["summary"]["lost_fraction"] == 0
+    assert data["lossy"]["decisions"]["disagree"] > 0
+    assert data["clean"]["decisions"]["disagree"] == 0
+
+
+def test_distances_are_those_of_the_positions(flights: dict[str, Path]) -> None:
+    with Bag(flights["lossy"]) as bag:
+        run = load_run(bag)
+    found = pair_distances(run)
+    assert found is not None
+    n = len(run.motion.ids)
+    brute = {
+        (i + 1, j + 1): np.linalg.norm(run.motion.position[:, :, i] - run.motion.position[:, :, j], axis=1)
+        for i in range(n)
+        for j in range(i + 1, n)
+    }
+    assert np.allclose(found.least, np.min(list(brute.values()), axis=0))
+    assert found.pairs == sorted(brute, key=lambda pair: brute[pair].min())[: len(found.pairs)]
+    for pair, series in zip(found.pairs, found.series, strict=True):
+        assert np.allclose(series, brute[pair])
+
+
+def test_the_scene_is_where_the_agents_were(data: dict[str, Any], flights: dict[str, Path]) -> None:
+    scene = data["clean"]["scene"]
+    with Bag(flights["clean"]) as bag:
+        run = load_run(bag)
+    times = numbers(scene["time"], "<f4")
+    places = numbers(scene["position"], "<i2").reshape(len(times), 3, -1) * scene["scale"]
+    for frame in (0, len(times) // 2, len(times) - 1):
+        row = np.abs((run.motion.time_ns - run.start_ns) / 1e9 - times[frame]).argmin()
+        assert np.abs(places[frame] - run.motion.position[row]).max() <= 0.51 * scene["scale"]
+    assert scene["scale"] < 0.001
+
+
+def test_ages_follow_from_who_was_heard(data: dict[str, Any]) -> None:
+    clean, lossy = (data[name]["summary"] for name in ("clean", "lossy"))
+    assert 0 < clean["age_mean_slots"] <= clean["age_max_slots"]
+    assert lossy["age_mean_slots"] > clean["age_mean_slots"]
+    rows = data["clean"]["table"]
+    assert [row["id"] for row in rows] == list(range(1, 7))
+    assert sum(row["moving"] for row in rows) == 4
+    assert all((row["age_mean"] is not None) == row["moving"] for row in rows)
+    assert sum(row["sent"] for row in rows) == clean["frames"]
+
+
+@pytest.fixture(scope="module")
+def crash(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """A flight in which several pairs crash, and which goes on."""
+    directory = tmp_path_factory.mktemp("crash") / "crash"
+    settings = {"agents": 16, "policy": "tdma", "estimator": "hold", "slot_ms": 20.0, "seed": 1003}
+    flight_bag(directory, slots=120, **settings)
+    return run_data(directory), directory
+
+
+def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], Path]) -> None:
+    data, directory = crash
+    found = data["crashes"]
+    assert found[0]["ids"] == data["summary"]["collided_pair"]
+    assert [one["time_s"] for one in found] == sorted(one["time_s"] for one in found)
+    motion = load_run(directory).motion
+    for one in found:
+        a, b = (motion.position[:, :, number - 1] for number in one["ids"])
+        near = np.flatnonzero(np.linalg.norm(a - b, axis=1) < 0.2)
+        assert (motion.time_ns[near[0]] - 1_000_000_000) / 1e9 == pytest.approx(one["time_s"], abs=1e-3)
+        assert one["place"] == pytest.approx(((a + b) / 2)[near[0]], abs=1e-3)
+    assert len({tuple(one["ids"]) for one in found}) == len(found) > 1
+
+
+def test_flights_without_a_crash_have_none(data: dict[str, Any]) -> None:
+    assert data["clean"]["crashes"] == []
+
+
+class Outside(HTMLParser):
+    """Finds everything that a browser would fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.found += [f"{tag} {values[name]}" for name in ("src", "href", "srcset", "data") if values.get(name)]
+        if tag in ("link", "iframe", "object", "embed", "base"):
+            self.found.append(tag)
+
+
+def test_the_page_fetches_nothing(data: dict[str, Any]) -> None:
+    page = render([data["clean"], data["lossy"]])
+    finder = Outside()
+    finder.feed(page)
+    assert finder.found == []
+    addresses = set(re.findall(r"https?://[^\s\"'<>)]+", page)) - {"http://www.w3.org/2000/svg"}
+    assert addresses == set()
+    assert "@import" not in page
+    assert not re.search(r"url\((?!#|data:)", page)
+    assert "default-src 'none'" in page
+
+
+def test_data_in_the_page_is_the_data(data: dict[str, Any]) -> None:
+    page = render([data["clean"]])
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
+    assert match is not None
+    content = json.loads(match[1])
+    assert content["runs"] == [json.loads(json.dumps(data["clean"]))]
+    assert content["reasons"].keys() == set(REASONS)
+
+
+def hostile(data: dict[str, Any]) -> dict[str, Any]:
+    """A run whose name and settings try to be HTML."""
+    evil = "</script><img src=x onerror=\"document.title='broken'\"><!-- {{ script }}"
+    return {**data["clean"], "name": evil, "config": [["swarm", evil, evil]], "notes": [evil]}
+
+
+def test_names_and_settings_cannot_break_out(data: dict[str, Any]) -> None:
+    page = render([hostile(data)])
+    assert page.count("</script>") == 2
+    finder = Outside()
+    finder.feed(page)
+    assert finder.found == []
+
+
+def test_a_bag_without_a_usable_configuration_still_gives_a_page(tmp_path: Path, flights: dict[str, Path]) -> None:
+    from dtsa_bench.recordings.bag.schema import Definition
+
+    with (
+        Bag(flights["clean"]) as bag,
+        BagWriter(tmp_path / "strange", {"swarm": {"agents": 6, "policy": "of tomorrow"}}) as writer,
+    ):
+        channels = {
+            name: writer.add_topic(name, t.type, list(t.profiles), Definition(t.type, t.definition, t.type_hash))
+            for name, t in bag.topics.items()
+        }
+        for message in bag.messages():
+            writer.write(channels[message.topic], message.data, message.log_time_ns, message.publish_time_ns)
+    found = run_data(tmp_path / "strange")
+    assert found["ages"] is None
+    assert "of tomorrow" in found["notes"][0]
+    assert found["summary"]["slots"]["total"] == SLOTS
+    assert found["summary"]["min_distance_m"] > 0
+    assert render([found])
+
+
+def test_equal_names_are_told_apart_and_bad_input_is_refused(flights: dict[str, Path], tmp_path: Path) -> None:
+    path = write_report([flights["clean"], flights["clean"]], tmp_path / "deep" / "report.html")
+    assert "clean (2)" in path.read_text(encoding="utf-8")
+    assert [entry.name for entry in path.parent.iterdir()] == ["report.html"]
+    with pytest.raises(ConfigError, match="1 to 6"):
+        write_report([flights["clean"]] * 7, tmp_path / "many.html")
+    with pytest.raises(ConfigError, match="directory"):
+        write_report([flights["clean"]], tmp_path)
+    with pytest.raises(UnusableBag):
+        write_report([tmp_path / "nothing"], tmp_path / "none.html")
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_the_command_writes_beside_the_bag(flights: dict[str, Path]) -> None:
+    command = [sys.executable, "-m", "dtsa_bench", "report", str(flights["clean"])]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert (flights["clean"].parent / "report.html").is_file()
+    assert "report.html" in result.stdout
+
+
+# ---- in a browser ----
+
+
+def drawn(page: Path, profile: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    """The page after its script has run, as text."""
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--enable-logging=stderr",
+        "--virtual-time-budget=4000",
+    ]
+    return subprocess.run(
+        [str(CHROMIUM), *options, f"--user-data-dir={profile}", *more, page.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def complaints(log: str) -> list[str]:
+    """What the page's script complained about."""
+    return [line for line in log.splitlines() if "CONSOLE" in line]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("names", [["clean"], ["clean", "lossy"]])
+def test_chromium_draws_every_part(data: dict[str, Any], tmp_path: Path, names: list[str]) -> None:
+    page = tmp_path / "report.html"
+    page.write_text(render([data[name] for name in names]), encoding="utf-8")
+    result = drawn(page, tmp_path / "profile", "--dump-dom", "--window-size=1400,2400")
+    assert "data-ready" in result.stdout, result.stderr
+    assert complaints(result.stderr) == []
+    headings = re.findall(r"<h2>([^<]+)</h2>", result.stdout)
+    expected = ["Flight", "Distances", "Slots", "Channel use", "Decisions", "Age", "Estimate error", "Agents"]
+    assert [heading for heading in headings if heading in expected] == expected
+    assert headings[-1] == "Configuration"
+    # distances, channel, decisions, twice age, twice error; scene and two canvases for the slots
+    assert result.stdout.count('<svg class="plot"') == 7 * len(names)
+    assert result.stdout.count("<canvas") == 3 * len(names)
+    assert "NaN" not in re.sub(r"<script.*?</script>", "", result.stdout, flags=re.S)
+
+
+PLAY = """
+const told = [];
+clock.set(0.5); clock.toggle(); clock.toggle(); told.push(clock.time); clock.toggle();
+setTimeout(() => {
+  clock.toggle(); const stood = clock.time; clock.toggle(); clock.toggle();
+  told.push(stood > 0.5, clock.time === stood);
+  clock.set(DURATION); told.push(document.querySelector(".play").textContent);
+  clock.toggle(); told.push(clock.time); clock.toggle();
+  document.body.append(el("div", {}, "told " + JSON.stringify(told)));
+}, 400);
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_chromium_plays_on_from_where_it_stood_and_marks_crashes(
+    crash: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    data, _ = crash
+    page = tmp_path / "report.html"
+    page.write_text(render([data]).replace("</body>", f"<script>{PLAY}</script></body>"), encoding="utf-8")
+    result = drawn(page, tmp_path / "profile", "--dump-dom")
+    assert complaints(result.stderr) == []
+    assert 'told [0.5,true,true,"↻",0]' in result.stdout
+    assert "A cross in a ring is a crash" in result.stdout
+    assert result.stdout.count('class="mark"') == len(data["crashes"])
+    for name in data["sent_for"]:
+        assert REASON_TEXTS[name] in result.stdout  # explained where they appear
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_chromium_shows_hostile_names_as_text(data: dict[str, Any], tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    page.write_text(render([hostile(data)]), encoding="utf-8")
+    result = drawn(page, tmp_path / "profile", "--dump-dom")
+    assert "<title>broken" not in result.stdout
+    assert "<img" not in re.sub(r"<script.*?</script>", "", result.stdout, flags=re.S)
+    assert "data-ready" in result.stdout
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_chromium_paints_the_canvases_and_prints(data: dict[str, Any], tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    page = tmp_path / "report.html"
+    page.write_text(render([data["clean"]]), encoding="utf-8")
+    picture, paper = tmp_path / "page.png", tmp_path / "page.pdf"
+    drawn(page, tmp_path / "profile", f"--screenshot={picture}", "--window-size=1200,1500", "--hide-scrollbars")
+    pixels = imread(picture)[:, :, :3]
+    colours = len(np.unique((pixels * 31).astype(np.uint8).reshape(-1, 3), axis=0))
+    assert colours > 150  # text and lines alone have far fewer
+    drawn(page, tmp_path / "profile", f"--print-to-pdf={paper}", "--no-pdf-header-footer")
+    assert paper.read_bytes().startswith(b"%PDF")
+    assert 2 <= len(re.findall(rb"/Type\s*/Page\b", paper.read_bytes())) <= 12

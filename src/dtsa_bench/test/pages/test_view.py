@@ -1,0 +1,316 @@
+"""The live view: what its sources tell, who may see it, and that it disturbs nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flight_helpers import flight_bag
+from view_helpers import AGENTS, PATIENCE_S, SLOTS, lossy_bag, numbers, track_of
+
+pytest.importorskip("aiohttp")
+
+import aiohttp
+from dtsa_dev.soak.view import serving
+from metronome import flown_again_when_overloaded
+from waiting import wait_for
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.commands.cli import main
+from dtsa_bench.pages.view.link import BEGIN, ViewLink, record
+from dtsa_bench.pages.view.moments import UNKNOWN, Moment, belief
+from dtsa_bench.pages.view.orders import Order, read_order
+from dtsa_bench.pages.view.recording import BagSource
+from dtsa_bench.pages.view.server import ViewServer, _Reader
+from dtsa_bench.pages.view.track import MOST_BYTES, MOST_MOMENTS, Track
+from dtsa_bench.recordings.bag.errors import UnusableBag
+from dtsa_bench.recordings.bag.run import load_run
+from dtsa_bench.recordings.tables.ages import follow_run, observed
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lossy_bag(tmp_path_factory.mktemp("view"))
+
+
+@pytest.fixture(scope="module")
+def track(bag: Path) -> Track:
+    return track_of(bag)
+
+
+# What a bag tells.
+
+
+def test_moments_tell_what_the_bag_holds(bag: Path, track: Track) -> None:
+    run = load_run(bag)
+    _, moments = track.since(0, MOST_MOMENTS)
+    told = [json.loads(moment.text) for moment in moments]
+    assert track.state == "recorded"
+    slots, senders, outcomes, received = (
+        np.concatenate([numbers(one["frames"][name], kind) for one in told])
+        for name, kind in (("slot", "<u4"), ("sender", "<u2"), ("outcome", "u1"), ("received", "u1"))
+    )
+    assert slots.tolist() == run.frames.slot.tolist()
+    assert senders.tolist() == run.frames.sender.tolist()
+    assert outcomes.tolist() == run.outcome[run.frames.slot].tolist()
+    assert np.abs(received / 255 - run.frames.received.sum(axis=1) / (AGENTS - 1)).max() < 0.01
+    for one in told:
+        places = numbers(one["place"], "<f4").reshape(-1, 3, AGENTS)
+        for slot, place in zip(numbers(one["at"], "<u4").tolist(), places, strict=True):
+            moment_ns = run.start_ns + slot * run.slot_ns
+            known = run.motion.position[np.abs(run.motion.time_ns - moment_ns).argmin()]
+            assert slot == 0 or np.abs(place - known).max() < 1e-5
+    assert told[-1]["slot"] == SLOTS
+
+
+def test_ages_and_beliefs_are_those_of_the_report(bag: Path, track: Track) -> None:
+    run = load_run(bag)
+    ages = follow_run(run).ages
+    assert ages is not None
+    by_slot = {one.slot: one for one in observed(run)}
+    _, moments = track.since(0, MOST_MOMENTS)
+    for moment in moments[3:]:
+        told = numbers(json.loads(moment.text)["age"], "<u2")
+        known = ages.age[moment.slot - 1]
+        assert (told == UNKNOWN).tolist() == np.isnan(known).tolist()
+        assert np.nanmax(np.abs(np.where(told == UNKNOWN, np.nan, told) / 10 - known)) <= 0.051
+        one = by_slot[moment.slot - 1]
+        for observer in (1, AGENTS):
+            heard = np.frombuffer(belief(moment, observer, AGENTS).heard, "<u2")
+            for agent, age in zip(one.agent[one.observer == observer], one.age[one.observer == observer], strict=True):
+                assert heard[agent - 1] == age
+
+
+def test_a_bag_is_followed_while_it_grows(bag: Path, tmp_path: Path) -> None:
+    data = next(bag.glob("*.mcap")).read_bytes()
+    growing = tmp_path / "run" / "bag"
+    growing.mkdir(parents=True)
+    file = growing / "bag_0.mcap"
+    file.write_bytes(data[: len(data) // 2])
+    found = Track("growing")
+    source = BagSource(tmp_path / "run", found)
+    thread = threading.Thread(target=source.run, daemon=True)
+    thread.start()
+    time.sleep(0.3)
+    assert thread.is_alive()
+    assert found.state in ("", "waiting: nobody writes this bag at the moment")
+    with file.open("ab") as stream:
+        stream.write(data[len(data) // 2 :])
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    _, moments = found.since(0, MOST_MOMENTS)
+    assert moments[-1].slot == SLOTS
+
+
+def test_what_is_no_bag_is_named_and_a_damaged_one_ends_in_words(bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    with pytest.raises(UnusableBag, match="is not an MCAP file"):
+        BagSource(tmp_path / "a.mcap", Track("a"))
+    data = bytearray(next(bag.glob("*.mcap")).read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    (tmp_path / "b.mcap").write_bytes(data)
+    found = Track("b")
+    BagSource(tmp_path / "b.mcap", found).run()
+    assert found.state
+
+
+def test_a_track_keeps_a_limited_number_of_moments() -> None:
+    found = Track("long")
+    found.begin({})
+    for slot in range(MOST_MOMENTS + 10):
+        found.add(Moment(slot, "{}", b"", b""))
+    first, moments = found.since(0, 5)
+    assert (first, moments[0].slot, len(moments)) == (10, 10, 5)
+    found.begin({})
+    for slot in range(5):
+        found.add(Moment(slot, "", b"", bytes(MOST_BYTES // 4)))
+    first, moments = found.since(0, 100)
+    assert len(moments) <= 4
+    assert moments[-1].slot == 4
+
+
+# Who may see it.
+
+
+async def _statuses(url: str) -> dict[str, int]:
+    base, token = url.rstrip("/").rsplit("/", 1)
+    found = {}
+    async with aiohttp.ClientSession() as session:
+        for name, address, headers in (
+            ("page", url, {}),
+            ("script", url + "view.js", {}),
+            ("three", url + "three.module.min.js", {}),
+            ("own origin", url, {"Origin": base}),
+            ("nothing", base + "/", {}),
+            ("wrong token", f"{base}/{token[:-1]}x/", {}),
+            ("no token", f"{base}/stream", {}),
+            ("other file", url + "server.py", {}),
+            ("way up", url + "..%2fserver.py", {}),
+            ("foreign origin", url, {"Origin": "http://elsewhere.example"}),
+            ("foreign host", url, {"Host": "elsewhere.example"}),
+        ):
+            async with session.get(address, headers=headers) as answer:
+                found[name] = answer.status
+                assert "no-referrer" in answer.headers.get("Referrer-Policy", "")
+        async with session.ws_connect(url + "stream", headers={"Origin": base}) as stream:
+            found["stream"] = 101
+            assert (await stream.receive_json(timeout=PATIENCE_S))["kind"] == "begin"
+            await stream.send_str(json.dumps({"order": {"kind": "jam", "value": True}}))
+            while (told := await stream.receive_json(timeout=PATIENCE_S))["kind"] != "answer":
+                pass
+            assert told["text"].startswith("refused")
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await session.ws_connect(url + "stream", headers={"Origin": "null"})
+        found["foreign stream"] = refused.value.status
+    return found
+
+
+def test_only_who_knows_the_token_and_comes_from_here_gets_anything(track: Track) -> None:
+    with serving(ViewServer([track], "some-token")) as url:
+        assert url.startswith("http://127.0.0.1:")
+        found = asyncio.run(_statuses(url))
+    allowed = {name: status for name, status in found.items() if status < 400}
+    assert allowed == {"page": 200, "script": 200, "three": 200, "own origin": 200, "stream": 101}
+    assert {status for name, status in found.items() if name not in allowed} <= {403, 404}
+
+
+def test_a_page_that_does_not_read_costs_nothing_and_garbage_is_let_go() -> None:
+    """The server's memory stays where it is while moments go on; another page gets them all."""
+    found = Track("fast")
+    found.begin({"agents": 1})
+    big = Moment(0, json.dumps({"filler": "x" * 200_000}), b"", b"")
+
+    async def session(url: str) -> int:
+        sleeping = socket.create_connection(("127.0.0.1", int(url.split(":")[2].split("/")[0])))
+        path = "/" + url.split("/", 3)[3] + "stream"
+        host = url.split("/")[2]
+        head = f"GET {path} HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        key = "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        sleeping.sendall((head + key).encode())
+        got = 0
+        async with aiohttp.ClientSession() as client, client.ws_connect(url + "stream", max_msg_size=0) as stream:
+            for _ in range(40):
+                found.add(big)
+            while got < 40:
+                message = await stream.receive_json(timeout=PATIENCE_S)
+                got += len(message.get("moments", ()))
+            await stream.send_str("[" * 4000)
+            closed = await stream.receive(timeout=PATIENCE_S)
+            while closed.type not in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED):
+                closed = await stream.receive(timeout=PATIENCE_S)
+        sleeping.close()
+        return got
+
+    with serving(ViewServer([found], "some-token")) as url:
+        assert asyncio.run(session(url)) == 40
+
+
+class Page:
+    """A connection whose other side takes everything."""
+
+    closed = False
+
+    async def send_str(self, _: str) -> None:
+        await asyncio.sleep(0)
+
+    async def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize("steps", range(25))
+def test_a_page_is_let_go_wherever_sending_stands(steps: int) -> None:
+    found = Track("fast")
+    found.begin({"agents": 1})
+    for _ in range(500):
+        found.add(Moment(0, "{}", b"", b""))
+
+    async def session() -> bool:
+        reader = _Reader(page := Page(), [found])  # type: ignore[arg-type]
+        running = asyncio.create_task(reader.run())
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        await reader.end(running)
+        return running.done() and (page.closed or not steps)
+
+    assert asyncio.run(session())
+
+
+NO_ORDERS = [
+    *(None, [], {}, {"kind": "reboot"}, {"kind": "kill"}, {"kind": "kill", "agent": True}),
+    *({"kind": "loss", "value": value} for value in (2, "1", True, float("nan"))),
+    *(
+        {"kind": "jam", "value": 1},
+        {"kind": "emergency"},
+        {"kind": "emergency", "value": True},
+        {"kind": "partition", "value": "1" * 5000},
+    ),
+]
+
+
+@pytest.mark.parametrize("content", NO_ORDERS)
+def test_orders_are_checked(content: Any) -> None:
+    with pytest.raises(ConfigError):
+        read_order(content)
+
+
+def test_usable_orders_are_read() -> None:
+    assert read_order({"kind": "kill", "agent": 3}) == Order("kill", 3)
+    assert read_order({"kind": "loss", "value": 1}) == Order("loss", value=1.0)
+    assert read_order({"kind": "partition", "value": ""}) == Order("partition", value="")
+
+
+@flown_again_when_overloaded
+def test_a_link_to_a_server_that_stands_still_never_waits() -> None:
+    """What it cannot take is dropped; that a process stands still is what SIGSTOP makes of it."""
+    link = ViewLink()
+    try:
+        assert link.offer(record(BEGIN, {}))
+        os.kill(link.process_id, signal.SIGSTOP)
+        data = record(BEGIN, "x" * 100_000)
+        begin = time.monotonic()
+        taken = sum(link.offer(data) for _ in range(100))
+        assert time.monotonic() - begin < 1.0
+        assert taken < 50
+        assert link.dropped == 100 - taken
+        os.kill(link.process_id, signal.SIGKILL)
+        wait_for(lambda: not link.alive())
+        wait_for(lambda: (link.offer(data), link.gone)[1])
+    finally:
+        link.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["view", "nowhere"], "there is no such file"),
+        (["view", "a", "b", "c"], "bags: got 3"),
+        (["view", "--port", "99999"], "port: got"),
+        (["view", "--listen", "0.0.0.0"], "listen: got"),
+        (["fly", "--out", "x", "--control"], "control: got True; allowed: only with --view"),
+    ],
+)
+def test_unusable_settings_are_one_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert text in said
+    assert said.count("\n") == 1
+
+
+def test_a_page_is_told_once_that_nobody_hears_anybody(tmp_path: Path) -> None:
+    """Also afterwards, of a bag; of one in which frames are heard it is told nothing."""
+    for name, loss, told in (("deaf", 1.0, 1), ("well", 0.2, 0)):
+        flight_bag(tmp_path / name, slots=300, loss=loss, agents=4, policy="tdma")
+        track = track_of(tmp_path / name)
+        moments = [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+        texts = [event[2] for moment in moments for event in moment["events"]]
+        found = [text for text in texts if text.startswith("nobody heard anybody: ")]
+        assert len(found) == told, texts

@@ -1,0 +1,95 @@
+"""Crazyflies on the live page: their bridge's words are shown, and orders reach simulated vehicles."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("cflib")
+pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs.srv")
+pytest.importorskip("aiohttp")
+
+from bridge_helpers import end_process, fake_fleet, settings
+from builtin_interfaces.msg import Duration
+from dtsa_dev.soak.chromium import CHROMIUM, Browser
+from dtsa_dev.soak.view import serving
+from dtsa_msgs.srv import Arm, Takeoff
+from metronome import flown_again_when_overloaded
+from node_helpers import ServedNode
+from waiting import wait_for
+
+from dtsa_bench.flights.domain import ros_domain
+from dtsa_bench.pages.view.server import ViewServer
+from dtsa_bench.pages.view.track import Track
+
+pytestmark = [pytest.mark.ros]
+COUNT = 2
+STATES = "[...document.querySelectorAll('.vehicles tbody tr')].map(row => row.children[1].firstChild.textContent)"
+CLICK = "document.querySelector('[data-order={}]').click()"
+
+
+def all_are(state: str) -> str:
+    """Whether the page says of all vehicles that they are in a state."""
+    return f"(found => found.length === {COUNT} && found.every(state => state === '{state}'))({STATES})"
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@flown_again_when_overloaded
+def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Path) -> None:
+    """Without a run: the bridge alone."""
+    from dtsa_bench.pages.view.graph import GraphSource
+
+    with ros_domain() as domain, fake_fleet(tmp_path, COUNT) as fleet, Browser(tmp_path) as browser:
+        config = tmp_path / "swarm.yaml"
+        # Nobody streams commands; the browser takes the processor from all.
+        safety: dict[str, Any] = {"link_age_s": 3.0, "emergency_watchdog": False}
+        config.write_text(yaml.safe_dump(settings(fleet, {"safety": safety})))
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        command = [
+            sys.executable,
+            "-m",
+            "dtsa_agent.crazyflie.node.bridge_node",
+            "--ros-args",
+            "-p",
+            f"config:={config}",
+        ]
+        bridge = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, text=True)
+        track, pilot = Track("/swarm"), ServedNode(domain, "pilot")
+        source = GraphSource(track, domain, control=True)
+        listening = threading.Thread(target=source.run)
+        listening.start()
+        try:
+            with serving(ViewServer([track], "some-token", source.order)) as url:
+                browser.open(url)
+                browser.wait_for(all_are("ready"))
+                assert pilot.call(Arm, "/all/arm", arm=True).success
+                browser.wait_for(all_are("armed"))
+                assert pilot.call(Takeoff, "/all/takeoff", height=0.6, duration=Duration(sec=2)).success
+                browser.wait_for(all_are("flying"))
+                assert browser.run("parseFloat(document.querySelector('.vehicles td:nth-child(3)').textContent)") > 3.0
+                browser.run(CLICK.format("land"))
+                wait_for(lambda: len({event["cf"] for event in fleet.events(name="land")}) == COUNT)
+                browser.wait_for(all_are("ready"))
+                browser.wait_for("document.querySelector('.vehicles .answer').textContent === 'land: done'")
+                browser.run(CLICK.format("emergency"))  # the first step of two
+                browser.wait_for("document.querySelector('[data-order=emergency]').textContent.startsWith('Once more')")
+                assert browser.run(STATES) == ["ready"] * COUNT
+                browser.run(CLICK.format("emergency"))
+                browser.wait_for(all_are("emergency"))
+                assert not [event for event in fleet.events(name="state") if event["state"] == "crashed"]
+                end_process(bridge)
+                browser.wait_for(all_are("silent (emergency)"))
+                assert browser.complaints() == []
+        finally:
+            source.stopped = True
+            listening.join()
+            pilot.close()
+            end_process(bridge)

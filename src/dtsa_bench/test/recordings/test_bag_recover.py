@@ -1,0 +1,221 @@
+"""What a killed recorder, a cut or a flipped bit leaves is saved: all that is readable, nothing that is not."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+from bag_helpers import SyntheticRun, synthetic_bag
+from mcap.reader import make_reader
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.recordings.bag import container
+from dtsa_bench.recordings.bag.errors import UnusableBag
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.bag.recover import recover
+
+Row = tuple[str, int, int, int, bytes]
+COMPRESSIONS = ("zstd", "lz4", "none")
+
+
+def rows_of(path: Path) -> list[Row]:
+    """All messages in the order of the file."""
+    with path.open("rb") as stream:
+        messages = make_reader(stream).iter_messages(log_time_order=False)
+        return [(c.topic, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in messages]
+
+
+def chunks_of(path: Path) -> list[tuple[int, int, int]]:
+    """(start, end, messages) of each chunk in the file."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    found = []
+    with path.open("rb") as stream:
+        for index in sorted(summary.chunk_indexes, key=lambda one: one.chunk_start_offset):
+            count = 0
+            for offset in index.message_index_offsets.values():
+                stream.seek(offset + 9 + 2)
+                count += int.from_bytes(stream.read(4), "little") // 16
+            found.append((index.chunk_start_offset, index.chunk_start_offset + index.chunk_length, count))
+    return found
+
+
+@pytest.fixture(scope="module", params=COMPRESSIONS)
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
+    """A bag in many small chunks."""
+    directory = tmp_path_factory.mktemp(f"bags_{request.param}") / "flight"
+    return synthetic_bag(directory, slots=30, agents=3, chunk_size=9000, compression=request.param)
+
+
+def recovered(path: Path, directory: Path, **options: bool) -> tuple[list[Row], list[str]]:
+    """Messages of the recovered bag, and what was said; none if there was nothing to save."""
+    before, said = path.read_bytes(), ""
+    try:
+        result = recover(path, directory, **options)
+    except UnusableBag as error:
+        said = str(error)
+    assert path.read_bytes() == before
+    if said:
+        assert "\n" not in said
+        assert not directory.exists()
+        return [], [said]
+    (file,) = directory.glob("*.mcap")
+    rows = rows_of(file)
+    assert len(rows) == result.count
+    assert (directory / "metadata.yaml").exists()
+    with Bag(directory) as bag:
+        assert sum(1 for _ in bag.messages()) == result.count
+        assert {name: topic.count for name, topic in bag.topics.items()} == result.saved
+    shutil.rmtree(directory)
+    return rows, result.damaged
+
+
+def test_100_truncations_give_back_all_that_is_readable(run: SyntheticRun, tmp_path: Path) -> None:
+    whole, rows, chunks = run.writer.path.read_bytes(), rows_of(run.writer.path), chunks_of(run.writer.path)
+    assert sum(count for _, _, count in chunks) == len(rows)
+    pick = random.Random(11)
+    path = tmp_path / "cut.mcap"
+    for size in [0, 7, 8, 9, *(pick.randrange(len(whole)) for _ in range(30)), len(whole) - 1]:
+        path.write_bytes(whole[:size])
+        found, said = recovered(path, tmp_path / "new")
+        sure = sum(count for _, end, count in chunks if end <= size)
+        assert found == rows[: len(found)], size
+        assert sure <= len(found) <= sure + max(count for _, _, count in chunks), size
+        if run.writer.path.parent.parent.name.startswith("bags_none"):
+            inside = [start for start, end, _ in chunks[1:] if start <= size < end]
+            if inside and size - inside[0] > 3000:
+                assert len(found) > sure, size  # messages before the cut in the same chunk
+        assert said
+
+
+def test_100_flipped_bits_lose_at_most_one_chunk_and_bring_nothing_wrong(run: SyntheticRun, tmp_path: Path) -> None:
+    whole, rows, chunks = run.writer.path.read_bytes(), rows_of(run.writer.path), chunks_of(run.writer.path)
+    known, most = set(rows), max(count for _, _, count in chunks)
+    pick = random.Random(13)
+    path = tmp_path / "flipped.mcap"
+    for _ in range(34):
+        data = bytearray(whole)
+        place = pick.randrange(len(data))
+        data[place] ^= 1 << pick.randrange(8)
+        path.write_bytes(data)
+        found, said = recovered(path, tmp_path / "new")
+        assert set(found) <= known, place
+        assert len(rows) - most <= len(found) <= len(rows), place
+        assert len(found) == len(rows) or said, place
+
+
+def test_a_flipped_bit_in_what_a_record_is_brings_nothing_wrong(
+    run: SyntheticRun, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    whole, rows = run.writer.path.read_bytes(), rows_of(run.writer.path)
+    known, most = set(rows), max(count for _, _, count in chunks_of(run.writer.path))
+    places, position = [], len(container.MAGIC)
+    while position < len(whole) - len(container.MAGIC):
+        places.append(position)
+        position += container.PREFIX.size + container.PREFIX.unpack_from(whole, position)[1]
+    path = tmp_path / "flipped.mcap"
+    last = max(place for place in places if whole[place] == container.CHUNK)
+    # One compression for each bit: what tells of a record is not compressed.
+    first = COMPRESSIONS.index(request.node.callspec.params["run"])
+    for k, place in enumerate([*places[:16], last, *places[-12:]]):
+        for bit in range((first + k) % 3, 8, 3):
+            data = bytearray(whole)
+            data[place] ^= 1 << bit
+            path.write_bytes(data)
+            found, said = recovered(path, tmp_path / "new")
+            assert set(found) <= known, (place, bit)
+            assert len(rows) - most <= len(found) <= len(rows), (place, bit)
+            assert len(found) == len(rows) or said, (place, bit)
+
+
+def test_a_hole_in_the_middle_is_stepped_over(run: SyntheticRun, tmp_path: Path) -> None:
+    rows, chunks = rows_of(run.writer.path), chunks_of(run.writer.path)
+    data = bytearray(run.writer.path.read_bytes())
+    (start, _, _), (_, end, _) = chunks[1], chunks[2]
+    data[start:end] = bytes(end - start)
+    (tmp_path / "hole.mcap").write_bytes(data)
+    found, said = recovered(tmp_path / "hole.mcap", tmp_path / "new")
+    lost = chunks[1][2] + chunks[2][2]
+    first = chunks[0][2]
+    assert found == rows[:first] + rows[first + lost :]
+    assert any("make no sense" in note for note in said)
+
+
+def test_without_its_first_chunk_the_definitions_come_from_the_end(run: SyntheticRun, tmp_path: Path) -> None:
+    rows, chunks = rows_of(run.writer.path), chunks_of(run.writer.path)
+    data = bytearray(run.writer.path.read_bytes())
+    start, end, count = chunks[0]
+    data[start + 100 : end] = bytes(end - start - 100)
+    (tmp_path / "headless.mcap").write_bytes(data)
+    found, _ = recovered(tmp_path / "headless.mcap", tmp_path / "new")
+    assert found == rows[count:]
+
+
+def test_damaged_chunks_are_kept_only_if_asked_for(tmp_path: Path) -> None:
+    run = synthetic_bag(tmp_path / "bag", slots=30, agents=3, chunk_size=9000, compression="none")
+    chunks, rows = chunks_of(run.writer.path), rows_of(run.writer.path)
+    data = bytearray(run.writer.path.read_bytes())
+    data[chunks[2][1] - 3] ^= 1  # in the last message of the third chunk
+    (tmp_path / "bad.mcap").write_bytes(data)
+    strict, said = recovered(tmp_path / "bad.mcap", tmp_path / "new")
+    assert len(strict) == len(rows) - chunks[2][2]
+    assert "left out" in said[0]
+    all_of_it, said = recovered(tmp_path / "bad.mcap", tmp_path / "new", keep_damaged=True)
+    assert len(all_of_it) == len(rows)
+    assert "kept unchecked" in said[0]
+
+
+def test_the_new_bag_knows_the_run_and_where_it_comes_from(run: SyntheticRun, tmp_path: Path) -> None:
+    source = tmp_path / "flight"
+    source.mkdir()
+    data = run.writer.path.read_bytes()
+    (source / "flight_0.mcap").write_bytes(data[: len(data) * 3 // 4])
+    result = recover(source)
+    assert result.directory == tmp_path / "flight_recovered"
+    assert not result.closed
+    with Bag(result.directory) as bag, Bag(run.writer.directory) as original:
+        assert bag.config == original.config
+        assert bag.is_ours
+        assert bag.custom_data["recovered_from"] == "flight_0.mcap"
+        for name, topic in bag.topics.items():
+            before = original.topics[name]
+            assert (topic.type, topic.profiles, topic.type_hash) == (before.type, before.profiles, before.type_hash)
+            assert topic.definition == before.definition
+
+
+def test_a_whole_bag_is_copied_whole(run: SyntheticRun, tmp_path: Path) -> None:
+    result = recover(run.writer.directory, tmp_path / "new")
+    assert result.closed
+    assert result.damaged == []
+    assert result.saved == result.expected == run.writer.counts
+
+
+def test_missing_messages_are_counted_by_topic_where_the_old_index_tells(run: SyntheticRun, tmp_path: Path) -> None:
+    chunks = chunks_of(run.writer.path)
+    data = bytearray(run.writer.path.read_bytes())
+    data[chunks[1][1] - 5] ^= 0xFF
+    (tmp_path / "bad.mcap").write_bytes(data)
+    result = recover(tmp_path / "bad.mcap", tmp_path / "new")
+    assert sum(result.expected.values()) - result.count == chunks[1][2]
+
+
+def test_a_directory_in_use_is_refused_and_left_alone(run: SyntheticRun, tmp_path: Path) -> None:
+    (tmp_path / "note").write_text("mine")
+    with pytest.raises(ConfigError, match="empty or does not exist"):
+        recover(run.writer.directory, tmp_path)
+    with pytest.raises(ConfigError, match="empty or does not exist"):
+        recover(run.writer.directory, run.writer.directory)
+    assert [path.name for path in tmp_path.iterdir()] == ["note"]
+
+
+def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("nothing of the kind")
+    (tmp_path / "nothing.mcap").touch()
+    for name in ("text.mcap", "nothing.mcap"):
+        with pytest.raises(UnusableBag, match="not an MCAP file"):
+            recover(tmp_path / name)
+    with pytest.raises(UnusableBag, match="no such file"):
+        recover(tmp_path / "missing")

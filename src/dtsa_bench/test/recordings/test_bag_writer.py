@@ -1,0 +1,322 @@
+"""What is written, field by field, read back by two independent libraries."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import yaml
+from bag_helpers import SECOND, SyntheticRun, definition, synthetic_bag, typestore
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.recordings.bag import chunk_builder, chunk_indexes, schema
+from dtsa_bench.recordings.bag.errors import BagError
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.bag.recover import recover
+from dtsa_bench.recordings.bag.writer import BagWriter
+
+INFINITE = {"sec": 9223372036, "nsec": 854775807}
+HERE = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
+    """A bag of 40 slots and 4 agents, in several chunks."""
+    return synthetic_bag(tmp_path_factory.mktemp("bags") / "flight", slots=40, chunk_size=20_000)
+
+
+def content(run: SyntheticRun) -> dict:
+    """The map below the root of metadata.yaml."""
+    loaded = yaml.safe_load((run.writer.directory / "metadata.yaml").read_text(encoding="utf-8"))
+    assert list(loaded) == ["rosbag2_bagfile_information"]
+    return loaded["rosbag2_bagfile_information"]
+
+
+def test_directory_holds_exactly_the_two_files(run: SyntheticRun) -> None:
+    names = sorted(path.name for path in run.writer.directory.iterdir())
+    assert names == ["flight_0.mcap", "metadata.yaml"]
+
+
+def test_metadata_has_every_mandatory_field(run: SyntheticRun) -> None:
+    found = content(run)
+    times = [log_ns for rows in run.written.values() for log_ns, _, _ in rows]
+    count = sum(map(len, run.written.values()))
+    assert found["version"] == 9
+    assert found["storage_identifier"] == "mcap"
+    assert found["duration"] == {"nanoseconds": max(times) - min(times)}
+    assert found["starting_time"] == {"nanoseconds_since_epoch": min(times)}
+    assert found["message_count"] == count
+    assert found["compression_format"] == ""
+    assert found["compression_mode"] == ""
+    assert found["relative_file_paths"] == ["flight_0.mcap"]
+    assert found["files"] == [
+        {
+            "path": "flight_0.mcap",
+            "starting_time": {"nanoseconds_since_epoch": min(times)},
+            "duration": {"nanoseconds": max(times) - min(times)},
+            "message_count": count,
+        }
+    ]
+    assert found["ros_distro"] == "jazzy"
+    assert all(isinstance(value, str) for value in found["custom_data"].values())
+    assert found["custom_data"]["seed"] == "7"
+    assert json.loads(found["custom_data"]["configuration"])["agents"] == 4
+    assert found["custom_data"]["version"]
+
+
+def test_metadata_describes_each_topic(run: SyntheticRun) -> None:
+    topics = {
+        entry["topic_metadata"]["name"]: (entry["topic_metadata"], entry["message_count"])
+        for entry in content(run)["topics_with_message_count"]
+    }
+    assert topics.keys() == run.written.keys()
+    for name, (topic, count) in topics.items():
+        assert count == len(run.written[name])
+        assert topic["serialization_format"] == "cdr"
+        assert topic["type_description_hash"] == definition(topic["type"]).type_hash
+        (profile,) = topic["offered_qos_profiles"]
+        assert profile == {
+            "history": "keep_last",
+            "depth": 5 if name.endswith("odom") else 10,
+            "reliability": "best_effort" if name.endswith("odom") else "reliable",
+            "durability": "volatile",
+            "deadline": INFINITE,
+            "lifespan": INFINITE,
+            "liveliness": "automatic",
+            "liveliness_lease_duration": INFINITE,
+            "avoid_ros_namespace_conventions": False,
+        }
+
+
+def test_metadata_has_no_yaml_anchors(run: SyntheticRun) -> None:
+    text = (run.writer.directory / "metadata.yaml").read_text(encoding="utf-8")
+    assert "&id" not in text
+    assert "*id" not in text
+
+
+def test_mcap_reads_header_schemas_channels_and_indexes(run: SyntheticRun) -> None:
+    with run.writer.path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert reader.get_header().profile == "ros2"
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == sum(map(len, run.written.values()))
+        assert len(summary.chunk_indexes) > 1
+        assert all(index.compression == "zstd" for index in summary.chunk_indexes)
+        assert all(index.message_index_length > 0 for index in summary.chunk_indexes)
+        for channel in summary.channels.values():
+            kind = summary.schemas[channel.schema_id]
+            assert channel.message_encoding == "cdr"
+            assert kind.encoding == "ros2msg"
+            assert kind.data.decode() == definition(kind.name).text
+            assert channel.metadata["topic_type_hash"] == definition(kind.name).type_hash
+            (profile,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
+            assert profile["history"] == "keep_last"
+            assert channel.metadata["offered_qos_profiles"].startswith("- history: keep_last\n")
+        found: dict[str, list[tuple[int, int, bytes]]] = {}
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            found.setdefault(channel.topic, []).append((message.log_time, message.publish_time, message.data))
+        assert found == run.written
+
+
+def test_metadata_record_stands_at_the_start_and_at_the_end(run: SyntheticRun) -> None:
+    with run.writer.path.open("rb") as stream:
+        records = list(make_reader(stream).iter_metadata())
+    assert [record.name for record in records] == ["rosbag2", "rosbag2"]
+    first, last = (yaml.safe_load(record.metadata["serialized_metadata"]) for record in records)
+    assert first["message_count"] == 0
+    assert first["custom_data"]["configuration"] == last["custom_data"]["configuration"]
+    assert last == content(run)
+
+
+def test_rosbags_reads_every_message_and_decodes_it(run: SyntheticRun) -> None:
+    store = typestore()
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    with Reader(run.writer.directory) as reader:
+        assert {c.topic for c in reader.connections} == run.written.keys()
+        for connection in reader.connections:
+            assert connection.digest == definition(connection.msgtype).type_hash
+        for connection, time_ns, data in reader.messages():
+            store.deserialize_cdr(data, connection.msgtype)
+            found.setdefault(connection.topic, []).append((time_ns, bytes(data)))
+    assert found == {topic: [(row[0], row[2]) for row in rows] for topic, rows in run.written.items()}
+
+
+def test_times_are_those_given(run: SyntheticRun) -> None:
+    with Bag(run.writer.directory) as bag:
+        rows = [(m.log_time_ns, m.publish_time_ns) for m in bag.messages(["/swarm/transmission"])]
+    assert rows == [(row[0], row[1]) for row in run.written["/swarm/transmission"]]
+    assert all(log_ns - publish_ns == 1000 for log_ns, publish_ns in rows)
+
+
+@pytest.mark.parametrize("name", ["dtsa_msgs/msg/Slot", "dtsa_msgs/msg/Transmission", "nav_msgs/msg/Odometry"])
+def test_hashes_agree_with_an_independent_computation(name: str) -> None:
+    try:
+        installed = schema.installed(name)
+    except BagError as error:
+        pytest.skip(f"not installed: {error}")
+    assert installed.type_hash == typestore().hash_rihs01(name)
+
+
+def test_definition_lists_each_dependency_once_and_keeps_comments() -> None:
+    texts = {
+        "a/msg/Root": "# about\nb/Leaf one\nb/Leaf[] many\nOwn[<=3] own  # note\nuint8 LEAF=1\nstring<=5 s",
+        "a/msg/Own": "builtin_interfaces/Time stamp\nb/Leaf leaf",
+        "b/msg/Leaf": "float64 x 1.5  # default",
+        "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    }
+    texts["a/msg/Root"] = texts["a/msg/Root"].replace("Own[<=3]", "Own[]")
+    line = "=" * 80
+    assert schema.concatenate("a/msg/Root", texts.__getitem__) == "\n".join(
+        [
+            texts["a/msg/Root"],
+            f"{line}\nMSG: b/Leaf\n{texts['b/msg/Leaf']}",
+            f"{line}\nMSG: a/Own\n{texts['a/msg/Own']}",
+            f"{line}\nMSG: builtin_interfaces/Time\n{texts['builtin_interfaces/msg/Time']}",
+        ]
+    )
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_every_compression_is_read_back(tmp_path: Path, compression: str) -> None:
+    run = synthetic_bag(tmp_path / "bag", slots=5, compression=compression)
+    with Bag(run.writer.directory) as bag:
+        assert sum(1 for _ in bag.messages()) == run.writer.message_count
+
+
+def test_an_empty_bag_is_a_bag(tmp_path: Path) -> None:
+    BagWriter(tmp_path / "empty", {"seed": 1}).close()
+    with Bag(tmp_path / "empty") as bag:
+        assert bag.message_count == 0
+        assert list(bag.messages()) == []
+
+
+def test_directory_in_use_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "something").write_text("precious")
+    with pytest.raises(ConfigError, match="empty or does not exist"):
+        BagWriter(tmp_path, {})
+    with pytest.raises(ConfigError, match="empty or does not exist"):
+        BagWriter(tmp_path / "something", {})
+    assert (tmp_path / "something").read_text() == "precious"
+
+
+def test_unknown_compression_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="zstd, lz4, none"):
+        BagWriter(tmp_path / "bag", {}, compression="rar")
+    assert not (tmp_path / "bag").exists()
+
+
+def test_nothing_is_swallowed_after_closing(tmp_path: Path) -> None:
+    run = synthetic_bag(tmp_path / "bag", slots=1)
+    run.writer.close()
+    for action in (lambda: run.slot(1), run.writer.flush, lambda: run.writer.add_topic("/x", "a/msg/B")):
+        with pytest.raises(BagError, match="closed"):
+            action()
+
+
+def test_wrong_messages_are_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag", {}) as writer:
+        kind = "nav_msgs/msg/Odometry"
+        channel = writer.add_topic("/odom", kind, "reliable", definition(kind))
+        with pytest.raises(BagError, match="times of a bag start at"):
+            writer.write(channel, b"\0\1\0\0", SECOND - 1, SECOND)
+        with pytest.raises(BagError, match="never added"):
+            writer.write(channel + 1, b"\0\1\0\0", SECOND, SECOND)
+        with pytest.raises(ConfigError, match="not in the bag yet"):
+            writer.add_topic("/odom", kind, "reliable", definition(kind))
+        with pytest.raises(ConfigError, match="best_effort"):
+            writer.add_topic("/other", kind, "perhaps", definition(kind))
+    with Bag(tmp_path / "bag") as bag:
+        assert bag.message_count == 0
+
+
+FULL_DISK = """
+import resource, sys
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from bag_helpers import SyntheticRun
+from dtsa_bench.recordings.bag.errors import BagError
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # what a full disk does, without one
+run = SyntheticRun(Path(sys.argv[1]), compression="none", chunk_size=20_000)
+try:
+    with run.writer:
+        for slot in range(10_000):
+            run.slot(slot)
+except BagError as error:
+    print(error)
+    print(run.writer.message_count)
+    sys.exit(7)
+"""
+
+
+def test_a_full_disk_is_said_at_once_and_what_was_saved_can_be_recovered(tmp_path: Path) -> None:
+    child = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(tmp_path / "bag"), str(HERE)], capture_output=True, text=True
+    )
+    assert child.returncode == 7, child.stderr
+    message, count = child.stdout.strip().splitlines()
+    assert "recover" in message
+    assert "not saved" in message
+    assert not (tmp_path / "bag" / "metadata.yaml").exists()
+    result = recover(tmp_path / "bag")
+    assert 0 < result.count <= int(count)
+    assert int(count) - result.count < 200  # at most the chunk that did not fit
+
+
+KILLED = """
+import sys, time
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from bag_helpers import SECOND, definition
+from dtsa_bench.recordings.bag.writer import BagWriter
+kind = "dtsa_msgs/msg/Slot"
+writer = BagWriter(Path(sys.argv[1]), {"seed": 5})
+channel = writer.add_topic("/swarm/slot", kind, "reliable", definition(kind))
+print("go", flush=True)
+while True:  # the message is the wall clock
+    now = time.time_ns()
+    writer.write(channel, b"\\0\\1\\0\\0" + now.to_bytes(8, "little"), now, now)
+    time.sleep(0.001)
+"""
+
+
+@pytest.mark.parametrize("alive_s", [0.9, 1.7])
+def test_kill_9_loses_at_most_the_last_second(tmp_path: Path, alive_s: float) -> None:
+    child = subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path / "bag"), str(HERE)], stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    child.stdout.readline()
+    began = time.time_ns()
+    time.sleep(alive_s)
+    killed = time.time_ns()
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    child.stdout.close()
+    result = recover(tmp_path / "bag")
+    with Bag(result.directory) as bag:
+        saved = [m.log_time_ns for m in bag.messages()]
+        assert bag.config == {"seed": 5}
+    assert saved[0] < began + SECOND // 10
+    assert saved[-1] > killed - SECOND
+    assert all(later - earlier < SECOND // 2 for earlier, later in pairwise(saved))
+
+
+def test_indexes_kept_in_little_memory_and_records_written_in_one_go_are_the_same_in_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = synthetic_bag(tmp_path / "small" / "bag", slots=40, chunk_size=5_000).writer
+    assert isinstance(getattr(small._mcap, chunk_indexes._ATTRIBUTE), chunk_indexes.ChunkIndexes)
+    assert "add_message" in vars(getattr(small._mcap, chunk_builder._ATTRIBUTE))
+    monkeypatch.setattr(chunk_indexes, "_ATTRIBUTE", "not there")
+    monkeypatch.setattr(chunk_builder, "_ATTRIBUTE", "not there")
+    large = synthetic_bag(tmp_path / "large" / "bag", slots=40, chunk_size=5_000).writer
+    assert len(large._mcap._Writer__chunk_indices) > 5
+    assert small.path.read_bytes() == large.path.read_bytes()

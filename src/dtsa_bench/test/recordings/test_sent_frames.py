@@ -1,0 +1,159 @@
+"""Frames of agents with clocks of their own, without nodes: verdicts are checked, spread and lateness told."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dtsa_agent.core.reference.alignment import ClockAligner
+from dtsa_bench.flights.clock_statistics import ClockStatistics
+from dtsa_bench.recordings.verify.carrier_sense import CarrierSense
+from dtsa_bench.recordings.verify.frames import SentFrames
+from dtsa_bench.recordings.verify.result import Mismatch
+from dtsa_channel_sim import Air, Channel, ChannelConfig
+
+MS = 1_000_000
+FRAME = st.tuples(st.integers(1, 5), st.integers(0, 12 * MS), st.integers(1, 60))  # sender, ns, bytes
+FRAMES = st.lists(FRAME, min_size=2, max_size=12, unique_by=lambda frame: frame[:2])
+
+
+def on_air(
+    config: ChannelConfig, frames: list[tuple[int, int, int]], flip: tuple[int, int] | None = None
+) -> SentFrames:
+    """Frames with the channel's verdicts on them, one receiver's bit turned round in deliveries and verdicts alike."""
+    line, sent = Air(Channel(config)), SentFrames(config, own_clocks=True)
+    ordered = sorted(frames, key=lambda f: f[1])
+    for number, (sender, start, length) in enumerate(ordered):
+        line.begin(number, sender, start, length)
+        sent.send(number, sender, start, bytes(length))
+    verdicts = sorted(line.settle(100 * MS), key=lambda v: v.frame_id)
+    for v in verdicts:
+        received = v.received.copy()
+        if flip and v.frame_id == flip[0] % len(ordered):
+            received[flip[1]] ^= True
+        if received.any():
+            sent.deliver(v.frame_id, v.sender, bytes(ordered[v.frame_id][2]), received)
+        sent.judged(v.slot, v.sender, received, v.lost, v.collided)
+    return sent
+
+
+@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
+@settings(max_examples=60, deadline=None)
+def test_the_channels_own_verdicts_always_pass(frames: list[tuple[int, int, int]], loss: float, seed: int) -> None:
+    sent = on_air(ChannelConfig(agents=5, loss=loss, seed=seed), frames)
+    sent.check_overlaps()
+    assert sent.check_verdicts([]) == len(frames)
+
+
+def test_a_frame_that_began_although_its_radio_heard_another_one_is_noticed() -> None:
+    config = ChannelConfig(agents=5)
+    turn = config.airtime.ramp_up_ns
+    for late, free in ((turn - 1, True), (turn, False)):
+        sense = CarrierSense(on_air(config, [(1, 1 * MS, 60), (2, 1 * MS + late, 60)]))
+        if free:
+            assert sense.check([]) == 2
+        else:
+            with pytest.raises(Mismatch, match="its radio listens before it sends"):
+                sense.check([])
+    # In another part of a partition nobody hears it.
+    assert sense.check([(0, {"partition": "1, 3-5 | 2"})]) == 2
+
+
+@pytest.mark.parametrize(("handed_ms", "right"), [(4.9, False), (5.0, True), (15.0, True), (15.1, False)])
+def test_a_frame_begins_when_it_was_handed_over_or_up_to_a_slot_later(handed_ms: float, right: bool) -> None:
+    config = ChannelConfig(agents=5)
+    sent = SentFrames(config, own_clocks=True)
+    sent.send(1, 2, 25 * MS, bytes(60))
+    sense = CarrierSense(sent)
+    lengths, offsets = np.array([60, 60, 0, 0]), np.array([round(handed_ms * MS), 0, 0, 0])
+    said = SimpleNamespace(agent=np.array([2, 4]), slot=np.array([1, 2]), length=lengths, offset_ns=offsets)
+    if right:
+        sense.report(said)
+        assert sense.not_sent == 1
+    else:
+        with pytest.raises(Mismatch, match="a radio sends what it was handed"):
+            sense.report(said)
+
+
+@given(FRAMES, st.integers(0, 99), st.integers(0, 4))
+@settings(max_examples=60, deadline=None)
+def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], frame: int, receiver: int) -> None:
+    def check() -> None:
+        sent = on_air(ChannelConfig(agents=5), frames, flip=(frame, receiver))
+        sent.check_overlaps()
+        sent.check_verdicts([])
+
+    with pytest.raises(Mismatch):
+        check()
+
+
+def test_a_dropped_frame_has_disturbed_nobody() -> None:
+    """Agent 1's frame met that of agent 2 in time, but came too late to be on the air: all heard agent 2."""
+    sent = SentFrames(ChannelConfig(agents=3), own_clocks=True)
+    nobody, others = np.zeros(3, dtype=bool), np.array([True, False, True])
+    for sender, received in ((1, nobody), (2, others)):
+        sent.send(0, sender, 0, bytes(24))
+        sent.judged(0, sender, received, 0, 0)
+    sent.deliver(0, 2, bytes(24), others)
+    with pytest.raises(Mismatch, match="who sends does not hear"):
+        sent.check_overlaps()
+    sent.check_overlaps(late=1)
+    assert sent.dropped == 1
+    assert sent.check_verdicts([], late=1) == 1
+    with pytest.raises(Mismatch):
+        sent.check_verdicts([])
+
+
+def both_heard(gap_ns: int, second: int) -> SentFrames:
+    """A frame of agent 1 and one of agent 2 that starts ``gap_ns`` later; agent 3 has heard both or not."""
+    sent = SentFrames(ChannelConfig(agents=3), own_clocks=True)
+    for sender, start, heard in ((1, 0, True), (2, gap_ns, second > 0)):
+        sent.send(0, sender, start, bytes(24))
+        received = np.array([False, False, heard])
+        sent.deliver(0, sender, bytes(24), received)
+        sent.judged(0, sender, received, 0, 0)
+    return sent
+
+
+def test_two_frames_at_one_time_are_never_both_heard() -> None:
+    length_ns = ChannelConfig(agents=3).airtime.total_ns(24)
+    with pytest.raises(Mismatch, match="both at cf3"):
+        both_heard(length_ns // 2, second=1).check_overlaps()
+    both_heard(length_ns, second=1).check_overlaps()
+    sent = both_heard(length_ns // 2, second=0)
+    sent.check_overlaps()
+    assert sent.safety()["overlapping_pairs"] == 1
+
+
+def test_spread_and_lateness_come_from_the_right_agents() -> None:
+    statistics = ClockStatistics(3)
+    statistics.add([0, 1], [1, 2], np.array([0, 400_000, 100_000, 0]), np.array([0, 0, 0, 24]))
+    statistics.add([0], [3], np.array([3_200_000]), np.array([24]))  # late by 3 ms: not a clock that is off
+    statistics.add([1], [3], np.array([100_000]), np.array([0]))
+    summary = statistics.summary()
+    assert summary["clock_spread_max_ms"] == pytest.approx(0.4)
+    assert summary["clock_spread_mean_ms"] == pytest.approx(0.2)
+    assert summary["clock_spread_end_ms"] == pytest.approx(0.4)
+    assert summary["sends_on_time_share"] == 0.5
+    assert summary["send_offset_ms"]["3"] == {"median": pytest.approx(3.0), "max": pytest.approx(3.0)}
+    statistics.add(
+        np.zeros(0, np.uint32), [1, 2], np.zeros(0, np.int64), np.zeros(0, np.uint8)
+    )  # nothing but what was heard
+    assert ClockStatistics(3).summary()["clock_spread_max_ms"] is None
+
+
+@given(st.integers(0, 2**31), st.floats(0.0, 0.5))
+@settings(max_examples=10, deadline=None)
+def test_late_frames_do_not_move_the_common_time(seed: int, late_share: float) -> None:
+    """Frames that a busy processor sends late are outliers for the median as long as they are fewer than half."""
+    random = np.random.default_rng(seed)
+    shift = 0
+    aligner = ClockAligner()
+    for _ in range(9 * 50):
+        late = int(random.integers(0, 900_000)) if random.random() < late_share * 0.5 else 0
+        shift += aligner.hear(late - shift)
+    assert abs(shift) < 300_000

@@ -1,0 +1,224 @@
+"""Exported tables against the bag they come from."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet
+import pytest
+from flight_helpers import flight_bag
+
+from dtsa_agent.core import decode_frame
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.commands.cli import main
+from dtsa_bench.commands.export import TABLES
+from dtsa_bench.recordings.bag.errors import BagError, UnusableBag
+from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.bag.run import load_run
+from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_bench.recordings.tables import export as module
+from dtsa_bench.recordings.tables.columns import COLUMNS, describe
+from dtsa_bench.recordings.tables.export import export
+
+SLOTS, AGENTS = 120, 6
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lossy flight whose frames collide: ALOHA."""
+    directory = tmp_path_factory.mktemp("bags") / "flight"
+    flight_bag(directory, slots=SLOTS, loss=0.2, agents=AGENTS, policy="aloha", seed=3)
+    return directory
+
+
+def read(directory: Path, kind: str) -> dict[str, pd.DataFrame]:
+    """All tables of an export."""
+    how = {"parquet": pd.read_parquet, "csv": pd.read_csv}[kind]
+    return {path.stem: how(path) for path in directory.glob(f"*.{kind}")}
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv"])
+def test_tables_have_the_documented_columns_and_the_bag_s_values(flight: Path, tmp_path: Path, kind: str) -> None:
+    written = export(flight, tmp_path / "tables", kind)
+    tables = read(tmp_path / "tables", kind)
+    assert {one.path.stem: one.rows for one in written} == {name: len(table) for name, table in tables.items()}
+    assert {name: list(table.columns) for name, table in tables.items()} == {
+        name: [column for column, _, _ in columns] for name, columns in COLUMNS.items()
+    }
+    text = (tmp_path / "tables" / "columns.md").read_text(encoding="utf-8")
+    for columns in COLUMNS.values():
+        for name, _, meaning in columns:
+            assert f"`{name}`" in text
+            assert meaning in text
+    with Bag(flight) as bag:
+        receptions = [typed for _, typed in bag.typed(["/swarm/reception"])]
+        decisions = [typed for _, typed in bag.typed(["/swarm/decision"])]
+        transmissions = [typed for _, typed in bag.typed(["/swarm/transmission"])]
+    outcomes = ["idle", "success", "collision"]
+    assert tables["slots"]["slot"].tolist() == list(range(SLOTS))
+    assert tables["slots"]["outcome"].tolist() == [outcomes[one.outcome] for one in receptions]
+    assert tables["slots"]["senders"].tolist() == [len(one.sender) for one in receptions]
+    assert np.allclose(tables["slots"]["time_s"], np.arange(SLOTS) * 0.01)
+    frames = tables["frames"]
+    assert frames["sender"].tolist() == [int(k) for one in receptions for k in one.sender]
+    assert frames["lost"].tolist() == [int(k) for one in receptions for k in one.lost]
+    for row in frames.itertuples():
+        data = bytes.fromhex(row.data)
+        heard = np.unpackbits(receptions[row.slot].received, bitorder="little")[:8].sum()
+        frame = decode_frame(data)
+        assert (frame.sender, frame.slot, len(data)) == (row.sender, row.slot, row.length)
+        assert (row.position_x_m, row.position_y_m, row.position_z_m) == pytest.approx(frame.position, abs=1e-9)
+        assert frame.c_r == row.c_r
+        if len(receptions[row.slot].sender) == 1:
+            assert row.received == heard
+            assert row.received + row.lost == AGENTS - 1
+    assert tables["decisions"]["chosen"].tolist() == [int(k) for one in decisions for k in one.chosen]
+    names = [one.reason_name[k] for one in decisions for k in one.reason_index]
+    assert tables["decisions"]["reason"].tolist() == names
+    assert tables["decisions"]["digest"].astype("uint32").tolist() == [int(k) for one in decisions for k in one.digest]
+    states = tables["states"]
+    first = states[states["agent"] == 3].reset_index(drop=True)
+    for slot in (1, 50, SLOTS - 1):
+        track = transmissions[slot].track.reshape(-1, 3, AGENTS)[-1, :, 2]
+        row = first[np.isclose(first["time_s"], slot * 0.01)].iloc[0]
+        assert [row["position_x_m"], row["position_y_m"], row["position_z_m"]] == pytest.approx(track, abs=1e-9)
+
+
+def test_who_received_what_and_who_knew_what(flight: Path, tmp_path: Path) -> None:
+    export(flight, tmp_path / "tables", tables=["frames", "receptions", "ages", "ages_by_observer"])
+    tables, run = read(tmp_path / "tables", "parquet"), load_run(flight)
+    by_frame = tables["receptions"].groupby(["slot", "sender"])["received"]
+    assert by_frame.sum().tolist() == tables["frames"].sort_values(["slot", "sender"])["received"].tolist()
+    assert set(by_frame.count()) == {AGENTS - 1}
+    for slot, sender, receiver, received in tables["receptions"][["slot", "sender", "receiver", "received"]].to_numpy():
+        row = np.flatnonzero((run.frames.slot == slot) & (run.frames.sender == sender))[0]
+        assert run.frames.received[row, receiver - 1] == received
+
+    # Age by hand: slots since the last frame of the agent that the observer received.
+    heard = tables["receptions"].query("received")
+    known = tables["ages_by_observer"].set_index(["slot", "observer", "agent"])
+    for observer, agent in ((1, 2), (3, 6), (5, 1)):
+        times = heard.query("receiver == @observer and sender == @agent")["slot"].to_numpy()
+        for slot in (times[0], times[0] + 1, times[-1], SLOTS - 1):
+            assert known.loc[(slot, observer, agent), "age_slots"] == slot - times[times <= slot].max()
+        assert (times[0] - 1, observer, agent) not in known.index
+    counted = known[known["counted"]].groupby(["slot", "agent"])
+    means = tables["ages"].dropna().set_index(["slot", "agent"])
+    assert np.allclose(counted["age_slots"].mean(), means["age_slots"])
+    assert np.allclose(counted["error_m"].mean(), means["error_m"])
+    assert (counted.size() == means["observers"]).all()
+
+
+def test_pairs_of_a_flight_without_losses_have_all_observers(tmp_path: Path) -> None:
+    """One table stands for all agents there."""
+    flight_bag(tmp_path / "bag", slots=40, agents=4, moving=2, policy="tdma", seed=1)
+    run = load_run(tmp_path / "bag")
+    known = module.arrow_table(run, "ages_by_observer").to_pandas()
+    last = known[known["slot"] == 39]
+    assert len(last) == 4 * 3
+    assert last.groupby("agent")["age_slots"].nunique().tolist() == [1] * 4
+    assert last.groupby("agent")["counted"].sum().isin([0, 3]).all()
+    ages = module.arrow_table(run, "ages").to_pandas().query("slot == 39")
+    assert sorted(ages["observers"]) == [0, 0, 3, 3]
+
+
+def test_the_document_of_columns_is_made_from_them() -> None:
+    document = Path(__file__).resolve().parents[4] / "docs" / "columns.md"
+    if not document.exists():
+        pytest.skip("not in the source tree")
+    assert document.read_text(encoding="utf-8") == describe()
+    assert tuple(COLUMNS) == TABLES
+
+
+def test_units_are_in_the_parquet_files(flight: Path, tmp_path: Path) -> None:
+    export(flight, tmp_path / "tables", tables=["states"])
+    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["columns.md", "states.parquet"]
+    schema = pyarrow.parquet.read_schema(tmp_path / "tables" / "states.parquet")
+    assert schema.field("velocity_x_mps").metadata[b"unit"] == b"m/s"
+
+
+def test_tables_larger_than_a_batch_are_whole(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(flight, tmp_path / "one")
+    monkeypatch.setattr(module, "ROWS", 50)
+    export(flight, tmp_path / "many")
+    for name, table in read(tmp_path / "one", "parquet").items():
+        assert table.equals(read(tmp_path / "many", "parquet")[name]), name
+
+
+def test_motion_falls_back_to_odometry(flight: Path, tmp_path: Path) -> None:
+    with (
+        Bag(flight) as bag,
+        BagWriter(tmp_path / "bag", bag.config) as writer,
+    ):
+        names = [name for name in bag.topics if name != "/swarm/transmission"]
+        channels = {}
+        for name in names:
+            topic = bag.topics[name]
+            definition = module_definition(topic)
+            channels[name] = writer.add_topic(name, topic.type, list(topic.profiles), definition)
+        for message in bag.messages(names):
+            writer.write(channels[message.topic], message.data, message.log_time_ns, message.publish_time_ns)
+    with Bag(flight) as bag:
+        with_tracks = load_run(bag).motion
+    with Bag(tmp_path / "bag") as bag:
+        run = load_run(bag)
+    assert not any(run.frames.data)
+    common, a, b = np.intersect1d(run.motion.time_ns, with_tracks.time_ns, return_indices=True)
+    assert len(common) > SLOTS - 3
+    assert np.array_equal(run.motion.position[a], with_tracks.position[b])
+
+
+def module_definition(topic: object) -> object:
+    """A topic's definition, to write it again."""
+    from dtsa_bench.recordings.bag.schema import Definition
+
+    return Definition(topic.type, topic.definition, topic.type_hash)  # type: ignore[attr-defined]
+
+
+def test_bad_input_is_refused(flight: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="parquet or csv"):
+        export(flight, tmp_path / "a", "xlsx")
+    with pytest.raises(ConfigError, match="slots, frames, receptions, decisions, states, ages, ages_by_observer"):
+        export(flight, tmp_path / "a", tables=["slot"])
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="empty or does not exist"):
+        export(flight, tmp_path)
+    with pytest.raises(UnusableBag):
+        export(tmp_path / "nothing", tmp_path / "a")
+    with pytest.raises((BagError, ConfigError)):
+        export(flight, tmp_path / "file" / "below")
+    assert not (tmp_path / "a").exists()
+
+
+SMALL_DISK = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, -1))  # no file gets larger, as on a disk that is full
+from dtsa_bench.commands.cli import main
+sys.exit(main(["export", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv"])
+def test_a_full_disk_leaves_no_half_table(flight: Path, tmp_path: Path, kind: str) -> None:
+    (tmp_path / "mine").mkdir()
+    for place in ("mine", "new"):
+        words = [sys.executable, "-c", SMALL_DISK, str(flight), "--to", kind, "--out", str(tmp_path / place)]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert done.returncode == 1
+        assert done.stderr.startswith(f"dtsa: error: cannot export to {tmp_path / place}: ")
+        assert done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine"]  # was there before, and is empty as before
+
+
+def test_json_says_what_was_written(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(flight), "--tables", "slots", "--json", "--out", str(tmp_path / "a")]) == 0
+    assert json.loads(capsys.readouterr().out) == [{"path": str(tmp_path / "a" / "slots.parquet"), "rows": SLOTS}]
+    assert main(["recover", str(flight), "--json", "--out", str(tmp_path / "b")]) == 0
+    saved = json.loads(capsys.readouterr().out)
+    assert saved["saved"]["/swarm/reception"] == SLOTS
+    assert saved["directory"] == str(tmp_path / "b")

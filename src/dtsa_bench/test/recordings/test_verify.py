@@ -1,0 +1,366 @@
+"""Verification of bags of real nodes: what is right passes, and no tampering gets through."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from dtsa_bench.commands.cli import main
+from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.recordings.bag.errors import UnusableBag
+from dtsa_bench.recordings.bag.reader import Bag, Message
+from dtsa_bench.recordings.bag.recover import recover
+from dtsa_bench.recordings.bag.run import load_run
+from dtsa_bench.recordings.verify import Result, verify_bag
+
+pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs")
+pytestmark = pytest.mark.ros
+
+KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
+KINDS = ["byte", "drop", "swap times", "swap data"]
+LEASE = ("--agents", "4", "--moving", "2", "--policy", "lease", "--processes", "1", "--timeout-s", "0.5")
+Edit = Callable[[list[Message]], list[Message]]
+
+
+def dtsa(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dtsa_bench", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def fly(directory: Path, *arguments: str) -> Path:
+    done = dtsa("fly", "--out", str(directory), "--avoider", "orca", "--timeout-s", "1.5", "--no-picture", *arguments)
+    assert done.returncode == 0, done.stderr
+    return directory
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six agents in two processes on a channel that loses frames: DTSA diverges, and every view is different."""
+    arguments = ("--agents", "6", "--policy", "dtsa", "--processes", "2", "--loss", "0.1", "--seed", "5")
+    return fly(tmp_path_factory.mktemp("verify") / "flight", *arguments)
+
+
+@pytest.fixture(scope="module")
+def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four agents whose frames carry tags of `KEY`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DTSA_AUTH_KEY", KEY)
+        return fly(tmp_path_factory.mktemp("sealed") / "flight", *LEASE, "--auth")
+
+
+def rewrite(original: Path, copy: Path, edit: Edit, keep_digest: bool = True) -> Path:
+    """A bag with the same header, metadata and indexes but other messages: what a careful forger would write."""
+    with Bag(original / "bag") as bag:
+        messages = edit(list(bag.messages()))
+        source = bag.path
+    with source.open("rb") as stream, copy.open("wb") as target:
+        reader = make_reader(stream)
+        writer = Writer(target, chunk_size=16384)
+        writer.start("ros2", "a forger")
+        for record in reader.iter_metadata():
+            values = record.metadata
+            if not keep_digest:
+                lines = values["serialized_metadata"].splitlines()
+                values["serialized_metadata"] = "\n".join(line for line in lines if "digest:" not in line)
+            writer.add_metadata(record.name, values)
+        summary = reader.get_summary()
+        assert summary is not None
+        channels = {}
+        for channel in summary.channels.values():
+            schema = summary.schemas[channel.schema_id]
+            number = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number, channel.metadata)
+        for m in messages:
+            writer.add_message(channels[m.topic], m.log_time_ns, m.data, m.publish_time_ns, m.sequence)
+        writer.finish()
+    return copy
+
+
+def test_a_flight_of_real_nodes_is_what_the_protocol_gives(flight: Path) -> None:
+    result = verify_bag(flight)
+    assert result.ok, result.difference
+    slots = json.loads((flight / "summary.json").read_text())["slots"]["total"]
+    assert result.slots == slots == result.checked["reception"] == result.checked["decision"]
+    assert result.checked["transmission"] >= 2 * slots
+    assert result.checked["odometry"] == 6 * slots
+    assert result.checked["digest of all messages"] == 1
+    assert result.checked["summary.json"] > 20
+    assert not result.safety["all_agents_chose_alike"]
+    done = dtsa("verify", str(flight))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "everything is what the protocol gives" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--agents", "5", "--policy", "tdma", "--estimator", "hold", "--slot-ms", "20"),
+        ("--agents", "4", "--policy", "aloha", "--estimator", "intent", "--processes", "1"),
+        ("--agents", "6", "--moving", "2", "--policy", "age", "--processes", "3"),
+        ("--agents", "6", "--policy", "lease", "--processes", "2", "--loss", "0.2", "--burst-length", "5"),
+    ],
+    ids=lambda a: a[a.index("--policy") + 1],
+)
+def test_every_policy_verifies(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    result = verify_bag(fly(tmp_path / "flight", "--timeout-s", "0.8", *arguments))
+    assert result.ok, result.difference
+    if {"tdma", "age"} & set(arguments):  # with equal tables; dtsa is in test_fly.py
+        assert result.safety["all_agents_chose_alike"]
+        assert result.safety["slots_with_two_senders"] == 0
+
+
+def test_a_sealed_flight_verifies_with_its_key_only(sealed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DTSA_AUTH_KEY", KEY)
+    assert verify_bag(sealed).ok
+    monkeypatch.setenv("DTSA_AUTH_KEY", "ff" + KEY[2:])
+    difference = verify_bag(sealed).difference
+    assert difference is not None
+    assert difference.what == "transmission.data"
+    for path in sealed.rglob("*"):
+        assert not path.is_file() or KEY[-6:].encode() not in path.read_bytes()  # the key is nowhere
+
+
+def test_an_untouched_copy_passes(flight: Path, tmp_path: Path) -> None:
+    assert verify_bag(rewrite(flight, tmp_path / "same.mcap", lambda messages: messages)).ok
+
+
+def frame_places(messages: list[Message], bag: Bag) -> list[tuple[int, int]]:
+    """Message and offset of every byte of every radio frame on the wire."""
+    places = []
+    for index, message in enumerate(messages):
+        if message.topic.endswith(("/slot", "/transmission")):
+            data = bag.decode(message).data.tobytes()
+            start = message.data.find(data) if data else -1
+            places += [(index, start + i) for i in range(len(data)) if start >= 0]
+    return places
+
+
+def altered(message: Message, at: int, bit: int) -> Message:
+    data = bytearray(message.data)
+    data[at] ^= 1 << bit
+    return message._replace(data=bytes(data))
+
+
+def tampering(random: np.random.Generator, kind: str, places: list[tuple[int, int]]) -> Edit:
+    def edit(messages: list[Message]) -> list[Message]:
+        if kind == "byte":
+            index, at = places[random.integers(len(places))]
+            messages[index] = altered(messages[index], at, int(random.integers(8)))
+        elif kind == "drop":
+            del messages[random.integers(len(messages))]
+        else:
+            a, b = (int(i) for i in random.choice(len(messages), 2, replace=False))
+            if messages[a].data == messages[b].data:
+                return edit(messages)
+            x, y = messages[a], messages[b]
+            if kind == "swap data" and x.topic == y.topic:
+                messages[a], messages[b] = x._replace(data=y.data), y._replace(data=x.data)
+            else:
+                times = ("log_time_ns", "publish_time_ns")
+                if x.log_time_ns == y.log_time_ns:
+                    return edit(messages)
+                messages[a] = x._replace(**{name: getattr(y, name) for name in times})
+                messages[b] = y._replace(**{name: getattr(x, name) for name in times})
+                messages.sort(key=lambda m: m.log_time_ns)
+        return messages
+
+    return edit
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_hundred_tamperings_are_found(flight: Path, tmp_path: Path, kind: str) -> None:
+    """25 of each kind; the forger keeps the digest that the recorder wrote."""
+    random = np.random.default_rng(KINDS.index(kind))
+    with Bag(flight / "bag") as bag:
+        places = frame_places(list(bag.messages()), bag)
+    missed = []
+    for number in range(25):
+        forged = rewrite(flight, tmp_path / f"{number}.mcap", tampering(random, kind, places))
+        if verify_bag(forged).ok:
+            missed.append(number)
+        forged.unlink()
+    assert not missed
+
+
+def test_a_changed_frame_is_named_without_any_digest(flight: Path, tmp_path: Path) -> None:
+    """One bit of the position in one frame: slot, agent, both values and the reason are shown."""
+    with Bag(flight / "bag") as bag:
+        messages = list(bag.messages())
+        wanted = [
+            (i, bag.decode(m))
+            for i, m in enumerate(messages)
+            if m.topic.endswith("/transmission") and i > len(messages) / 2
+        ]
+        index, sent = next((i, m) for i, m in wanted if m.data.size)
+        at = messages[index].data.find(sent.data.tobytes()) + 9
+
+    def edit(all_messages: list[Message]) -> list[Message]:
+        all_messages[index] = altered(all_messages[index], at, 0)
+        return all_messages
+
+    result = verify_bag(rewrite(flight, tmp_path / "changed.mcap", edit, keep_digest=False))
+    found = result.difference
+    assert found is not None
+    assert result.slots == found.slot > 0  # those before it are right
+    assert found.what == "transmission.data"
+    assert found.slot == int(sent.slot)
+    assert found.agent == int(sent.agent[np.flatnonzero(sent.length)[0]])
+    assert f"cf{found.agent}" in found.expected
+    assert found.expected != found.recorded
+    assert "codec" in found.reason
+
+
+def result_of(flight: Path, tmp_path: Path, edit: Edit) -> Result:
+    return verify_bag(rewrite(flight, tmp_path / "edited.mcap", edit, keep_digest=False))
+
+
+def test_a_missing_message_is_found_without_any_digest(flight: Path, tmp_path: Path) -> None:
+    for topic in ("/swarm/slot", "/swarm/transmission", "/swarm/decision", "/swarm/reception", "/cf3/odom"):
+
+        def drop(messages: list[Message], topic: str = topic) -> list[Message]:
+            there = [i for i, m in enumerate(messages) if m.topic == topic]
+            del messages[there[len(there) // 2]]
+            return messages
+
+        result = result_of(flight, tmp_path, drop)
+        assert not result.ok, topic
+        assert result.difference is not None
+        assert result.difference.slot is not None
+
+
+@pytest.mark.parametrize(
+    "topic", ["/swarm/slot", "/swarm/transmission", "/swarm/decision", "/swarm/reception", "/cf3/odom"]
+)
+def test_a_wrong_sequence_number_is_named_without_any_digest(flight: Path, tmp_path: Path, topic: str) -> None:
+    def renumber(messages: list[Message]) -> list[Message]:
+        there = [i for i, m in enumerate(messages) if m.topic == topic]
+        at = there[len(there) // 2]
+        messages[at] = messages[at]._replace(sequence=messages[at].sequence + 1)
+        return messages
+
+    difference = result_of(flight, tmp_path, renumber).difference
+    assert difference is not None
+    assert difference.what == f"{topic}, sequence number"
+    assert int(difference.recorded) == int(difference.expected) + 1
+
+
+def test_a_tampered_decision_and_a_tampered_loss_are_named(flight: Path, tmp_path: Path) -> None:
+    def change(topic: str, field: str) -> Edit:
+        def edit(messages: list[Message]) -> list[Message]:
+            with Bag(flight / "bag") as bag:
+                for i in range(len(messages) // 2, len(messages)):
+                    if messages[i].topic != topic:
+                        continue
+                    value: Any = getattr(bag.decode(messages[i]), field)
+                    if isinstance(value, np.ndarray) and value.size:
+                        at = messages[i].data.rfind(value.tobytes())
+                        messages[i] = altered(messages[i], at, 0)
+                        return messages
+            raise AssertionError("nothing to change")
+
+        return edit
+
+    for topic, field, part in (("/swarm/decision", "score", "score"), ("/swarm/reception", "received", "received")):
+        difference = result_of(flight, tmp_path, change(topic, field)).difference
+        assert difference is not None
+        assert part in difference.what
+
+
+def test_a_recovered_bag_verifies_up_to_where_it_was_cut(flight: Path, tmp_path: Path) -> None:
+    whole = verify_bag(flight)
+    copy = rewrite(flight, tmp_path / "copy.mcap", lambda messages: messages)
+    with copy.open("rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[-1]
+    cut = chunk.chunk_start_offset + chunk.chunk_length * 4 // 5  # within the messages, whatever else the file holds
+    (tmp_path / "cut.mcap").write_bytes(copy.read_bytes()[:cut])
+    with pytest.raises(UnusableBag, match="recover"):
+        verify_bag(tmp_path / "cut.mcap")
+    recover(tmp_path / "cut.mcap", tmp_path / "saved")
+    result = verify_bag(tmp_path / "saved")
+    assert result.ok, result.difference
+    assert 0.5 * whole.slots < result.slots < whole.slots
+
+
+def with_a_hole(flight: Path, folder: Path) -> Path:
+    """A copy of a flight's file whose middle is lost, saved again."""
+    copy = rewrite(flight, folder / "copy.mcap", lambda messages: messages)
+    with copy.open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    data = bytearray(copy.read_bytes())
+    data[chunks[len(chunks) // 2].chunk_start_offset + 200] ^= 1
+    copy.write_bytes(data)
+    recover(copy, folder / "saved")
+    return folder / "saved"
+
+
+def test_of_a_recovered_bag_with_a_hole_it_is_said_what_is_missing(
+    holed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = with_a_hole(holed, tmp_path)
+    with Bag(saved) as bag:
+        run = load_run(bag)
+    (before,) = np.flatnonzero(np.diff(run.slots) > 1)
+    first, last = int(run.slots[before]) + 1, int(run.slots[before + 1]) - 1
+    missing = f"slots {first} to {last}"
+    assert run.missing == missing
+    result = verify_bag(saved)
+    assert result.difference is not None
+    assert result.difference.recorded == f"{missing} are missing"
+    assert "recovered" in result.difference.reason
+    assert first <= result.slots <= len(run.slots)  # that many are equal, and none that is missing counts
+    assert main(["export", str(saved), "--to", "csv", "--out", str(tmp_path / "tables")]) == 0
+    why = f"Ages, estimates and results are left out: {missing} are missing in the bag."
+    assert capsys.readouterr().err == f"dtsa: {why}\n"
+    decisions = (tmp_path / "tables" / "decisions.csv").read_text().count("\n") - 1
+    assert decisions == len(run.decisions.slot) * run.agents > 0
+    assert why in run_data(saved)["notes"]
+
+
+@pytest.fixture(params=["lockstep", "realtime"])
+def holed(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A flight of some chunks."""
+    shape = ("--agents", "4", "--policy", "lease", "--processes", "1", "--timeout-s", "3")
+    fly(tmp_path / "flown", *shape, "--mode", request.param, "--slot-ms", "10")
+    return tmp_path / "flown"
+
+
+@pytest.mark.parametrize("tagged", [False, True])
+def test_a_wrong_frame_is_shown_in_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sealed: Path, tagged: bool
+) -> None:
+    monkeypatch.setenv("DTSA_AUTH_KEY", KEY)
+    flight = sealed if tagged else fly(tmp_path / "flight", *LEASE)
+
+    def edit(messages: list[Message]) -> list[Message]:
+        with Bag(flight / "bag") as bag:
+            for i, message in enumerate(messages[len(messages) // 2 :], len(messages) // 2):
+                if message.topic == "/swarm/transmission" and (data := bag.decode(message).data).size:
+                    at = message.data.index(data.tobytes()) + 8  # the sender's position
+                    messages[i] = altered(message, at, 0)
+                    return messages
+        raise AssertionError("nobody sent")
+
+    difference = result_of(flight, tmp_path, edit).difference
+    assert difference is not None
+    for text in (difference.expected, difference.recorded):
+        assert "no frame" not in text
+        assert "state of cf" in text
+        assert ("sealed" in text) == tagged
+
+
+def test_what_is_no_bag_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"nonsense")
+    for path in (tmp_path / "x.mcap", tmp_path / "nothing"):
+        done = dtsa("verify", str(path))
+        assert done.returncode == 2
+        assert len(done.stderr.strip().splitlines()) == 1

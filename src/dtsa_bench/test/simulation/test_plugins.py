@@ -1,0 +1,448 @@
+"""Policies, estimators and avoiders from a package of the user's, found by entry point."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dtsa
+from dtsa_agent.core import REASONS, Agent, ConfigError, PluginError, SwarmConfig, plug_in_random
+from dtsa_agent.core.plugins import entry_points as plugins
+from dtsa_agent.core.registry import POLICIES
+from dtsa_agent.core.settings.flight_models import flight_model
+from dtsa_bench.commands.cli import main
+from dtsa_bench.experiments.batch.task import Task
+from dtsa_bench.experiments.sweep import spec, work
+from dtsa_bench.simulation.simulate import simulate
+
+EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "dtsa_plugins"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The example package, installed by pip into a directory of its own."""
+    source, target = tmp_path_factory.mktemp("source") / "example", tmp_path_factory.mktemp("target")
+    shutil.copytree(EXAMPLE, source)
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run([*command, "--target", str(target), str(source)], check=True, capture_output=True)
+    sys.path.append(str(target))
+    importlib.invalidate_caches()
+    yield target
+    sys.path.remove(str(target))
+    sys.modules.pop("dtsa_plugins", None)
+
+
+def flight(**settings: Any) -> Any:
+    return simulate(spec.run_config({"agents": 6, "seed": 5, "timeout_s": 1.5, **settings}), trace=True)
+
+
+def test_a_policy_of_ones_own_decides_who_sends() -> None:
+    result = flight(policy="least-known")
+    assert {REASONS[code] for code in result.trace.reasons} == {"plugin"}
+    senders = result.trace.senders
+    assert senders[:6] == [(i,) for i in range(1, 7)]
+    assert all(len(ids) == 1 for ids in senders)
+    assert [ids[0] for ids in senders[10::10]] == [slot // 10 % 6 + 1 for slot in range(10, len(senders), 10)]
+
+
+def test_an_estimator_of_ones_own_feeds_avoider_and_metrics() -> None:
+    linear, damped = (flight(estimator=name, policy="tdma") for name in ("linear", "damped"))
+    quick = flight(estimator="damped", policy="tdma", options={"damped.rest_s": 0.05})
+    assert len({f.trace.positions().tobytes() for f in (linear, damped, quick)}) == 3
+    # Whoever is believed to stop at once is believed to be too far back.
+    errors = [f.summary()["estimate_error_mean_m"] for f in (linear, damped, quick)]
+    assert errors[0] < errors[1] < errors[2]
+    swarm = quick.swarm
+    age = (quick.metrics.slots - swarm.sent_slot[0]) * 0.01
+    expected = swarm.sent_position[0] + swarm.sent_velocity[0] * age * (1 + 1 / (1 + age / 0.05)) / 2
+    np.testing.assert_allclose(quick.trace.estimates[-1], expected, atol=1e-12)
+
+
+def test_an_avoider_of_ones_own_flies() -> None:
+    result = flight(avoider="give-way", timeout_s=20.0)
+    assert result.summary()["end"] == "completed"
+    assert flight_model("give-way").vehicle.tau == 0.1
+    speed = np.linalg.norm(np.diff(result.trace.positions(), axis=0), axis=1) / 0.01
+    assert 0.9 < speed.max() <= 1.0 + 1e-9
+    straight = flight(
+        avoider="none", timeout_s=20.0, options={"v_max": 1.0, "tau": 0.1, "spacing": 0.55, "min_radius": 1.8}
+    )
+    assert straight.summary()["end"] == "crashed"
+
+
+def test_all_three_together_are_the_same_flight_every_time_and_with_single_agents() -> None:
+    settings = {"policy": "least-known", "estimator": "damped", "avoider": "give-way", "timeout_s": 0.6}
+    together = flight(**settings)
+    config = SwarmConfig(agents=6, seed=5, **{k: v for k, v in settings.items() if k != "timeout_s"})
+    agents = [Agent(i, config) for i in range(1, 7)]
+    for slot in range(60):
+        frames = {agent.id: agent.on_slot(slot) for agent in agents}
+        sent = {i: data for i, data in frames.items() if data}
+        assert tuple(sent) == together.trace.senders[slot]
+        for agent in agents:
+            agent.swarm.fly(slot)
+            for i, data in sent.items():
+                assert agent.id == i or agent.on_frame(data, slot)
+        positions = np.concatenate([agent.swarm.position for agent in agents], axis=1)
+        assert np.array_equal(positions, together.trace.tracks[slot][-1])
+
+
+@pytest.mark.ros
+def test_nodes_find_plugins_too_and_agree_with_the_simulator(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy")
+    from dtsa_bench.flights.flight import fly
+    from dtsa_bench.flights.options import FlightOptions
+
+    # Its processes inherit the way to the package.
+    before = os.environ.get("PYTHONPATH", "")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(installed), before])))
+    settings = {"agents": 4, "policy": "least-known", "estimator": "damped", "avoider": "give-way", "loss": 0.1}
+    run = spec.run_config({**settings, "seed": 5, "timeout_s": 0.8})
+    real = fly(run, tmp_path / "flight", FlightOptions(processes=2, pictures=False))
+    ours = simulate(run, trace=True)
+    assert ours.trace is not None
+    ends = np.stack([track[-1] for track in ours.trace.tracks])
+    assert len(real.positions) >= 80
+    assert np.array_equal(real.positions[1:80], ends[:79])
+
+
+def test_sweeps_take_plugins_by_name_and_their_failures_are_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = spec.load_file(EXAMPLE / "sweep.yaml", seeds=1)
+    assert {cell.labels["policy"] for cell in sweep.cells} == {"tdma", "dtsa", "least-known"}
+    tasks = [task for task in sweep.tasks() if task.settings["policy"] == "least-known"]
+    rows = [work.fly_one(task) for task in tasks]
+    assert len(rows) == 4
+    assert {row["status"] for row in rows} <= {"completed", "crashed"}
+    assert all(row["summary"]["policy"] == "least-known" for row in rows)
+
+    import dtsa_plugins
+
+    monkeypatch.setattr(dtsa_plugins.LeastKnown, "choose", lambda self, view, slot: 1 // 0)
+    row = work.fly_one(tasks[0])
+    assert row["status"] == "failed"
+    assert "ZeroDivisionError" in row["reason"]
+    monkeypatch.setattr(dtsa_plugins.LeastKnown, "choose", lambda self, view, slot: 99)
+    with pytest.raises(PluginError, match="policy least-known, choose: chose agent 99 in slot 0; allowed: 0"):
+        simulate(spec.run_config({**tasks[0].settings, "agents": 6, "moving": 6}))
+
+
+_WRONG = """
+class {name}:
+    def __init__(self, config, agent):
+        if {where!r} == "factory":
+            raise KeyError("no such option")
+
+    def choose(self, table, slot):
+        {choose}
+
+    def estimate(self, table, slot, step, position, velocity):
+        position[0, 0] = float("nan")
+
+    def command(self, table, slot, step):
+        return {command}
+"""
+
+
+def _wrong(where: str, choose: str = "return 1", command: str = "(0.0, 0.0, 0.0)") -> Any:
+    scope: dict[str, Any] = {}
+    exec(compile(_WRONG.format(name="Wrong", where=where, choose=choose, command=command), "wrong.py", "exec"), scope)
+    return scope["Wrong"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "said"),
+    [
+        ("policy", _wrong("factory"), r"policy wrong: KeyError: 'no such option' \(wrong.py:5\)"),
+        ("policy", _wrong("", "raise RuntimeError('lost')"), r"policy wrong, choose: RuntimeError: lost \(wrong"),
+        ("policy", _wrong("", "while True: pass"), r"wrong, choose: TimeoutError: no answer within 0.2 s \(wrong.py:8"),
+        ("policy", _wrong("", "return None"), r"chose agent None in slot 0; allowed: an integer, 0 \(nobody\) to 4"),
+        ("policy", _wrong("", "return 3.0"), "wrong, choose: chose agent 3.0 in slot 0; allowed: an integer, 0"),
+        ("policy", _wrong("", "return -1"), "policy wrong, choose: chose agent -1 in slot 0"),
+        ("estimator", _wrong(""), "estimator wrong, estimate: wrote a number that is not finite in slot 0"),
+        ("avoider", _wrong("", command="(1.0, 2.0)"), r"wrong, command: gave \(1.0, 2.0\) in slot 0; allowed: three"),
+        ("avoider", _wrong("", command="(1.0, 2.0, float('inf'))"), "avoider wrong, command: gave"),
+        ("avoider", _wrong("", command="'fast'"), "avoider wrong, command: gave 'fast'"),
+    ],
+)  # fmt: skip
+def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(
+    monkeypatch: pytest.MonkeyPatch, kind: str, wrong: Any, said: str
+) -> None:
+    monkeypatch.setenv("DTSA_PLUGIN_LIMIT_S", "0.2")
+    dtsa.register(kind, "wrong", wrong)
+    settings = {"policy": "tdma", "estimator": "linear", kind: "wrong"}
+    run = spec.run_config({"agents": 4, "timeout_s": 0.2, **settings})
+    with pytest.raises(PluginError, match=said):
+        simulate(run)
+    row = work.fly_one(Task("key", 0, 1, {"agents": 4, "timeout_s": 0.2, **settings}, 1.0))
+    assert row["status"] == "failed"
+    assert row["reason"].startswith(f"PluginError: {kind} wrong")
+
+
+def test_a_plugin_that_catches_its_own_errors_or_waits_in_a_thread_is_ended_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("DTSA_PLUGIN_LIMIT_S", "0.2")
+    settings = {"agents": 4, "timeout_s": 0.2, "policy": "wrong"}
+    rows = []
+    for choose in (
+        "import time; time.sleep(60)",
+        "while True:\n            try: pass\n            except Exception: pass",
+    ):
+        dtsa.register("policy", "wrong", _wrong("", choose))
+        rows.append(work.fly_one(Task("key", 0, 1, settings, 1.0)))
+    other = threading.Thread(target=lambda: rows.append(work.fly_one(Task("key", 0, 1, settings, 1.0))))
+    other.start()  # as on a cluster
+    other.join(timeout=30)
+    assert len(rows) == 3
+    assert all("policy wrong, choose: TimeoutError: no answer within 0.2 s (wrong.py:" in r["reason"] for r in rows)
+    monkeypatch.setenv("DTSA_PLUGIN_LIMIT_S", "soon")
+    with pytest.raises(ConfigError, match=r"^DTSA_PLUGIN_LIMIT_S: got .soon.; allowed: 0\.05 to 86400 s"):
+        simulate(spec.run_config(settings))
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("raise RuntimeError('lost')", "RuntimeError: lost ("),
+        ("while True: pass", "TimeoutError: no answer within 1 s ("),
+    ],
+)
+def test_a_plugin_that_raises_or_hangs_is_named_where_nodes_fly_it(
+    installed: Path, tmp_path: Path, fault: str, said: str
+) -> None:
+    pytest.importorskip("rclpy")
+    broken = tmp_path / "path"
+    shutil.copytree(installed, broken)
+    source = broken / "dtsa_plugins" / "__init__.py"
+    source.write_text(
+        source.read_text().replace("        speed = np.sqrt(", f"        {fault}\n        speed = np.sqrt(")
+    )
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(broken), os.environ.get("PYTHONPATH", "")])),
+        "DTSA_PLUGIN_LIMIT_S": "1",
+    }
+    for words in (["simulate"], ["fly", "--out", str(tmp_path / "flight"), "--no-picture", "--processes", "2"]):
+        command = [sys.executable, "-m", "dtsa_bench", *words, "--agents", "4", "--policy", "least-known"]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+        assert ended.returncode == 1, words
+        assert f"policy least-known, choose: {said}" in ended.stderr, words
+        assert "Traceback" not in ended.stderr, words
+
+
+class Empty:
+    def __init__(self, config: object, agent: int) -> None:
+        pass
+
+
+class Mute(Empty):
+    own_bytes = 1
+
+    def choose(self, table: object, slot: int) -> int:
+        return 1
+
+
+class Nobody(Empty):
+    def senders(self, swarm: object, slot: int) -> Any:
+        return None
+
+
+class Odd:
+    """Whatever is asked of it raises an error."""
+
+    def _raise(self, *_: object) -> Any:
+        raise KeyError("odd")
+
+    __repr__ = __index__ = __len__ = __iter__ = __float__ = __bool__ = _raise
+
+
+class Leaves(Empty):
+    def choose(self, table: object, slot: int) -> int:
+        raise SystemExit(0)
+
+
+def _odd(*methods: str) -> type:
+    return type("OddAnswers", (Empty,), {method: lambda self, *_: Odd() for method in methods})
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "said"),
+    [
+        ("policy", Empty, r"^policy wrong: Empty has no method choose\(table, slot\)$"),
+        ("policy", lambda config, agent: None, r"^policy wrong: NoneType has no method choose"),
+        (
+            "policy",
+            Mute,
+            r"^policy wrong: Mute has no method say\(table, slot\) and heard\(table, slot, sender, data\)$",
+        ),
+        ("policy", Nobody, r"^policy wrong, senders: gave None in slot 0; allowed: a list of the ids that send$"),
+        ("policy", Leaves, r"^policy wrong, choose: SystemExit: 0 \(.*test_plugins.py"),
+        ("policy", _odd("choose"), r"^policy wrong, choose: chose agent <Odd> in slot 0; allowed: an integer, 0"),
+        ("policy", _odd("senders"), r"^policy wrong, senders: gave <Odd> in slot 0; allowed: a list"),
+        ("policy", _odd("wake"), r"^policy wrong, wake: gave <Odd> ns; allowed: whole numbers above 0"),
+        ("avoider", _odd("command"), r"^avoider wrong, command: gave <Odd> in slot 0; allowed: three finite numbers"),
+        ("policy", type("Args", (), {}), r"^policy wrong: TypeError: Args\(\) takes no arguments"),
+        (
+            "estimator",
+            Empty,
+            r"^estimator wrong: Empty has no method estimate\(table, slot, step, position, velocity\)$",
+        ),
+        ("avoider", Empty, r"^avoider wrong: Empty has no method command\(table, slot, step\)$"),
+    ],
+)
+def test_a_method_that_is_missing_is_named(kind: str, wrong: Any, said: str) -> None:
+    dtsa.register(kind, "wrong", wrong)
+    with pytest.raises(PluginError, match=said):
+        simulate(spec.run_config({"agents": 4, "timeout_s": 0.2, kind: "wrong"}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "attribute", "value"),
+    [
+        ("policy", "port", "send"),
+        ("policy", "port", 3),
+        ("policy", "port", (["send"],)),
+        ("policy", "own_bytes", "3"),
+        ("policy", "may_join", 1),
+        ("policy", "own_bytes", Odd()),
+        ("estimator", "needs_intent", Odd()),
+        ("avoider", "model", []),
+        ("policy", "options", "error_m"),
+        ("estimator", "options", (1,)),
+    ],
+)
+def test_attributes_that_mean_nothing_are_named(kind: str, attribute: str, value: Any) -> None:
+    wrong = type("Wrong", (Empty,), {attribute: value})
+    name = f"wrong-{kind}"
+
+    def use() -> SwarmConfig:
+        dtsa.register(kind, name, wrong)
+        return SwarmConfig(**{kind: name}, options={f"{name}.error_m": 1.0})
+
+    with pytest.raises(ConfigError, match=rf"^{name}\.{attribute}: got "):
+        use()
+
+
+@pytest.mark.parametrize(
+    ("option", "near"),
+    [
+        ("event-tdma.eror_m", "event-tdma.error_m"),
+        ("event-tmda.error_m", "event-tdma"),
+        ("damped.rest", "damped.rest_s"),
+        ("least-known.every", ""),
+        ("lease.probation", ""),
+    ],
+)
+def test_an_option_that_no_plug_in_has_is_refused_with_the_nearest(
+    option: str, near: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for policy in ("event-tdma", "tdma"):
+        file = tmp_path / "sweep.yaml"
+        file.write_text(f"base: {{agents: 4, options: {{{option}: 9}}}}\naxes: {{policy: [{policy}]}}\n")
+        for words in (
+            ["simulate", "--agents", "4", "--policy", policy, "--options", f"{option}=9"],
+            ["sweep", "--file", str(file), "--out", str(tmp_path / "runs")],
+        ):
+            assert main(words) == 2
+            said = capsys.readouterr().err
+            assert f"options: got '{option}'; allowed: " in said
+            assert not near or said.endswith(f"; did you mean {near}?\n")
+            assert len(said.splitlines()) == 1
+
+
+def test_options_of_plug_ins_that_do_not_fly_are_allowed() -> None:
+    for _ in range(2):
+        SwarmConfig(policy="tdma", options={"event-tdma.error_m": 0.1, "damped.rest_s": 2.0})
+
+
+def test_the_page_lists_the_fields_of_the_table() -> None:
+    page = (EXAMPLE.parents[1] / "docs" / "bench.md").read_text(encoding="utf-8")
+    rows = page.partition("| field | what it is |\n|---|---|\n")[2].partition("\n\n")[0].splitlines()
+    assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row.split("|")[1])) == sorted(
+        plugins.Table.__slots__
+    )
+
+
+def test_random_numbers_of_plug_ins_follow_from_seed_agent_and_name() -> None:
+    def drawn(seed: int, agent: int, name: str) -> bytes:
+        return plug_in_random(SwarmConfig(seed=seed), agent, name).bytes(16)
+
+    assert drawn(1, 1, "mine") == drawn(1, 1, "mine")
+    assert len({drawn(*who) for who in ((1, 1, "mine"), (2, 1, "mine"), (1, 2, "mine"), (1, 1, "min"))}) == 4
+
+
+_LOTS = """
+from dtsa_agent.core import plug_in_random
+
+class Lots:
+    may_join = True
+    def __init__(self, config, agent):
+        self.agent, self.agents = agent, config.agents
+        self.random = plug_in_random(config, agent, "lots")
+
+    def choose(self, table, slot):
+        return self.agent if self.random.random() < 1.0 / self.agents else 0
+"""
+
+
+@pytest.mark.ros
+def test_drawn_lots_are_the_same_in_nodes_processes_and_simulator_and_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy")
+    from dtsa_bench.flights.flight import fly
+    from dtsa_bench.flights.options import FlightOptions
+
+    (tmp_path / "lots_of_test.py").write_text(_LOTS)
+    about = tmp_path / "lots-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: lots\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[dtsa.policies]\nlots = lots_of_test:Lots\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH", "")])))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = spec.run_config({"agents": 4, "policy": "lots", "loss": 0.1, "seed": 5, "timeout_s": 0.8})
+    ours = simulate(run, trace=True)
+    assert ours.trace is not None
+    assert {len(ids) for ids in ours.trace.senders} >= {0, 1, 2}
+    ends = np.stack([track[-1] for track in ours.trace.tracks])
+    for processes in (1, 4):
+        real = fly(run, tmp_path / f"flight-{processes}", FlightOptions(processes=processes, pictures=False))
+        assert np.array_equal(real.positions[1:80], ends[:79])
+        assert main(["verify", str(tmp_path / f"flight-{processes}")]) == 0
+
+
+def test_what_does_not_exist_or_does_not_import_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind, near in (("policy", "least-known"), ("estimator", "damped"), ("avoider", "give-way")):
+        with pytest.raises(ConfigError, match=f"^{kind}: got 'nothing'.*{near}"):
+            SwarmConfig(**{kind: "nothing"})
+    broken = importlib.metadata.EntryPoint("broken", "no_such_module:Thing", "dtsa.policies")
+    monkeypatch.setattr(POLICIES, "plug_ins", lambda: {"broken": broken})
+    with pytest.raises(ConfigError, match="no_such_module"):
+        SwarmConfig(policy="broken")
+
+
+def test_what_a_plugin_sees_it_cannot_change() -> None:
+    swarm = plugins.make_swarm(SwarmConfig(agents=3, moving=2, policy="least-known"))
+    table = plugins.Table(swarm, 0)
+    for name in ("sent_position", "in_ap", "last_turn", "own_position", "goal"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(table, name)[...] = 0
+
+
+def test_built_in_names_never_make_a_plugin_swarm() -> None:
+    assert type(plugins.make_swarm(SwarmConfig())).__name__ == "Swarm"
+    assert type(plugins.make_swarm(SwarmConfig(policy="least-known"))).__name__ == "PluginSwarm"

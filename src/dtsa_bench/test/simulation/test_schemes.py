@@ -1,0 +1,421 @@
+"""Schemes of the literature, and bounds: numbers of their sources, and what they may not do."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dtsa_dev.protocol.experiment import Experiment
+
+import dtsa
+from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
+from dtsa_agent.core.errors import PluginError
+from dtsa_agent.core.plugins.entry_points import make_swarm, plug_ins_of
+from dtsa_agent.core.plugins.unslotted import check_slotted
+from dtsa_agent.core.registry import POLICIES
+from dtsa_agent.crazyflie.settings.config import StationSettings, SwarmSettings
+from dtsa_agent.ros.common.process.loop import Stop
+from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
+from dtsa_bench.experiments.sweep.spec import run_config
+from dtsa_bench.flights.flight import FlightOptions, check_options
+from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.simulation.schemes.knowledge import whittle_index
+from dtsa_bench.simulation.schemes.optimum import optimum
+from dtsa_bench.simulation.simulate import simulate
+from dtsa_bench.simulation.unslotted import UnslottedTraffic
+from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim.model.airtime import Airtime
+from dtsa_channel_sim.model.verdict import COLLISION
+
+LEAGUE = Path(__file__).resolve().parents[4] / "docs" / "league.md"
+
+
+def steady(
+    policy: str,
+    agents: int,
+    movers: int,
+    loss: float = 0.0,
+    slots: int = 3000,
+    warmup: int | None = None,
+    **settings: object,
+) -> Experiment:
+    """Some circle, the rest hover."""
+    config = SwarmConfig(agents=agents, moving=0, avoider="none", seed=3, policy=policy, **settings)
+    channel = ChannelConfig(agents=agents, slot_ns=config.slot_ns, seed=3, loss=loss)
+    experiment = Experiment(config, channel, movers=range(1, movers + 1), warmup=warmup or 20 * agents)
+    experiment.run(slots)
+    return experiment
+
+
+def test_without_loss_the_genie_reaches_the_bound_and_nobody_gets_below_it() -> None:
+    """(N_p - 1) / 2: round robin over the movers."""
+    assert steady("genie-age", 12, 6).outcome.age == pytest.approx(2.5)
+    for policy in ("tdma", "lease", "genie-error", "dtsa"):
+        assert steady(policy, 12, 6).outcome.age > 2.5 - 1e-9
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.3])
+def test_nobody_is_ahead_of_the_genie_under_loss(loss: float) -> None:
+    genie = steady("genie-age", 12, 6, loss, frame="extended").outcome.age
+    assert genie < steady("lease", 12, 6, loss).outcome.age < steady("tdma", 12, 6, loss).outcome.age
+    assert genie < steady("tdma", 12, 6, loss, frame="extended").outcome.age
+
+
+def test_greedy_is_almost_optimal_for_three_agents() -> None:
+    perfect = optimum(0.0, cap=4)
+    assert perfect.best == perfect.greedy == perfect.tdma == pytest.approx(1.0)
+    lossy = optimum(0.2, cap=6, tolerance=1e-4)
+    assert lossy.best <= lossy.greedy < 1.005 * lossy.best < 0.95 * lossy.tdma
+    assert lossy.greedy < lossy.whittle < 1.01 * lossy.best
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.5])
+def test_whittles_index_is_the_price_at_which_waiting_costs_as_much(loss: float) -> None:
+    """One link that sends from an age on, at a price a frame: that age and the next one are then equally good."""
+    arrives = 1.0 - loss
+
+    def cost(first: int, price: float) -> float:
+        lengths = first - 1 + np.arange(1, 400)  # of the time between two frames that arrive; ages run from 1 to it
+        share = arrives * loss ** np.arange(399)
+        return float((share @ (lengths * (lengths + 1) / 2) + price / arrives) / (share @ lengths))
+
+    for age in (1, 2, 5, 12):
+        price = float(whittle_index(np.array(float(age)), loss))
+        assert cost(age, price) == pytest.approx(cost(age + 1, price), rel=1e-12)
+        assert min(cost(other, price) for other in range(1, 20)) == pytest.approx(cost(age, price), rel=1e-12)
+
+
+def test_whittles_index_is_close_to_the_genie_and_needs_a_probability() -> None:
+    genie = steady("genie-age", 12, 6, 0.3).outcome.age
+    assert genie < steady("whittle", 12, 6, 0.3, options={"whittle.loss": 0.3}).outcome.age < 1.05 * genie
+    assert steady("whittle", 12, 6).outcome.age == pytest.approx(2.5)
+    with pytest.raises(ConfigError, match=r"whittle\.loss: got 1\.0; allowed: 0 to below 1"):
+        make_swarm(SwarmConfig(agents=4, policy="whittle", options={"whittle.loss": 1.0}))
+
+
+def test_the_tdma_of_the_dynamic_program_is_that_of_the_simulation() -> None:
+    simulated = steady("tdma", 3, 3, 0.2, slots=40_000).outcome.age
+    assert simulated == pytest.approx(optimum(0.2, cap=4, tolerance=1e-3).tdma, rel=0.03)
+
+
+def mean_error(policy: str) -> float:
+    """Of flights in which half of the agents move, m."""
+    flights = [dtsa.simulate(agents=12, moving=6, policy=policy, slot_ms=30, seed=seed) for seed in range(1, 5)]
+    return float(np.mean([flight.summary["estimate_error_mean_m"] for flight in flights]))
+
+
+def test_the_genie_by_error_has_the_least_errors() -> None:
+    """Squared errors, which it weighs: of few that move, those that turn are worth more than those that do not."""
+    assert mean_error("genie-error") < mean_error("genie-age") < mean_error("tdma")
+
+
+def test_threshold_aloha_has_the_age_of_its_source() -> None:
+    """1.4169 n for many agents, ages counted from 1."""
+    ages = steady("threshold-aloha", 200, 200, slots=4000, warmup=1200).outcome
+    assert (ages.age + 1) / 200 == pytest.approx(1.4169, rel=0.05)
+
+
+def traffic(policy: str, slots: int, **settings: object) -> tuple[UnslottedTraffic, list[object], SwarmConfig]:
+    """The air alone: nobody flies."""
+    config = SwarmConfig(agents=20, policy=policy, seed=5, slot_ms=2, **settings)
+    swarm = make_swarm(config)
+    air = UnslottedTraffic(swarm, Channel(ChannelConfig(agents=20, slot_ns=config.slot_ns, seed=5)))
+    return air, [air.slot(slot) for slot in range(slots)], config
+
+
+@pytest.mark.parametrize(("load", "most"), [(0.5, 1 / (2 * math.e)), (0.1, 0.1 * math.exp(-0.2))])
+def test_pure_aloha_carries_what_the_textbook_says(load: float, most: float) -> None:
+    """G e^(-2 G) of the air carries whole frames."""
+    _, carried, config = traffic("pure-aloha", 4000, options={"pure-aloha.load": load})
+    whole = sum(len(slot.heard) for slot in carried)
+    share = whole * Airtime().on_air_ns(config.frame_length) / (4000 * config.slot_ns)
+    assert share == pytest.approx(most, rel=0.05)
+
+
+def test_carrier_sense_helps_where_frames_are_longer_than_the_turn_round_of_radios() -> None:
+    """Who finds the air free needs 0.13 ms to send: as long as a frame of 19 bytes is, half as long as one of 60."""
+
+    def lost(policy: str, frame: str, **settings: object) -> tuple[float, int, int]:
+        _, carried, config = traffic(policy, 2000, frame=frame, **settings)
+        sent = sum(len(slot.lengths) for slot in carried)
+        return 1.0 - sum(len(slot.heard) for slot in carried) / sent, sent, config.frame_length
+
+    def gain(frame: str) -> float:
+        sensing, sent, length = lost("csma", frame, options={"csma.period_ms": 15.0, "csma.window_ms": 15.0})
+        load = sent * Airtime().on_air_ns(length) / (2000 * 2_000_000)
+        return lost("pure-aloha", frame, options={"pure-aloha.load": load})[0] / sensing
+
+    assert gain("extended") > 1.15
+    assert gain("paper") < 1.05
+
+
+def test_the_radio_of_an_agent_that_is_switched_off_sends_nothing() -> None:
+    options = {"csma.period_ms": 15.0, "csma.window_ms": 60.0}
+    air, _, _ = traffic("csma", 0, frame="extended", options=options)
+    assert air._radios is not None
+    slots = iter(range(2000))
+    while not air._radios.holds(4):
+        air.slot(next(slots))
+    air._swarm.present[3] = 0
+    assert not any(4 in air.slot(next(slots)).senders for _ in range(100))
+    air._swarm.present[3] = 1
+    assert any(4 in air.slot(next(slots)).senders for _ in range(100))
+
+
+def test_beacons_come_at_their_rate_and_two_with_one_phase_collide_for_good() -> None:
+    _, carried, _ = traffic("beacons", 1000, options={"beacons.period_ms": 20.0})
+    sent = sum(len(slot.lengths) for slot in carried)
+    assert sent == pytest.approx(20 * 1000 * 2 / 20, rel=0.02)
+    heard = [len({frame[1] for frame, _ in slot.heard}) for slot in carried]
+    assert sum(heard[:500]) == pytest.approx(sum(heard[500:]), abs=20)  # the same ones, period after period
+
+
+def test_the_token_ring_takes_as_long_as_its_packets_and_stops_with_one_agent() -> None:
+    """A turn: 19 frames and acknowledgements, TOKEN, RTS, CTS; each is turned to, sent, and carried to and from it."""
+    air, carried, config = traffic("dtr", 1000)
+    airtime, links_ns = Airtime(), 300_000 + ChannelConfig(agents=20).link_delay_ns
+    frame_ns, short_ns = (airtime.total_ns(5 + length) + links_ns for length in (config.frame_length, 0))
+    turn_ns = 19 * (frame_ns + short_ns) + 3 * short_ns
+    heard = [(frame[1], mask) for slot in carried for frame, mask in slot.heard]
+    assert len(heard) == pytest.approx(19 * 1000 * config.slot_ns / turn_ns, abs=19)
+    assert all(mask.sum() == 1 for _, mask in heard)
+    everybody_else = [mask.argmax() for _, mask in heard[:19]]
+    assert sorted(everybody_else) == list(range(1, 20))
+    assert not any(slot.outcome == COLLISION for slot in carried)
+    air._swarm.present[7] = 0
+    after = [air.slot(slot) for slot in range(1000, 1400)]
+    assert {int(mask.argmax()) for slot in after[200:] for _, mask in slot.heard} == {7}  # sent to it again and again
+    assert sum(len(slot.lengths) for slot in after[200:]) == pytest.approx(20, abs=1)  # one agent, every 20 ms
+
+
+def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
+    config = SwarmConfig(agents=4, policy="dtr", seed=5, slot_ms=2)
+    air = UnslottedTraffic(make_swarm(config), Channel(ChannelConfig(agents=4, slot_ns=2_000_000, seed=5, loss=0.3)))
+    late = [{int(frame[1]) for frame, _ in air.slot(slot).heard} for slot in range(4000)][3000:]
+    assert set().union(*late) == {1, 2, 3, 4}
+    with pytest.raises(ConfigError, match="agents: got 21; allowed: 2 to 20 with policy dtr"):
+        make_swarm(SwarmConfig(agents=21, policy="dtr"))
+
+
+def test_agents_that_open_their_own_slots_send_when_those_of_the_simulator_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[tuple[int, int]] = []
+    plain = UnslottedTraffic.send
+    monkeypatch.setattr(
+        UnslottedTraffic,
+        "send",
+        lambda self, k, now_ns, *more: plain(self, k, now_ns, *more) and not begun.append((now_ns, k)),
+    )
+    for policy, options in (("beacons", {"beacons.jitter_ms": 3.0}), ("pure-aloha", {})):
+        begun.clear()
+        run = run_config({"agents": 5, "policy": policy, "seed": 3, "timeout_s": 1.0, "options": options})
+        simulate(run)
+        agents = AgentGroup(make_swarm(run.swarm))
+        sent = set()
+        for slot in range(100):
+            senders = agents.on_slot(slot)
+            assert np.flatnonzero(agents.swarm.chosen).tolist() == list(senders)
+            offsets = agents.swarm.send_offset_ns[list(senders)].tolist()
+            sent |= {(slot * run.swarm.slot_ns + offset, k) for k, offset in zip(senders, offsets, strict=True)}
+            agents.swarm.fly(slot)
+            agents.on_slot_end()
+        # Of two frames that one of them would begin in a slot, the first.
+        first = {(now_ns // run.swarm.slot_ns, k): now_ns for now_ns, k in reversed(begun)}
+        assert sent == {(now_ns, k) for (_, k), now_ns in first.items()}
+        assert len(sent) > 80
+
+
+def test_an_agent_whose_radio_listens_waits_for_what_became_of_its_frame() -> None:
+    told: list[tuple[int, bool]] = []
+
+    class Eager:
+        port = ("send", "sent", "busy")
+
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            pass
+
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            radio.send()
+            return 0  # does not count
+
+        def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> int:
+            return int(busy)
+
+        def sent(self, table: object, now_ns: int, begun: bool) -> int:
+            told.append((now_ns, begun))
+            return now_ns + 3_000_000
+
+    dtsa.register("policy", "eager", Eager)
+    agents = AgentGroup(make_swarm(SwarmConfig(agents=2, policy="eager")))
+    parts = plug_ins_of(agents.swarm)
+    assert parts is not None
+
+    def senders(*slots: int) -> list[tuple[int, ...]]:
+        result = []
+        for slot in slots:
+            result.append(agents.on_slot(slot))
+            agents.on_slot_end()
+        return result
+
+    assert senders(0, 1) == [(0, 1), ()]
+    parts.radio_told(0, 0, 12_000_000)  # began in slot 1: its policy acts 3 ms later, in the next slot that opens
+    parts.radio_told(1, 7, 5)  # of no frame that anybody waits for
+    assert senders(2) == [(0,)]
+    assert told == [(12_000_000, True)]
+    assert agents.swarm.send_offset_ns[0] == 0
+    parts.radio_told(0, 2, None)
+    assert senders(3, 4, 5, 6) == [(0,), (), (), ()]
+    assert told[1:] == [(30_000_000, False)]
+    assert agents.swarm.send_offset_ns[0] == 0
+    # A radio that says nothing has not sent: 50 ms beyond two slots.
+    assert senders(7) == [(1,)]
+    assert told[2:] == [(70_000_000, False)]
+
+
+def test_what_policies_without_slots_do_wrong_in_nodes_is_named() -> None:
+    class Rogue:
+        port = ("send",)
+        options = ("listens",)
+
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            self.listens = config.options.get("rogue.listens", 0.0) > 0
+
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            return now_ns + 1 if not (self.listens and radio.busy()) else 0
+
+    class Deaf(Rogue):
+        port = ("send", "busy")
+
+    dtsa.register("policy", "rogue", Rogue)
+    with pytest.raises(ConfigError, match=r"deaf\.port.*'busy' with the methods sensed and sent"):
+        dtsa.register("policy", "deaf", Deaf)
+    for options, said in (
+        ({"rogue.listens": 1.0}, "rogue, wake: .*has no attribute 'busy'"),
+        ({}, "more than 10000 times in a slot"),
+    ):
+        with pytest.raises(PluginError, match=said):
+            AgentGroup(make_swarm(SwarmConfig(agents=2, policy="rogue", options=options))).on_slot(0)
+
+
+def test_event_triggered_tdma_is_silent_while_it_would_say_nothing_new() -> None:
+    busy, quiet = (steady(policy, 12, 4).outcome for policy in ("tdma", "event-tdma"))
+    assert busy.idle == 0
+    assert quiet.idle > 0.4 * quiet.slots
+    assert quiet.collisions == 0
+    flown = dtsa.simulate(agents=12, policy="event-tdma", slot_ms=2, options={"event-tdma.error_m": 0.02}).summary
+    assert flown["completed"]
+    assert flown["channel_load"] < 0.8 * dtsa.simulate(agents=12, policy="tdma", slot_ms=2).summary["channel_load"]
+
+
+def test_sotdma_finds_slots_of_its_own() -> None:
+    run = steady("sotdma", 12, 12, slots=3000)
+    late = [slot for slot in run.outcome.collision_slots if slot >= 1500]
+    assert len(late) < 0.05 * 1500
+    assert run.outcome.age < 2 * 12
+
+
+def test_dominance_prefers_those_who_turn() -> None:
+    assert mean_error("dominance") < mean_error("tdma")
+
+
+def test_radios_that_listen_before_they_talk_need_no_leases() -> None:
+    """Without loss all have the same ranks; with it a few do that should not."""
+    sense, lease = (steady(policy, 12, 2, frame="extended").outcome for policy in ("sense", "lease"))
+    assert 0.5 < sense.age < lease.age
+    assert sense.collisions <= 1  # of two that have just set out
+    lossy = steady("sense", 12, 6, 0.3, frame="extended").outcome
+    assert 0 < lossy.collisions < 0.02 * lossy.slots
+    assert lossy.age < steady("lease", 12, 6, 0.3).outcome.age
+
+
+def test_every_scheme_flies_and_the_same_seed_gives_the_same_flight() -> None:
+    for name in sorted(POLICIES.plug_ins()):
+        if not POLICIES.factory(name).__module__.startswith("dtsa_bench.simulation.schemes"):
+            continue
+        flights = [dtsa.simulate(agents=4, policy=name, slot_ms=2, loss=0.1, seed=7, timeout_s=3) for _ in range(2)]
+        assert flights[0].summary["slots"]["total"] > 500, name
+        first, second = ({**flight.summary, "wall_time_s": 0, "realtime_factor": 0} for flight in flights)
+        assert first == second, name
+
+
+def test_nodes_refuse_what_nodes_cannot_do() -> None:
+    for policy, options, mode in (
+        ("beacons", FlightOptions(processes=1), "lockstep"),
+        ("beacons", FlightOptions(respawn=1.0), "realtime"),
+        ("csma", FlightOptions(), "lockstep"),
+        ("dtr", FlightOptions(), "realtime"),
+        ("genie-age", FlightOptions(processes=2), "lockstep"),
+        ("genie-age", FlightOptions(processes=1), "realtime"),
+    ):
+        with pytest.raises(ConfigError, match="policy"):
+            check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode=mode), options)
+    check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="genie-age")), FlightOptions(processes=1))
+    for policy in ("beacons", "csma"):
+        check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode="realtime"), FlightOptions())
+    with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: a slotted one here"):
+        check_slotted("pure-aloha")
+    mission = RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime")
+    settings = SwarmSettings((), StationSettings())
+    with pytest.raises(ConfigError, match="policy: got 'beacons'; allowed: a slotted one here"):
+        fly_crazyflies(mission, settings, Path("swarm.yaml"), Path("out"), FlightOptions(), Stop())
+    with pytest.raises(ConfigError, match="policy"):
+        make_swarm(SwarmConfig(agents=4, policy="genie-age"), local=[1, 2])
+
+
+def test_wrong_answers_of_such_plug_ins_are_named() -> None:
+    class Wrong:
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            pass
+
+        def senders(self, swarm: object, slot: int) -> list[int]:
+            return [5]
+
+    class Stuck:
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            pass
+
+        def wake(self, table: object, now_ns: int, radio: object) -> int:
+            return now_ns
+
+    class Chatty:
+        options = ("to",)
+
+        def __init__(self, config: SwarmConfig, agent: int) -> None:
+            self.to = int(config.options.get("chatty.to", 0.0))
+
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            radio.send(bytes(250), self.to)
+            return now_ns + 1
+
+        def received(self, table: object, now_ns: int, sender: int, note: bytes) -> int:
+            return 0
+
+    dtsa.register("policy", "chatty", Chatty)
+    for to, said in (
+        (0.0, "sent 269 bytes; allowed: 1 to 255"),
+        (5.0, r"sent .*, 5\); allowed: bytes, to 0 \(all\) to 4"),
+    ):
+        with pytest.raises(PluginError, match=f"policy chatty, wake: {said}"):
+            simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="chatty", options={"chatty.to": to})))
+    dtsa.register("policy", "wrong-genie", Wrong)
+    dtsa.register("policy", "stuck", Stuck)
+    with pytest.raises(PluginError, match="policy wrong-genie, senders: chose agent 5 in slot 0; allowed: 1 to 4"):
+        simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="wrong-genie")))
+    with pytest.raises(PluginError, match="policy stuck, wake: gave 0 ns"):
+        simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="stuck")))
+
+
+def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
+    rows = [line.split("|")[1:-1] for line in LEAGUE.read_text().splitlines() if line.startswith("| nRF51")]
+    assert len(rows) == 4
+    for radio, policy, turn, frame, guard, links, decision, shortest in (map(str.strip, row) for row in rows):
+        airtime = Airtime(bitrate=2_000_000 if "2 Mbit" in radio else 1_000_000)
+        length = int(policy.split(", ")[1])
+        assert length == SwarmConfig(policy=policy.split(",")[0]).frame_length
+        assert float(turn.split()[0]) == airtime.ramp_up_ns / 1e6
+        assert float(frame.split()[0]) == pytest.approx(airtime.on_air_ns(length) / 1e6, abs=5e-4)
+        parts = {"guard_ns": guard, "link_delay_ns": links, "decide_ns": decision}
+        given = {name: round(float(text.split("x ")[-1].split()[0]) * 1e6) for name, text in parts.items() if text}
+        assert float(shortest.split()[0]) == pytest.approx(airtime.shortest_slot_ns(length, **given) / 1e6, abs=6e-3)

@@ -1,0 +1,198 @@
+"""The Monte Carlo engine:
+
+one table or many, with and without loss, and the same flights as with real nodes.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dtsa_agent.core import REASONS
+from dtsa_bench.experiments.sweep.spec import run_config
+from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.simulation.simulate import Flight, may_share, simulate
+
+
+def run(**settings: Any) -> RunConfig:
+    return run_config({"seed": 7, "timeout_s": 4.0, **settings})
+
+
+def fly(**settings: Any) -> Flight:
+    return simulate(run(**settings), trace=True)
+
+
+def plain(flight: Flight) -> dict[str, Any]:
+    """The results without what depends on the machine."""
+    return {key: value for key, value in flight.summary().items() if key not in ("wall_time_s", "realtime_factor")}
+
+
+@pytest.mark.parametrize("policy", ["tdma", "dtsa", "age"])
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"estimator": "linear"},
+        {"estimator": "hold", "avoider": "potential"},
+        {"estimator": "intent", "slot_ms": 25.0},
+        {"frame": "extended", "moving": 6},
+        {"scenario": "stop-and-go", "pause_slots": 10},
+        {"scenario": "staggered", "stagger_slots": 30, "moving": 6},
+    ],
+    ids=["linear", "hold", "intent", "extended", "stop-and-go", "staggered"],
+)
+def test_without_loss_one_table_for_all_makes_no_difference(policy: str, more: dict[str, Any]) -> None:
+    config = run(agents=9, policy=policy, timeout_s=2.0, **{"moving": 8, **more})
+    assert may_share(config)
+    one, many = (simulate(config, shared_table=shared, trace=True) for shared in (True, False))
+    assert one.swarm.sent_slot.shape[0] == 1
+    assert many.swarm.sent_slot.shape[0] == 9
+    assert one.trace is not None
+    assert many.trace is not None
+    assert one.trace.senders == many.trace.senders
+    assert one.trace.reasons == many.trace.reasons
+    assert np.array_equal(one.trace.positions(), many.trace.positions())
+    assert np.array_equal(one.trace.estimates, many.trace.estimates)
+    first, second = plain(one), plain(many)
+    error = [first.pop("estimate_error_mean_m"), second.pop("estimate_error_mean_m")]
+    assert first == second
+    assert error[0] == pytest.approx(error[1], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"loss": 0.1},
+        {"policy": "aloha"},
+        {"jam": True},
+        {"range_m": 3.0},
+        {"partition": "1-3 | 4-6"},
+        {"burst_length": 3.0, "loss": 0.1},
+    ],
+)
+def test_where_views_may_differ_everyone_has_a_table(more: dict[str, Any]) -> None:
+    config = run(agents=6, timeout_s=0.5, **more)
+    assert not may_share(config)
+    assert simulate(config).swarm.sent_slot.shape == (6, 6)
+
+
+def test_loss_makes_the_tables_of_dtsa_differ_and_wastes_slots() -> None:
+    lossless, lossy = (
+        simulate(run(agents=12, loss=loss, timeout_s=2.0, stop_on_crash=False), shared_table=False)
+        for loss in (0.0, 0.1)
+    )
+    assert len(set(lossless.swarm.digest.tolist())) == 1
+    assert len(set(lossy.swarm.digest.tolist())) > 1
+    assert lossless.summary()["slots"]["collision"] == 0
+    assert lossy.summary()["slots"]["collision"] > 0
+
+
+def test_the_same_seed_is_the_same_flight_and_another_seed_another_one() -> None:
+    a, b, c = (fly(agents=8, loss=0.2, seed=seed) for seed in (3, 3, 4))
+    assert plain(a) == plain(b)
+    assert a.trace is not None
+    assert b.trace is not None
+    assert c.trace is not None
+    assert np.array_equal(a.trace.positions(), b.trace.positions())
+    assert not np.array_equal(a.trace.positions()[:100], c.trace.positions()[:100])
+
+
+def test_the_summary_says_what_the_tracks_say() -> None:
+    flight = fly(agents=8, moving=4, avoider="potential", slot_ms=30.0, timeout_s=20.0)
+    assert flight.trace is not None
+    summary, positions = flight.summary(), flight.trace.positions()
+    assert json.loads(json.dumps(summary)) == summary
+    assert summary["end"] == "completed"
+    assert len(positions) == 3 * summary["slots"]["total"]
+    pairs = [(i, j) for i in range(8) for j in range(i)]
+    distance = min(np.linalg.norm(positions[:, :, i] - positions[:, :, j], axis=1).min() for i, j in pairs)
+    assert summary["min_distance_m"] == pytest.approx(distance, abs=1e-12)
+    moving = flight.scenario.moving
+    legs = np.diff(np.concatenate((flight.scenario.start[None], positions)), axis=0)
+    flown = np.linalg.norm(legs, axis=1).sum(axis=0)[moving]
+    direct = np.linalg.norm(positions[-1] - flight.scenario.start, axis=0)[moving]
+    assert summary["efficiency_mean"] == pytest.approx((direct / flown).mean(), rel=1e-9)
+    near = (np.linalg.norm(positions[2::3] - flight.scenario.target, axis=1)[:, moving] <= 0.3).all(axis=1)
+    assert summary["completion_time_s"] == pytest.approx((np.argmax(near) + 1) * 0.03)
+    assert summary["flight_time_s"] == pytest.approx(summary["completion_time_s"] + 1.0, abs=0.03)
+    assert (positions[:, :, ~moving] == flight.scenario.start[:, ~moving]).all()
+
+
+def test_a_crash_ends_the_flight_and_a_timeout_too() -> None:
+    crash = simulate(run(agents=24, estimator="hold", policy="tdma", slot_ms=20.0, timeout_s=20)).summary()
+    assert crash["end"] == "crashed"
+    assert crash["collided"]
+    assert crash["min_distance_m"] < 0.2
+    late = simulate(run(agents=8, timeout_s=0.5)).summary()
+    assert late["end"] == "timed out"
+    assert late["slots"]["total"] == 50
+    assert late["completion_time_s"] is None
+
+
+def test_an_agent_with_a_new_goal_waits_until_it_has_said_so() -> None:
+    for announce in (True, False):
+        flight = fly(agents=6, scenario="staggered", stagger_slots=40, policy="dtsa", announce=announce, timeout_s=6.0)
+        assert flight.trace is not None
+        assert flight.scenario.plan is not None
+        path = np.concatenate((flight.scenario.start[None], flight.trace.positions()))
+        moved = (np.abs(np.diff(path, axis=0)).max(axis=1) > 0).argmax(axis=0)  # first slot in which each moves
+        waited = 0
+        for k in range(6):
+            begin = flight.scenario.plan.begin[k]
+            said = next(slot for slot, ids in enumerate(flight.trace.senders) if slot >= begin and k + 1 in ids)
+            if begin:
+                assert moved[k] == (said + 1 if announce else begin)
+                waited += said > begin
+        assert waited
+
+
+def test_dtsa_chooses_for_the_reasons_that_it_has() -> None:
+    flight = fly(agents=12, moving=6, timeout_s=20.0)
+    assert flight.trace is not None
+    seen = {REASONS[code] for code in flight.trace.reasons}
+    assert {"boot", "priority", "tie", "return"} <= seen
+    assert flight.trace.senders[:12] == [(i,) for i in range(1, 13)]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ("agents", "processes", "loss"),
+    [(12, 2, 0.0), (12, 3, 0.1), (18, 2, 0.15)],  # one process an agent: test_fly.py
+)
+def test_simulate_and_fly_agree_bit_for_bit(tmp_path: Path, agents: int, processes: int, loss: float) -> None:
+    pytest.importorskip("rclpy")
+    from dtsa_bench.flights.flight import fly as fly_nodes
+    from dtsa_bench.flights.options import FlightOptions
+    from dtsa_bench.recordings.bag.reader import Bag
+
+    moving = 2 if agents == 12 else agents
+    config = run(agents=agents, moving=moving, loss=loss, timeout_s=1.5, stop_on_crash=False, seed=agents)
+    real = fly_nodes(config, tmp_path / "flight", FlightOptions(processes=processes, pictures=False))
+    ours = simulate(config, trace=True)
+    assert ours.trace is not None
+    ours_at_start = np.concatenate((ours.scenario.start[None], np.stack([track[-1] for track in ours.trace.tracks])))
+    count = min(len(real.positions), len(ours_at_start))
+    assert count >= 150
+    assert np.array_equal(real.positions[:count], ours_at_start[:count])
+    with Bag(real.bag) as bag:
+        senders = [tuple(int(i) for i in message.sender) for _, message in bag.typed(["/swarm/reception"])]
+    assert senders == ours.trace.senders
+    same = {key: value for key, value in plain(ours).items() if key in real.summary}
+    # One table is summed up as often as many tables are: the mean's last digit differs.
+    error = same.pop("estimate_error_mean_m")
+    assert real.summary["estimate_error_mean_m"] == pytest.approx(error, rel=1e-9)
+    assert {key: real.summary[key] for key in same} == same
+    assert len(same) > 20
+
+
+def test_one_lost_frame_splits_the_views_of_dtsa_but_not_the_choice_of_tdma() -> None:
+    cases = (("dtsa", 0.0), ("dtsa", 0.01), ("tdma", 0.01))
+    whole, torn, tdma = (fly(agents=12, loss=p, policy=name) for name, p in cases)
+    assert whole.summary()["first_divergence_slot"] is None
+    assert whole.summary()["agreement_share"] == whole.summary()["equal_tables_share"] == 1.0
+    assert 0 < torn.summary()["first_divergence_slot"] < 100
+    assert torn.summary()["agreement_share"] < 0.6
+    assert tdma.summary()["equal_tables_share"] < 1.0 == tdma.summary()["agreement_share"]

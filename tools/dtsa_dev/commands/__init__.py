@@ -1,0 +1,1 @@
+"""Commands of a checkout beside those of `dtsa_bench.commands`."""

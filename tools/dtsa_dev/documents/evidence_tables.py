@@ -1,0 +1,180 @@
+"""What the documentation quotes of measurements, made from their records.
+
+A quotation stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`QUOTED`, and its
+record ``docs/evidence/NAME.json``. The command ``python -m dtsa_dev.documents.evidence_tables docs/*.md`` rewrites all
+quotations of these files.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.experiments.batch.table import markdown
+
+Row = dict[str, Any]
+
+_BLOCK = re.compile(r"(<!-- evidence: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+_SIZES = (18, 70, 200)
+_PARTS = ("kernels", "avoidance", "slots", "flights", "nodes")  # of a benchmark, that are quoted
+
+
+def rewritten(text: str, evidence: Path) -> str:
+    """A page with its quotations made again; one without a record stays as it is.
+
+    :param text: the page, Markdown.
+    :param evidence: the directory of records.
+    :raises ConfigError: if a quotation has a name that is none of :data:`QUOTED`.
+    """
+
+    def quotation(found: re.Match[str]) -> str:
+        name = found["name"]
+        if name not in QUOTED:
+            raise ConfigError("evidence", name, ", ".join(QUOTED))
+        record = evidence / f"{name}.json"
+        if not record.exists():
+            return found[0]
+        return f"{found[1]}{QUOTED[name](json.loads(record.read_text(encoding='utf-8')))}{found[3]}"
+
+    return _BLOCK.sub(quotation, text)
+
+
+def speed(record: Row) -> str:
+    """The table of speeds.
+
+    :param record: ``benchmark.json`` of `dtsa benchmark`.
+    :raises ConfigError: if a part is missing that the table quotes.
+    """
+    for part in _PARTS:
+        if part not in record:
+            raise ConfigError("parts", [name for name in _PARTS if name in record], ", ".join(_PARTS))
+    machine = record["machine"]
+    kernels = _by_size(record["kernels"], "priorities of all")
+    avoided = _by_size(record["avoidance"], "avoidance of all")
+    tdma, dtsa = (_by_size(record["slots"], "whole slot", policy) for policy in ("tdma", "dtsa"))
+    flights = [_by_size(_plain(record["flights"]), "flight", policy) for policy in ("tdma", "dtsa")]
+    lines = [
+        ["all priorities g, one thread", *_cells(kernels, lambda row: _us(row["ours_us"]))],
+        ["... against plain NumPy", *_cells(kernels, lambda row: f"{row['ratio']:.0f} x faster")],
+        ["whole slot, tdma (policy, estimates, avoider, physics)", *_cells(tdma, lambda row: _us(row["core_us"]))],
+        ["whole slot, dtsa", *_cells(dtsa, lambda row: _us(row["core_us"]))],
+        ["whole slot in plain NumPy, dtsa", *_cells(dtsa, lambda row: _us(row["numpy_us"]))],
+        ["pyrvo's avoidance step alone, ten neighbours", *_cells(avoided, lambda row: _us(row["pyrvo_ten_us"]))],
+        ["whole slot over that step, tdma", *_cells(tdma, lambda row: f"{row['share_of_pyrvo']:.2f}")],
+        ["whole slot over that step, dtsa", *_cells(dtsa, lambda row: f"{row['share_of_pyrvo']:.2f}")],
+        *(
+            [f"whole flight, {policy}", *_cells(rows, lambda row: f"{_figure(row['best_ms'])} ms")]
+            for policy, rows in zip(("tdma", "dtsa"), flights, strict=True)
+        ),
+    ]
+    heads = ("what", f"{_SIZES[0]} agents", *map(str, _SIZES[1:]))
+    return (
+        f"On {machine['cores']} cores of a server processor, load {machine['load']:.1f} before it began, Python "
+        f"{machine['python']} ([its record](evidence/speed.json), {record['date'][:10]}):\n\n"
+        f"{markdown(heads, lines)}\n\n{_nodes(record['nodes'])}\n{_targets(record['targets'])}"
+    )
+
+
+def fuzz(record: Row) -> str:
+    """What fuzzing found.
+
+    :param record: of `dtsa soak fuzz`.
+    """
+    found, failures = record["figures"], len(record["failures"])
+    return (
+        f"{record['wall_s'] / 60:.0f} minutes of it ([its record](evidence/fuzz.json)): "
+        f"{found['frames: inputs']:,} inputs of decoders and {found['agents: inputs']:,} streams of events, "
+        f"{failures or 'no'} findings.\n"
+    )
+
+
+def mutants(record: Row) -> str:
+    """How many small changes of the source the tests found.
+
+    :param record: of `dtsa soak mutants`.
+    """
+    modules = {name: row for name, row in record["figures"].items() if name != "survivors"}
+    lost = [failure["item"].rsplit(" ", 1)[0] for failure in record["failures"]]
+    lines = [
+        [name, *(str(n) for n in (row["found"], row["equivalent"], lost.count(name)))] for name, row in modules.items()
+    ]
+    found, equivalent = (sum(row[key] for row in modules.values()) for key in ("found", "equivalent"))
+    before = len(record.get("failed_before_they_passed", ()))
+    return (
+        f"{found} of {found + equivalent + len(lost)} are found ([its record](evidence/mutants.json)); {before} of the "
+        "items failed at first, and got a test or a note.\n\n"
+        f"{markdown(('module', 'found', 'nobody can tell', 'not found'), lines)}\n"
+    )
+
+
+def setup(record: Row) -> str:
+    """How many interrupted set-ups ended well.
+
+    :param record: of `dtsa soak setup`.
+    """
+    figures = record["figures"]
+    signals, both = figures["by signal"], figures["with another set-up at the same time"]
+    how = f"{signals['SIGINT']} by Ctrl-C, {signals['SIGKILL']} by SIGKILL"
+    said = (
+        f"After {figures['interruptions that ended well']} interruptions at random moments ({how}) the same command",
+        f"ended well, {both} times with another set-up in the same moment; {len(record['failures'])} chains of",
+        "interruptions failed ([its record](evidence/setup.json)).",
+    )
+    return "\n".join(said) + "\n"
+
+
+def _plain(rows: Iterable[Row]) -> Iterable[Row]:
+    return [row for row in rows if "avoider" not in row and "loss" not in row]
+
+
+def _by_size(rows: Iterable[Row], what: str, policy: str | None = None) -> dict[int, Row]:
+    return {row["agents"]: row for row in rows if row["what"] == what and row.get("policy") == policy}
+
+
+def _cells(rows: dict[int, Row], text: Callable[[Row], str]) -> list[str]:
+    return [text(rows[size]) if size in rows else "" for size in _SIZES]
+
+
+def _figure(value: float) -> str:
+    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+
+
+def _us(value: float) -> str:
+    return f"{_figure(value)} µs"
+
+
+def _nodes(rows: Iterable[Row]) -> str:
+    lines = []
+    for row in rows:
+        bare = f"{row['bare_rounds_per_s']:.0f}" if "bare_rounds_per_s" in row else ""
+        limit = f"{row['limit_per_s']:.0f}" if row["limit_per_s"] else ""
+        lines.append([str(row["agents"]), str(row["processes"]), f"{row['slots_per_s']:.0f}", limit, bare])
+    heads = ("agents", "processes", "slots/s", "target", "rounds/s of bare messages")
+    return f"Nodes in lockstep, recorded:\n\n{markdown(heads, lines)}\n"
+
+
+def _targets(rows: Sequence[Row]) -> str:
+    missed = [f"{row['target']}: {row['value']:.3g}, not {row['limit']:.3g}" for row in rows if not row["met"]]
+    said = f"{len(rows) - len(missed)} of {len(rows)} targets are met"
+    return f"{said}; not: {'; '.join(missed)}.\n" if missed else f"{said}.\n"
+
+
+QUOTED: dict[str, Callable[[Row], str]] = {"speed": speed, "fuzz": fuzz, "mutants": mutants, "setup": setup}
+
+
+def main(paths: Sequence[str]) -> int:
+    """Rewrites pages; records are in the directory ``evidence`` beside each."""
+    for name in paths:
+        path = Path(name)
+        text = path.read_text(encoding="utf-8")
+        path.write_text(rewritten(text, path.parent / "evidence"), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""Computers for trials of agents on a network: network namespaces, switches between them, and strangers."""

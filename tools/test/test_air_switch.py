@@ -1,0 +1,235 @@
+"""The switch of trials: the channel model's medium between cables; and agents on hosts of their own, joined by it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from dtsa_dev.network.hosts import Host, hosts, why_not
+from dtsa_dev.network.intruder import Intruder
+from dtsa_dev.network.switch import Links, Switch
+from dtsa_dev.network.trial import NotFlown, Trial, flight_time, under_way
+from metronome import flown_again_when_overloaded
+
+import dtsa
+from dtsa_agent.air.udp.datagram import Wrapping
+from dtsa_agent.core import Frame, SwarmConfig, encode_frame
+from dtsa_bench.recordings.merge.merge import Merge, verified
+from dtsa_bench.recordings.merge.merged_run import lay
+from dtsa_bench.recordings.merge.merged_writer import write
+from dtsa_bench.recordings.verify import verify_bag
+from dtsa_channel_sim import ChannelConfig
+
+GROUP = ("239.1.2.3", 4567)
+CONFIG = SwarmConfig(agents=3, policy="tdma")
+
+
+def ethernet(payload: bytes, group: tuple[str, int] = GROUP, protocol: int = 17) -> bytes:
+    """A datagram as it is on a cable."""
+    udp = struct.pack("!HHHH", 5000, group[1], 8 + len(payload), 0) + payload
+    head = struct.pack("!BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 1, protocol, 0, b"\x0a\0\0\1",
+                       socket.inet_aton(group[0]))  # fmt: skip
+    return bytes(12) + b"\x08\x00" + head + udp
+
+
+def frame(sender: int, slot: int) -> bytes:
+    """A frame of an agent on a cable."""
+    state = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    return ethernet(Wrapping(CONFIG, None).wrap(encode_frame(Frame(sender, slot, 1, *state)), slot))
+
+
+class Cables:
+    """Three cables, and a switch between them that needs no hosts."""
+
+    def __init__(self, links: Links | None = None, **channel: Any) -> None:
+        self.pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(3)]
+        for pair in self.pairs:
+            for end in pair:
+                end.setblocking(False)
+        joined = [Host(k + 1, "", pair[0].fileno(), -1) for k, pair in enumerate(self.pairs)]
+        self.switch = Switch(joined, GROUP, ChannelConfig(agents=3, link_delay_ns=0, **channel), links)
+
+    def send(self, host: int, data: bytes) -> None:
+        """A host sends."""
+        self.pairs[host - 1][1].send(data)
+
+    def carry_on(self, frames: int) -> None:
+        """Carries until so many frames have left the air."""
+        assert self.switch.run(lambda: len(self.switch.log) >= frames, 30.0)
+
+    def carry(self, frames: int) -> None:
+        """Carries until so many frames have left the air, and a little longer."""
+        self.carry_on(frames)
+        self.switch.run(lambda: False, 0.02)
+
+    def heard(self, host: int) -> list[bytes]:
+        """What has arrived at a host."""
+        found: list[bytes] = []
+        with suppress(BlockingIOError):
+            while True:
+                found.append(self.pairs[host - 1][1].recv(4096))
+        return found
+
+    def close(self) -> None:
+        """All cables are pulled."""
+        for pair in self.pairs:
+            for end in pair:
+                end.close()
+
+
+@pytest.fixture
+def cables() -> Iterator[Cables]:
+    joined = Cables()
+    yield joined
+    joined.close()
+
+
+def test_a_frame_reaches_all_others_as_it_was_sent(cables: Cables) -> None:
+    cables.send(2, frame(2, 7))
+    cables.carry(1)
+    assert [cables.heard(host) for host in (1, 2, 3)] == [[frame(2, 7)], [], [frame(2, 7)]]
+    (seen,) = cables.switch.log
+    assert (seen.sender, seen.agent, seen.slot, seen.received, seen.lost, seen.collided) == (2, 2, 7, 2, 0, 0)
+    # 45 bytes at 2 Mbit/s and the radio's way to sending
+    assert seen.end_ns - seen.start_ns == 130_000 + (73 + 8 * 47) * 500
+
+
+def test_frames_that_overlap_destroy_each_other(cables: Cables) -> None:
+    cables.send(1, frame(1, 3))
+    cables.send(2, frame(2, 3))
+    cables.carry(2)
+    assert [cables.heard(host) for host in (1, 2, 3)] == [[], [], []]
+    assert [seen.collided > 0 for seen in cables.switch.log] == [True, True]
+
+
+def test_a_cut_medium_carries_to_one_side(cables: Cables) -> None:
+    cables.switch.set(partition="1-2 | 3")
+    cables.send(1, frame(1, 3))
+    cables.carry(1)
+    assert [len(cables.heard(host)) for host in (1, 2, 3)] == [0, 1, 0]
+
+
+def test_what_is_no_frame_is_not_on_the_air(cables: Cables) -> None:
+    good = frame(1, 1)
+    strange = (b"", bytes(60), good[:30], good[:50], ethernet(b"x" * 40), frame(1, 1)[:12] + b"\x86\xdd" + good[14:])
+    for data in strange:
+        cables.send(1, data)
+    for other in (ethernet(good[42:], ("239.1.2.4", 4567)), ethernet(good[42:], ("239.1.2.3", 1))):
+        cables.send(1, other)
+    cables.send(1, ethernet(good[42:], protocol=6))
+    cables.send(3, good)
+    cables.carry(1)
+    assert [len(cables.heard(host)) for host in (1, 2, 3)] == [1, 1, 0]
+    assert cables.switch.left_out >= len(strange) + 2
+
+
+def test_links_delay_and_double() -> None:
+    cables = Cables(Links(delay_ns=50_000_000, double=1.0))
+    try:
+        cables.send(1, frame(1, 1))
+        assert cables.switch.run(lambda: len(cables.switch.log) == 1, 30.0)
+        assert cables.heard(2) == []
+        cables.switch.run(lambda: False, 0.1)
+        assert cables.heard(2) == [frame(1, 1)] * 2
+    finally:
+        cables.close()
+
+
+def test_a_stranger_brings_all_what_was_never_on_the_air(cables: Cables) -> None:
+    good = [frame(1 + slot % 3, slot) for slot in range(100)]
+    intruder = Intruder(cables.switch, 1)
+    found: list[bytes] = []
+    for number, data in enumerate(good, 1):
+        cables.send(1, data)
+        cables.carry_on(number)
+        found += cables.heard(2)
+    said = len(found) - len(good)
+    assert said == intruder.said >= len(good)
+    assert all(data in found for data in good)
+    kinds = {Wrapping(CONFIG, None).read(data[42:]).fault for data in found}
+    assert {"", "not ours", "other settings", "no frame"} <= kinds
+    assert len(cables.switch.log) == len(good)
+
+
+def test_a_datagram_takes_as_long_as_agents_are_told() -> None:
+    config = ChannelConfig(agents=3)
+    fixed, byte = flight_time(config.airtime)
+    assert fixed + byte * 68 == config.airtime.total_ns(68)
+
+
+SWARM = SwarmConfig(
+    agents=4, policy="lease", slot_ms=20.0, open_every=0, adoption=False, auth=True, auth_session=5,
+    scenario="waypoints",
+)  # fmt: skip
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+@flown_again_when_overloaded
+def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_path: Path) -> None:
+    """Cold start in random order, drifts, losses; one is killed and comes back; the air is cut in two for a while."""
+    trial = Trial(SWARM, {"loss": 0.1}, seconds=2.0, spread_s=0.3, drift_ppm=50.0)
+    home = os.readlink("/proc/self/ns/net")
+    with under_way(trial, tmp_path) as flight:
+        assert os.readlink("/proc/self/ns/net") == home
+        flight.carry(1.0)
+        flight.signal(2, signal.SIGKILL)
+        flight.switch.set(partition="1-2 | 3-4")
+        flight.start(2)
+        flight.carry(1.0)
+        flight.switch.set(partition="")
+        frames = len([seen for seen in flight.switch.log if seen.sender == 2])
+
+        def back() -> bool:
+            return len([seen for seen in flight.switch.log if seen.sender == 2]) > frames + 3
+
+        assert flight.switch.run(back, 60.0)
+        stranger = Intruder(flight.switch, 1)
+        flight.carry(0.5)
+        flight.end()
+        merged = Merge(flight.bags())
+        found = merged.judge()
+    assert os.readlink("/proc/self/ns/net") == home
+    assert found["broken_off"] == ["cf2"]
+    assert (found["bags"], found["missing"], found["not_on_the_time_line"]) == (5, [], [])
+    assert verified(found), found["decisions_again"]
+    assert found["slots_with_two_senders"] == 0
+    assert found["flight"] is not None
+    assert stranger.said > 10
+    refused = {reason for counts in found["not_taken_in"].values() for reason in counts}
+    assert {"other time", "repeated", "rejected"} <= refused
+    whole = tmp_path / "whole"
+    write(whole, lay(merged, found), found)
+    assert verify_bag(whole).to_dict()["difference"] is None
+    run = dtsa.read_bag(whole)
+    assert run.summary == found["flight"]
+    assert run.frames.lost.sum() > 0
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+def test_hosts_have_clocks_of_their_own() -> None:
+    with hosts(1) as joined:
+        says = [sys.executable, "-c", "import time; print(time.monotonic(), time.time())"]
+        process = joined[0].start(says, 1_000_000, stdout=subprocess.PIPE)
+        monotonic, real = map(float, process.communicate(timeout=60.0)[0].split())
+    if monotonic < time.monotonic() + 900_000:
+        pytest.skip("no time namespaces here")
+    assert abs(monotonic - time.monotonic() - 1_000_000) < 60.0
+    assert abs(real - time.time()) < 60.0
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+def test_an_agent_that_does_not_begin_says_why(tmp_path: Path) -> None:
+    wrong = dataclasses.replace(SWARM, agents=1, policy="dtsa", moving=None)
+    with pytest.raises(NotFlown, match="policy: got 'dtsa'"), under_way(Trial(wrong, spread_s=0.0), tmp_path):
+        pass

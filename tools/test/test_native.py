@@ -1,0 +1,89 @@
+"""libdtsa outside of Python: fuzzed, and on a microcontroller."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from dtsa_dev.proofs.embedded import fly_here, fly_on_cortex
+from dtsa_dev.proofs.fuzz import Found, build, fuzz
+from dtsa_dev.proofs.library import LIBRARY, NotHere
+from dtsa_dev.proofs.prove import MUTANTS, World, explore
+from dtsa_dev.proofs.prove import build as build_prover
+
+
+@pytest.mark.parametrize(("target", "inputs"), [("frames", 200_000), ("agents", 10_000), ("hearing", 20_000)])
+def test_fuzzing_finds_nothing(target: str, inputs: int, tmp_path: Path) -> None:
+    try:
+        program = build(target, tmp_path)
+    except NotHere as error:
+        pytest.skip(str(error))
+    done = fuzz(program, 120, tmp_path / "corpus", seed=1, most=inputs)
+    assert done.runs >= inputs
+    assert done.covered > 50  # it got past the first checks
+
+
+def test_fuzzing_finds_a_missing_check(tmp_path: Path) -> None:
+    broken = shutil.copytree(LIBRARY, tmp_path / "libdtsa")
+    source, check = broken / "frame_extended.c", "if (count > RELAY_IDS) return FRAME_BAD_FIELD;"
+    assert check in source.read_text()
+    source.write_text(
+        source.read_text()
+        .replace(check, "")
+        .replace("i < RELAY_IDS; i++) {\n        e->relay", "i < count; i++) {\n        e->relay")
+    )
+    try:
+        program = build("frames", tmp_path, broken)
+    except NotHere as error:
+        pytest.skip(str(error))
+    with pytest.raises(Found, match=r"overflow|out of bounds|ABRT|deadly"):
+        fuzz(program, 20, tmp_path / "corpus", seed=1)
+
+
+def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
+    try:
+        cortex = fly_on_cortex(tmp_path, slots=30, metered=False)
+    except NotHere as error:
+        pytest.skip(str(error))
+    here = fly_here(tmp_path, slots=30)
+    assert [(flight.policy, flight.agents) for flight in here] == [
+        (policy, agents) for policy in ("tdma", "dtsa", "lease") for agents in (12, 18)
+    ]
+    assert [flight.digest for flight in cortex] == [flight.digest for flight in here]
+    assert len({flight.digest for flight in here}) == 6
+    assert all(flight.memory < 8192 for flight in cortex)
+
+
+def test_code_for_software_doubles_gives_the_same_bits(tmp_path: Path) -> None:
+    """Here, where a longer flight costs nothing: meetings, overlaps, arrivals."""
+    plain, soft = (fly_here(tmp_path, slots=1500, soft=soft) for soft in (False, True))
+    assert [flight.digest for flight in soft] == [flight.digest for flight in plain]
+
+
+@pytest.mark.parametrize("adoption", [False, True])
+def test_every_state_of_three_agents_keeps_the_rules(adoption: bool, tmp_path: Path) -> None:
+    """Through a restart, a death and what it leads to, for all patterns of loss."""
+    claims = 1 if adoption else 0
+    world = World("three agents", 3, adoption=adoption, restarts=1, deaths=1, returns=0, claims=claims)
+    whole = explore(build_prover(tmp_path), world)
+    assert whole.closed
+    assert not whole.broken
+    assert whole.states > 1_000
+
+
+def test_anchors_that_are_given_away_keep_the_rules(tmp_path: Path) -> None:
+    """OPEN turns, adoption, a restart, a wrong claim; one anchor in two is a main one."""
+    world = World(
+        "two agents", 2, anchor_rest=2, open_every=3, adoption=True, restarts=1, deaths=0, returns=0, claims=1
+    )
+    whole = explore(build_prover(tmp_path), world)
+    assert whole.closed
+    assert not whole.broken
+    assert whole.states > 1_000
+
+
+def test_every_broken_rule_is_found(tmp_path: Path) -> None:
+    found = {mutant.rule: explore(build_prover(tmp_path, mutant), mutant.world).broken for mutant in MUTANTS}
+    assert all(found.values()), [rule for rule, broken in found.items() if not broken]
+    assert len({mutant.right for mutant in MUTANTS}) >= 8
