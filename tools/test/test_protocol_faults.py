@@ -143,3 +143,17 @@ def test_a_ledger_notes_a_turn_handed_on_to_its_owner_and_a_claim_in_probation()
     own = dataclasses.replace(own, sender=lessee, slot=turn - 2)
     book.read(turn - 2, lessee, encode_extended(ExtendedFrame(own, relay=((2, 1),))))
     assert book.broken == [f"slot {turn - 2}: agent 2 hands turn {turn} on to 1"]
+
+
+def test_turns_that_an_unrecorded_frame_may_have_given_away_are_counted_and_not_judged() -> None:
+    """A frame that is made too late is not sent; its agent keeps to what it gave away in it all the same."""
+    config = SwarmConfig(agents=3, policy="lease", anchor_every=3, open_every=0, adoption=False)
+    state = ((0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
+    reach = (config.main_every + 2) * config.agents
+    for late, later, broken, unjudged in (((), 0, 1, 0), ((2,), 0, 0, 1), ((2,), reach, 1, 0)):
+        judge = Judge(config)
+        judge.slot(0, {1: encode_extended(ExtendedFrame(Frame(1, 0, 1, *state)))})
+        judge.slot(1, {}, unrecorded=late)
+        wrong = 3 + later  # a turn of agent 1
+        judge.slot(wrong, {2: encode_extended(ExtendedFrame(Frame(2, wrong, 1, *state)))})
+        assert (len(judge.broken), judge.unjudged) == (broken, unjudged)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from dtsa_agent.core import SwarmConfig
@@ -28,15 +28,25 @@ class Judge:
         self._window = (config.main_every + 2) * config.agents if self._ledger else 0
         self._from: int | None = None  # slot
         self.broken: list[str] = []
+        self._known_from = 0  # slot from which on no turn depends on a frame that nobody has recorded
         self.slots = self.frames = 0
+        self.unjudged = 0  # slots that may depend on such a frame
         self.double = 0  # slots with two senders or more
 
-    def slot(self, slot: int, frames: Mapping[int, bytes], unsent: Mapping[int, bytes] | None = None) -> None:
+    def slot(
+        self,
+        slot: int,
+        frames: Mapping[int, bytes],
+        unsent: Mapping[int, bytes] | None = None,
+        unrecorded: Collection[int] = (),
+    ) -> None:
         """A slot in which frames were sent.
 
         :param slot: its number; slots come in ascending order.
         :param frames: the frames as they were on the air, by sender.
         :param unsent: frames, without tags, that were too late to be sent; turns given away in them are given away.
+        :param unrecorded: agents whose frame was too late to be sent and is not known. Such an agent keeps to what it
+            gave away, and may relay it: until those turns are over, slots that seem wrong are counted, not judged.
         """
         if self._from is None:
             self._from = slot + self._window if slot else 0
@@ -48,7 +58,12 @@ class Judge:
             found, self._ledger.broken = self._ledger.broken, []
         else:
             found = self._turns(slot, frames)
+        if unrecorded:
+            self._known_from = slot + self._window
         if slot < self._from:
+            return
+        if found and slot < self._known_from:
+            self.unjudged += 1
             return
         self.slots += 1
         self.frames += len(frames)
@@ -78,6 +93,7 @@ class Judge:
         }  # fmt: skip
         return {
             "slots_judged": self.slots,
+            "slots_not_judged": self.unjudged,
             "frames_judged": self.frames,
             "slots_with_two_senders": self.double,
             **shared,

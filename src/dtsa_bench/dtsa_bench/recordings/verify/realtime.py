@@ -84,6 +84,7 @@ class RealtimeCheck:
         self._starts: dict[int, dict[int, int]] = {}  # ns, by slot and agent
         self._last_stamp = 0
         self._apart = FRAME in bag.topics  # frames have messages of their own
+        self._unsent: dict[int, list[int]] = {}  # agents whose frame was too late to be sent, by slot
         self._told: dict[int, set[int]] = {}  # who is in the transmissions, by slot
 
     def check(self) -> None:
@@ -157,13 +158,13 @@ class RealtimeCheck:
             result.safety["clock_spread_mean_ms"] = float(np.mean(spread)) / 1e6 if spread else 0.0
 
     def _judge(self) -> None:
-        """Whether the frames keep to the rules; those that came too late to be on the air were said all the same."""
+        """Whether the frames keep to the rules; those that came too late to be sent were made all the same."""
         judge = Judge(self.run.swarm)
         slots: dict[int, dict[int, bytes]] = {}
         for sent in self.frames.all():
             slots.setdefault(sent.slot, {})[sent.sender] = sent.data
-        for slot in sorted(slots):
-            judge.slot(slot, slots[slot])
+        for slot in sorted({*slots, *self._unsent}):
+            judge.slot(slot, slots.get(slot, {}), unrecorded=self._unsent.get(slot, ()))
         self.result.take_judgement(judge)
 
     def _fail(
@@ -231,6 +232,12 @@ class RealtimeCheck:
             self._fail("transmission.data", recorded, data.hex(), "the frame that was handed over", slot, agent)
         self._equal_time("transmission.offset_ns", sent.on_air.start_ns, start_ns, slot, agent)
 
+    def _note_unsent(self, said: Any) -> None:
+        """Takes note of the agents that took themselves for the sender and did not send: what they made is unknown."""
+        ids = np.tile(said.agent, len(said.slot))
+        for at in np.flatnonzero((np.asarray(said.chosen) == ids) & (np.asarray(said.length) == 0)):
+            self._unsent.setdefault(int(said.slot[at // len(said.agent)]), []).append(int(ids[at]))
+
     def _reports(self, summary: dict[str, Any]) -> None:
         """What the agents took in had been delivered to them, and what they reported is in the transmissions."""
         intake, untold = Intake(self.frames, self.run.air.link_delay_ns, self.result.slots), 0
@@ -243,6 +250,7 @@ class RealtimeCheck:
                 decisions.report(said)
             if sense is not None:
                 sense.report(said)
+            self._note_unsent(said)
             ids = set(said.agent.tolist())
             untold += sum(len(ids - self._told.get(s, set())) for s in said.slot.tolist() if s < self.result.slots)
         missed = summary.get("missed_reports", untold)

@@ -88,6 +88,9 @@ class Result:
             why = "a turn is its owner's, or of the last one to whom it was given (docs/protocol.md)"
             raise Mismatch(Difference("frames", "none against the rules", "; ".join(judge.broken[:3]), why))
         self.count("slots whose frames keep to the rules", judge.slots)
+        if judge.unjudged:
+            why = "they may depend on frames that were too late to be sent, and that nobody has recorded"
+            self.skipped["frames against the rules"] = f"in {judge.unjudged} slots: {why}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
