@@ -1,5 +1,6 @@
-/* The same flights on any machine: 200 slots of each policy, N = 12 and 18, a tenth of all receptions lost. Prints a digest
- * of all frames, decisions, tables and commands; on a microcontroller also memory, stack and instructions per call. */
+/* The same flights on any machine: 200 slots of each policy, N = 12 and 18, a tenth of all
+ * receptions lost. Prints a digest of all frames, decisions, tables and commands; on a
+ * microcontroller also memory, stack and instructions per call. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>

@@ -1,6 +1,7 @@
-/* Fuzzed: streams of events. The first bytes choose the settings; then each byte is an event of one of two agents: a slot
- * (with or without the other's frame, changed or not), a slot number, a state, a goal, a restart, a leave, a frame of any
- * bytes; besides, a time base hears what it likes, and tags are opened. Nothing may crash, and a digest stays one. */
+/* Fuzzed: streams of events. The first bytes choose the settings; then each byte is an event of one
+ * of two agents: a slot (with or without the other's frame, changed or not), a slot number, a
+ * state, a goal, a restart, a leave, a frame of any bytes; besides, a time base hears what it
+ * likes, and tags are opened. Nothing may crash, and a digest stays one. */
 #include <stdlib.h>
 #include <string.h>
 

@@ -1,5 +1,6 @@
-/* Fuzzed: what an agent on a network makes of datagrams. The first bytes are settings; each datagram has a length, a time
- * and what is to be made of it before: bytes as they are, or a good header, or a whole datagram with a right tag. */
+/* Fuzzed: what an agent on a network makes of datagrams. The first bytes are settings; each
+ * datagram has a length, a time and what is to be made of it before: bytes as they are, or a good
+ * header, or a whole datagram with a right tag. */
 #include <stdlib.h>
 #include <string.h>
 

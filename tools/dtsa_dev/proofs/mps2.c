@@ -1,7 +1,8 @@
 /* Board mps2-an386 (Cortex-M4F), for QEMU: reset, output by semihosting, and what calls cost.
  *
- * Run with -icount shift=5 an instruction takes 32 ns, and the processor's clock of 25 MHz ticks every 40 ns: 5 ticks are
- * 4 x 1.5625 instructions. Stack: painted before a call, looked at after it. */
+ * Run with -icount shift=5 an instruction takes 32 ns, and the processor's clock of 25 MHz ticks
+ * every 40 ns: 5 ticks are 4 x 1.5625 instructions. Stack: painted before a call, looked at after
+ * it. */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>

@@ -1,26 +1,31 @@
-/* Explores policy lease state by state: libdtsa's own code, with every choice of the world tried in every slot.
+/* Explores policy lease state by state: libdtsa's own code, with every choice of the world tried in
+ * every slot.
  *
- * A state is what the agents remember and what can make a difference: who is there, in probation, past an own anchor, waking
- * (with OPEN turns only), and what is known of turns that can be leased; and a ledger of what was given away in frames. What
- * rests on ages and contents is free, in every slot and for each agent on its own, and so covers all that ages and contents
- * can be:
+ * A state is what the agents remember and what can make a difference: who is there, in probation,
+ * past an own anchor, waking (with OPEN turns only), and what is known of turns that can be leased;
+ * and a ledger of what was given away in frames. What rests on ages and contents is free, in every
+ * slot and for each agent on its own, and so covers all that ages and contents can be:
  *
  *   who has something to say, and who knows that it will rest          (goals)
- *   whether a turn is given away, and to whom of those not thought dead (contents; choose_lessee is prove_lessee)
- *   whether a turn is handed on, and to whom                           (contents; choose_next is prove_next)
- *   which turns are OPEN                                               (contents; is_open is prove_open)
- *   whether a mover gives turns away                                   (contents; it may always, and need not)
- *   whom a speaker thinks dead, and whether a hearer thought it dead   (all that absence, silence and gossip can lead to)
+ *   whether a turn is given away, and to whom of those not thought dead
+ *                                              (contents; choose_lessee is prove_lessee)
+ *   whether a turn is handed on, and to whom           (contents; choose_next is prove_next)
+ *   which turns are OPEN                               (contents; is_open is prove_open)
+ *   whether a mover gives turns away                   (contents; it may always, and need not)
+ *   whom a speaker thinks dead, and whether a hearer thought it dead
+ *                                              (all that absence, silence and gossip can lead to)
  *   whether the wait that ends probation with adoption is over         (ages)
  *   whether an OPEN turn is taken, whether gossip names a waker        (draws, gossip)
  *   which one of those that send each receiver hears, or nothing       (loss)
- *   restarts, deaths (or leaving), returns, frames that claim somebody dead: as often as the budgets say
+ *   restarts, deaths (or leaving), returns, frames that claim somebody dead:
+ *                                              as often as the budgets say
  *
  * Breadth first, states compared byte by byte, until there are no new ones.
  *
  *     prove AGENTS M KM S ADOPTION RESTARTS DEATHS RETURNS CLAIMS MOST_STATES
  *
- * prints one line of words and numbers, or the rule that is broken; exit code 1 then. A budget below 0: any number.
+ * prints one line of words and numbers, or the rule that is broken; exit code 1 then. A budget
+ * below 0: any number.
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -119,8 +124,8 @@ static void start(void)
     config.r_min = 0.3;
     config.position_step = 0.002;
     config.lease.share = 1.0;
-    config.targets_known =
-        1; /* who is not heard of is known to set out: leases of any depth from the first round on */
+    config.targets_known = 1; /* who is not heard of is known to set out: leases of any depth from
+                                 the first round on */
     config.lease.patience = PATIENCE;
     config.start = places;
     config.target = places + 3 * n;
@@ -153,7 +158,8 @@ static int64_t take(void) { return *at++; }
 /* Turns are handed on where there is adoption, and there are OPEN turns. */
 static int hands_on(void) { return config.lease.open_every && config.lease.adoption; }
 
-/* An entry of an agent's ring. Who gave a turn away makes no difference without adoption: it was its owner. */
+/* An entry of an agent's ring. Who gave a turn away makes no difference without adoption: it was
+ * its owner. */
 static int entry_byte(int lessee, int issuer)
 {
     const int by = !config.lease.adoption ? 0 : issuer == LEASE_HANDED ? 7 : issuer;
@@ -237,7 +243,8 @@ static void rule(int holds, const char *name)
     if (!holds && !broken) broken = name;
 }
 
-/* Whether a turn that was given away first to agent `first` (an id) is agent k's by now; each hands it on once. */
+/* Whether a turn that was given away first to agent `first` (an id) is agent k's by now; each hands
+ * it on once. */
 static int is_last(const ledger *entry, int first, int k)
 {
     if (first == LEASE_OPEN || !first) return 0;
@@ -253,7 +260,8 @@ static int is_reached(const ledger *entry, int first, int id)
     return first == id;
 }
 
-/* Whether agent k was given a turn, by its owner or an adopter, or by who had it before, and has not handed it on. */
+/* Whether agent k was given a turn, by its owner or an adopter, or by who had it before, and has
+ * not handed it on. */
 static int is_given(const ledger *entry, int k)
 {
     int given = is_last(entry, entry->owner, k);
@@ -267,7 +275,8 @@ static int is_named(const ledger *entry, int k)
     return entry->owner == k + 1 || entry->others >> k & 1 || entry->next[k];
 }
 
-/* To whom a frame says that a turn is given, 0: it says nothing of it. `i` of the relay's ids have been read. */
+/* To whom a frame says that a turn is given, 0: it says nothing of it. `i` of the relay's ids have
+ * been read. */
 static int said_of(const extended_frame *e, int d, int *i)
 {
     if (d <= RELAY_REACH) return e->relay_mask >> (d - 1) & 1 ? e->relay_ids[(*i)++] : 0;
@@ -323,12 +332,14 @@ static void write_down(int sender, const uint8_t *data)
 {
     extended_frame e;
     rule(extended_decode(data, EXTENDED_LENGTH, config.position_step, &e) == FRAME_OK, "frame");
-    rule(!e.c_s || !(e.probation || e.leaving), "14: claims nobody dead in probation, or when it leaves");
+    rule(!e.c_s || !(e.probation || e.leaving),
+         "14: claims nobody dead in probation, or when it leaves");
     if (!broken && e.lease_count) write_given(sender, &e);
     if (!broken) write_handed(sender, &e);
 }
 
-/* Whether its owner sends in an anchor of which it does not know that it has given it away, in an earlier life. */
+/* Whether its owner sends in an anchor of which it does not know that it has given it away, in an
+ * earlier life. */
 static int taken_back(int sender, int probation)
 {
     return probation && slot % n == sender && anchor(slot) && !main_anchor(slot);
@@ -407,7 +418,8 @@ static void speak(int k, uint8_t *frame)
         a->table->in_ap[other] = 1;
         v.miss[other] = v.quiet[other] = 0;
     }
-    /* moving, those up to its next anchor given away or not; idle, all of its turns given away; idle, none of them */
+    /* moving, those up to its next anchor given away or not; idle, all of its turns given away;
+     * idle, none of them */
     const int mood = own && !v.a->probation ? choose(dead ? 3 : 2) : 0;
     v.a->moving = mood == 0;
     v.a->idle_since = mood ? slot : -1;

@@ -184,7 +184,8 @@ int agent_speak(dtsa_agent *a, int64_t slot, uint8_t *out)
     }
     if (c->profile != DTSA_PROFILE_EXTENDED) return frame_encode(&e.own, c->position_step, out);
     if (a->policy->speak) a->policy->speak(a, slot, &e);
-    const int used = (e.lease_count + SECTION_BYTES - 1) / SECTION_BYTES + (e.relay_mask != 0) + (e.far_id != 0);
+    const int used =
+        (e.lease_count + SECTION_BYTES - 1) / SECTION_BYTES + (e.relay_mask != 0) + (e.far_id != 0);
     if (c->gossip)
         e.gossip_count = gossip_collect(a->table, a->self, slot, SECTIONS - used, e.gossip);
     return extended_encode(&e, c->position_step, out);

@@ -1,4 +1,5 @@
-/* Inside libdtsa, and for the layer above it that holds many agents: tables, agents, and what policies are made of. */
+/* Inside libdtsa, and for the layer above it that holds many agents: tables, agents, and what
+ * policies are made of. */
 #ifndef DTSA_CORE_H
 #define DTSA_CORE_H
 
@@ -51,8 +52,8 @@ double priority_of(int n, double slot_s, const double *p, const double *v, int k
 int select_sender(int n, int selection, double epsilon, const double *g, const int64_t *h,
                   const uint8_t *in_ap, uint8_t *candidates, int *reason);
 
-/* urgent.c: as priority_values and select_sender, but g is NaN where the choice does not depend on it. g of the sender is
- * there. */
+/* urgent.c: as priority_values and select_sender, but g is NaN where the choice does not depend on
+ * it. g of the sender is there. */
 int select_urgent(const dtsa_config *config, const double *p, const double *v, const int64_t *h,
                   const uint8_t *in_ap, double *g, double *scratch, int *reason);
 
@@ -102,8 +103,8 @@ int frame_admit(const dtsa_config *config, int64_t slot, const uint8_t *data, lo
 /* A table takes in what was heard. -> whether its sender was not in A_p and is now. */
 int table_take(dtsa_table *table, const heard_frame *heard);
 void agent_take(dtsa_agent *agent, const heard_frame *heard);
-/* A sender's entry for itself is its own last SENT state, whether or not anybody heard it; but for a frame in an OPEN turn,
- * where others may send, too. */
+/* A sender's entry for itself is its own last SENT state, whether or not anybody heard it; but for
+ * a frame in an OPEN turn, where others may send, too. */
 void agent_said(dtsa_agent *a, int64_t slot, const uint8_t *data, long length);
 
 /* gossip.c */
@@ -113,7 +114,8 @@ void gossip_learn(dtsa_table *table, int64_t sampled, const gossip_entry *entry)
 /* The same, of the table's own agent: somebody has heard it. */
 void gossip_confirm(dtsa_table *table, int64_t sampled, const gossip_entry *entry);
 
-/* avoider/avoider.c: command of one agent from others' states as believed, docs/avoiders.md. `ages` may be NULL. */
+/* avoider/avoider.c: command of one agent from others' states as believed, docs/avoiders.md. `ages`
+ * may be NULL. */
 int avoid_scratch_doubles(int n);
 
 #endif

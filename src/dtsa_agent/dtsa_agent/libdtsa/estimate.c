@@ -17,7 +17,8 @@ static void estimate_intent(const dtsa_table *t, int64_t slot, int step, double 
     const int n = c->agents;
     for (int k = 0; k < n; k++) {
         const int64_t ago = t->sent_slot[k] < 0 ? 0 : (slot - t->sent_slot[k]) * c->steps + step;
-        /* A frame of the next slot may be heard before this one is over: nothing has decayed then. */
+        /* A frame of the next slot may be heard before this one is over: nothing has decayed then.
+         */
         const int64_t decayed = ago > 0 ? ago : 0;
         const int at = decayed < c->decay_len ? (int)decayed : c->decay_len - 1;
         const double q = c->decay[at], w = c->decay[c->decay_len + at];
@@ -43,7 +44,8 @@ void estimate_into(const dtsa_table *t, int kind, int64_t slot, int step, double
         estimate_intent(t, slot, step, p, v);
         return;
     }
-    /* hold: position and velocity as last heard. The frame carries the velocity, so the avoider may use it. */
+    /* hold: position and velocity as last heard. The frame carries the velocity, so the avoider may
+     * use it. */
     if (kind == DTSA_ESTIMATE_HOLD)
         memcpy(p, t->sent_p, planes);
     else

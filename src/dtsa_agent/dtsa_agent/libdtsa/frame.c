@@ -5,10 +5,11 @@
  *   3      c_r
  *   4-7    slot in which the state was sampled
  *   8-13   position, 3 x 16 bits, in steps that the swarm agrees on (2 mm)
- *   14-18  velocity, 3 x 12 bits, 1 cm/s, 4 bits zero          (profile paper, 19 bytes)
- *   14-22  velocity and intended velocity, 6 x 12 bits, 1 cm/s (profile paper with intent, 23 bytes)
+ *   14-18  velocity, 3 x 12 bits, 1 cm/s, 4 bits zero          (profile paper)
+ *   14-22  velocity and intended velocity, 6 x 12 bits, 1 cm/s (profile paper with intent)
  *
- * Profile extended begins with the same 23 bytes, but for bytes 2 and 3: see frame_extended.c.
+ * Profile paper has 19 bytes, with intent 23. Profile extended begins with the same 23 bytes, but
+ * for bytes 2 and 3: see frame_extended.c.
  */
 #include <string.h>
 

@@ -49,8 +49,8 @@ typedef struct extended_frame {
 /* ---- frame.c ---- */
 
 int frame_length(int profile); /* bytes, 0 for an unknown profile */
-/* position_step: m, agreed on by the whole swarm; the largest coordinate that fits is 32767 steps. -> length, 0 if a
- * field cannot be said. */
+/* position_step: m, agreed on by the whole swarm; the largest coordinate that fits is 32767 steps.
+ * -> length, 0 if a field cannot be said. */
 int frame_encode(const dtsa_frame *frame, double position_step, uint8_t *out);
 int frame_decode(const uint8_t *data, long length, double position_step, dtsa_frame *frame);
 /* Quantised fields, shared by all profiles; saturate, never wrap. */

@@ -1,13 +1,15 @@
-/* The extended frame: the paper's state, and three sections about others. Layout in docs/protocol.md.
+/* The extended frame: the paper's state, and three sections about others. Layout in
+ * docs/protocol.md.
  *
  *   0      version (high nibble), profile 2 (low nibble)
  *   1      sender's id, 1..254
  *   2      c_s, 0..253; 255: the sender leaves with this frame
- *   3      bit 0: c_r is not 0; bit 1: in probation; bits 2-3, 4-5, 6-7: kinds of the three sections
+ *   3      bit 0: c_r is not 0; bit 1: in probation;
+ *          bits 2-3, 4-5, 6-7: kinds of the three sections
  *   4-22   slot, position, velocity, intended velocity as in profile paper with intent
  *   23-33, 34-44, 45-55   sections:
- *     kind 0, gossip: id (0: empty), age << 1 | c_r is not 0, position 3 x 14 bits at twice the frame's step (4 mm),
- *       velocity 3 x 10 bits at 2 cm/s
+ *     kind 0, gossip: id (0: empty), age << 1 | c_r is not 0, position 3 x 14 bits at twice the
+ *       frame's step (4 mm), velocity 3 x 10 bits at 2 cm/s
  *     kind 1, leases: a byte a turn (0: none, id of the lessee, 255: open)
  *     kind 2, relay: 24 bits, bit d - 1: turn slot + d is leased; then at most 8 lessees
  *     kind 3, far: id of a lessee; 80 bits, bit d - 25: turn slot + d is handed on to it
@@ -21,7 +23,8 @@ enum { KIND_GOSSIP, KIND_LEASES, KIND_RELAY, KIND_FAR };
 
 static const double VELOCITY_STEP = 0.02;
 
-/* Gossip has two bits less for a coordinate than the sender's own state: twice the step, half the extent. */
+/* Gossip has two bits less for a coordinate than the sender's own state: twice the step, half the
+ * extent. */
 static double gossip_step(double position_step) { return 2.0 * position_step; }
 
 int gossip_fits(const double p[3], const double v[3], double position_step)

@@ -15,7 +15,8 @@ static int sayable(const dtsa_table *t, int k)
     return gossip_fits(p, v, t->config->position_step);
 }
 
-/* The newest state of somebody not yet chosen that is `age` slots old or older and can be said; -1: none. */
+/* The newest state of somebody not yet chosen that is `age` slots old or older and can be said; -1:
+ * none. */
 static int newest_of_age(const dtsa_table *t, int self, int64_t slot, int age, const int *chosen,
                          int count)
 {
@@ -31,8 +32,8 @@ static int newest_of_age(const dtsa_table *t, int self, int64_t slot, int age, c
     return best;
 }
 
-/* Every state is said again three times: at once, which mends single losses soonest, and at two later times, which bring it
- * to those who were deaf for a while. */
+/* Every state is said again three times: at once, which mends single losses soonest, and at two
+ * later times, which bring it to those who were deaf for a while. */
 int gossip_collect(const dtsa_table *t, int self, int64_t slot, int room, gossip_entry *out)
 {
     const int n = t->config->agents;
@@ -55,7 +56,8 @@ int gossip_collect(const dtsa_table *t, int self, int64_t slot, int room, gossip
     return count;
 }
 
-/* A state that somebody else heard replaces an older one only; one at the codec's limit may be a wrong one. */
+/* A state that somebody else heard replaces an older one only; one at the codec's limit may be a
+ * wrong one. */
 void gossip_learn(dtsa_table *t, int64_t sampled, const gossip_entry *g)
 {
     if (t->observer != g->id - 1) gossip_confirm(t, sampled, g);

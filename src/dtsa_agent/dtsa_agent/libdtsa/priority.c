@@ -1,10 +1,12 @@
 /* The paper's priority value and selection function.
  *
- *   eta_{j,k} = |v_jk| t_s / |p_kj| * (pi - alpha_jk) / pi,   alpha = arccos(v_jk . p_kj / (|v_jk| |p_kj|))
- *   g_k       = sum over j != k of eta_{j,k}                                  (eq:permission_d_p_ang)
+ *   eta_{j,k} = |v_jk| t_s / |p_kj| * (pi - alpha_jk) / pi
+ *   alpha_jk  = arccos(v_jk . p_kj / (|v_jk| |p_kj|))
+ *   g_k       = sum over j != k of eta_{j,k}                     (eq:permission_d_p_ang)
  *
- * eta is symmetric in j and k, so each pair is computed once. (pi - arccos x) / pi = 1/2 + arcsin(x) / pi, and arcsin is
- * our own polynomial: libm's last bit differs between machines, and agents must agree on every bit.
+ * eta is symmetric in j and k, so each pair is computed once. (pi - arccos x) / pi = 1/2 +
+ * arcsin(x) / pi, and arcsin is our own polynomial: libm's last bit differs between machines, and
+ * agents must agree on every bit.
  */
 #include <math.h>
 
@@ -119,7 +121,8 @@ double priority_of(int n, double slot_s, const double *p, const double *v, int k
     return g + sum_row(n - k - 1, eta + k + 1);
 }
 
-/* The largest counter h among the agents of `set`, the lowest id on ties; -1 if the set is empty. */
+/* The largest counter h among the agents of `set`, the lowest id on ties; -1 if the set is empty.
+ */
 static int oldest(int n, const int64_t *h, const uint8_t *set)
 {
     int best = -1;

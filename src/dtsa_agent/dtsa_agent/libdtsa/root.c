@@ -5,9 +5,10 @@
 
 #ifdef DTSA_SOFT_DOUBLES
 
-/* x = m 4^q with a whole m of 53 or 54 bits; s, the whole root of m 2^52, has 53, and the remainder says how to round. A
- * root of single precision gives the first half of s, remainder / 2 s the rest of it but for 100 units, and once more but
- * for 2. Remainders have less than 62 bits, so their low 64 bits are enough. */
+/* x = m 4^q with a whole m of 53 or 54 bits; s, the whole root of m 2^52, has 53, and the remainder
+ * says how to round. A root of single precision gives the first half of s, remainder / 2 s the rest
+ * of it but for 100 units, and once more but for 2. Remainders have less than 62 bits, so their low
+ * 64 bits are enough. */
 double root(double x)
 {
     uint64_t bits;

@@ -1,5 +1,6 @@
-/* The square root of a double where doubles are software: the same bits as sqrt, by the roots of single precision that such
- * processors have. Compile with -DDTSA_SOFT_DOUBLES to have it, and all else that saves operations there, anywhere. */
+/* The square root of a double where doubles are software: the same bits as sqrt, by the roots of
+ * single precision that such processors have. Compile with -DDTSA_SOFT_DOUBLES to have it, and all
+ * else that saves operations there, anywhere. */
 #ifndef DTSA_ROOT_H
 #define DTSA_ROOT_H
 

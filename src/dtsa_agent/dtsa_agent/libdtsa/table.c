@@ -1,5 +1,5 @@
-/* Tables: what one observer has heard of everybody. Without loss one table can serve all agents, because every agent then
- * hears the same and computes the same. */
+/* Tables: what one observer has heard of everybody. Without loss one table can serve all agents,
+ * because every agent then hears the same and computes the same. */
 #include <string.h>
 
 #include "core.h"

@@ -1,5 +1,6 @@
-/* Which slot it is, where no channel says so: taken from the first frame heard, or from the own clock in silence; and how
- * slots of a group stay together. No clock is read: every function is told what the own clock shows.
+/* Which slot it is, where no channel says so: taken from the first frame heard, or from the own
+ * clock in silence; and how slots of a group stay together. No clock is read: every function is
+ * told what the own clock shows.
  *
  *   LISTENING --- a frame ---> JOINED            the frame says which slot it was sent in
  *       |                        ^  |
@@ -52,7 +53,8 @@ int dtsa_timebase_init(dtsa_timebase *b, int agents, int anchor_every, int64_t s
     memset(b, 0, sizeof *b);
     b->slot_ns = slot_ns;
     b->round_ns = (int64_t)anchor_every * agents * slot_ns;
-    /* Spread over a whole round of anchors: one is the first, and the others hear it while they still listen. */
+    /* Spread over a whole round of anchors: one is the first, and the others hear it while they
+     * still listen. */
     b->wait_ns = b->round_ns + (int64_t)(mixed(seed, (uint64_t)id) % (uint64_t)b->round_ns);
     b->aligner = (dtsa_aligner){.receptions = 9, .share = 32768, .limit_ns = 1000000};
     b->deadline_ns = INT64_MAX;
@@ -97,7 +99,8 @@ int dtsa_timebase_hear(dtsa_timebase *b, int64_t slot, int64_t start_ns)
     }
     const int64_t ahead = b->origin_ns - origin;
     if ((ahead < 0 ? -ahead : ahead) < b->slot_ns / 2) {
-        /* Slot starts move towards the sender's: a frame that came later than expected moves them back. */
+        /* Slot starts move towards the sender's: a frame that came later than expected moves them
+         * back. */
         b->origin_ns += dtsa_align(&b->aligner, -ahead);
         b->state = DTSA_JOINED;
         return DTSA_ALIGNED;

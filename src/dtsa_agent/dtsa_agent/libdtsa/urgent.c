@@ -1,16 +1,18 @@
 /* Who sends by priority, without most of the priorities.
  *
- * The choice depends on who is within epsilon of the greatest g, hardly ever on the last bits of anybody's. So g is first
- * computed in single precision (which microcontrollers have, and of which other processors do twice as many at a time),
- * with bounds that surely contain the double. Exact values are computed for the chosen one, and for those whom the bounds
- * do not separate; the choice is the same in any case.
+ * The choice depends on who is within epsilon of the greatest g, hardly ever on the last bits of
+ * anybody's. So g is first computed in single precision (which microcontrollers have, and of which
+ * other processors do twice as many at a time), with bounds that surely contain the double. Exact
+ * values are computed for the chosen one, and for those whom the bounds do not separate; the choice
+ * is the same in any case.
  *
- * Bounds. Let u = 2^-23, P and V the largest coordinates, d the smallest distance. Rounded input moves p_kj by a share of
- * less than rho = 4 u P / d, and v_jk by less than 4 u V: eta changes by less than (1 + 2 / pi) rho |v| / |p| + 6 u V / d
- * (in units of t_s). Rounded operations move the cosine x by less than delta = 2^-20: arccos x by less than 3 delta /
- * max(sqrt(1 - |x|), sqrt delta), because its slope is less than 1 / sqrt(1 - |x|), and no two arguments
- * that are delta apart have arccosines more than 1.001 sqrt(2 delta) apart. Lengths, series and sums of n terms: less than (n + 40) u
- * |v| / |p|. What is left over pays for terms of second order. */
+ * Bounds. Let u = 2^-23, P and V the largest coordinates, d the smallest distance. Rounded input
+ * moves p_kj by a share of less than rho = 4 u P / d, and v_jk by less than 4 u V: eta changes by
+ * less than (1 + 2 / pi) rho |v| / |p| + 6 u V / d (in units of t_s). Rounded operations move the
+ * cosine x by less than delta = 2^-20: arccos x by less than 3 delta / max(sqrt(1 - |x|), sqrt
+ * delta), because its slope is less than 1 / sqrt(1 - |x|), and no two arguments that are delta
+ * apart have arccosines more than 1.001 sqrt(2 delta) apart. Lengths, series and sums of n terms:
+ * less than (n + 40) u |v| / |p|. What is left over pays for terms of second order. */
 #include <float.h>
 #include <math.h>
 
@@ -18,7 +20,8 @@
 
 enum { WIDE = 8 };
 
-/* Parts of the scratch memory, n floats each. LOW and HIGH: bounds of g; before that g, and the sum of |v| / |p|. */
+/* Parts of the scratch memory, n floats each. LOW and HIGH: bounds of g; before that g, and the sum
+ * of |v| / |p|. */
 enum { PX, PY, PZ, VX, VY, VZ, ETA, SIZE, SLACK, LOW, HIGH, SLACKS, NEAREST };
 
 typedef struct rows {
@@ -28,7 +31,8 @@ typedef struct rows {
 
 static float *row(const rows *r, int which) { return r->at + (long)which * r->n; }
 
-/* Elementwise, as eta_row. The series: arccos a / (pi sqrt(1 - a)) on [0, 1], to 1e-8 (Abramowitz and Stegun, 4.4.46). */
+/* Elementwise, as eta_row. The series: arccos a / (pi sqrt(1 - a)) on [0, 1], to 1e-8 (Abramowitz
+ * and Stegun, 4.4.46). */
 DTSA_SIMD
 static void guess_row(int count, const float *restrict px, const float *restrict py,
                       const float *restrict pz, const float *restrict vx, const float *restrict vy,
@@ -140,7 +144,8 @@ static int bound(const rows *r, const double *p, const double *v)
     return 1;
 }
 
-/* What the bounds say: nobody's top is below `top`, and who is below `out` is no candidate, from `in` on surely one. */
+/* What the bounds say: nobody's top is below `top`, and who is below `out` is no candidate, from
+ * `in` on surely one. */
 typedef struct limits {
     float top, out, in;
 } limits;
@@ -173,7 +178,8 @@ static int oldest_near(int n, const rows *r, const limits *l, const int64_t *h,
     return best;
 }
 
-/* Exact values of those that may or may not be candidates, and of those that may be the greatest; -1: they are many. */
+/* Exact values of those that may or may not be candidates, and of those that may be the greatest;
+ * -1: they are many. */
 static int settle(const dtsa_config *c, const rows *r, const limits *l, const double *p,
                   const double *v, const int64_t *h, const uint8_t *in_ap, double *g, double *eta,
                   int *reason)

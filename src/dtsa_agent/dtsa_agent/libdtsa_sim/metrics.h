@@ -26,11 +26,13 @@ typedef struct metrics {
     double *goal;          /* (3, n) m, where each flies to now; NaN: it does not stop there */
     int64_t *woken;        /* (n) slot in which each that flies got a goal; -1: it stands */
     uint8_t *heard;        /* (n) somebody has heard it since */
-    int64_t *delays;       /* (METRICS_DELAYS) wakings by slots until the first frame was heard; the last: or more */
-    metrics_sums *sums;    /* so far */
+    int64_t *delays; /* (METRICS_DELAYS) wakings by slots until the first frame was heard; the last:
+                        or more */
+    metrics_sums *sums; /* so far */
 } metrics;
 
-/* A slot is over. track: (steps, 3, n) m; tables: NULL: ages do not count. -> METRICS_CRASHED, METRICS_ARRIVED or both. */
+/* A slot is over. track: (steps, 3, n) m; tables: NULL: ages do not count. -> METRICS_CRASHED,
+ * METRICS_ARRIVED or both. */
 int metrics_update(metrics *m, int64_t slot, int steps, const double *track, swarm *tables);
 
 #endif

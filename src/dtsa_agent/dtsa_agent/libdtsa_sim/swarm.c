@@ -1,7 +1,8 @@
 /* Agents in slots, many at once: the same agents that libdtsa makes one of, on arrays of a caller.
  *
- * A slot i, in this order: decide and emit (from what was heard before slot i), fly, hear (what the air carried in
- * slot i), end. Without loss one table can serve all, because every agent then hears the same and computes the same.
+ * A slot i, in this order: decide and emit (from what was heard before slot i), fly, hear (what the
+ * air carried in slot i), end. Without loss one table can serve all, because every agent then hears
+ * the same and computes the same.
  */
 #include "swarm.h"
 

@@ -1,4 +1,5 @@
-/* Many agents and tables at once, with vehicles: what simulator, nodes and verifier hold. Arrays are the caller's. */
+/* Many agents and tables at once, with vehicles: what simulator, nodes and verifier hold. Arrays
+ * are the caller's. */
 #ifndef DTSA_SWARM_H
 #define DTSA_SWARM_H
 

@@ -2,7 +2,8 @@
 
 #include <math.h>
 
-/* One axis triple. Every operation is rounded by itself (no contraction), so the scalar and the vectorised loop agree. */
+/* One axis triple. Every operation is rounded by itself (no contraction), so the scalar and the
+ * vectorised loop agree. */
 static inline void step_one(double tau, double a_max, double dt, double *px, double *py, double *pz,
                             double *vx, double *vy, double *vz, double cx, double cy, double cz)
 {
@@ -12,7 +13,8 @@ static inline void step_one(double tau, double a_max, double dt, double *px, dou
     double norm = sqrt(ax * ax + ay * ay + az * az);
     double scale = norm > a_max ? a_max / norm : 1.0;
     double gain = dt * scale;
-    /* velocity first, then position with the new velocity (semi-implicit Euler); estimator `intent` relies on it */
+    /* velocity first, then position with the new velocity (semi-implicit Euler); estimator `intent`
+     * relies on it */
     *vx += gain * ax;
     *vy += gain * ay;
     *vz += gain * az;

@@ -1,4 +1,5 @@
-/* How a quadcopter answers a velocity command: point mass with first-order response and limited acceleration. */
+/* How a quadcopter answers a velocity command: point mass with first-order response and limited
+ * acceleration. */
 #ifndef DTSA_VEHICLE_H
 #define DTSA_VEHICLE_H
 
@@ -7,9 +8,9 @@ typedef struct {
     double a_max; /* m/s^2, largest acceleration (norm) */
 } vehicle_params;
 
-/* One integration step of dt seconds for one vehicle; position and velocity (3 values, `stride` doubles apart) are
- * updated in place. command: m/s, 3 values, same stride. Semi-implicit Euler: the position moves
- * with the new velocity. */
+/* One integration step of dt seconds for one vehicle; position and velocity (3 values, `stride`
+ * doubles apart) are updated in place. command: m/s, 3 values, same stride. Semi-implicit Euler:
+ * the position moves with the new velocity. */
 void vehicle_step(const vehicle_params *params, double dt, double *position, double *velocity,
                   const double *command, int stride);
 

@@ -1,8 +1,9 @@
 /* The binding of libdtsa: what Python can call; _kernel.pyi says what each function does.
  *
- * What crosses are whole numbers, doubles and bytes, and the images of structures that live on (a swarm, metrics):
- * core/binding.py makes them, and their arrays are NumPy's, borrowed by address, so that both sides look at the same memory.
- * All in the limited API: one compiled module serves Python 3.10 and all later versions. */
+ * What crosses are whole numbers, doubles and bytes, and the images of structures that live on (a
+ * swarm, metrics): core/binding.py makes them, and their arrays are NumPy's, borrowed by address,
+ * so that both sides look at the same memory. All in the limited API: one compiled module serves
+ * Python 3.10 and all later versions. */
 #define Py_LIMITED_API 0x030A0000
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -15,9 +16,10 @@
 
 /* ---- arguments: a function says by letters what it takes ---- */
 
-/* q whole number, d double, y bytes, o any object; s swarm, m metrics; of the swarm: i local index, k control instant, K the
- * same but not the last. Bytes that are arrays: 3 three doubles; of the same n: P (3, n) doubles, G n values of eight bytes,
- * B n bytes. z, g, t: y, G, s or None, for which `at` is NULL. */
+/* q whole number, d double, y bytes, o any object; s swarm, m metrics; of the swarm: i local index,
+ * k control instant, K the same but not the last. Bytes that are arrays: 3 three doubles; of the
+ * same n: P (3, n) doubles, G n values of eight bytes, B n bytes. z, g, t: y, G, s or None, for
+ * which `at` is NULL. */
 typedef struct value {
     int64_t whole;
     double real;

@@ -21,7 +21,8 @@ int avoid_vector_level(int level)
 
 int avoid_scratch_doubles(int n) { return PLANES * avoid_plane_length(n); }
 
-/* Leaves alone what exceeds v_max by rounding only: for a vector that was limited before the branch would be a toss. */
+/* Leaves alone what exceeds v_max by rounding only: for a vector that was limited before the branch
+ * would be a toss. */
 static inline void limit(double v[3], double v_max)
 {
     double squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
@@ -42,7 +43,9 @@ static void prefer(const dtsa_avoid_params *params, const double position[3], co
     limit(preferred, params->v_max);
 }
 
-/* --- one agent ------------------------------------------------------------------------------------------------- */
+/* --- one agent
+ * -------------------------------------------------------------------------------------------------
+ */
 
 void avoid_command(int kind, const dtsa_avoid_params *params, int n, int self,
                    const double position[3], const double velocity[3], const double goal[3],

@@ -1,6 +1,7 @@
-/* Buffered Voronoi cells: fly to the point of the own cell that is nearest to the goal. The rules are those of the
- * Crazyflie firmware's collision avoidance in position mode (cell, box, step to the right near a wall, stay if the cell is
- * empty); the projection is this project's own solver with a stiff penalty instead of Dykstra's sweeps. */
+/* Buffered Voronoi cells: fly to the point of the own cell that is nearest to the goal. The rules
+ * are those of the Crazyflie firmware's collision avoidance in position mode (cell, box, step to
+ * the right near a wall, stay if the cell is empty); the projection is this project's own solver
+ * with a stiff penalty instead of Dykstra's sweeps. */
 #include <math.h>
 
 #include "internal.h"
@@ -10,7 +11,8 @@
 #define TOLERANCE                                                                                  \
     1e-4 /* m, a wall violated by more than this: the cell is empty (as in the firmware) */
 
-/* Walls a.x <= c of the cell around the own position, unit normals, stored as n = -a, b = -c; returns how many. */
+/* Walls a.x <= c of the cell around the own position, unit normals, stored as n = -a, b = -c;
+ * returns how many. */
 static int bvc_walls(const avoid_query *q)
 {
     const dtsa_avoid_params *params = q->params;

@@ -24,7 +24,8 @@ void avoid_orca(const avoid_query *query, double command[3]);
 void avoid_potential(const avoid_query *query, double command[3]);
 void avoid_bvc(const avoid_query *query, double command[3]);
 
-/* Planes of the scratch memory, each long enough for n neighbours, 6 box faces and padding to whole vectors. */
+/* Planes of the scratch memory, each long enough for n neighbours, 6 box faces and padding to whole
+ * vectors. */
 enum { PLANE_X, PLANE_Y, PLANE_Z, PLANE_B, PLANE_BITS, PLANES };
 
 static inline int avoid_plane_length(int n) { return (n + 6 + 3) / 4 * 4 + 4; }

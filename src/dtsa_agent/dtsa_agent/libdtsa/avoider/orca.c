@@ -1,4 +1,5 @@
-/* Reciprocal avoidance in three dimensions, soft: one half-plane of velocities for each neighbour within reach. */
+/* Reciprocal avoidance in three dimensions, soft: one half-plane of velocities for each neighbour
+ * within reach. */
 #include "internal.h"
 #include "root.h"
 
@@ -19,8 +20,8 @@ AVOID_INLINE v4d orca_margin(const dtsa_avoid_params *params, v4d age)
                   v4_all(0.0));
 }
 
-/* Those of one block that are within reach, appended to `who`; returns their number. Without branches: which agents are
- * near is anybody's guess, and a wrong one costs more than the work. */
+/* Those of one block that are within reach, appended to `who`; returns their number. Without
+ * branches: which agents are near is anybody's guess, and a wrong one costs more than the work. */
 AVOID_INLINE int orca_append(int32_t *who, int first, int self, v4d dx, v4d dy, v4d dz, v4d reach)
 {
     int bits = v4_bits(dx * dx + dy * dy + dz * dz < reach * reach);
@@ -29,8 +30,8 @@ AVOID_INLINE int orca_append(int32_t *who, int first, int self, v4d dx, v4d dy, 
     return LANE_COUNTS[bits];
 }
 
-/* Writes the indices of the neighbours within R_c + 2 v_max T in ascending order; returns how many. Whoever's position is
- * not a number fails the comparison. */
+/* Writes the indices of the neighbours within R_c + 2 v_max T in ascending order; returns how many.
+ * Whoever's position is not a number fails the comparison. */
 AVOID_INLINE int orca_neighbours(const avoid_query *q, int32_t *who)
 {
     const dtsa_avoid_params *params = q->params;
@@ -63,8 +64,8 @@ AVOID_INLINE v4d orca_gather(const double *plane, const int32_t *who)
     return (v4d){plane[who[0]], plane[who[1]], plane[who[2]], plane[who[3]]};
 }
 
-/* Velocities exactly at the centre of the obstacle have no nearest way out: go straight away from the neighbour. Two
- * agents at the very same point part along x, in the order of their ids. */
+/* Velocities exactly at the centre of the obstacle have no nearest way out: go straight away from
+ * the neighbour. Two agents at the very same point part along x, in the order of their ids. */
 AVOID_INLINE void orca_part(int self, const int32_t *who, v4i lanes, const v4d r[3], v4d *nx,
                             v4d *ny, v4d *nz)
 {
@@ -79,9 +80,10 @@ AVOID_INLINE void orca_part(int self, const int32_t *who, v4i lanes, const v4d r
     }
 }
 
-/* Half-planes n.v >= b of the m neighbours (planes X, Y, Z, B); returns the number of whole vectors.
- * With w = w0 - s r the three cases of RVO2-3D differ in s only: 1 / T_s when they overlap already, 1 / T at the round end
- * of the velocity obstacle, and t on its cone; kappa = R_c s - |w|. */
+/* Half-planes n.v >= b of the m neighbours (planes X, Y, Z, B); returns the number of whole
+ * vectors. With w = w0 - s r the three cases of RVO2-3D differ in s only: 1 / T_s when they overlap
+ * already, 1 / T at the round end of the velocity obstacle, and t on its cone; kappa = R_c s - |w|.
+ */
 AVOID_INLINE int orca_half_planes(const avoid_query *q, int32_t *who, int m)
 {
     const dtsa_avoid_params *params = q->params;
@@ -116,8 +118,8 @@ AVOID_INLINE int orca_half_planes(const avoid_query *q, int32_t *who, int m)
         const v4d ex = ux - per_horizon * x, ey = uy - per_horizon * y, ez = uz - per_horizon * z;
         const v4d er = ex * x + ey * y + ez * z;
         const v4i round_end = (er < zero) & (er * er > rc * rc * (ex * ex + ey * ey + ez * ez));
-        /* cone: (r.w0)^2 - |r|^2 c = R_c^2 |r x w0|^2 / (|r|^2 - R_c^2), which cannot turn negative by rounding
-         * (overlapping lanes may hold NaN here; they take another s) */
+        /* cone: (r.w0)^2 - |r|^2 c = R_c^2 |r x w0|^2 / (|r|^2 - R_c^2), which cannot turn negative
+         * by rounding (overlapping lanes may hold NaN here; they take another s) */
         const v4d cx = y * uz - z * uy, cy = z * ux - x * uz, cz = x * uy - y * ux;
         const v4d cross2 = cx * cx + cy * cy + cz * cz;
         const v4d t = (ru * outside + rc * v4_sqrt(cross2 * outside)) / (outside * r2);

@@ -1,12 +1,14 @@
-/* orca.c for processors whose doubles are software: the same bits with as few operations on doubles as can be.
+/* orca.c for processors whose doubles are software: the same bits with as few operations on doubles
+ * as can be.
  *
- * A neighbour counts where a point that the solver looks at violates its half-plane. Single precision, which such
- * processors have, says of most that they do not: the half-plane of a neighbour is computed when that is not certain. What
- * is left out adds zeros to sums in orca.c; the order of the sums, in four lanes, is the same.
+ * A neighbour counts where a point that the solver looks at violates its half-plane. Single
+ * precision, which such processors have, says of most that they do not: the half-plane of a
+ * neighbour is computed when that is not certain. What is left out adds zeros to sums in orca.c;
+ * the order of the sums, in four lanes, is the same.
  *
- * Bound. The half-plane is n.x >= n.v + kappa / 2, and -kappa is the distance of u from the velocity obstacle, which is
- * at least `away`; so no point nearer to v than away / 2 violates it. `away` is the distance from the infinite cone, or
- * from the plane in front of its round end. */
+ * Bound. The half-plane is n.x >= n.v + kappa / 2, and -kappa is the distance of u from the
+ * velocity obstacle, which is at least `away`; so no point nearer to v than away / 2 violates it.
+ * `away` is the distance from the infinite cone, or from the plane in front of its round end. */
 #include "root.h"
 
 #ifdef DTSA_SOFT_DOUBLES

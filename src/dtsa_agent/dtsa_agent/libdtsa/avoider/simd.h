@@ -1,5 +1,6 @@
-/* Four doubles at a time, in plain C with GCC's and clang's vector extensions: the same source is compiled for the
- * baseline and for AVX2, every lane is an IEEE operation of its own, and sums over lanes have one fixed order. */
+/* Four doubles at a time, in plain C with GCC's and clang's vector extensions: the same source is
+ * compiled for the baseline and for AVX2, every lane is an IEEE operation of its own, and sums over
+ * lanes have one fixed order. */
 #ifndef DTSA_AVOIDER_SIMD_H
 #define DTSA_AVOIDER_SIMD_H
 
@@ -11,7 +12,8 @@
 #include <emmintrin.h>
 #endif
 
-/* Everything below is inlined into its callers, so no vector is ever passed by an ABI that could differ. */
+/* Everything below is inlined into its callers, so no vector is ever passed by an ABI that could
+ * differ. */
 #pragma GCC diagnostic ignored "-Wpsabi"
 
 #define AVOID_INLINE static inline __attribute__((always_inline))

@@ -1,8 +1,8 @@
 /* The point nearest to a wish under soft half-spaces, exactly:
  *     minimise |x - x0|^2 / 2 + rho / 2 * sum_j max(0, b_j - n_j.x)^2        over x in R^3
- * The function is strongly convex and piecewise quadratic: Newton's method with a line search ends after a few passes, as
- * soon as a full step leaves the set of violated half-spaces as it was. It is the same problem whose dual Hildreth's
- * sweeps climb slowly. */
+ * The function is strongly convex and piecewise quadratic: Newton's method with a line search ends
+ * after a few passes, as soon as a full step leaves the set of violated half-spaces as it was. It
+ * is the same problem whose dual Hildreth's sweeps climb slowly. */
 #ifndef DTSA_AVOIDER_SOLVER_H
 #define DTSA_AVOIDER_SOLVER_H
 
@@ -114,7 +114,8 @@ SOLVER_STEP void soft_newton(const soft_pass *h, const soft_pass *g, double step
     step[2] = scale * (c * g->gx + e * g->gy + f * g->gz);
 }
 
-/* Writes the minimiser; returns 1 if it was reached, 0 if the steps ran out (then x is the best point found). */
+/* Writes the minimiser; returns 1 if it was reached, 0 if the steps ran out (then x is the best
+ * point found). */
 AVOID_INLINE int soft_minimise(const soft_problem *p, double x[3])
 {
     soft_pass here, there;
@@ -138,7 +139,8 @@ AVOID_INLINE int soft_minimise(const soft_problem *p, double x[3])
         }
         for (int axis = 0; axis < 3; axis++) x[axis] = to[axis];
         if (t == 1.0 && !there.changed) {
-            /* the minimiser of this piece; once more with its own gradient removes the rounding of the first step */
+            /* the minimiser of this piece; once more with its own gradient removes the rounding of
+             * the first step */
             soft_newton(&here, &there, step);
             for (int axis = 0; axis < 3; axis++) x[axis] += step[axis];
             return 1;

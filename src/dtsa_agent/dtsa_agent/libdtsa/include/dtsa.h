@@ -1,24 +1,28 @@
-/* libdtsa: one agent of a swarm that shares a radio channel in slots. Protocol and frames: docs/protocol.md.
+/* libdtsa: one agent of a swarm that shares a radio channel in slots. Protocol and frames:
+ * docs/protocol.md.
  *
- * No Python, ROS, clock, heap, I/O, or function of libm but sqrt: the caller owns memory, time and radio. All agents
- * compute the same bits on every machine with IEEE 754 doubles: compile without fast-math and with -ffp-contract=off.
+ * No Python, ROS, clock, heap, I/O, or function of libm but sqrt: the caller owns memory, time and
+ * radio. All agents compute the same bits on every machine with IEEE 754 doubles: compile without
+ * fast-math and with -ffp-contract=off.
  *
- * Ids count from 1, as in the paper; indices are id - 1. Times are slot numbers, or ns of the caller's own clock. Metres,
- * m/s, frame map. A vector of N agents is three planes of N doubles: all x, all y, all z.
+ * Ids count from 1, as in the paper; indices are id - 1. Times are slot numbers, or ns of the
+ * caller's own clock. Metres, m/s, frame map. A vector of N agents is three planes of N doubles:
+ * all x, all y, all z.
  *
  * Use:
- *     size_t bytes = dtsa_agent_bytes(&config);              once; 0: the configuration is not usable
+ *     size_t bytes = dtsa_agent_bytes(&config);              once; 0: config is not usable
  *     dtsa_agent *agent = dtsa_agent_start(memory, bytes, &config, id);
  *     in every slot:
- *         dtsa_agent_set_state(agent, position, velocity);   own true state at the start of the slot
+ *         dtsa_agent_set_state(agent, position, velocity);   own state at the slot's start
  *         length = dtsa_agent_slot(agent, slot, frame);      decides; > 0: send these bytes now
  *         dtsa_agent_command(agent, slot, step, command);    where to fly, at each control instant
  *         dtsa_agent_hear(agent, slot, data, length);        for each frame received
  *         dtsa_agent_end(agent, slot);                       the slot is over
  *
- * Version: major * 100 + minor. The minor number grows when something is added at the end of a structure or a list, or a
- * function is added; the major number when anything else here changes, or the bytes of a frame do. Structures are filled
- * by name; a field that is zero has the meaning it had before there was such a field.
+ * Version: major * 100 + minor. The minor number grows when something is added at the end of a
+ * structure or a list, or a function is added; the major number when anything else here changes, or
+ * the bytes of a frame do. Structures are filled by name; a field that is zero has the meaning it
+ * had before there was such a field.
  */
 #ifndef DTSA_H
 #define DTSA_H
@@ -92,8 +96,8 @@ enum {
     DTSA_REASON_COUNT
 };
 
-/* Parameters of all avoiders; which fields count depends on the avoider. Formulas and defaults: docs/avoiders.md. All are
- * doubles, so that bindings can read them as a list. */
+/* Parameters of all avoiders; which fields count depends on the avoider. Formulas and defaults:
+ * docs/avoiders.md. All are doubles, so that bindings can read them as a list. */
 typedef struct dtsa_avoid_params {
     double v_max;       /* m/s, largest commanded speed */
     double gain;        /* 1/s, K_P: v_pref = min(v_max, gain * distance) towards the goal */
@@ -121,9 +125,10 @@ typedef struct dtsa_lease_config {
     int adoption;   /* the turns of the dead are given away by the next one alive */
     double depth_rate; /* c: turns given away per round of idleness */
     double share;      /* no leases when more than this share of those alive has something to say */
-    int64_t
-        patience; /* slots of silence after which an agent is thought absent; 0: max(1000, 6 M N), 6 K M N if it rests */
-    int main_every; /* K M: every so many rounds an anchor is a main one, a multiple of M, 15 at most; 0: M */
+    int64_t patience;  /* slots of silence after which an agent is thought absent; 0: max(1000, 6 M
+                          N), 6 K M N if it rests */
+    int main_every;    /* K M: every so many rounds an anchor is a main one, a multiple of M, 15 at
+                          most; 0: M */
 } dtsa_lease_config;
 
 typedef struct dtsa_config {
@@ -149,7 +154,8 @@ typedef struct dtsa_config {
 /* The name of a field that is out of range; NULL: all are fine. */
 DTSA_API const char *dtsa_config_fault(const dtsa_config *config);
 
-/* Names of everything that has a number: policies, estimators, avoiders, selections, profiles, reasons. */
+/* Names of everything that has a number: policies, estimators, avoiders, selections, profiles,
+ * reasons. */
 typedef struct dtsa_name_list {
     const char *kind;
     const char *const *names;
@@ -158,8 +164,8 @@ typedef struct dtsa_name_list {
 
 DTSA_API const dtsa_name_list *dtsa_names(int list); /* NULL: there are no more */
 
-/* How an unsaturated vehicle with time constant tau (s) approaches its command: q^k, and dt (q + .. + q^k), with q = 1 -
- * dt / tau, for k = 0 .. length - 1. */
+/* How an unsaturated vehicle with time constant tau (s) approaches its command: q^k, and dt (q + ..
+ * + q^k), with q = 1 - dt / tau, for k = 0 .. length - 1. */
 DTSA_API void dtsa_decay(double tau, double dt, int length, double *table);
 
 /* ---- an agent ---- */
@@ -187,8 +193,9 @@ typedef struct dtsa_status {
 /* Bytes of memory that an agent needs; 0: the configuration is not usable. */
 DTSA_API size_t dtsa_agent_bytes(const dtsa_config *config);
 
-/* An agent in `memory`, aligned for doubles; NULL if it is too small, or id or configuration are not usable. It keeps a
- * pointer to the configuration. It is at its start position and wants to fly to its target. */
+/* An agent in `memory`, aligned for doubles; NULL if it is too small, or id or configuration are
+ * not usable. It keeps a pointer to the configuration. It is at its start position and wants to fly
+ * to its target. */
 DTSA_API dtsa_agent *dtsa_agent_start(void *memory, size_t bytes, const dtsa_config *config,
                                       int id);
 
@@ -198,7 +205,8 @@ DTSA_API void dtsa_agent_restart(dtsa_agent *agent);
 /* Switched off it neither decides nor sends, and forgets everything. */
 DTSA_API void dtsa_agent_switch(dtsa_agent *agent, int on);
 
-/* It leaves: with policy lease after a frame in its next own turn that says so, with others at once. */
+/* It leaves: with policy lease after a frame in its next own turn that says so, with others at
+ * once. */
 DTSA_API void dtsa_agent_leave(dtsa_agent *agent);
 DTSA_API int dtsa_agent_is_on(const dtsa_agent *agent);
 
@@ -209,19 +217,21 @@ DTSA_API void dtsa_agent_set_state(dtsa_agent *agent, const double position[3],
 /* final: no further goal is scheduled. */
 DTSA_API void dtsa_agent_set_goal(dtsa_agent *agent, const double goal[3], int final);
 
-/* A slot opens. Returns the length of the frame to send in it, 0: it is silent. Slots ascend; none has to be missed, but
- * they may be. */
+/* A slot opens. Returns the length of the frame to send in it, 0: it is silent. Slots ascend; none
+ * has to be missed, but they may be. */
 DTSA_API int dtsa_agent_slot(dtsa_agent *agent, int64_t slot, uint8_t frame[DTSA_FRAME_MAX]);
 DTSA_API dtsa_decision dtsa_agent_decision(const dtsa_agent *agent);
 
-/* A frame was heard in a slot, before the slot's end; also the own one may be handed in. Returns whether it was one of
- * this swarm and time. Anything may be handed in: what is no frame is counted. */
+/* A frame was heard in a slot, before the slot's end; also the own one may be handed in. Returns
+ * whether it was one of this swarm and time. Anything may be handed in: what is no frame is
+ * counted. */
 DTSA_API int dtsa_agent_hear(dtsa_agent *agent, int64_t slot, const uint8_t *data, long length);
 
 /* A slot is over: all that was heard in it has been handed in. */
 DTSA_API void dtsa_agent_end(dtsa_agent *agent, int64_t slot);
 
-/* Commanded velocity at control instant `step` of a slot; frames carry the last one where the profile says so. */
+/* Commanded velocity at control instant `step` of a slot; frames carry the last one where the
+ * profile says so. */
 DTSA_API void dtsa_agent_command(dtsa_agent *agent, int64_t slot, int step, double command[3]);
 
 DTSA_API dtsa_status dtsa_agent_status(const dtsa_agent *agent);
@@ -230,8 +240,8 @@ DTSA_API dtsa_status dtsa_agent_status(const dtsa_agent *agent);
 
 enum { DTSA_ALIGN_MAX = 15 };
 
-/* Turns arrival offsets of heard frames into small shifts of the own slots: after every `receptions` usable ones by `share`
- * / 65536 of their median. */
+/* Turns arrival offsets of heard frames into small shifts of the own slots: after every
+ * `receptions` usable ones by `share` / 65536 of their median. */
 typedef struct dtsa_aligner {
     int receptions;   /* 1 .. DTSA_ALIGN_MAX; 9 */
     int32_t share;    /* 1 .. 65536; 32768 */
@@ -241,8 +251,8 @@ typedef struct dtsa_aligner {
     uint32_t corrections, ignored, ignored_in_a_row;
 } dtsa_aligner;
 
-/* By how much the own slots move now, ns (0 most of the time). offset_ns: when a frame arrived minus when the own clock
- * expected it. */
+/* By how much the own slots move now, ns (0 most of the time). offset_ns: when a frame arrived
+ * minus when the own clock expected it. */
 DTSA_API int64_t dtsa_align(dtsa_aligner *aligner, int64_t offset_ns);
 DTSA_API void dtsa_align_reset(dtsa_aligner *aligner);
 
@@ -276,10 +286,12 @@ DTSA_API int dtsa_timebase_hear(dtsa_timebase *base, int64_t slot, int64_t start
 
 /* ---- authentication: a frame is followed by 4 bytes that only holders of the key can make ---- */
 
-/* BLAKE2s, keyed, person "dtsa v1", over session (8 bytes), slot (8 bytes) and data. key_length: 16 .. 32. */
+/* BLAKE2s, keyed, person "dtsa v1", over session (8 bytes), slot (8 bytes) and data. key_length: 16
+ * .. 32. */
 DTSA_API void dtsa_tag(const uint8_t *key, int key_length, uint64_t session, uint64_t slot,
                        const uint8_t *data, long length, uint8_t tag[DTSA_TAG_BYTES]);
-/* Length of the frame without its tag, 0: it is not authentic. It may come `late` slots after its own. */
+/* Length of the frame without its tag, 0: it is not authentic. It may come `late` slots after its
+ * own. */
 DTSA_API long dtsa_open(const uint8_t *key, int key_length, uint64_t session, int64_t slot,
                         int late, const uint8_t *data, long length);
 

@@ -1,4 +1,5 @@
-/* ALOHA: each agent in A_p sends with probability 1 / N_p, by a seeded draw that depends on slot and id only. */
+/* ALOHA: each agent in A_p sends with probability 1 / N_p, by a seeded draw that depends on slot
+ * and id only. */
 #include "policy.h"
 
 static choice aloha_decide(dtsa_agent *a, int64_t slot)

@@ -31,7 +31,8 @@ const policy_row *policy_of(int number); /* NULL: there is none */
 /* common.c: what several policies do */
 choice choose_nobody(void);
 choice choose_outside(const dtsa_table *table, int64_t slot); /* return_every */
-/* Fills the counters h; -> number of members of A_p, and of these the one with the largest h (-1: none). */
+/* Fills the counters h; -> number of members of A_p, and of these the one with the largest h (-1:
+ * none). */
 int count_members(dtsa_table *table, int64_t slot, int *oldest);
 void end_counters(dtsa_agent *agent, int64_t slot); /* eq:secondary */
 

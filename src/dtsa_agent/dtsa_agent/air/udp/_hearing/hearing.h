@@ -1,6 +1,8 @@
-/* What an agent on a network makes of datagrams: whose they are, what time they say it is, how long they were under way.
+/* What an agent on a network makes of datagrams: whose they are, what time they say it is, how long
+ * they were under way.
  *
- * The same is said in plain Python by air/udp/plain_hearing.py and what it is made of; tests compare the two. Times are ns. */
+ * The same is said in plain Python by air/udp/plain_hearing.py and what it is made of; tests
+ * compare the two. Times are ns. */
 #ifndef DTSA_HEARING_H
 #define DTSA_HEARING_H
 

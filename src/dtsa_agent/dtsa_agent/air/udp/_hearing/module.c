@@ -1,4 +1,5 @@
-/* The binding of what an agent on a network hears to Python; _hearing.pyi says what each method does. In the limited API. */
+/* The binding of what an agent on a network hears to Python; _hearing.pyi says what each method
+ * does. In the limited API. */
 #define Py_LIMITED_API 0x030A0000
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>

@@ -89,8 +89,8 @@ void hearing_receive(hearing *h)
     if (count < 0 && errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR)
         h->unreadable++; /* an interface that has gone, for example: it may come back */
     if (!h->count) return;
-    stamps_look(
-        &h->stamps); /* afterwards: however long this process was kept waiting, all have arrived before */
+    stamps_look(&h->stamps); /* afterwards: however long this process was kept waiting, all have
+                                arrived before */
     for (int i = 0; i < h->count; i++) {
         arrived *a = &h->batch[i];
         a->arrival = stamps_arrival(&h->stamps, stamp_of(&h->vector[i].msg_hdr));

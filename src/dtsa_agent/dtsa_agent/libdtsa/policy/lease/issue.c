@@ -1,4 +1,5 @@
-/* Policy lease: what an agent says about turns: those it gives away, and those it knows to be given away. */
+/* Policy lease: what an agent says about turns: those it gives away, and those it knows to be given
+ * away. */
 #include <math.h>
 #include <string.h>
 
@@ -10,17 +11,19 @@ enum {
     KEPT_EVERY = 2,  /* who may get another goal keeps its turn of every so many rounds */
     ROUNDS_TOLD = 3, /* who has arrived says so for so many rounds, where frames are lost */
     MORE = 2, /* a mover hands on turns that are worth so many times as much to somebody else */
-    MUCH_MORE = 3 /* ... where many frames are lost, so that some of those named do not learn of it */
+    MUCH_MORE =
+        3 /* ... where many frames are lost, so that some of those named do not learn of it */
 };
 
 typedef struct {
-    int alive;    /* N_alive: me and those heard of lately */
-    int members;  /* N_p: those in A_p that do not miss their turns */
-    int block;    /* one turn in so many is OPEN, 0: none */
-    int informed; /* all have spoken, or all know where all want to be */
-    int lends; /* movers give turns away, too: most rest, all of them settled, and no frames are lost */
-    int64_t *last;   /* (n) last slot in which each sent, or is foreseen to send */
-    int64_t *next;   /* (n) next slot in which each is known to send */
+    int alive;     /* N_alive: me and those heard of lately */
+    int members;   /* N_p: those in A_p that do not miss their turns */
+    int block;     /* one turn in so many is OPEN, 0: none */
+    int informed;  /* all have spoken, or all know where all want to be */
+    int lends;     /* movers give turns away, too: most rest, all of them settled, and no frames are
+                      lost */
+    int64_t *last; /* (n) last slot in which each sent, or is foreseen to send */
+    int64_t *next; /* (n) next slot in which each is known to send */
     uint16_t *again; /* (w) slots from each turn to the next one of the same agent */
     uint8_t *able;   /* (n) may be given a turn */
     uint8_t *rests;  /* (n) gives its turns away, as far as is known */
@@ -38,9 +41,9 @@ static int common_factor(int a, int b)
     return a;
 }
 
-/* Slots of which one turn goes to those who wake: S turns of those that rest lie in so many; half as many more where all of
- * them are settled; OFTEN for each that wakes, if that is more. No factor in common with n, or the same few owners would always
- * pay. */
+/* Slots of which one turn goes to those who wake: S turns of those that rest lie in so many; half
+ * as many more where all of them are settled; OFTEN for each that wakes, if that is more. No factor
+ * in common with n, or the same few owners would always pay. */
 static int open_block(int every, const lease_scope *v, int resting, int settled)
 {
     if (!every || !resting) return 0;
@@ -104,7 +107,8 @@ static void count_electorate(const dtsa_agent *agent, const lease_scope *v, int6
     }
     who->informed = slot >= v->n || table->config->targets_known;
     const int few_move = settled && settled == resting && 3 * who->members < v->n;
-    /* In the first round those that wait for a goal are taken for settled, and give a mover nothing. */
+    /* In the first round those that wait for a goal are taken for settled, and give a mover
+     * nothing. */
     who->lends = slot >= v->n && few_move && v->a->lost < FEW;
     who->block = open_block(table->config->lease.open_every, v, resting, settled);
 }
@@ -117,7 +121,8 @@ static int count_absent_before(const lease_scope *v, int64_t slot)
     return count;
 }
 
-/* What a turn is worth to an agent: its wait before it, times the wait that follows, as far as that is short.
+/* What a turn is worth to an agent: its wait before it, times the wait that follows, as far as that
+ * is short.
  *
  * next: slot in which it is known to send after the turn. */
 static long worth(const lease_scope *v, const electorate *who, int k, int64_t turn, int64_t next)
@@ -142,7 +147,8 @@ static int choose_lessee(const lease_scope *v, const electorate *who, int64_t tu
     return best;
 }
 
-/* Whether a turn stays with an owner that rests and may get another goal: it must be heard soon when it wakes. */
+/* Whether a turn stays with an owner that rests and may get another goal: it must be heard soon
+ * when it wakes. */
 static int is_kept(const lease_scope *v, int64_t turn)
 {
     return (turn / v->n + turn % v->n) % KEPT_EVERY == 0 || lease_is_anchor(v, turn);
@@ -156,7 +162,8 @@ static int is_spare(const lease_scope *v, const electorate *who, int64_t turn)
     return who->sure[owner] ? !lease_is_main(v, turn) : !is_kept(v, turn);
 }
 
-/* Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known. */
+/* Whether a turn is one that a mover gives away, or keeps, as it is worth most; as far as is known.
+ */
 static int is_lent(const lease_scope *v, const electorate *who, int64_t turn)
 {
     return who->lends && who->able[turn % v->n] && turn >= v->n && !lease_is_anchor(v, turn) &&
@@ -187,8 +194,8 @@ static void look_ahead(const lease_scope *v, electorate *who, int64_t slot, int 
     }
 }
 
-/* Whether a mover keeps a turn of its own, for without it it would wait for longer than a round: no later turn in that time
- * is its, or can be given to it. */
+/* Whether a mover keeps a turn of its own, for without it it would wait for longer than a round: no
+ * later turn in that time is its, or can be given to it. */
 static int keeps(const lease_scope *v, const electorate *who, int64_t turn)
 {
     const int owner = (int)(turn % v->n);
@@ -200,8 +207,8 @@ static int keeps(const lease_scope *v, const electorate *who, int64_t turn)
     return 1;
 }
 
-/* Who will send in the slots before a turn: as far as is known, and where a settled owner or a mover has not said it yet, the
- * one to whom it will be worth most.
+/* Who will send in the slots before a turn: as far as is known, and where a settled owner or a
+ * mover has not said it yet, the one to whom it will be worth most.
  *
  * from: the first of these slots. */
 static void foresee(const lease_scope *v, electorate *who, int64_t from, int64_t turn)
@@ -275,7 +282,8 @@ static int is_dispensable(const lease_scope *v, const electorate *who, int k, in
     return worth(v, who, k, turn, who->next[k]) >= factor * own;
 }
 
-/* To whom this agent hands a turn on that it was given. -1: to nobody. Its owner has given it away. */
+/* To whom this agent hands a turn on that it was given. -1: to nobody. Its owner has given it away.
+ */
 static int choose_next(const lease_scope *v, const electorate *who, int idle, int64_t turn)
 {
     const int k = choose_lessee(v, who, turn);
@@ -291,9 +299,10 @@ static void hand(lease_scope *v, electorate *who, int64_t turn, int k)
     v->issuer[turn % v->window] = LEASE_HANDED;
 }
 
-/* Hands on turns that this agent was given. If it rests: all within reach that come before its last turn there, in which it can
- * hand on further ones; beyond the relay's reach all to one agent, to whom the first of them is worth most. If it moves: those
- * that are worth much more to somebody else. Not the next slot's: frames may arrive late.
+/* Hands on turns that this agent was given. If it rests: all within reach that come before its last
+ * turn there, in which it can hand on further ones; beyond the relay's reach all to one agent, to
+ * whom the first of them is worth most. If it moves: those that are worth much more to somebody
+ * else. Not the next slot's: frames may arrive late.
  *
  * -> mask of the turns handed on, as in relay_mask; e->far_* says those beyond. */
 static uint32_t hand_on(const dtsa_agent *agent, lease_scope *v, int64_t slot, extended_frame *e)

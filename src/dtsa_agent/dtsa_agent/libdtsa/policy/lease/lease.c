@@ -1,8 +1,8 @@
 /* Policy lease: an agent's decisions. Who may send in a slot, and what silence means.
  *
- * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its next main anchor; who was given
- * it may hand it on in the same way. So whoever sends in a turn is its owner or the last one that was named for it.
- * docs/protocol.md has states, events and proof.
+ * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its
+ * next main anchor; who was given it may hand it on in the same way. So whoever sends in a turn is
+ * its owner or the last one that was named for it. docs/protocol.md has states, events and proof.
  */
 #include <string.h>
 
@@ -105,7 +105,8 @@ void lease_note(lease_scope *v, int sender, int64_t turn, int lessee, int issuer
     } else if (sender == *there) { /* whose turn it was hands it on */
         *there = (uint8_t)lessee;
     } else if (issuer && *by && issuer != *by && lessee < *there) {
-        /* Two have given it away: only adoption can do that. The smaller id, so that all who know both agree. */
+        /* Two have given it away: only adoption can do that. The smaller id, so that all who know
+         * both agree. */
         *there = (uint8_t)lessee;
         *by = (uint8_t)issuer;
     }
@@ -117,7 +118,8 @@ int lease_turns(const lease_scope *v, int64_t slot, int c_s, int64_t *turns, int
     for (int j = 1; j <= v->main; j++)
         for (int i = c_s; i >= 0; i--) {
             const int64_t turn = slot + (int64_t)j * v->n - i;
-            /* Its own turns up to its next main anchor; those of the dead as far as it goes, but for anchors. */
+            /* Its own turns up to its next main anchor; those of the dead as far as it goes, but
+             * for anchors. */
             if (!i && lease_is_main(v, turn)) own = 0;
             if (i ? lease_is_anchor(v, turn) : !own) continue;
             if (count == room) return count;
@@ -145,8 +147,8 @@ static void lease_begin(dtsa_agent *agent)
     memset(agent->state, 0, state_bytes(agent->table->config));
 }
 
-/* Whoever begins with slot 0 begins with everybody else. Whoever comes later may have lived before, and may have given
- * turns away that it knows nothing of. */
+/* Whoever begins with slot 0 begins with everybody else. Whoever comes later may have lived before,
+ * and may have given turns away that it knows nothing of. */
 static void start(lease_scope *v, int64_t slot)
 {
     lease_agent *a = v->a;
@@ -184,9 +186,10 @@ static int own_right_is_near(const lease_scope *v, int self, int64_t slot)
     return 0;
 }
 
-/* An OPEN turn is for those whom nobody expects. The first one is taken at once, or with a chance that falls with the number
- * of agents that wake in these days; without an answer (a gossip entry of mine in the frames that follow) the chance halves
- * each time, so that many who woke together get out of each other's way. */
+/* An OPEN turn is for those whom nobody expects. The first one is taken at once, or with a chance
+ * that falls with the number of agents that wake in these days; without an answer (a gossip entry
+ * of mine in the frames that follow) the chance halves each time, so that many who woke together
+ * get out of each other's way. */
 static int takes_open(const dtsa_agent *agent, const lease_scope *v, int64_t slot)
 {
     const int self = agent->self;
@@ -248,7 +251,8 @@ static void judge_claim(const dtsa_agent *agent, lease_scope *v, int64_t slot,
     const int sender = e->own.sender - 1, distance = (sender - agent->self + v->n) % v->n;
     if (!agent->table->config->lease.adoption || e->leaving) return;
     if (distance <= e->c_s || (was_absent && !e->probation)) {
-        /* It thinks me dead and gives my turns away; or it lived all the time elsewhere, so others there may. */
+        /* It thinks me dead and gives my turns away; or it lived all the time elsewhere, so others
+         * there may. */
         a->probation = 1;
         a->anchored = 0;
         a->claimed = slot;
@@ -316,8 +320,8 @@ static void end_probation(const dtsa_agent *agent, lease_scope *v, int64_t slot)
     lease_agent *a = v->a;
     if (slot % v->n == agent->self && lease_is_main(v, slot)) a->anchored = 1;
     if (!a->probation || !a->anchored) return;
-    /* Leases of an earlier life reach up to my first main anchor at most. Without adoption nobody else gives my turns away;
-     * with it, everybody who might has spoken twice by then. */
+    /* Leases of an earlier life reach up to my first main anchor at most. Without adoption nobody
+     * else gives my turns away; with it, everybody who might has spoken twice by then. */
     const int64_t quiet = slot - a->claimed;
     if (!agent->table->config->lease.adoption ||
         (quiet >= 2 * (int64_t)v->main * v->n && a->deaf <= LEASE_DEAF))

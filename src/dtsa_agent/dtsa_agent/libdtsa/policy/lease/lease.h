@@ -18,11 +18,11 @@ typedef struct lease_agent {
     int64_t born;       /* slot of the first decision since the (re)start */
     int64_t now;        /* the ring holds the turns now .. now + w - 1 */
     int64_t idle_since; /* -1: has something to say */
-    int64_t
-        woke; /* slot in which it woke or joined and since when nobody is known to have heard it, -1: none */
-    int64_t claimed;  /* slot in which probation began or was last confirmed */
-    double wakers;    /* agents that woke lately: about so many in the last n slots */
-    double lost;      /* frames missed lately: about so many in the last 8 n slots */
+    int64_t woke;    /* slot in which it woke or joined and since when nobody is known to have heard
+                        it, -1: none */
+    int64_t claimed; /* slot in which probation began or was last confirmed */
+    double wakers;   /* agents that woke lately: about so many in the last n slots */
+    double lost;     /* frames missed lately: about so many in the last 8 n slots */
     int32_t expected; /* 0-based agent expected in this slot, -1: nobody in particular */
     int32_t deaf;     /* silent slots in a row */
     uint8_t started, heard_now, probation, anchored, attempts, moving, leaving;
@@ -50,9 +50,11 @@ int lease_absent(const lease_scope *v, int k, int64_t slot);
 int lease_alive(const lease_scope *v, int k, int64_t slot);
 int lease_scheduled(const lease_scope *v,
                     int64_t slot); /* 0-based agent whose turn it is in this table, -1: nobody's */
-/* Takes note of what the frame of `sender` (an id) says of a turn. issuer: who gave it away, 0: the sender relays it. */
+/* Takes note of what the frame of `sender` (an id) says of a turn. issuer: who gave it away, 0: the
+ * sender relays it. */
 void lease_note(lease_scope *v, int sender, int64_t turn, int lessee, int issuer);
-/* The turns a frame's lease bytes speak of, in order; the same for sender and receiver. -> number of turns. */
+/* The turns a frame's lease bytes speak of, in order; the same for sender and receiver. -> number
+ * of turns. */
 int lease_turns(const lease_scope *v, int64_t slot, int c_s, int64_t *turns, int room);
 
 /* issue.c */

@@ -1,9 +1,11 @@
-/* Waits without an end that a library compiled with libstdc++ 9 or older asks for, and does not get.
+/* Waits without an end that a library compiled with libstdc++ 9 or older asks for, and does not
+ * get.
  *
- * There std::condition_variable::wait_until(steady_clock::time_point::max()) adds the difference of two clocks to the
- * largest time. It overflows; pthread_cond_timedwait refuses the negative time without giving the mutex free, and is
- * asked again, for ever: who should be waited for waits for the mutex. Fast DDS does that when a participant is removed
- * while another one is noticed to come or go (its issue 6513). Here such a wait is one without an end. */
+ * There std::condition_variable::wait_until(steady_clock::time_point::max()) adds the difference of
+ * two clocks to the largest time. It overflows; pthread_cond_timedwait refuses the negative time
+ * without giving the mutex free, and is asked again, for ever: who should be waited for waits for
+ * the mutex. Fast DDS does that when a participant is removed while another one is noticed to come
+ * or go (its issue 6513). Here such a wait is one without an end. */
 #define _GNU_SOURCE
 #define Py_LIMITED_API 0x030A0000
 #define PY_SSIZE_T_CLEAN
@@ -14,7 +16,8 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-static int wait_until(pthread_cond_t *condition, pthread_mutex_t *mutex, const struct timespec *until)
+static int wait_until(pthread_cond_t *condition, pthread_mutex_t *mutex,
+                      const struct timespec *until)
 {
     if (until->tv_sec < 0) return pthread_cond_wait(condition, mutex);
     return pthread_cond_timedwait(condition, mutex, until);
@@ -25,7 +28,8 @@ typedef struct {
     int places;          /* where it calls us now */
 } search;
 
-/* Puts our function into one place of a library's table of functions; whether that could be done. */
+/* Puts our function into one place of a library's table of functions; whether that could be done.
+ */
 static int put(void **place)
 {
     const uintptr_t size = (uintptr_t)sysconf(_SC_PAGESIZE), page = (uintptr_t)place & ~(size - 1);
@@ -53,9 +57,10 @@ static int look(struct dl_phdr_info *info, size_t size, void *into)
         if (entry->d_tag == DT_PLTRELSZ) length = entry->d_un.d_val;
         if (entry->d_tag == DT_PLTREL) kind = entry->d_un.d_val;
     }
-    /* Only where the loader has made addresses of these, and entries are as on all 64-bit machines. */
-    if (kind != DT_RELA || sizeof(void *) != 8 || symbols < info->dlpi_addr || names < info->dlpi_addr ||
-        calls < info->dlpi_addr)
+    /* Only where the loader has made addresses of these, and entries are as on all 64-bit machines.
+     */
+    if (kind != DT_RELA || sizeof(void *) != 8 || symbols < info->dlpi_addr ||
+        names < info->dlpi_addr || calls < info->dlpi_addr)
         return 0;
     for (const ElfW(Rela) *call = (const void *)calls; (ElfW(Addr))call < calls + length; call++) {
         const ElfW(Sym) *symbol = (const ElfW(Sym) *)symbols + ELF64_R_SYM(call->r_info);
@@ -78,13 +83,21 @@ static PyObject *mend(PyObject *self, PyObject *name)
 }
 
 static PyMethodDef methods[] = {
-    {"mend", mend, METH_O, "mend(library, /): number of places in which a library that is loaded calls us now"},
+    {"mend", mend, METH_O,
+     "mend(library, /): number of places in which a library that is loaded calls us now"},
     {NULL, NULL, 0, NULL},
 };
 
 static struct PyModuleDef module = {
-    PyModuleDef_HEAD_INIT, "_endless", "Waits without an end, in libraries that have them wrong", -1, methods,
-    NULL, NULL, NULL, NULL,
+    PyModuleDef_HEAD_INIT,
+    "_endless",
+    "Waits without an end, in libraries that have them wrong",
+    -1,
+    methods,
+    NULL,
+    NULL,
+    NULL,
+    NULL,
 };
 
 PyMODINIT_FUNC PyInit__endless(void) { return PyModule_Create(&module); }
