@@ -4,7 +4,7 @@ How a flight in real time works, and where each part stands ("channel": `dtsa_ch
 
 1. **The time line.** The channel calls all processes (`roll_call`), then sends START with the time of slot 0 on
    CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own, off by an offset and a
-   drift; :meth:`RealtimeNode.starts` says when its slots begin on the time line.
+   drift; `slot_clocks` says when its slots begin on the time line.
 2. **A slot here.** :meth:`RealtimeNode._step` takes in messages until a lead before the slot's start
    (`core/agents/pacing.py`). :meth:`~RealtimeNode._open` ends the slot before, decides, sends, and moves the vehicles.
    A frame is published with the time at which its transmission starts; one that would leave half a slot late is not
@@ -44,7 +44,6 @@ from dtsa_agent.core.agents.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_lon
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins.entry_points import plug_ins_of
-from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, generator
 from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING
 from dtsa_agent.ros.common.graph import names
@@ -57,6 +56,7 @@ from dtsa_agent.ros.common.wire.stamps import header_of, time_of
 
 from .handed_over import HandedOver
 from .reporter import Reporter
+from .slot_clocks import SlotClocks
 from .swarm_node import SwarmNode
 
 _PPB = 1_000_000_000
@@ -67,18 +67,6 @@ _DOUBTS = 9  # frames in a row that do not fit the time which an agent took from
 # With a policy that needs all tables equal it waits beyond the start: a late frame costs less than tables that differ.
 _LATEST, _LATEST_NS = 0.3, 3_000_000
 _BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
-
-
-def slot_starts(local_ns: int, offset_ns: NDArray[np.int64], drift_ppb: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How much later than the channel's clock some clocks show a time, ns: the first ns at which they show it.
-
-    :param local_ns: the time, ns.
-    :param offset_ns: (L,) ns, what each clock shows at the channel's time 0.
-    :param drift_ppb: (L,) parts per billion by which each runs fast.
-    """
-    # The first c with c (1 + drift) + offset >= local, written so that no product leaves 64 bits within months.
-    ahead = local_ns - offset_ns
-    return np.asarray(ahead - ahead * drift_ppb // (_PPB + drift_ppb) - local_ns)
 
 
 class RealtimeNode(SwarmNode):
@@ -129,15 +117,10 @@ class RealtimeNode(SwarmNode):
         self._own_or_nobody = {0, *self.swarm.ids}
         self._awaits = False  # somebody here takes another one for the slot's sender, and has not heard it yet
         self.unsent = 0  # frames that would have left half a slot late or more
-        self._offset: NDArray[np.int64] = np.array(offset_ns, dtype=np.int64)
-        self._drift: NDArray[np.int64] = np.array(drift_ppb, dtype=np.int64)
-        self._shift: NDArray[np.int64] = np.zeros(count, dtype=np.int64)  # ns, what each has learned to wait
-        self._starts: tuple[int | None, NDArray[np.int64]] = None, self._shift  # of the slot asked for last
-        self._ideal = not (self._offset.any() or self._drift.any())  # all clocks show the channel's time
         self._slotted = not self.config.policy_row.unslotted
         parts = plug_ins_of(self.swarm) if self.config.policy_row.listens else None
         self._handed = None if parts is None else HandedOver(parts)
-        self._aligners = [ClockAligner() for _ in range(count)] if align and self._slotted else []
+        self._clocks = SlotClocks(self.slot_ns, offset_ns, drift_ppb, align and self._slotted)
         self._lengths: NDArray[np.uint8] = np.zeros(count, dtype=np.uint8)  # bytes sent in the present slot
         self._free_ns = [0] * count  # when each radio has done with its last frame; of policies without slots
         self._jitter_ns = jitter_ns
@@ -147,9 +130,8 @@ class RealtimeNode(SwarmNode):
         self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3).T
         self._called = False  # was there when the channel asked who is
         self._listeners: Listeners | None = None
-        self._timeless: NDArray[np.bool_] = np.zeros(
-            count, dtype=np.bool_
-        )  # came late, and takes its time from the next frame
+        # Came late, and takes its time from the next frame.
+        self._timeless: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         self._first = 0  # slot with which this process began, or began anew
         self._too_long_ns = too_long_ns(self.config)
         self._leaves_by: int | None = None  # slot: leaving; ends then at the latest
@@ -164,33 +146,6 @@ class RealtimeNode(SwarmNode):
         self._air = create(Frame, f"{swarm_namespace}/{names.AIR_FRAME}", qos)
         self._telemetry = create(Report, f"{swarm_namespace}/{names.REPORT}", qos)
         self._reporter = Reporter(self._telemetry, self.swarm)
-
-    def starts(self, slot: int) -> NDArray[np.int64]:
-        """When each agent's slot starts, ns after the channel's start of that slot.
-
-        :param slot: its number.
-        """
-        if self._ideal:
-            return self._shift
-        if slot != self._starts[0]:
-            self._starts = slot, slot_starts(slot * self.slot_ns, self._offset, self._drift) + self._shift
-        return self._starts[1]
-
-    def _move(self, index: int | np.intp, by_ns: int) -> None:
-        """Moves the slots of an agent.
-
-        :param index: position in ``swarm.ids``.
-        :param by_ns: ns, positive: later.
-        """
-        self._shift[index] += by_ns
-        self._starts = None, self._shift
-
-    def local_ns(self, time_ns: int) -> NDArray[np.int64]:
-        """What each agent's clock shows, ns.
-
-        :param time_ns: ns on the channel's time line.
-        """
-        return np.asarray(time_ns + time_ns * self._drift // _PPB + self._offset)
 
     def _plausible(self, message: SlotFields) -> None:
         now = time.monotonic_ns()
@@ -251,14 +206,14 @@ class RealtimeNode(SwarmNode):
             self._called = True
             if message.slot > names.FIRST_CALL:
                 self._go_first()
-            self._reporter.add_slot(message.slot, self.starts(0), self._lengths)
+            self._reporter.add_slot(message.slot, self._clocks.starts(0), self._lengths)
             self._reporter.publish(message.run)
         elif message.phase == Slot.START and (self._called or self._may_join()):
             self._go_first()
             self._begin(message.run)
             self._zero = message.time_ns
             if not self._called:
-                now = self.local_ns(time.monotonic_ns() - self._zero)
+                now = self._clocks.local_ns(time.monotonic_ns() - self._zero)
                 self._listeners = Listeners(self.config, self.swarm.ids, now.tolist())
                 self._timeless[:] = True
                 if self._resume_at.size:
@@ -297,7 +252,7 @@ class RealtimeNode(SwarmNode):
         if message is not None and message.phase == Slot.RUN:
             self._overhear(message)
         now = time.monotonic_ns() - self._zero
-        if self._listeners.ready(self.local_ns(now).tolist()):
+        if self._listeners.ready(self._clocks.local_ns(now).tolist()):
             self._listeners = None
             self._begin_anew(now)
         return True
@@ -308,17 +263,16 @@ class RealtimeNode(SwarmNode):
         :param now: ns on the channel's time line.
         """
         ahead = now + self._lead_ns
-        following = (ahead - int(self.starts(ahead // self.slot_ns).min())) // self.slot_ns + 1
+        following = (ahead - int(self._clocks.starts(ahead // self.slot_ns).min())) // self.slot_ns + 1
         self._first, self.slot = following, following - 1
         for index in range(len(self.swarm.ids)):
             self.agents.restart(index, following)
-        for aligner in self._aligners:
-            aligner.reset()
+        self._clocks.forget()
 
     def _step(self) -> bool:
         """Waits for the next slot or message; False when the run is over."""
         lead_ns = self._latest_lead_ns if self._awaits else self._lead_ns
-        due = self._zero + (self.slot + 1) * self.slot_ns + int(self.starts(self.slot + 1).min()) - lead_ns
+        due = self._zero + (self.slot + 1) * self.slot_ns + int(self._clocks.starts(self.slot + 1).min()) - lead_ns
         remaining = due - time.monotonic_ns()
         if remaining > 0:
             message = self.loop.wait(min(remaining, _PATIENCE_NS))
@@ -365,7 +319,7 @@ class RealtimeNode(SwarmNode):
                 )
                 if own or mask.any():
                     self._reporter.add_heard(sender, message.heard_slot, self.slot, now, mask)
-        if masks is None or not (self._aligners or self._timeless.any()):
+        if masks is None or not (self._clocks.align or self._timeless.any()):
             return
         late = self._lateness(message)
         for index in np.flatnonzero(masks[0]):
@@ -373,13 +327,10 @@ class RealtimeNode(SwarmNode):
                 self._take_time(index, late)
                 if abs(late[index]) >= self.slot_ns // 2:
                     self.agents.restart(index, self.slot + 1)
-            elif self._aligners:
-                aligner = self._aligners[index]
-                moved = aligner.hear(int(late[index]))
-                if moved:
-                    self._move(index, moved)
+            elif self._clocks.align:
+                misfits = self._clocks.hear(index, int(late[index]))
                 # The frame that a newcomer took its time from may have left late.
-                self._timeless[index] = not self._called and aligner.ignored_in_a_row >= _DOUBTS
+                self._timeless[index] = not self._called and misfits >= _DOUBTS
 
     def _overhear(self, message: SlotFields) -> None:
         """Takes in a frame of which only the time counts."""
@@ -388,16 +339,14 @@ class RealtimeNode(SwarmNode):
         (frame,) = split_frames(message.data, message.length)
         if self.swarm.unseal(frame, message.heard_slot) is None:
             return
-        late, began = self._lateness(message), self.local_ns(self._began_ns(message))
+        late, began = self._lateness(message), self._clocks.local_ns(self._began_ns(message))
         for index in np.flatnonzero(heard[0, self.swarm.local]):
             if self._listeners.hear(index, message.heard_slot, int(began[index])):
                 self._take_time(index, late)
 
     def _take_time(self, index: np.intp, late: NDArray[np.int64]) -> None:
-        self._move(index, int(late[index]))
+        self._clocks.take(index, int(late[index]))
         self._timeless[index] = False
-        if self._aligners:
-            self._aligners[index].reset()
 
     def _began_ns(self, message: SlotFields) -> int:
         """When the transmission of a frame began, by its arrival and length: ns on the channel's time line."""
@@ -407,7 +356,7 @@ class RealtimeNode(SwarmNode):
     def _lateness(self, message: SlotFields) -> NDArray[np.int64]:
         """How much later than each agent expects a frame has begun, ns."""
         slot = int(message.heard_slot)
-        return np.asarray(self._began_ns(message) - slot * self.slot_ns - self.starts(slot))
+        return np.asarray(self._began_ns(message) - slot * self.slot_ns - self._clocks.starts(slot))
 
     def _open(self, slot: int) -> None:
         """Closes the last slot and opens the next: decide, send, fly."""
@@ -417,7 +366,7 @@ class RealtimeNode(SwarmNode):
         if self._leaves_by is not None:
             swarm.present[~self._gone] = PRESENT_LEAVING
         senders = self.agents.on_slot(slot)
-        starts = self.starts(slot)
+        starts = self._clocks.starts(slot)
         offsets = self._send(slot, senders, starts)
         self.slot = slot
         self._awaits = not self._own_or_nobody.issuperset(swarm.chosen.tolist())

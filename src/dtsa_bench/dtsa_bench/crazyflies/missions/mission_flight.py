@@ -15,7 +15,7 @@ import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 
-from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core import Scenario, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.unslotted import check_slotted
 from dtsa_agent.crazyflie.links.link import require_cflib
@@ -114,6 +114,81 @@ class CrashWatch(ChannelObserver):
             )
 
 
+class _Station:
+    """The processes of a mission, and the one order in which they end.
+
+    :param settings: the swarm's YAML, read.
+    :param directory: for the bag of the whole mission and the logs.
+    :param environment: of the processes.
+    :param attach: whether a bridge runs already, and goes on running.
+    """
+
+    def __init__(self, settings: SwarmSettings, directory: Path, environment: dict[str, str], attach: bool) -> None:
+        self.settings, self._directory, self._attach = settings, directory, attach
+        self.context, self.progress = Context(), ProgressLine("fly")
+        self.bridge, self.agents, self._recorder = (Children(directory / "log", environment) for _ in range(3))
+        self._mission: Mission | None = None
+
+    def start(self, swarm_yaml: Path) -> None:
+        """Starts the recorder, and the bridge unless there is one.
+
+        :param swarm_yaml: path of the swarm's YAML.
+        """
+        robots = [robot.name for robot in self.settings.robots]
+        arguments = ["--bag", str(self._directory / MISSION_BAG), "--names", *robots]
+        self._recorder.start("recorder", [], "dtsa_bench.crazyflies.missions.mission_recorder", arguments)
+        if not self._attach:
+            self.bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
+                              ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
+
+    def take_off(self, run: RunConfig, scenario: Scenario, domain: int, ended: Ended) -> tuple[RunConfig, Mission]:
+        """Connects all vehicles and brings them into the air, at their places.
+
+        :param run: what is flown.
+        :param scenario: where all begin.
+        :param domain: the ROS domain.
+        :param ended: ends the mission early.
+        :returns: what is flown, with the places that were found, and the mission.
+        """
+        init_ros(QUIET, self.context, domain)
+        node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
+        mission = self._mission = Mission(node, self.settings, scenario, ended, self.progress.show)
+        mission.bridge_alive = mission.check_bridge if self._attach else self.bridge.check
+        mission.start()
+        take_priority(self.settings.station.priority)
+        mission.connect()
+        swarm = mission.find_places(run.swarm)
+        if swarm != run.swarm:
+            self.progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
+            run = dataclasses.replace(run, swarm=swarm)
+        if mission.crossing:
+            self.progress.say(f"brought to their places one by one: {', '.join(mission.crossing)} otherwise")
+        mission.take_off()
+        return run, mission
+
+    def end(self, ended: Ended) -> None:
+        """All land, agents before; then the bridge ends, then the recorder closes its bag.
+
+        :param ended: why the mission has ended.
+        """
+        mission = self._mission
+        with _second_interrupt() as urgent:
+            self.agents.stop()
+            if mission is not None:
+                mission.land(urgent)
+                mission.close()
+            try:
+                if not self._attach:
+                    _end_bridge(self.bridge.all[0])
+            finally:
+                # If the recorder does not close its bag, the bag is recovered as any other.
+                end_process(self._recorder.all[0].process, RECORDER_END_S)
+                if mission is not None:
+                    mission.log.write(self._directory, ended.reason)
+        self.progress.end()
+        self.context.try_shutdown()
+
+
 def fly_crazyflies(
     run: RunConfig,
     settings: SwarmSettings,
@@ -151,57 +226,21 @@ def fly_crazyflies(
         wanted = whole_number(os.environ.get("ROS_DOMAIN_ID") or "0", "ROS_DOMAIN_ID", 0, LAST_DOMAIN)
     with ros_domain(wanted, shared=shared) as domain, ExitStack() as shown:
         directory = new_directory(out)
-        logs = directory / "log"
-        logs.mkdir()
-        environment = run_environment(domain, logs, shared_memory=False)
+        (directory / "log").mkdir()
+        environment = run_environment(domain, directory / "log", shared_memory=False)
         shown.enter_context(mission_page(domain, environment, page))
-        context = Context()
-        progress = ProgressLine("fly")
-        bridge, agents, recorder = (Children(logs, environment) for _ in range(3))
-        robots = [robot.name for robot in settings.robots]
-        arguments = ["--bag", str(directory / MISSION_BAG), "--names", *robots]
-        recorder.start("recorder", [], "dtsa_bench.crazyflies.missions.mission_recorder", arguments)
-        if not attach:
-            bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
-                         ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
-        ended = Ended(stop)
-        mission: Mission | None = None
+        station, ended = _Station(settings, directory, environment, attach), Ended(stop)
+        station.start(swarm_yaml)
         try:
-            init_ros(QUIET, context, domain)
-            node = Node("mission", context=context, enable_rosout=False, start_parameter_services=False)
-            mission = Mission(node, settings, scenario, ended, progress.show)
-            mission.bridge_alive = mission.check_bridge if attach else bridge.check
-            mission.start()
-            take_priority(settings.station.priority)
-            mission.connect()
-            swarm = mission.find_places(run.swarm)
-            if swarm != run.swarm:
-                progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
-                run = dataclasses.replace(run, swarm=swarm)
-            if mission.crossing:
-                progress.say(f"brought to their places one by one: {', '.join(mission.crossing)} otherwise")
-            mission.take_off()
-            _start_agents(agents, run, settings, directory)
-            flight = _exchange(context, run, directory, agents, bridge, progress, options, ended, mission)
+            run, mission = station.take_off(run, scenario, domain, ended)
+            _start_agents(station.agents, run, settings, directory)
+            flight = _exchange(station, run, directory, options, ended, mission)
             return flight, ended.reason
         except DtsaError as error:
             ended.reason = ended.reason or str(error)
             raise
         finally:
-            with _second_interrupt() as urgent:
-                agents.stop()
-                if mission is not None:
-                    mission.land(urgent)
-                    mission.close()
-                try:
-                    if not attach:
-                        _end_bridge(bridge.all[0])
-                finally:
-                    _end_recorder(recorder)
-                    if mission is not None:
-                        mission.log.write(directory, ended.reason)
-            progress.end()
-            context.try_shutdown()
+            station.end(ended)
 
 
 @contextmanager
@@ -230,9 +269,11 @@ def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, dir
                   "--disable-external-lib-logs", "--disable-rosout-logs"])  # fmt: skip
 
 
-def _exchange(context: Context, run: RunConfig, directory: Path, agents: Children, bridge: Children,
-              progress: ProgressLine, options: FlightOptions, ended: Ended, mission: Mission) -> Flight:  # fmt: skip
-    node = Node("channel", namespace=names.SWARM, context=context)
+def _exchange(
+    station: _Station, run: RunConfig, directory: Path, options: FlightOptions, ended: Ended, mission: Mission
+) -> Flight:
+    agents, progress = station.agents, station.progress
+    node = Node("channel", namespace=names.SWARM, context=station.context)
     try:
         declare_channel(node, run.air)
         stop_on_crash = run.limits.stop_on_crash
@@ -273,11 +314,6 @@ def _exchange(context: Context, run: RunConfig, directory: Path, agents: Childre
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         node.destroy_node()
-
-
-def _end_recorder(recorder: Children) -> None:
-    """It closes its bag; if it does not, the bag is recovered as any other."""
-    end_process(recorder.all[0].process, RECORDER_END_S)
 
 
 def _end_bridge(child: Child) -> None:

@@ -225,6 +225,35 @@ static void foresee(const lease_scope *v, electorate *who, int64_t from, int64_t
     }
 }
 
+/* Whether a turn is this agent's to give away now.
+ *
+ * reach: so many rounds ahead the turns of its owner are. */
+static int may_give(const dtsa_agent *agent, const lease_scope *v, int64_t slot, int64_t turn,
+                    int reach)
+{
+    const int idle = v->a->idle_since >= 0, mine = turn % v->n == v->self;
+    if (v->lessee[turn % v->window] != LEASE_NONE || v->a->probation) return 0;
+    if (mine && idle && !agent->final && is_kept(v, turn)) return 0;
+    return (turn - slot + v->n - 1) / v->n <= reach;
+}
+
+/* To whom a turn is given; LEASE_NONE: to nobody, it is kept.
+ *
+ * from: the first slot whose sender has not been foreseen; `slot` + 1 at first. */
+static uint8_t choose_heir(const lease_scope *v, electorate *who, int64_t slot, int64_t turn,
+                           int64_t *from)
+{
+    const int idle = v->a->idle_since >= 0, mine = turn % v->n == v->self;
+    if (idle && mine && is_open(v, who, turn)) return LEASE_OPEN;
+    if (!who->members || !(mine || v->a->deaf <= LEASE_DEAF)) return LEASE_NONE;
+    if (*from == slot + 1) look_ahead(v, who, slot, v->window - 1);
+    foresee(v, who, *from, turn);
+    *from = turn;
+    const int k = choose_lessee(v, who, turn);
+    if (mine && (k == v->self || (!idle && keeps(v, who, turn)))) return LEASE_NONE;
+    return (uint8_t)(k + 1);
+}
+
 /* How many of its next turns an agent gives away. */
 static int depth(const dtsa_agent *agent, const lease_scope *v, const electorate *who, int64_t slot)
 {
@@ -240,34 +269,24 @@ static int depth(const dtsa_agent *agent, const lease_scope *v, const electorate
     return turns < v->every ? (int)turns : v->every;
 }
 
+/* Writes down which turns the frame of an own turn gives away, and gives away more of them. */
 static void issue(const dtsa_agent *agent, lease_scope *v, int64_t slot, extended_frame *e)
 {
     int64_t turns[LEASE_ROOM];
     electorate who;
-    const int self = v->self, count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
+    const int count = lease_turns(v, slot, e->c_s, turns, LEASE_ROOM);
     int64_t from = slot + 1;
     count_electorate(agent, v, slot, &who);
     const int idle = v->a->idle_since >= 0, adopted = idle ? v->every : 1;
     int own = e->leaving ? 0 : depth(agent, v, &who, slot);
     for (int i = 0; i < count; i++) {
         const int64_t turn = turns[i];
-        const int mine = turn % v->n == self;
+        const int mine = turn % v->n == v->self;
         uint8_t *given = &v->lessee[turn % v->window];
         if (mine && !(agent->final && idle) && lease_is_anchor(v, turn)) own = 0;
-        const int kept = mine && idle && !agent->final && is_kept(v, turn);
-        if (*given == LEASE_NONE && !kept && !v->a->probation &&
-            (turn - slot + v->n - 1) / v->n <= (mine ? own : adopted)) {
-            if (idle && mine && is_open(v, &who, turn)) {
-                *given = LEASE_OPEN;
-            } else if (who.members && (mine || v->a->deaf <= LEASE_DEAF)) {
-                if (from == slot + 1) look_ahead(v, &who, slot, v->window - 1);
-                foresee(v, &who, from, turn);
-                from = turn;
-                *given = (uint8_t)(choose_lessee(v, &who, turn) + 1);
-                if (mine && (*given == self + 1 || (!idle && keeps(v, &who, turn))))
-                    *given = LEASE_NONE;
-            }
-            if (*given != LEASE_NONE) v->issuer[turn % v->window] = (uint8_t)(self + 1);
+        if (may_give(agent, v, slot, turn, mine ? own : adopted)) {
+            *given = choose_heir(v, &who, slot, turn, &from);
+            if (*given != LEASE_NONE) v->issuer[turn % v->window] = (uint8_t)(v->self + 1);
         }
         e->leases[i] = *given;
         if (*given != LEASE_NONE) e->lease_count = i + 1;
