@@ -129,6 +129,7 @@ def start(program: str, arguments: list[str]) -> int:
     """Replace this process by a program in the workspace's environment, in which `dtsa_dev` can be imported."""
     environment = workspace.environment()
     tools = str(layout.ROOT / "tools")
+    environment["DTSA_PROGRAM"] = "tools/dtsa"
     environment["PYTHONPATH"] = os.pathsep.join([tools, *filter(None, [environment.get("PYTHONPATH", "")])])
     path = shutil.which(program, path=environment["PATH"])
     if path is None:

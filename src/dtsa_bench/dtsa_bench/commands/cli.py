@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from dtsa_bench import __version__
+from dtsa_bench.runs.program import program
 
 from .examples import epilog
 from .missing_packages import say_missing
@@ -87,7 +88,7 @@ def build_parser(command: str | None) -> tuple[argparse.ArgumentParser, object |
         if name == command:
             chosen = importlib.import_module(module_of(name))
             chosen.add_parser(subparsers)
-            subparsers.choices[name].epilog = epilog(name)
+            subparsers.choices[name].epilog = epilog(name, program())
         else:
             subparsers.add_parser(name, help=text)
     return parser, chosen

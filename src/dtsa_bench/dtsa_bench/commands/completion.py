@@ -10,8 +10,8 @@ SHELLS = ("bash", "zsh")
 OF_THE_TOOL = ("setup", "shell", "test", "ros2", "clean")
 
 DESCRIPTION = """\
-Prints a script for bash or zsh that completes the commands of tools/dtsa, their options, and the values of options that
-have names. It asks nobody while one types; after an update it is made again."""
+Prints a script for bash or zsh that completes the commands of this program, their options, and the values of
+options that have names. It asks nobody while one types; after an update it is made again."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

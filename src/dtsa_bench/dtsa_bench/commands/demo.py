@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from dtsa_bench.pages.browser import open_page
 from dtsa_bench.runs.options import new_directory, whole_number
+from dtsa_bench.runs.program import program
 
 if TYPE_CHECKING:
     from dtsa_bench.pages.demo.flown import Flights
@@ -144,13 +145,13 @@ def _progress(text: str) -> None:
 def _commands(directory: Path) -> list[tuple[str, str]]:
     """What to do with the recordings."""
     return [
-        ("a flight with everything in it, as a page", f"tools/dtsa report {directory}/two-tdma {directory}/two-dtsa"),
-        ("was every decision what the protocol says?", f"tools/dtsa verify {directory}/two-lease"),
-        ("play a recording into the ROS graph", f"tools/dtsa replay {directory}/two-lease"),
-        ("as tables", f"tools/dtsa export {directory}/two-lease"),
+        ("a flight with everything in it, as a page", f"{program()} report {directory}/two-tdma {directory}/two-dtsa"),
+        ("was every decision what the protocol says?", f"{program()} verify {directory}/two-lease"),
+        ("play a recording into the ROS graph", f"{program()} replay {directory}/two-lease"),
+        ("as tables", f"{program()} export {directory}/two-lease"),
         ("look inside with Foxglove or PlotJuggler", f"{directory}/two-lease/bag/bag_0.mcap"),
-        ("the same without ROS, in milliseconds", "tools/dtsa simulate --agents 12 --moving 2 --policy lease"),
-        ("thousands of flights", "tools/dtsa sweep --preset loss"),
+        ("the same without ROS, in milliseconds", f"{program()} simulate --agents 12 --moving 2 --policy lease"),
+        ("thousands of flights", f"{program()} sweep --preset loss"),
     ]
 
 

@@ -64,7 +64,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
 }
 
 
-def epilog(command: str, program: str = "tools/dtsa") -> str:
+def epilog(command: str, program: str) -> str:
     """The examples of a command as its help shows them; empty if it has none.
 
     :param command: its name.

@@ -7,12 +7,13 @@ import sys
 _WORKSPACE = "build the workspace and source it: colcon build && . install/setup.bash"
 _HOW = {
     **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
-    **dict.fromkeys(("mcap", "rosbags", "pyarrow", "lz4", "zstandard", "pandas", "distributed"), "pip install {}"),
-    "rclpy": "source an installation of ROS 2 Jazzy, or use tools/dtsa",
+    **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard"), "pip install {}"),
+    **dict.fromkeys(("pyarrow", "pandas"), 'pip install {}, or "dtsa[tables]"'),
+    "distributed": 'pip install {}, or "dtsa[cluster]"',
+    "aiohttp": 'pip install {}, or "dtsa[view]"',
+    "rclpy": "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout",
     "yaml": "apt install python3-yaml",
-    **dict.fromkeys(
-        ("numpy", "matplotlib", "rich", "joblib", "aiohttp"), "apt install python3-{0}, or pip install {0}"
-    ),
+    **dict.fromkeys(("numpy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
 }
 
 

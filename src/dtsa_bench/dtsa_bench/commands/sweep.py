@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dtsa_bench.runs.program import program
+
 if TYPE_CHECKING:
     from dtsa_bench.experiments.sweep.spec import Sweep
 
@@ -121,7 +123,7 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     if not args.no_report:
         from dtsa_bench.pages.report.sweep import write_report
 
-        path = write_report(table, directory, work.code(), f"tools/dtsa {shlex.join(sys.argv[1:])}")
+        path = write_report(table, directory, work.code(), f"{program()} {shlex.join(sys.argv[1:])}")
         if not args.json:
             print(f"report: {path}")
     if not args.json:

@@ -18,6 +18,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 
 from dtsa_bench.drawing.palette import COLLIDED, SERIES, agent_colour, ink_on
+from dtsa_bench.runs.program import program
 
 from .flown import Flights, Flown, compared_s, of_step
 from .story import KILLED, Step
@@ -82,7 +83,7 @@ def draw_demo(path: Path, steps: Sequence[Step], flights: Flights) -> None:
             sheet.y += height
         swarm = steps[0].takes[0].run.swarm
         note = (
-            f"Drawn by “tools/dtsa demo” from the recordings of {sum(len(step.takes) for step in steps)} flights of "
+            f"Drawn by “{program()} demo” from the recordings of {sum(len(step.takes) for step in steps)} flights of "
             f"ROS 2 nodes, seed {swarm.seed}. Seen from above: rings are starts, dots are ends."
         )
         sheet.rule(sheet.height - 0.34)

@@ -22,12 +22,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
+from dtsa_bench.runs.program import program
+
 from . import columns, container, metadata, qos
 from .errors import BagError, UnusableBag
 from .place import find_file
 
 PACKED_MESSAGES = "its messages are compressed one by one; `ros2 bag convert` makes a plain bag of it"
-MERGED = "one agent's, recorded on a network: `tools/dtsa merge` with --out makes one bag of those of all agents"
+MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
 _ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
 
 
@@ -105,7 +107,7 @@ class Bag:
         )
 
     def _damaged(self, what: str) -> UnusableBag:
-        return UnusableBag(self.given, f"{what}; `tools/dtsa recover {self.given}` saves what can be read")
+        return UnusableBag(self.given, f"{what}; `{program()} recover {self.given}` saves what can be read")
 
     def _read_topics(self, summary: Summary) -> None:
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
@@ -115,7 +117,7 @@ class Bag:
             schema = summary.schemas.get(channel.schema_id)
             if channel.message_encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
                 if schema is not None and schema.name.startswith(_ON_A_NETWORK):
-                    raise UnusableBag(self.given, MERGED)
+                    raise UnusableBag(self.given, MERGED.format(program()))
                 encoding = f"{channel.message_encoding}/{schema.encoding if schema else 'no schema'}"
                 raise UnusableBag(
                     self.given,

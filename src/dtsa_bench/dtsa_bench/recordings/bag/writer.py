@@ -22,6 +22,7 @@ from mcap.writer import CompressionType, Writer
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES
 from dtsa_bench import __version__
+from dtsa_bench.runs.program import program
 
 from . import metadata, schema
 from .chunk_builder import write_quickly
@@ -277,7 +278,7 @@ class BagWriter:
         lost = f", up to {self._unsaved} messages are not saved" if self._unsaved else ""
         self._failure = (
             f"recording to {self.path} stopped: {error.strerror or error}{lost}; "
-            f"`tools/dtsa recover {self.directory}` makes a full bag of the rest"
+            f"`{program()} recover {self.directory}` makes a full bag of the rest"
         )
         with suppress(OSError):
             self._stream.close()

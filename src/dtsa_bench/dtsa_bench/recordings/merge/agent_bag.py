@@ -19,6 +19,7 @@ from dtsa_agent.air.udp import Heard, SlotRecord
 from dtsa_agent.air.udp.datagram import flight_ns
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.recordings.bag.errors import UnusableBag
+from dtsa_bench.runs.program import program
 
 from .agent_recorder import METADATA, REFUSED, SLOT, SUMMARY
 
@@ -93,7 +94,7 @@ def read(path: str | Path) -> AgentBag:
     except OSError as error:
         raise UnusableBag(file, error.strerror or str(error)) from None
     if bag is None:
-        raise UnusableBag(file, "no bag of an agent on a network, as `tools/dtsa agent --out` makes them")
+        raise UnusableBag(file, f"no bag of an agent on a network, as `{program()} agent --out` makes them")
     bag.broken_off = not finished
     return bag
 
