@@ -1,7 +1,9 @@
 #!/usr/bin/env python3
 """Renews the pinned requirements: `requirements/*.in` say what is wanted, `*.txt` what is installed.
 
-Usage: tools/lock.py PYTHON3.10 PYTHON3.11 PYTHON3.12 PYTHON3.13
+Usage: tools/lock.py [--keep] PYTHON3.10 PYTHON3.11 PYTHON3.12 PYTHON3.13
+
+With --keep what is pinned keeps its version, and only what is new is chosen.
 
 Each interpreter lets pip choose versions for everything together, so that all sets fit each other. A
 version that differs between interpreters becomes one line for each, with a marker.
@@ -18,7 +20,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 REQUIREMENTS = Path(__file__).resolve().parent.parent / "requirements"
-SETS = ("ros", "runtime", "test", "dev", "cflib", "benchmark", "cluster")
+SETS = ("ros", "runtime", "test", "dev", "cflib", "benchmark", "cluster", "docs", "release")
 
 # Runs in a fresh environment: names, versions and dependencies (by the markers of this interpreter) as JSON.
 RESOLVE = """
@@ -30,7 +32,7 @@ from pip._vendor.packaging.markers import default_environment
 sets = {name: [line.strip() for line in open(path) if line.strip() and not line.startswith("#")]
         for name, path in json.loads(sys.argv[1]).items()}
 everything = [line for lines in sets.values() for line in lines]
-pip = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-"]
+pip = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-", *sys.argv[2:]]
 out = subprocess.run([*pip, *everything], check=True, stdout=subprocess.PIPE).stdout
 metadata = [item["metadata"] for item in json.loads(out)["install"]]
 chosen = {canonicalize_name(each["name"]): each for each in metadata}
@@ -55,10 +57,11 @@ json.dump({name: closure(lines) for name, lines in sets.items()}, sys.stdout)
 """
 
 
-def resolve(interpreter: str) -> tuple[str, dict[str, dict[str, str]]]:
+def resolve(interpreter: str, keep: bool) -> tuple[str, dict[str, dict[str, str]]]:
     """Let one interpreter choose.
 
     :param interpreter: path of a Python that has pip and venv.
+    :param keep: whether pinned versions stay.
     :returns: its version, such as 3.12, and for each set the chosen version of each package.
     """
     show = "import sys; print('%d.%d' % sys.version_info[:2])"
@@ -67,6 +70,9 @@ def resolve(interpreter: str) -> tuple[str, dict[str, dict[str, str]]]:
         subprocess.run([interpreter, "-m", "venv", directory], check=True)
         files = json.dumps({name: str(REQUIREMENTS / f"{name}.in") for name in SETS})
         command = [f"{directory}/bin/python", "-c", RESOLVE, files]
+        for name in SETS if keep else ():
+            if (pinned := REQUIREMENTS / f"{name}.txt").exists():
+                command += ["--constraint", str(pinned)]
         chosen = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
     return version, chosen
 
@@ -88,13 +94,15 @@ def lines(name: str, versions: dict[str, dict[str, dict[str, str]]]) -> Iterable
 
 
 def main() -> int:
-    if len(sys.argv) < 2:
+    keep = "--keep" in sys.argv
+    interpreters = [word for word in sys.argv[1:] if word != "--keep"]
+    if not interpreters:
         print(__doc__, file=sys.stderr)
         return 2
     versions = {}
-    for interpreter in sys.argv[1:]:
+    for interpreter in interpreters:
         print(f"resolving with {interpreter} ...", file=sys.stderr, flush=True)
-        version, chosen = resolve(interpreter)
+        version, chosen = resolve(interpreter, keep)
         versions[version] = chosen
     for name in SETS:
         head = f"# Written by tools/lock.py from {name}.in for Python {', '.join(versions)}. Do not edit.\n"
