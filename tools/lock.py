@@ -32,7 +32,8 @@ from pip._vendor.packaging.markers import default_environment
 sets = {name: [line.strip() for line in open(path) if line.strip() and not line.startswith("#")]
         for name, path in json.loads(sys.argv[1]).items()}
 everything = [line for lines in sets.values() for line in lines]
-pip = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-", *sys.argv[2:]]
+pip = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-"]
+pip += sys.argv[2:]
 out = subprocess.run([*pip, *everything], check=True, stdout=subprocess.PIPE).stdout
 metadata = [item["metadata"] for item in json.loads(out)["install"]]
 chosen = {canonicalize_name(each["name"]): each for each in metadata}

@@ -22,6 +22,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.unslotted import check_carried
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.graph.parameters import to_parameters
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import init_ros, keep_node
@@ -30,7 +31,6 @@ from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.options import new_directory
 from dtsa_bench.simulation.simulate import may_share
-from dtsa_channel_sim.ros.answers import named
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.observer import ChannelObserver

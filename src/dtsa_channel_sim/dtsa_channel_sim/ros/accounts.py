@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, SLOT, Unusable, check_ids
 from dtsa_agent.ros.common.wire.report_fields import ReportFields
 
-from .answers import Answers, TakenIn, named
+from .answers import Answers, TakenIn
 
 _LONGEST = 2000  # slots in one report
 _MOST_HEARD = 20_000  # frames taken in, in one report

@@ -11,6 +11,7 @@ import numpy as np
 from dtsa_msgs.msg import Transmission
 from numpy.typing import NDArray
 
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.wire.checks import FARTHEST_M, RANGE, SIZES, UNKNOWN, Unusable, check_frames
 from dtsa_agent.ros.common.wire.packing import split_frames
 from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields
@@ -224,15 +225,3 @@ class Answers:
             known = len(index), slice(int(index[0]), int(index[-1]) + 1) if run else index
             self._layouts[key] = known
         return known
-
-
-def named(ids: Any) -> str:
-    """Agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row."""
-    listed = sorted(ids)
-    parts, start = [], 0
-    for end in range(1, len(listed) + 1):
-        if end == len(listed) or listed[end] != listed[end - 1] + 1:
-            first, last = listed[start], listed[end - 1]
-            parts.append(f"cf{first}" if first == last else f"cf{first} .. cf{last}")
-            start = end
-    return ", ".join(parts) or "nobody"

@@ -12,6 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.runs import run_text
 from dtsa_agent.ros.common.process.waiting import Patience
 from dtsa_agent.ros.common.wire.checks import OTHER_RUN, OTHER_SENDER, SLOT, UNREADABLE, Unusable
@@ -20,7 +21,6 @@ from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, r
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
-from .answers import named
 from .ros_channel import RosChannel, put_frames
 
 _REPEAT_S = 0.1  # until all agents have answered slot 0, it is sent again and again

@@ -17,6 +17,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from dtsa_agent.core.errors import LocalProtocolError
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.process.runs import run_text
 from dtsa_agent.ros.common.process.waiting import Patience
@@ -29,7 +30,7 @@ from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
 from .accounts import Accounts, Delivered
-from .answers import Answers, named
+from .answers import Answers
 from .live_air import Begun, LiveAir, Sent, slot_verdict
 from .pace import Pace
 from .roll_call import RollCall

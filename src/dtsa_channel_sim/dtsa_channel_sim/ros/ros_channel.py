@@ -17,6 +17,7 @@ from rosgraph_msgs.msg import Clock
 
 from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.loop import Feed, Loop
 from dtsa_agent.ros.common.process.runs import Run
 from dtsa_agent.ros.common.process.waiting import Patience
@@ -26,7 +27,7 @@ from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.schedule import Change
 
-from .answers import Answers, named
+from .answers import Answers
 from .observer import ChannelObserver, ChannelStatus, Observers, Referee, SlotLimit
 from .roster import Roster
 

@@ -11,6 +11,7 @@ from dtsa_msgs.msg import Process
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.agreement import settings_hash
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.runs import run_text
 from dtsa_agent.ros.common.wire.checks import (
     OTHER_RUN,
@@ -24,8 +25,6 @@ from dtsa_agent.ros.common.wire.checks import (
     plain,
 )
 from dtsa_agent.ros.common.wire.intake import add_counts
-
-from .answers import named
 
 _DOUBT_S = 0.5  # two processes with the same agent: which of them is alive shows within this time
 _LATE_DOUBT_S = 2.5  # the same once the run is under way: an agent is lost after 2 s

@@ -6,10 +6,11 @@ import time
 
 from rclpy.node import Node
 
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.waiting import Waiting
 from dtsa_channel_sim.model.config import Change
 
-from .answers import Answers, named
+from .answers import Answers
 from .observer import ChannelObserver, ChannelStatus
 
 _SLOW_S = 1.0  # wall time after which an answer that is missing in flight is worth a warning

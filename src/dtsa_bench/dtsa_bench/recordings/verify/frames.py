@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.ros.common.graph.names import named
 from dtsa_channel_sim import Air, Channel, ChannelConfig, OnAir
 
 from .result import Difference, Mismatch
@@ -229,6 +230,4 @@ def _shown(received: Mask, lost: int, collided: int) -> tuple[str, str, str]:
 
 
 def _ids(mask: Mask) -> str:
-    from dtsa_channel_sim.ros.answers import named
-
     return named((np.flatnonzero(mask) + 1).tolist())

@@ -32,6 +32,7 @@ from .decisions import Decisions
 from .frames import SentFrames
 from .intake import Intake
 from .lockstep import parameter_value
+from .odometry import Report, odometry_fault
 from .rebuild import DECISION, RECEPTION, SLOT, TRANSMISSION
 from .result import Difference, Mismatch, Result
 from .stream import Streams
@@ -43,8 +44,6 @@ _CHECKED = (SLOT, TRANSMISSION, FRAME, REPORT, DECISION, RECEPTION, EVENTS)
 _RUN = 0  # Slot.RUN
 _SECOND = 1_000_000_000
 _SLOT_MASK = 0xFFFFFFFF  # slots have 32 bits in frames
-_PLACE_M = 1e-6  # m, for rounding
-_FASTER = 20.0  # m/s^2: no vehicle changes its velocity faster
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -76,7 +75,7 @@ class RealtimeCheck:
         self.frames = SentFrames(self.run.air, self.own_clocks)
         self.position = np.full((3, self.agents), np.nan)  # m, true, as last reported
         self._slots = np.full(self.agents, -1, dtype=np.int64)  # last slot that each has answered
-        self._places: list[list[tuple[int, NDArray[np.float64], float]]] = [[] for _ in range(self.agents)]
+        self._places: list[list[Report]] = [[] for _ in range(self.agents)]
         self._decided: dict[int, dict[int, tuple[int, int, int, float]]] = {}
         self._digests = np.zeros(self.agents, dtype=np.uint32)  # in the decisions of the slot before
         self._carried: set[tuple[int, int]] = set()  # slot and agent whose report missed the slot's account
@@ -420,25 +419,16 @@ class RealtimeCheck:
                 self.result.skipped[topic] = "not recorded"
                 continue
             table = tables[topic]
-            slots = np.array([report[0] for report in reports])
-            at = names.TIME_ZERO_NS + slots * self.slot_ns
-            row = np.clip(np.searchsorted(at, table["log_time_ns"], "right") - 1, 0, len(at) - 1)
-            place = np.array([report[1] for report in reports])[row]
-            speed = np.array([report[2] for report in reports])[row]
-            gap = np.abs(table["log_time_ns"] - at[row]) / 1e9
-            last = row == len(at) - 1  # an agent that has fallen silent is taken to stay
-            allowed = np.where(last, np.inf, _PLACE_M + speed * gap + 0.5 * _FASTER * gap * gap)
+            times = table["log_time_ns"]
             found = np.column_stack([table[name] for name in fields])
-            seen = (table["log_time_ns"] - names.TIME_ZERO_NS) // self.slot_ns
+            seen = (times - names.TIME_ZERO_NS) // self.slot_ns
             carried = np.array([(int(slot), agent) in self._carried for slot in seen])
-            place[carried] = np.roll(found, 1, axis=0)[carried]
-            allowed[carried] = _PLACE_M
-            away = np.linalg.norm(found - place, axis=1)
-            bad = np.flatnonzero(away > allowed)
-            if len(bad):
-                self._fail(topic, f"within {allowed[bad[0]]:.6f} m of the reported place", f"{away[bad[0]]:.6f} m away",
-                           "odometry is the true motion", int(slots[row[bad[0]]]), agent)  # fmt: skip
-            self.result.count("odometry", len(row))
+            fault = odometry_fault(times, found, carried, reports, self.slot_ns)
+            if fault is not None:
+                row, away, allowed = fault
+                self._fail(topic, f"within {allowed:.6f} m of the reported place", f"{away:.6f} m away",
+                           "odometry is the true motion", int(seen[row]), agent)  # fmt: skip
+            self.result.count("odometry", len(times))
 
     def _summary(self) -> dict[str, Any]:
         if self.result.broken_off:

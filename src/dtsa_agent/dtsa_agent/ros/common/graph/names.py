@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 SWARM = "/swarm"  # namespace of what the whole swarm shares
@@ -90,3 +91,18 @@ def lockstep_qos(writers: int = 1) -> Any:
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.VOLATILE,
     )
+
+
+def named(ids: Iterable[int]) -> str:
+    """Agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row.
+
+    :param ids: of the agents.
+    """
+    listed = sorted(ids)
+    parts, start = [], 0
+    for end in range(1, len(listed) + 1):
+        if end == len(listed) or listed[end] != listed[end - 1] + 1:
+            first, last = listed[start], listed[end - 1]
+            parts.append(f"cf{first}" if first == last else f"cf{first} .. cf{last}")
+            start = end
+    return ", ".join(parts) or "nobody"
