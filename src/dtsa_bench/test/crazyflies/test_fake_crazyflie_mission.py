@@ -127,6 +127,7 @@ def check_records(out: Path) -> None:
     assert [s["state"] for s in one["states"]][-4:] == ["armed", "flying", "landing", "ready"]
     assert 3.0 < one["battery_least_v"] <= one["battery_first_v"] < 4.3
     assert "commands [Hz]" in one["last"]
+    assert (out / "mission_bag" / "metadata.yaml").is_file(), "the recorder got no time to close its bag"
     with AnyReader([out / "mission_bag"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
         counts = {name: topic.msgcount for name, topic in bag.topics.items()}
     assert set(counts) >= {"/all/events", "/diagnostics"}

@@ -38,6 +38,7 @@ from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_bench.runs.options import new_directory, whole_number
 from dtsa_bench.runs.processes import end_process
+from dtsa_bench.runs.program import program
 from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
@@ -181,8 +182,12 @@ class _Station:
                 if not self._attach:
                     _end_bridge(self.bridge.all[0])
             finally:
-                # If the recorder does not close its bag, the bag is recovered as any other.
                 end_process(self._recorder.all[0].process, RECORDER_END_S)
+                bag = self._directory / MISSION_BAG
+                if not (bag / "metadata.yaml").is_file():
+                    self.progress.say(
+                        f"the recorder did not close {bag}: `{program()} recover {bag}` saves what it holds"
+                    )
                 if mission is not None:
                     mission.log.write(self._directory, ended.reason)
         self.progress.end()
