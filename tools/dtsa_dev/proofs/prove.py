@@ -18,11 +18,13 @@ _SPEED = "-O2"
 ANY = -1  # any number of times
 # Not explored as they fly: whom a turn is worth most to (any of those able may get it, or nobody, also when it is
 # handed on), which are OPEN, and whether movers give turns away (they may).
-_CHOICE = "choose_lessee(v, &who, turn)"
-_FREE_CHOICE = "prove_lessee(who.able, v->n)"
-_OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, &who, turn)", "mine && prove_open()"
+_CHOICE, _FREE_CHOICE = (
+    "k = choose_lessee(v, who, turn);\n    if (mine",
+    "k = prove_lessee(who->able, v->n);\n    if (mine",
+)
+_OPEN_TURN, _FREE_OPEN_TURN = "mine && is_open(v, who, turn)", "mine && prove_open()"
 _LENDS, _FREE_LENDS = "few_move && v->a->lost < FEW;", "(few_move || 1);"
-_KEEPS = "(!idle && keeps(v, &who, turn))"
+_KEEPS = "(!idle && keeps(v, who, turn))"
 _NEXT, _FREE_NEXT = "choose_next(v, &who, idle, turn)", "prove_next(who.able, v->self, v->n)"
 _LAST, _EACH = "turn < last + !idle;", "turn <= last;"
 _REACH = "RELAY_REACH = 24"
