@@ -1,7 +1,7 @@
 """The pictures of the explanation pages, drawn from slots that the protocol core really plays.
 
-`python -m dtsa_dev.documents.pictures DIR` writes them as SVG. They stand on a light ground of their own, so that they can
-be read on a dark page, and are as wide as a telephone shows.
+`python -m dtsa_dev.documents.pictures DIR` writes them as SVG. They stand on a light ground of their own, so that they
+can be read on a dark page, and their letters are large enough for a telephone.
 """
 
 from __future__ import annotations
@@ -182,7 +182,8 @@ def lost_frame() -> Drawing:
     both = sum(len(slot.senders) > 1 for slot in shown)
     silent = sum(not slot.senders for slot in shown)
     spoilt = sum(len(slot.senders) != 1 for slot in slots(config, first + count)[0][first:])
-    drawing.words([f"In slot {missed} cf{by} misses the frame of cf{shown[missed - first].senders[0]}. Its table differs from now on,",
+    sender = shown[missed - first].senders[0]
+    drawing.words([f"In slot {missed} cf{by} misses the frame of cf{sender}. Its table differs from now on,",
                    f"and so do its choices. Of {count} slots, {both} hold two frames that",
                    f"collide and {silent} stay empty. Without the loss: {spoilt or 'none'}."])  # fmt: skip
     return drawing
