@@ -7,7 +7,7 @@ from collections.abc import Sequence
 COMMANDS = {
     "soak": "what is too long for the tests: kills, faults, load and memory over hours",
     "prove": "policy lease explored state by state, for all patterns of loss",
-    "protocol": "the slot protocols alone, without flight: the tables of docs/protocol.md",
+    "protocol": "the slot protocols alone, without flight: the tables of docs/evidence/protocol.md",
     "embedded": "the protocol on a simulated microcontroller: the same bits, and what it costs",
     "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
 }
@@ -15,7 +15,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "soak": (("--list", "what there is"), ("kill --sample", "a few minutes' part of one")),
     "benchmark": (("--json", "all parts, as JSON"),),
     "prove": (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only")),
-    "embedded": (("", "needs a cross compiler and QEMU, see docs/embedded.md"),),
+    "embedded": (("", "needs a cross compiler and QEMU, see docs/evidence/embedded.md"),),
     "protocol": (("", "all tables, into runs/protocol"), ("--seeds 3 --slots 6000", "fewer and shorter runs")),
 }
 

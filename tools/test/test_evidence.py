@@ -14,29 +14,31 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = "Before.\n<!-- evidence: fuzz -->\nold\n<!-- end -->\nAfter.\n"
 
 
-@pytest.mark.parametrize("path", sorted(DOCS.glob("*.md")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted(DOCS.rglob("*.md")), ids=lambda path: str(path.relative_to(DOCS)))
 def test_quotations_are_those_of_the_records(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    assert rewritten(text, DOCS / "evidence") == text, "run: python -m dtsa_dev.documents.evidence_tables docs/*.md"
+    assert rewritten(text, DOCS / "evidence") == text, "run: python -m dtsa_dev.documents.evidence_tables docs/*/*.md"
 
 
 def test_every_quotation_is_on_a_page() -> None:
-    text = "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("*.md"))
+    text = "".join(path.read_text(encoding="utf-8") for path in DOCS.rglob("*.md"))
     assert all(f"<!-- evidence: {name} -->" in text for name in QUOTED)
 
 
 def test_a_page_follows_its_record(tmp_path: Path) -> None:
-    (tmp_path / "page.md").write_text(PAGE)
-    assert main([str(tmp_path / "page.md")]) == 0
-    assert (tmp_path / "page.md").read_text() == PAGE  # no record yet
+    page = tmp_path / "how-to" / "page.md"
+    page.parent.mkdir()
+    page.write_text(PAGE)
+    assert main([str(page)]) == 0
+    assert page.read_text() == PAGE  # no record yet
     (tmp_path / "evidence").mkdir()
     figures = {"frames: inputs": 1_000_000, "agents: inputs": 2000}
     failures = [{"item": "frames 1", "reason": "stands still"}]
     for found, word in (([], "no findings"), (failures, "1 findings")):
         record = {"wall_s": 3600.0, "figures": figures, "failures": found}
         (tmp_path / "evidence" / "fuzz.json").write_text(json.dumps(record))
-        assert main([str(tmp_path / "page.md")]) == 0
-        text = (tmp_path / "page.md").read_text()
+        assert main([str(page)]) == 0
+        text = page.read_text()
         assert "60 minutes" in text
         assert "1,000,000" in text
         assert word in text

@@ -136,7 +136,7 @@ def test_the_documented_table_is_the_one_that_the_preset_writes() -> None:
     lines = long_table(summarise(rows, found)).splitlines()
     assert lines[2].endswith("|" + " 5.55 |" * 6 + " 1.00 |")
     assert sum(" 110 |" in line for line in lines) == 6
-    page = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8").splitlines()
+    page = (Path(__file__).parents[2] / "docs" / "evidence" / "protocol.md").read_text(encoding="utf-8").splitlines()
     begin = page.index(lines[0])
     shown = page[begin : begin + len(lines)]
     assert [line.split("|")[1] for line in shown] == [line.split("|")[1] for line in lines]

@@ -111,8 +111,8 @@ def test_items_of_a_soak_have_names_of_their_own_and_settings_for_the_journal(na
 
 
 def test_the_table_of_faults_in_the_docs_is_the_one_that_is_run() -> None:
-    text = (Path(__file__).resolve().parents[2] / "docs" / "faults.md").read_text(encoding="utf-8")
-    assert rewritten(text) == text, "run: python -m dtsa_dev.soak.faults docs/faults.md"
+    text = (Path(__file__).resolve().parents[2] / "docs" / "evidence" / "faults.md").read_text(encoding="utf-8")
+    assert rewritten(text) == text, "run: python -m dtsa_dev.soak.faults docs/evidence/faults.md"
     assert len(FAULTS) >= 30
     assert 3 * sum(fault.sample for fault in FAULTS) >= len(FAULTS)
 

@@ -1,4 +1,4 @@
-"""One of each: who sends next, where the others are, where to fly. See docs/bench.md.
+"""One of each: who sends next, where the others are, where to fly. See docs/reference/plug-ins.md.
 
 Everything here is a pure function of what the observer knows: no clock, no global random numbers. That is
 what makes nodes and simulator agree, and flights repeatable.

@@ -2,7 +2,7 @@
 
 This is the public interface; everything else in `dtsa_agent`, `dtsa_channel_sim` and `dtsa_bench` may change. Importing
 it costs next to nothing: what a name needs is loaded when the name is first used. Units are SI, positions are in frame
-`map` (the room's centre, ENU). Figures need Matplotlib, data frames need pandas. See docs/library.md.
+`map` (the room's centre, ENU). Figures need Matplotlib, data frames need pandas. See docs/how-to/python.md.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ _REGISTRIES: dict[str, Registry[Any]] = {registry.kind: registry for registry in
 def register(kind: str, name: str, factory: Any) -> None:
     """Makes a policy, estimator or avoider known to this process: `simulate` and `sweep` fly it by its name.
 
-    Worker processes and nodes do not know it: for these announce it by an entry point, see docs/bench.md.
+    Worker processes and nodes do not know it: for these announce it by an entry point, see docs/reference/plug-ins.md.
 
     :param kind: "policy", "estimator" or "avoider".
     :param name: what the setting of that kind calls it; one that was registered before is replaced.

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 
 class Recording:
-    """A recorded run. Tables are made when first asked for, with the columns of `dtsa export`: docs/columns.md.
+    """A recorded run. Tables are made when first asked for.
+
+    They have the columns of `dtsa export`: docs/reference/columns.md.
 
     :param path: run directory, bag directory or .mcap file.
     :raises UnusableBag: if it is no bag of this project, or is damaged.

@@ -79,7 +79,9 @@ def _refuse_registered(plan: Sweep, field: str, value: object) -> None:
             name = getattr(cell.run(plan.seeds[0]).swarm, kind)
             if name in names:
                 allowed = f"{'1' if field == 'jobs' else 'None'} with the registered {kind} {name}"
-                raise ConfigError(field, value, f"{allowed}; or announce it by an entry point (docs/bench.md)")
+                raise ConfigError(
+                    field, value, f"{allowed}; or announce it by an entry point (docs/reference/plug-ins.md)"
+                )
 
 
 def sweep(

@@ -48,7 +48,7 @@ def priorities(position: Array, velocity: Array, slot_s: float) -> Array:
 
 
 def orca(model: FlightModel, p: Array, v: Array, goal: Array, believed_p: Array, believed_v: Array) -> Array:
-    """Commands of all agents, (3, N), from one common table of beliefs; formulas in docs/avoiders.md."""
+    """Commands of all agents, (3, N), from one common table of beliefs; formulas in docs/reference/avoiders.md."""
     a, count = model.avoider, p.shape[1]
     wish = limited(a.gain * (goal - p), a.v_max)
     wish = limited(wish + a.bias * np.stack((wish[1], -wish[0], 0 * wish[0])), a.v_max)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 DESCRIPTION = """\
 Runs the slot protocols without flight: ages, waking, joins, deaths, jams, partitions. Writes results.json and the
-tables of docs/protocol.md, long.md and protocol.md. Interrupted, it goes on where it stopped when the same command is
-given again."""
+tables of docs/evidence/protocol.md, long.md and protocol.md. Interrupted, it goes on where it stopped
+when the same command is given again."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -1,8 +1,8 @@
 """What the documentation quotes of measurements, made from their records.
 
 A quotation stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`QUOTED`, and its
-record ``docs/evidence/NAME.json``. The command ``python -m dtsa_dev.documents.evidence_tables docs/*.md`` rewrites all
-quotations of these files.
+record ``docs/evidence/NAME.json``. The command ``python -m dtsa_dev.documents.evidence_tables docs/*/*.md`` rewrites
+all quotations of these files.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def speed(record: Row) -> str:
     heads = ("what", f"{_SIZES[0]} agents", *map(str, _SIZES[1:]))
     return (
         f"On {machine['cores']} cores of a server processor, load {machine['load']:.1f} before it began, Python "
-        f"{machine['python']} ([its record](evidence/speed.json), {record['date'][:10]}):\n\n"
+        f"{machine['python']} ([its record](../evidence/speed.json), {record['date'][:10]}):\n\n"
         f"{markdown(heads, lines)}\n\n{_nodes(record['nodes'])}\n{_targets(record['targets'])}"
     )
 
@@ -87,7 +87,7 @@ def fuzz(record: Row) -> str:
     """
     found, failures = record["figures"], len(record["failures"])
     return (
-        f"{record['wall_s'] / 60:.0f} minutes of it ([its record](evidence/fuzz.json)): "
+        f"{record['wall_s'] / 60:.0f} minutes of it ([its record](../evidence/fuzz.json)): "
         f"{found['frames: inputs']:,} inputs of decoders and {found['agents: inputs']:,} streams of events, "
         f"{failures or 'no'} findings.\n"
     )
@@ -106,8 +106,8 @@ def mutants(record: Row) -> str:
     found, equivalent = (sum(row[key] for row in modules.values()) for key in ("found", "equivalent"))
     before = len(record.get("failed_before_they_passed", ()))
     return (
-        f"{found} of {found + equivalent + len(lost)} are found ([its record](evidence/mutants.json)); {before} of the "
-        "items failed at first, and got a test or a note.\n\n"
+        f"{found} of {found + equivalent + len(lost)} are found ([its record](../evidence/mutants.json)); {before} of "
+        "the items failed at first, and got a test or a note.\n\n"
         f"{markdown(('module', 'found', 'nobody can tell', 'not found'), lines)}\n"
     )
 
@@ -123,7 +123,7 @@ def setup(record: Row) -> str:
     said = (
         f"After {figures['interruptions that ended well']} interruptions at random moments ({how}) the same command",
         f"ended well, {both} times with another set-up in the same moment; {len(record['failures'])} chains of",
-        "interruptions failed ([its record](evidence/setup.json)).",
+        "interruptions failed ([its record](../evidence/setup.json)).",
     )
     return "\n".join(said) + "\n"
 
@@ -168,11 +168,11 @@ QUOTED: dict[str, Callable[[Row], str]] = {"speed": speed, "fuzz": fuzz, "mutant
 
 
 def main(paths: Sequence[str]) -> int:
-    """Rewrites pages; records are in the directory ``evidence`` beside each."""
+    """Rewrites pages; records are in the directory ``evidence`` beside that of each."""
     for name in paths:
         path = Path(name)
         text = path.read_text(encoding="utf-8")
-        path.write_text(rewritten(text, path.parent / "evidence"), encoding="utf-8")
+        path.write_text(rewritten(text, path.resolve().parent.parent / "evidence"), encoding="utf-8")
     return 0
 
 

@@ -1,7 +1,7 @@
 """The tables of settings in the documentation, made from the code.
 
 A table stands between ``<!-- settings: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`TABLES`. The command
-``python -m dtsa_dev.documents.settings_tables docs/*.md`` rewrites all tables of these files.
+``python -m dtsa_dev.documents.settings_tables docs/*/*.md`` rewrites all tables of these files.
 """
 
 from __future__ import annotations

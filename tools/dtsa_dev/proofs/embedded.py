@@ -121,7 +121,7 @@ def _read(text: str) -> list[Flight]:
 
 
 def table(here: list[Flight], cortex: list[Flight], code: dict[str, int]) -> str:
-    """What docs/embedded.md shows, as Markdown.
+    """What docs/evidence/embedded.md shows, as Markdown.
 
     :param here: the flights on this machine.
     :param cortex: the same on the Cortex-M4F.

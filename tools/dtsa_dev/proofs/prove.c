@@ -236,7 +236,7 @@ static void unpack(const uint8_t *in)
     }
 }
 
-/* ---- rules (docs/protocol.md, invariants) ---- */
+/* ---- rules (docs/reference/protocol.md, invariants) ---- */
 
 static void rule(int holds, const char *name)
 {

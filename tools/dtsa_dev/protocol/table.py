@@ -129,7 +129,7 @@ _LONG = {
 
 
 def long_table(table: Sequence[dict[str, Any]]) -> str:
-    """Mean ages alone, as docs/protocol.md shows them, in Markdown.
+    """Mean ages alone, as docs/evidence/protocol.md shows them, in Markdown.
 
     :param table: from :func:`summarise`.
     """

@@ -8,7 +8,7 @@ from .item import Soak
 
 SOAKS = {
     "recorder": "the recorder killed at random moments of flights in both modes; its bags recovered and verified",
-    "faults": "every row of the table of faults, docs/faults.md, against real processes",
+    "faults": "every row of the table of faults, docs/evidence/faults.md, against real processes",
     "memory": "an hour of lockstep and ten minutes of real time: no process grows",
     "reference": "200 random flights on the compiled core and on the specification: equal bit for bit",
     "safer": "300 settings drawn at random: crashes and ages of `lease` beside TDMA and TDMA with gossip",

@@ -19,7 +19,7 @@ from .errors import ConfigError
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/protocol.md
+PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/reference/protocol.md
 
 
 class _Named(Protocol):

@@ -1,4 +1,4 @@
-/* The radio frame, byte by byte. Little-endian; layout in docs/protocol.md.
+/* The radio frame, byte by byte. Little-endian; layout in docs/reference/protocol.md.
  *
  *   0      version (high nibble), profile (low nibble)
  *   1-2    sender's id

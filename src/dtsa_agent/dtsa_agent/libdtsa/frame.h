@@ -1,4 +1,4 @@
-/* The radio frame: the only codec. Layout: docs/protocol.md. */
+/* The radio frame: the only codec. Layout: docs/reference/protocol.md. */
 #ifndef DTSA_FRAME_H
 #define DTSA_FRAME_H
 

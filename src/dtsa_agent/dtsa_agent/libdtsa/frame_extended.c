@@ -1,5 +1,5 @@
 /* The extended frame: the paper's state, and three sections about others. Layout in
- * docs/protocol.md.
+ * docs/reference/protocol.md.
  *
  *   0      version (high nibble), profile 2 (low nibble)
  *   1      sender's id, 1..254

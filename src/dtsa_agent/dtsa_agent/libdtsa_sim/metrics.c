@@ -1,5 +1,5 @@
 /* What a flight was worth: true distances, paths flown, ages and errors of estimates (see
- * docs/metrics.md). */
+ * docs/reference/metrics.md). */
 #include <math.h>
 
 #include "metrics.h"

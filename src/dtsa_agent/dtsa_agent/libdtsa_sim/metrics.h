@@ -1,4 +1,4 @@
-/* What a flight was worth: sums over its slots (docs/metrics.md). */
+/* What a flight was worth: sums over its slots (docs/reference/metrics.md). */
 #ifndef DTSA_METRICS_H
 #define DTSA_METRICS_H
 

@@ -1,4 +1,7 @@
-"""``ros2 run dtsa_agent agent`` with ``air:=udp``: frames over a network, a vehicle on the graph. docs/vehicles.md."""
+"""``ros2 run dtsa_agent agent`` with ``air:=udp``: frames over a network, a vehicle on the graph.
+
+How it is used: docs/how-to/vehicles.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A vehicle that offers odometry and takes velocities, flown by an agent on a network. docs/vehicles.md."""
+"""A vehicle that offers odometry and takes velocities, flown by an agent on a network. docs/how-to/vehicles.md."""
 
 from __future__ import annotations
 

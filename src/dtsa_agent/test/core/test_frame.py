@@ -19,7 +19,7 @@ from dtsa_agent.core import (
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
 
-# Written down by hand from the layout in docs/protocol.md: header 10 or 11, id, c_r, slot, position / 2 mm,
+# Written down by hand from the layout in docs/reference/protocol.md: header 10 or 11, id, c_r, slot, position / 2 mm,
 # velocity / 1 cm/s in 12 bits each, low nibble first.
 GOLDEN = [
     (Frame(1, 0, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "10 0100 00 00000000 0000 0000 0000 000000 0000"),

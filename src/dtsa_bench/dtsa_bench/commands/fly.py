@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
     group.add_argument("--picture", action=argparse.BooleanOptionalAction, default=True, help="draw trajectories.png")
     group.add_argument("--json", action="store_true", help="print summary.json instead of lines")
     group.add_argument(
-        "--view", action="store_true", help="show the flight in a browser on this machine, see docs/view.md"
+        "--view", action="store_true", help="show the flight in a browser on this machine, see docs/how-to/view.md"
     )
     group.add_argument("--view-port", metavar="N", default=None, help="port of the page [a free one]")
     group.add_argument(

@@ -24,7 +24,7 @@ def explained(error: ImportError) -> str:
     """
     name = (error.name or "").split(".")[0]
     how = _HOW.get(name)
-    return f"the Python package {name} is missing: {how.format(name)} (docs/install.md)" if how else ""
+    return f"the Python package {name} is missing: {how.format(name)} (docs/how-to/install.md)" if how else ""
 
 
 def say_missing(program: str, error: ImportError) -> int:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 DESCRIPTION = """\
 Writes a package with a policy of your own that works: the policy, a test, a sweep that sets it against the league's
-best and the bound, and the lines that install and run it. docs/bench.md says what a policy is given and returns."""
+best and the bound, and the lines that install and run it. What a policy is given and what it
+returns: docs/reference/plug-ins.md."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -18,7 +18,7 @@ DESCRIPTION = """\
 Flies every combination of a sweep's axes with every seed, without ROS, on all cores or on a Dask cluster, and
 writes results.csv, results.json, figures (PNG and SVG) and report.html. Interrupted, it goes on where it
 stopped when the same
-command is given again. Sweeps of your own: docs/bench.md."""
+command is given again. Sweeps of your own: docs/how-to/sweep.md."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -1,6 +1,6 @@
 """Intervals for what a sweep measured:
 
-shares with Wilson, means with a seeded bootstrap. See docs/metrics.md.
+shares with Wilson, means with a seeded bootstrap. See docs/reference/metrics.md.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ _MARKER_RECORD_NS = 100_000_000  # simulated time from one picture of the swarm 
 
 
 class FlightRecorder(ChannelObserver):
-    """Writes a flight into a bag, slot after slot; see docs/recording.md for topics and times.
+    """Writes a flight into a bag, slot after slot; see docs/reference/bag.md for topics and times.
 
     A slot counts as flown once all agents have told where it took them, in their answers to the next one. What a flight
     that is cut short leaves half done does not get into its bag.

@@ -1,6 +1,6 @@
 """The sums over a flight in plain Python: for swarms on the specification, whose tables the compiled ones do not see.
 
-The same numbers, bit for bit: sums go over agents in the order of their ids. What they mean: docs/metrics.md.
+The same numbers, bit for bit: sums go over agents in the order of their ids. What they mean: docs/reference/metrics.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Wakings: who has got a goal while it stood, and how long the others took to hear of it.
 
 Ages leave out those that an observer takes to stand: a mover that nobody has heard since it set out is in none of
-them. What is counted here begins with the goal, for every receiver, heard or not (docs/metrics.md).
+them. What is counted here begins with the goal, for every receiver, heard or not (docs/reference/metrics.md).
 """
 
 from __future__ import annotations

@@ -70,12 +70,12 @@ def test_all_presets_are_there_and_every_run_of_them_is_possible() -> None:
 
 
 def test_slots_of_slow_radios_hold_their_frames() -> None:
-    """As docs/channel.md computes them: the air time and 5 ms, rounded up."""
+    """As docs/reference/channel.md computes them: the air time and 5 ms, rounded up."""
 
     def lora_ms(length: int, bandwidth_khz: float) -> float:
         return float((8 + 4.25 + 8 + 5 * math.ceil((8 * length - 4 * 7 + 44) / (4 * 7))) * 2**7 / bandwidth_khz)
 
-    text = (Path(__file__).resolve().parents[4] / "docs" / "channel.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[4] / "docs" / "reference" / "channel.md").read_text(encoding="utf-8")
     times = {
         "LoRa 250 kHz": [lora_ms(length, 250.0) for length in (19, 56)],
         "LoRa 500 kHz": [lora_ms(length, 500.0) for length in (19, 56)],

@@ -25,7 +25,7 @@ from dtsa_channel_sim.ros import live_air, pace, realtime_channel, roster
 
 ROOT = Path(__file__).resolve().parents[4]
 NAMES = ("README.md", "CONTRIBUTING.md", "REPRODUCTION.md")
-DOCUMENTS = [*(ROOT / name for name in NAMES), *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [*(ROOT / name for name in NAMES), *sorted((ROOT / "docs").rglob("*.md"))]
 SOURCES = [
     path for path in (ROOT / "src").rglob("*") if path.suffix in (".py", ".c", ".h") and "build" not in path.parts
 ]
@@ -35,14 +35,14 @@ OF_THE_TOOL = {"setup", "shell", "test", "ros2", "clean"}
 pytestmark = pytest.mark.skipif(not (ROOT / "tools" / "dtsa").exists(), reason="not in the source tree")
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_lead_somewhere(document: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", document.read_text(encoding="utf-8")):
         if "://" not in target:
-            assert (document.parent / target).exists(), f"{document.name} links to {target}"
+            assert (document.parent / target).exists(), f"{document.relative_to(ROOT)} links to {target}"
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_commands_exist(document: Path) -> None:
     known = OF_THE_TOOL | {*COMMANDS}
     for command in re.findall(r"tools/dtsa ([a-z][a-z0-9-]*)", document.read_text(encoding="utf-8")):
@@ -100,7 +100,7 @@ WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "
 SPANS = {1_000_000_000: "a second", 500_000_000: "half a second"}
 # What documents say with numbers that code has; a number that changes there changes here.
 FIGURES: dict[str, list[str]] = {
-    "realtime.md": [
+    "explanation/real-time.md": [
         f"more than {SPANS[pace._BEHIND_NS]} behind for {seconds(pace._TOO_LONG_NS)} seconds, the flight is ended",
         f"takes in {realtime_channel._FRAMES} frames and {WORDS[realtime_channel._REPORTS]} reports",
         f"for {WORDS[pace._STALL_SLOTS]} slots and {ms(pace._STALL_NS)} at least",
@@ -109,20 +109,20 @@ FIGURES: dict[str, list[str]] = {
         f"A frame is settled {live_air._GRACE:g} slots after it has left the air",
         f"until {realtime._LATEST:g} slots, at most {ms(realtime._LATEST_NS)}, after it",
         f"If that is more than {realtime_channel._TIGHT:g}",
-        f"frames that left within {ms(clock_statistics.ON_TIME_NS)} of the swarm's common time",
-        f"largest of the last {clock_statistics._END} slots",
         "after (K M + 1) N slots at the latest",  # RealtimeNode._ended; test_nodes leaves a flight so
     ],
-    "security.md": [
+    "how-to/security.md": [
         f"ends with a {authentication.TAG_LENGTH}-byte code",
         f"{authentication.MIN_KEY} to {authentication.MAX_KEY} bytes",
         f"processes of another run that stay for {roster._LEFT_OVER_S:g} s",
         f"(a line every {intake._LOG_S:g} s at most)",
     ],
-    "flights.md": [f"once {hearing._ROUNDS} N slots have passed"],
-    "metrics.md": [
+    "how-to/fly.md": [f"once {hearing._ROUNDS} N slots have passed"],
+    "reference/metrics.md": [
         f"closer than `collision_m` ({RunLimits().collision_m:g} m)",
         f"within `r_min` ({SwarmConfig().r_min:g} m)",
+        f"frames that left within {ms(clock_statistics.ON_TIME_NS)} of the swarm's common time",
+        f"largest of the last {clock_statistics._END} slots",
     ],
 }
 

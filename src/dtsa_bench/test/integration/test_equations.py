@@ -1,4 +1,4 @@
-"""docs/equations.md leads to code that exists, and every equation of the paper that is computed stands in it."""
+"""docs/reference/equations.md leads to code that exists and has every equation of the paper that is computed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LABELS = {
 
 
 def rows() -> list[list[str]]:
-    text = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "equations.md").read_text(encoding="utf-8")
     lines = [line.replace("\\|", "!") for line in text.splitlines() if line.startswith("|")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [row for row in cells if not row[0].startswith(("equation or rule", "rule", "---"))]
@@ -38,10 +38,10 @@ def found(name: str) -> Any:
         except ModuleNotFoundError:
             continue
         for part in parts[count:]:
-            assert hasattr(thing, part), f"docs/equations.md: {name}: there is no {part!r} in {thing!r}"
+            assert hasattr(thing, part), f"docs/reference/equations.md: {name}: there is no {part!r} in {thing!r}"
             thing = getattr(thing, part)
         return thing
-    pytest.fail(f"docs/equations.md: {name}: no such module below {SPECIFICATION}")
+    pytest.fail(f"docs/reference/equations.md: {name}: no such module below {SPECIFICATION}")
 
 
 @cache
@@ -60,7 +60,7 @@ def test_every_name_exists(row: list[str]) -> None:
     for label in re.findall(r"eq:\w+", rule):
         assert any(label in (thing.__doc__ or "") for thing in things), f"no docstring of {python} names {label}"
     missing = [name for name in names(c) if name not in compiled()]
-    assert not missing, f"docs/equations.md: {rule}: the C sources define no {', '.join(missing)}"
+    assert not missing, f"docs/reference/equations.md: {rule}: the C sources define no {', '.join(missing)}"
 
 
 def test_every_equation_that_is_computed_is_there() -> None:

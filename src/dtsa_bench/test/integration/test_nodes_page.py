@@ -1,4 +1,4 @@
-"""The lines of docs/nodes.md fly as they stand there."""
+"""The lines of docs/how-to/nodes.md fly as they stand there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHARE = Path(__file__).resolve().parents[2]
 packages = pytest.importorskip("ament_index_python.packages")
 pytest.importorskip("dtsa_msgs.msg")
 
-PAGE = (Path(__file__).resolve().parents[4] / "docs/nodes.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[4] / "docs/how-to/nodes.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
 
 

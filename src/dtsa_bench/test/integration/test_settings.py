@@ -277,14 +277,14 @@ def test_all_columns_of_the_results_are_reserved() -> None:
 
 
 # -- documentation ---------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("path", sorted(DOCS.glob("*.md")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted(DOCS.rglob("*.md")), ids=lambda path: str(path.relative_to(DOCS)))
 def test_tables_of_settings_are_those_of_the_code(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    assert rewritten(text) == text, "run: python -m dtsa_dev.documents.settings_tables docs/*.md"
+    assert rewritten(text) == text, "run: python -m dtsa_dev.documents.settings_tables docs/*/*.md"
 
 
 def test_every_setting_is_in_the_documentation() -> None:
-    text = "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("*.md"))
+    text = "".join(path.read_text(encoding="utf-8") for path in DOCS.rglob("*.md"))
     missing = {name for name in TABLES if f"<!-- settings: {name} -->" not in text}
     assert missing <= {"flight models, none"}
     assert all(f"| `{name}` * |" in text for name in CHANGEABLE)

@@ -128,7 +128,7 @@ def test_pairs_of_a_flight_without_losses_have_all_observers(tmp_path: Path) -> 
 
 
 def test_the_document_of_columns_is_made_from_them() -> None:
-    document = Path(__file__).resolve().parents[4] / "docs" / "columns.md"
+    document = Path(__file__).resolve().parents[4] / "docs" / "reference" / "columns.md"
     if not document.exists():
         pytest.skip("not in the source tree")
     assert document.read_text(encoding="utf-8") == describe()

@@ -370,7 +370,7 @@ def test_options_of_plug_ins_that_do_not_fly_are_allowed() -> None:
 
 
 def test_the_page_lists_the_fields_of_the_table() -> None:
-    page = (EXAMPLE.parents[1] / "docs" / "bench.md").read_text(encoding="utf-8")
+    page = (EXAMPLE.parents[1] / "docs" / "reference" / "plug-ins.md").read_text(encoding="utf-8")
     rows = page.partition("| field | what it is |\n|---|---|\n")[2].partition("\n\n")[0].splitlines()
     assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row.split("|")[1])) == sorted(
         plugins.Table.__slots__

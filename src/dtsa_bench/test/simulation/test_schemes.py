@@ -30,7 +30,7 @@ from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.airtime import Airtime
 from dtsa_channel_sim.model.verdict import COLLISION
 
-LEAGUE = Path(__file__).resolve().parents[4] / "docs" / "league.md"
+LEAGUE = Path(__file__).resolve().parents[4] / "docs" / "evidence" / "league.md"
 
 
 def steady(

@@ -22,7 +22,7 @@ _SLOT_MS = Setting("slot_ms", "float", None, "length of a slot", unit="ms", mini
 
 @dataclass(frozen=True, slots=True)
 class ChannelConfig(Settings):
-    """Everything that the channel's behaviour depends on. Models and formulas: docs/channel.md.
+    """Everything that the channel's behaviour depends on. Models and formulas: docs/reference/channel.md.
 
     :raises ConfigError: when a setting, or a combination of settings, is not usable.
     """

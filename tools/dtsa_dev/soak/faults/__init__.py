@@ -21,7 +21,7 @@ FAULTS: tuple[Fault, ...] = (
     *clocks.FAULTS,
 )
 _BY_NAME = {fault.name: fault for fault in FAULTS}
-_MARK = "<!-- faults: made by `python -m dtsa_dev.soak.faults docs/faults.md` -->"
+_MARK = "<!-- faults: made by `python -m dtsa_dev.soak.faults docs/evidence/faults.md` -->"
 _END = "<!-- end -->"
 _SECONDS = 25.0  # a guess of the wall time of a row
 
@@ -56,7 +56,7 @@ def rewritten(text: str) -> str:
 
 SOAK = Soak(
     "faults",
-    "Each fault of docs/faults.md has the reaction that stands beside it.",
+    "Each fault of docs/evidence/faults.md has the reaction that stands beside it.",
     tuple(Item(fault.name, {}, 0, _SECONDS, fault.sample) for fault in FAULTS),
     _run,
     _figures,

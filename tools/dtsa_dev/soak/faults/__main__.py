@@ -1,4 +1,4 @@
-"""Writes the table of faults into a document: ``python -m dtsa_dev.soak.faults docs/faults.md``."""
+"""Writes the table of faults into a document: ``python -m dtsa_dev.soak.faults docs/evidence/faults.md``."""
 
 from __future__ import annotations
 

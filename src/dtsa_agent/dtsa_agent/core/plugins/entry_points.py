@@ -1,4 +1,4 @@
-"""Policies, estimators and avoiders from other packages, found by entry point. See docs/bench.md.
+"""Policies, estimators and avoiders from other packages, found by entry point. See docs/reference/plug-ins.md.
 
 A package announces them in its metadata::
 
@@ -7,7 +7,7 @@ A package announces them in its metadata::
 
 and then ``policy="reverse"`` works everywhere: in `simulate`, `sweep` and in the nodes. What is announced is
 a factory; it is called once for every observer, as ``factory(config, agent)`` (agent: its id, 0 for tables
-that hear everything). What it makes is one of :mod:`.plugin_kinds`.
+that hear everything). What it makes is one of :mod:`.kinds`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The protocol as a specification that runs: plain Python, to be read beside the paper and docs/protocol.md.
+"""The protocol as a specification that runs: plain Python, to be read beside the paper and docs/reference/protocol.md.
 
 Everything that agents must agree on stands here once, and once more in C (``libdtsa``), which is what flies. Both
-give the same frames, tables, decisions, digests and times, bit for bit; tests hold them together. docs/equations.md
-leads from an equation to both.
+give the same frames, tables, decisions, digests and times, bit for bit; tests hold them together.
+docs/reference/equations.md leads from an equation to both.
 
 Nothing in here needs NumPy, a compiler or the rest of the core. One file, one subject:
 

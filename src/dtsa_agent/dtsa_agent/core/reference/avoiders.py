@@ -1,4 +1,4 @@
-"""Where to fly: collision avoidance for one agent, as docs/avoiders.md has it, in clear geometry.
+"""Where to fly: collision avoidance for one agent, as docs/reference/avoiders.md has it, in clear geometry.
 
 The compiled avoiders compute the same in another order; they agree to about 1e-12 m/s, not bit for bit: every agent
 commands itself only, so nobody else has to compute the same.

@@ -1,6 +1,6 @@
 """The radio frame, byte by byte: profiles ``paper`` and ``paper-intent``, and the head of ``extended`` ones.
 
-Little-endian; the layout is docs/protocol.md's table::
+Little-endian; the layout is docs/reference/protocol.md's table::
 
     0      version (high nibble), profile (low nibble)
     1-2    sender's id

@@ -1,4 +1,6 @@
-"""The extended frame: the paper's state, and three sections about others; the layout is docs/protocol.md's table::
+"""The extended frame: the paper's state, and three sections about others.
+
+The layout is docs/reference/protocol.md's table::
 
 0      version (high nibble), profile 2 (low nibble)
 1      sender's id, 1..254

@@ -1,4 +1,7 @@
-"""Whose frame it was: a truncated message authentication code over frame, slot and session (docs/security.md)."""
+"""Whose frame it was: a truncated message authentication code over frame, slot and session.
+
+What it protects: docs/how-to/security.md.
+"""
 
 from __future__ import annotations
 

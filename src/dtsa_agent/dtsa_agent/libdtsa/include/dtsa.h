@@ -1,5 +1,5 @@
 /* libdtsa: one agent of a swarm that shares a radio channel in slots. Protocol and frames:
- * docs/protocol.md.
+ * docs/reference/protocol.md.
  *
  * No Python, ROS, clock, heap, I/O, or function of libm but sqrt: the caller owns memory, time and
  * radio. All agents compute the same bits on every machine with IEEE 754 doubles: compile without
@@ -97,7 +97,7 @@ enum {
 };
 
 /* Parameters of all avoiders; which fields count depends on the avoider. Formulas and defaults:
- * docs/avoiders.md. All are doubles, so that bindings can read them as a list. */
+ * docs/reference/avoiders.md. All are doubles, so that bindings can read them as a list. */
 typedef struct dtsa_avoid_params {
     double v_max;       /* m/s, largest commanded speed */
     double gain;        /* 1/s, K_P: v_pref = min(v_max, gain * distance) towards the goal */

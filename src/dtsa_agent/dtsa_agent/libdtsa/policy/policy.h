@@ -1,4 +1,4 @@
-/* What a policy is: one row, one file. docs/protocol.md says who sends under each. */
+/* What a policy is: one row, one file. docs/reference/protocol.md says who sends under each. */
 #ifndef DTSA_POLICY_H
 #define DTSA_POLICY_H
 

@@ -1,4 +1,7 @@
-"""What a sweep flies: a base, axes that are combined with each other, and seeds. Read from YAML; see docs/bench.md."""
+"""What a sweep flies: a base, axes that are combined with each other, and seeds.
+
+Read from YAML; see docs/how-to/sweep.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Records what one agent did and heard: MCAP with JSON messages, which needs no ROS (docs/several-computers.md)."""
+"""Records what one agent did and heard: MCAP with JSON messages, which needs no ROS.
+
+What is in it: docs/how-to/several-computers.md.
+"""
 
 from __future__ import annotations
 

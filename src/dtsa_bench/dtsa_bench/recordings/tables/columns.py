@@ -1,6 +1,6 @@
 """What each column of each table holds: the one place from which the documents and the files' metadata come.
 
-python -m dtsa_bench.recordings.tables.columns > docs/columns.md
+python -m dtsa_bench.recordings.tables.columns > docs/reference/columns.md
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ class Result:
         if not judge.knows_rules:
             return
         if judge.broken:
-            why = "a turn is its owner's, or of the last one to whom it was given (docs/protocol.md)"
+            why = "a turn is its owner's, or of the last one to whom it was given (docs/reference/protocol.md)"
             raise Mismatch(Difference("frames", "none against the rules", "; ".join(judge.broken[:3]), why))
         self.count("slots whose frames keep to the rules", judge.slots)
         if judge.unjudged:

@@ -1,4 +1,6 @@
-"""Policy ``lease``: only whose turn it is gives it away. Rules, events and proof: docs/protocol.md.
+"""Policy ``lease``: only the owner of a turn gives it away.
+
+Rules and events: docs/reference/protocol.md; proof: docs/explanation/lease.md.
 
 * :mod:`.memory`: what an agent remembers, and what that says about a turn
 * :mod:`.decide`: who sends in a slot

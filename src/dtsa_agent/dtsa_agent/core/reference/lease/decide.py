@@ -1,4 +1,4 @@
-"""Policy ``lease``: who sends in a slot, as one agent sees it (docs/protocol.md, "Who sends in slot T")."""
+"""Policy ``lease``: who sends in a slot, as one agent sees it (docs/reference/protocol.md, "Who sends in slot T")."""
 
 from __future__ import annotations
 

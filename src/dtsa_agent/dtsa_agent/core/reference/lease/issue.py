@@ -1,4 +1,4 @@
-"""Policy ``lease``: what an agent says about turns (docs/protocol.md, "Giving turns away")."""
+"""Policy ``lease``: what an agent says about turns (docs/reference/protocol.md, "Giving turns away")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Policy ``lease``: what a frame changes, and what silence does (docs/protocol.md, "States and events of an agent")."""
+"""Policy ``lease``: what a frame changes, and what silence does.
+
+docs/reference/protocol.md, "States and events of an agent".
+"""
 
 from __future__ import annotations
 

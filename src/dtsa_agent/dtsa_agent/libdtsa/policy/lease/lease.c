@@ -2,7 +2,8 @@
  *
  * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its
  * next main anchor; who was given it may hand it on in the same way. So whoever sends in a turn is
- * its owner or the last one that was named for it. docs/protocol.md has states, events and proof.
+ * its owner or the last one that was named for it. docs/reference/protocol.md has states and events,
+ * docs/explanation/lease.md the proof.
  */
 #include <string.h>
 

@@ -1,4 +1,4 @@
-/* Policy lease: only whose turn it is gives it away (docs/protocol.md). */
+/* Policy lease: only whose turn it is gives it away (docs/reference/protocol.md). */
 #ifndef DTSA_LEASE_H
 #define DTSA_LEASE_H
 
