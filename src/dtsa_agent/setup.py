@@ -21,7 +21,7 @@ COMPILE_FLAGS = [
 ]
 
 LIBRARY, SIMULATOR, BINDING = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/core/_kernel"
-HEARING = "dtsa_agent/air/udp/_hearing"
+HEARING, SOCKET = "dtsa_agent/air/_hearing", "dtsa_agent/air/udp/_socket"
 WORKAROUNDS = "dtsa_agent/ros/common/workarounds"
 OF_THE_LIBRARY = ("draw", "frame", "tag", "timebase")  # what an agent on a network uses without Python between
 
@@ -46,11 +46,20 @@ setup(
             libraries=["m"],
         ),
         Extension(
-            "dtsa_agent.air.udp._hearing",
+            "dtsa_agent.air._hearing",
             sources=[*files(".c", (HEARING,)), *(f"{LIBRARY}/{name}.c" for name in OF_THE_LIBRARY)],
             depends=[*files(".h", (LIBRARY, HEARING)), "setup.py"],
             include_dirs=[f"{LIBRARY}/include", LIBRARY, HEARING],
-            define_macros=[("_GNU_SOURCE", None)],  # recvmmsg, ppoll
+            define_macros=[("_GNU_SOURCE", None)],  # ppoll
+            extra_compile_args=COMPILE_FLAGS,
+            py_limited_api=True,
+        ),
+        Extension(
+            "dtsa_agent.air.udp._socket",
+            sources=files(".c", (SOCKET,)),
+            depends=[*files(".h", (HEARING, SOCKET)), "setup.py"],
+            include_dirs=[HEARING, SOCKET],  # of the hearing: port.h alone
+            define_macros=[("_GNU_SOURCE", None)],  # recvmmsg
             extra_compile_args=COMPILE_FLAGS,
             py_limited_api=True,
         ),

@@ -176,7 +176,8 @@ def compiled() -> list[Path]:
     package = layout.SOURCES / "dtsa_agent" / "dtsa_agent"
     return [
         kernel(),
-        package / "air" / "udp" / "_hearing.abi3.so",
+        package / "air" / "_hearing.abi3.so",
+        package / "air" / "udp" / "_socket.abi3.so",
         package / "ros" / "common" / "workarounds" / "_endless.abi3.so",
     ]
 

@@ -23,7 +23,7 @@ from dtsa_dev.network.trial import NotFlown, Trial, flight_time, under_way
 from metronome import flown_again_when_overloaded
 
 import dtsa
-from dtsa_agent.air.udp.datagram import Wrapping
+from dtsa_agent.air.datagram import Wrapping
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_bench.recordings.merge.merge import Merge, verified
 from dtsa_bench.recordings.merge.merged_run import lay

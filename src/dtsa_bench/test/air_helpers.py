@@ -15,7 +15,10 @@ from typing import Any
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.udp import AgentSettings, MulticastSocket, SlotRecord, UdpAgent, UdpSettings
+from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.record import SlotRecord
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.network.sniffer import Sniffer
@@ -48,7 +51,8 @@ class Flying:
     """One agent in a thread; a watcher of it beside its recorder."""
 
     def __init__(self, own: AgentSettings, config: SwarmConfig, udp: UdpSettings, path: Path) -> None:
-        self.agent = UdpAgent(own, config, udp)
+        self.port = UdpPort(udp)
+        self.agent = AirAgent(own, config, self.port)
         self.recorder = AgentRecorder(path, own, config, udp)
         self.agent.watcher = self
         self.stop = Stop()
@@ -70,7 +74,7 @@ class Flying:
         self.recorder.other(reason, data, arrival_ns)
 
     def _run(self) -> None:
-        with self.recorder, self.agent:
+        with self.recorder, self.port:
             self.agent.run(self.stop)
             self.recorder.finish(self.agent.summary())
 

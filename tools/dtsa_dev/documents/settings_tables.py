@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from dtsa_agent.air.udp.settings import AgentSettings, UdpSettings
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp.settings import UdpSettings
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Setting, Settings, settings_of
@@ -132,7 +133,7 @@ def _node(name: str) -> str:
 
 
 def _vehicle() -> str:
-    from dtsa_agent.ros.udp_vehicle import VehicleSettings  # needs ROS, too
+    from dtsa_agent.ros.odometry_vehicle import VehicleSettings  # needs ROS, too
 
     return settings_table(VehicleSettings)
 

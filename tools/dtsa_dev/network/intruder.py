@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections import deque
 
-from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.air.datagram import HEADER
 
 from .switch import Switch
 

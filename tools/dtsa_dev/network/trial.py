@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.air.datagram import HEADER
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import VARIABLE

@@ -12,7 +12,8 @@ from dtsa_agent.core.errors import DtsaError
 from .library import HERE, LIBRARY, NotHere, compile_program, sources, tool
 
 TARGETS = {"frames": 64, "agents": 1024, "hearing": 1024}  # largest input, bytes
-_HEARING = LIBRARY.parent / "air" / "udp" / "_hearing"  # what agents on a network hear
+_AIR = LIBRARY.parent / "air"
+_HEARING, _SOCKET = _AIR / "_hearing", _AIR / "udp" / "_socket"  # what agents on a network hear, and by what
 _FLAGS = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -43,8 +44,8 @@ def build(target: str, directory: Path, library: Path = LIBRARY) -> Path:
         parts = [path for path in parts if path.name.startswith("frame")]
     files, flags = [HERE / f"fuzz_{target}.c", *parts], list(_FLAGS)
     if target == "hearing":
-        files += [_HEARING / "hearing.c", _HEARING / "socket.c"]
-        flags += ["-D_GNU_SOURCE", f"-I{_HEARING}"]
+        files += [_HEARING / "hearing.c", _SOCKET / "stamps.c"]
+        flags += ["-D_GNU_SOURCE", f"-I{_HEARING}", f"-I{_SOCKET}"]
     try:
         return compile_program(clang, directory / f"fuzz_{target}", files, flags, library)
     except DtsaError as error:

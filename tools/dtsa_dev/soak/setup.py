@@ -27,7 +27,7 @@ _KILLS = ("packages", "kernels")  # in each chain; SIGKILL
 _TAKES_S = {_FIRST: 80.0, "packages": 10.0, "kernels": 12.0, "messages": 40.0}  # a first guess
 _PATIENCE_S = 900.0
 _SWAPPED = ("setuptools", "wheel", "colcon_core", "numpy", "pandas", "pyarrow")
-_SMOKE = "import dtsa_msgs.msg, pandas, pyarrow, rclpy, setuptools; import dtsa_agent.air.udp._hearing"
+_SMOKE = "import dtsa_msgs.msg, pandas, pyarrow, rclpy, setuptools; import dtsa_agent.air.udp._socket"
 _OURS = ("_PREFIX_PATH", "LD_LIBRARY_PATH", "PYTHONPATH", "VIRTUAL_ENV", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
 
 

@@ -1,4 +1,8 @@
-"""The port through which an agent's frames get on an air: simulated, or a real radio or network."""
+"""An agent with a clock of its own (`agent`: its loop), and the ports through which frames get on an air.
+
+`port` says what is asked of a port. `udp` is the port of a network; the simulated one is in the channel. Nothing here
+imports a port: who starts an agent makes one and hands it over.
+"""
 
 from .port import AirListener, AirPort, SlotHearing
 

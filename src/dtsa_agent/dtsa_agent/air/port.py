@@ -7,7 +7,7 @@ derives the outcome of a slot from what its own receiver has heard.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from dtsa_agent.core.swarms.outcome import SlotOutcome
 
@@ -49,6 +49,23 @@ class AirListener(Protocol):
         :param when_ns: ns, when the receiver had it whole.
         :param rssi_dbm: dBm, how strong it was; None where the air cannot tell.
         """
+
+
+class DatagramPort(Protocol):
+    """What an agent with a clock of its own asks of the port that carries its datagrams."""
+
+    flight_time_ns: int  # from the order to send a datagram until its arrival, without the time of its bytes
+    byte_time_ns: int  # what each byte adds to that
+    compiled: Any  # a capsule: what the compiled hearing reads (_hearing/port.h)
+
+    def send(self, data: bytes) -> bool:
+        """Sends a datagram at once; whether the port has taken it.
+
+        :param data: the datagram.
+        """
+
+    def counts(self) -> dict[str, int]:
+        """What it counts, by name, for the agent's summary."""
 
 
 @dataclass(slots=True)

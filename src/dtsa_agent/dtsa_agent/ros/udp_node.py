@@ -9,12 +9,14 @@ import json
 
 from rclpy.node import Node
 
-from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.ros.common.graph.parameters import declare_settings
 from dtsa_agent.stop import Stop
 
-from .udp_vehicle import ODOMETRY, OdometryVehicle, VehicleSettings
+from .odometry_vehicle import ODOMETRY, OdometryVehicle, VehicleSettings
 
 _DEFAULTS = {"policy": "lease", "auth": True}  # as of `tools/dtsa agent`
 
@@ -35,7 +37,8 @@ def fly_over_udp(node: Node, agent: int, stop: Stop) -> int:
     vehicle = OdometryVehicle(node, settings, config.slot_s) if settings.vehicle == ODOMETRY else None
     logger = node.get_logger()
     try:
-        with UdpAgent(own, config, udp, vehicle=vehicle) as flying:
+        with UdpPort(udp) as port:
+            flying = AirAgent(own, config, port, vehicle=vehicle)
             flying.run(stop)
             logger.info(f"ends: {json.dumps(flying.summary())}")
     finally:

@@ -12,14 +12,16 @@ from typing import Any
 
 import pytest
 
-from dtsa_agent.air.udp import AgentSettings, MulticastSocket, UdpAgent, UdpSettings
-from dtsa_agent.air.udp.clock import OwnClock
-from dtsa_agent.air.udp.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
-from dtsa_agent.air.udp.delay import Delay
-from dtsa_agent.air.udp.precision import going_first
-from dtsa_agent.air.udp.slots import SlotTime
+from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.clock import OwnClock
+from dtsa_agent.air.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
+from dtsa_agent.air.delay import Delay
+from dtsa_agent.air.precision import going_first
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.slots import SlotTime
+from dtsa_agent.air.tally import Tally
+from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings
 from dtsa_agent.air.udp.sockets import Datagram, StampClock
-from dtsa_agent.air.udp.tally import Tally
 from dtsa_agent.core import ConfigError, Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.agents.authentication import Authenticator
 from dtsa_agent.core.agents.pacing import latest_send_ns
@@ -62,8 +64,8 @@ def test_agents_that_cannot_fly_are_refused_by_name(
     monkeypatch: pytest.MonkeyPatch, field: str, own: int, config: SwarmConfig, key: str
 ) -> None:
     monkeypatch.setenv("DTSA_AUTH_KEY", key)
-    with pytest.raises(ConfigError) as error:
-        UdpAgent(AgentSettings(id=own), config, UdpSettings(interface="lo"))
+    with UdpPort(UdpSettings(interface="lo")) as port, pytest.raises(ConfigError) as error:
+        AirAgent(AgentSettings(id=own), config, port)
     assert error.value.field == field
 
 
@@ -250,7 +252,8 @@ def test_who_wakes_late_sends_as_long_as_the_next_turn_is_not_disturbed(
     assert latest + flight_ns < SLOT_NS
     config = SwarmConfig(agents=2, policy="tdma", auth=False)
     udp = UdpSettings(interface="lo", group=f"239.255.78.78:{20_000 + os.getpid() % 10_000}", flight_time_ns=flight_ns)
-    with UdpAgent(AgentSettings(id=1), config, udp) as agent:
+    with UdpPort(udp) as port:
+        agent = AirAgent(AgentSettings(id=1), config, port)
         now = [time.monotonic_ns()]
         monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
         monkeypatch.setattr(agent, "_late_ns", lambda slot: now[0] - agent.hearing.slot_start_ns(slot))

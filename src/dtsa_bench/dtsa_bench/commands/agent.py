@@ -18,7 +18,7 @@ DEFAULT_POLICY = "lease"
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
-    from dtsa_agent.air.udp.settings import AgentSettings
+    from dtsa_agent.air.settings import AgentSettings
     from dtsa_bench.runs.options import add_options
 
     parser = subparsers.add_parser("agent", help="one agent on a real network", description=DESCRIPTION)
@@ -77,8 +77,9 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
 
 def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C, and print what came of it."""
-    from dtsa_agent.air.udp import AgentSettings, UdpSettings
-    from dtsa_agent.air.udp.prepared import prepare
+    from dtsa_agent.air.prepared import prepare
+    from dtsa_agent.air.settings import AgentSettings
+    from dtsa_agent.air.udp import UdpSettings
     from dtsa_agent.core.agents.joining import check_joinable
     from dtsa_agent.keys import check_key
     from dtsa_bench.network.flying import Order, become, fly

@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
-    from dtsa_agent.air.udp.prepared import Prepared
+    from dtsa_agent.air.agent import AirAgent
+    from dtsa_agent.air.prepared import Prepared
+    from dtsa_agent.air.settings import AgentSettings
+    from dtsa_agent.air.udp import UdpSettings
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.stop import Stop
 
@@ -63,18 +65,20 @@ def fly(order: Order) -> int:
     :raises ConfigError: for a network, a directory or an id that cannot be used.
     :raises BagError: if the record is not whole.
     """
-    from dtsa_agent.air.udp import UdpAgent
+    from dtsa_agent.air.agent import AirAgent
+    from dtsa_agent.air.udp import UdpPort
     from dtsa_agent.stop import Stop
 
     failure, directory = "", None
-    with Stop() as stop, UdpAgent(order.own, order.config, order.udp, prepared=order.prepared) as agent:
+    with Stop() as stop, UdpPort(order.udp) as port:
+        agent = AirAgent(order.own, order.config, port, prepared=order.prepared)
         if order.out is None:
             agent.run(stop)
         else:
             from dtsa_bench.runs.options import new_directory
 
             directory = new_directory(order.out)
-            failure = _run_recorded(agent, stop, directory)
+            failure = _run_recorded(agent, order.udp, stop, directory)
     summary = agent.summary()
     text = json.dumps(summary, indent=2) + "\n"
     if directory is not None:
@@ -97,11 +101,11 @@ def fly(order: Order) -> int:
     return int(bool(problem))
 
 
-def _run_recorded(agent: UdpAgent, stop: Stop, directory: Path) -> str:
+def _run_recorded(agent: AirAgent, udp: UdpSettings, stop: Stop, directory: Path) -> str:
     """Flies, and records it; why the record is not whole, or an empty text."""
     from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 
-    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, agent.udp) as recorder:
+    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, udp) as recorder:
         agent.watcher = recorder
         agent.run(stop)
         recorder.finish(agent.summary())

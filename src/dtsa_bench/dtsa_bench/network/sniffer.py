@@ -9,8 +9,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.air.datagram import HEADER, Wrapping
 from dtsa_agent.air.udp import MulticastSocket, UdpSettings
-from dtsa_agent.air.udp.datagram import HEADER, Wrapping
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop

@@ -22,7 +22,9 @@ from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
 import dtsa
-from dtsa_agent.air.udp import AgentSettings, UdpAgent, UdpSettings
+from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.stop import Stop
@@ -404,8 +406,8 @@ def test_a_second_agent_of_the_same_id_does_not_begin(tmp_path: Path) -> None:
         other.end()
         other = helpers.Flying(AgentSettings(id=2), config, udp, tmp_path / "again.mcap")
         wait_for(lambda: len(other.slots) > 5)  # who comes back is welcome
-        with pytest.raises(ConfigError, match="id: got 1"), UdpAgent(AgentSettings(id=1), config, udp) as twin:
-            twin.run(Stop())
+        with pytest.raises(ConfigError, match="id: got 1"), UdpPort(udp) as port:
+            AirAgent(AgentSettings(id=1), config, port).run(Stop())
     finally:
         other.end()
         first.end()

@@ -9,7 +9,7 @@ import json
 import sys
 import time
 
-from dtsa_agent.air.udp.precision import going_first, wake_precisely
+from dtsa_agent.air.precision import going_first, wake_precisely
 
 PRIORITY = 20  # as of agents
 

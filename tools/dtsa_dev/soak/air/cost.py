@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from dtsa_agent.air.datagram import Wrapping
 from dtsa_agent.air.udp import MulticastSocket, UdpSettings
-from dtsa_agent.air.udp.datagram import Wrapping
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.agents.authentication import Authenticator
 from dtsa_agent.keys import VARIABLE

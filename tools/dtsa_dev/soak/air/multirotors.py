@@ -24,7 +24,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.ros.common.process.priority import take_priority
-from dtsa_agent.ros.udp_vehicle import turned
+from dtsa_agent.ros.odometry_vehicle import turned
 
 STEP_S = 0.02
 _ARRIVED_M = 0.3

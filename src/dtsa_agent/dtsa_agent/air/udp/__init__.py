@@ -1,12 +1,7 @@
-"""Agents whose frames go over a network: one process each, no channel node, no start signal, no ROS."""
+"""The port that carries an agent's datagrams over a network: a multicast group on one interface."""
 
-from .agent import UdpAgent
-from .record import Heard, SlotRecord, Watcher
-from .settings import AgentSettings, UdpSettings
+from .port import UdpPort
+from .settings import UdpSettings
 from .sockets import MulticastSocket
-from .vehicle import SimulatedVehicle, Vehicle
 
-__all__ = [
-    "AgentSettings", "Heard", "MulticastSocket", "SimulatedVehicle", "SlotRecord", "UdpAgent", "UdpSettings", "Vehicle",
-    "Watcher",
-]  # fmt: skip
+__all__ = ["MulticastSocket", "UdpPort", "UdpSettings"]

@@ -1,4 +1,4 @@
-"""The network, and the agent of one process: what its swarm need not agree on."""
+"""The network that carries the frames of a swarm."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import socket
 from dataclasses import dataclass
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings.config import MAX_AGENTS
 from dtsa_agent.core.settings.declaration import REQUIRED, Settings, check, setting
 
 _GROUP = "a multicast group and a port, as 239.68.84.83:7583"
@@ -64,23 +63,3 @@ def _address(text: object) -> tuple[str, int]:
     if not (colon and port.isascii() and port.isdigit() and 0 < int(port) < 65536 and first >> 4 == 14):
         raise ConfigError("group", text, f"{_GROUP}: 224.0.0.0 to 239.255.255.255, port 1 to 65535")
     return host, int(port)
-
-
-@dataclass(frozen=True, slots=True)
-class AgentSettings(Settings):
-    """One agent of a swarm, and its clock.
-
-    :raises ConfigError: at creation, naming the field, the value and what is allowed.
-    """
-
-    id: int = setting(REQUIRED, "id of this agent, 1 to agents", minimum=1, maximum=MAX_AGENTS)
-    duration_s: float = setting(
-        0.0, "it ends by itself after this time; 0: with a signal only", unit="s", minimum=0, maximum=1e6
-    )
-    priority: int = setting(20, "real-time priority, where allowed; 0: none", minimum=0, maximum=90)
-    clock_offset_ns: int = setting(
-        0, "for trials: its clock shows this much more at the start", unit="ns", minimum=-(10**15), maximum=10**15
-    )
-    clock_drift_ppb: int = setting(
-        0, "for trials: its clock runs fast by this many parts per billion", minimum=-(10**6), maximum=10**6
-    )

@@ -10,8 +10,7 @@ from collections import Counter, deque
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.udp import MulticastSocket, UdpSettings
-from dtsa_agent.air.udp.datagram import (
+from dtsa_agent.air.datagram import (
     EARLY,
     HEADER,
     NO_FRAME,
@@ -21,6 +20,7 @@ from dtsa_agent.air.udp.datagram import (
     Wrapping,
     flight_ns,
 )
+from dtsa_agent.air.udp import MulticastSocket, UdpSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.agents.pacing import MOST_EARLY, too_long_ns

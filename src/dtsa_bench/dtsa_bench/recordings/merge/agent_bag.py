@@ -15,8 +15,8 @@ from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
-from dtsa_agent.air.udp import Heard, SlotRecord
-from dtsa_agent.air.udp.datagram import flight_ns
+from dtsa_agent.air.datagram import flight_ns
+from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.recordings.bag.errors import UnusableBag
 from dtsa_bench.runs.program import program

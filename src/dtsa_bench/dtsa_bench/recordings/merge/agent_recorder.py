@@ -10,7 +10,9 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
-from dtsa_agent.air.udp import AgentSettings, Heard, SlotRecord, UdpSettings
+from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
 
 from .json_bag import JsonBag, described

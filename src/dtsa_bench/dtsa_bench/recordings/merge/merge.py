@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dtsa_agent.air.udp import SlotRecord
-from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.recordings.rules.judge import Judge
 from dtsa_bench.runs.hearing import of_datagrams

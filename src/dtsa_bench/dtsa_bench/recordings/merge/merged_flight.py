@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.udp import SlotRecord
+from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core import AbstractSwarm, SwarmConfig, make_scenario
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_bench.runs.config import REALTIME, RunConfig, RunLimits, from_swarm

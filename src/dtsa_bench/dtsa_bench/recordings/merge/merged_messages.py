@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dtsa_agent.air.udp import SlotRecord
-from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core import REASONS
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.packing import pack_received

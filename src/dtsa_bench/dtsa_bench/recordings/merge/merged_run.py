@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.air.udp import Heard, SlotRecord
-from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import TAG_LENGTH

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from dtsa_agent.air.udp import Heard, SlotRecord
-from dtsa_agent.air.udp.datagram import HEADER
+from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import AgentGroup, make_scenario
 from dtsa_agent.core.frame import TAG_LENGTH
 from dtsa_agent.core.plugins.entry_points import make_swarm

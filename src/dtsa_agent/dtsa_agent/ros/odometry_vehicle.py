@@ -65,7 +65,7 @@ class VehicleSettings(Settings):
 
 
 class OdometryVehicle:
-    """See the module; a :class:`~dtsa_agent.air.udp.vehicle.Vehicle`.
+    """See the module; a :class:`~dtsa_agent.air.vehicle.Vehicle`.
 
     Odometry that cannot be, or lies where the vehicle cannot have got since the last one that was believed, is counted
     and not used. Without any for a while the vehicle gets the velocity 0, and the agent says that it stands.

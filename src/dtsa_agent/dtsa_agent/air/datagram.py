@@ -41,7 +41,7 @@ def flight_ns(config: SwarmConfig, flight_time_ns: int, byte_time_ns: int) -> in
     """From the order to send a frame to its arrival, as agents take it to be, ns.
 
     :param config: what all agents share.
-    :param flight_time_ns: of :class:`.settings.UdpSettings`.
+    :param flight_time_ns: of :class:`.port.DatagramPort`.
     :param byte_time_ns: likewise.
     """
     return flight_time_ns + byte_time_ns * (HEADER + config.frame_length)

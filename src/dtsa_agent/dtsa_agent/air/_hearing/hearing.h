@@ -1,16 +1,13 @@
-/* What an agent on a network makes of datagrams: whose they are, what time they say it is, how long
- * they were under way.
+/* What an agent with a clock of its own makes of datagrams: whose they are, what time they say it
+ * is, how long they were under way. It knows no port and reads no clock.
  *
- * The same is said in plain Python by air/udp/plain_hearing.py and what it is made of; tests
- * compare the two. Times are ns. */
+ * The same is said in plain Python by air/plain_hearing.py and what it is made of; tests compare
+ * the two. Times are ns. */
 #ifndef DTSA_HEARING_H
 #define DTSA_HEARING_H
 
-#include <netinet/in.h>
-#include <sys/socket.h>
-#include <sys/uio.h>
-
 #include "dtsa.h"
+#include "port.h"
 
 enum {
     AGREED = 8,
@@ -18,7 +15,6 @@ enum {
     HEADER = AGREED + TIMES,
     PEERS = 4
 }; /* bytes of a datagram; see datagram.py */
-enum { BURST = 16, LONGEST = 512, NOTES = 64 };
 
 /* What has come of a datagram. */
 typedef enum verdict {
@@ -65,22 +61,6 @@ typedef struct delays {
 
 enum { HEARS = 1, SAYS = 2, SUM = 4 };
 
-/* sockets.py: CLOCK_REALTIME, of which the kernel's stamps are, against CLOCK_MONOTONIC. */
-typedef struct stamp_clock {
-    int64_t ahead, now;
-    int usable;
-    unsigned steps;
-} stamp_clock;
-
-typedef struct arrived {
-    struct sockaddr_in source;
-    struct iovec room;
-    uint8_t data[LONGEST];
-    _Alignas(struct cmsghdr) uint8_t notes[NOTES];
-    int64_t arrival; /* CLOCK_MONOTONIC */
-    int own;
-} arrived;
-
 typedef struct hearing {
     /* Given. */
     int agents, self; /* number of agents, own index */
@@ -91,19 +71,12 @@ typedef struct hearing {
     double position_step;
     int length, own_bytes; /* of a datagram; of these what plug-ins append to a frame */
     own_clock clock;
-    int socket;
-    struct sockaddr_in address; /* own: what comes from there this very agent has sent */
 
     /* Its own. */
     dtsa_timebase base;
     unsigned corrected;
     delays delay;
     int64_t *last; /* (n) slot of the last frame, -1: none */
-    stamp_clock stamps;
-    unsigned unreadable;
-    struct mmsghdr vector[BURST];
-    arrived batch[BURST];
-    int count, at; /* of the batch; of these looked at */
     int64_t *memory;
 } hearing;
 
@@ -111,7 +84,6 @@ int hearing_open(
     hearing *h); /* after what is given is filled in, and the time base made; 0: no memory */
 void hearing_close(hearing *h);
 
-int64_t floor_div(int64_t a, int64_t b); /* b > 0 */
 int64_t clock_local(const own_clock *clock, int64_t monotonic);
 int64_t clock_monotonic(const own_clock *clock, int64_t local);
 
@@ -122,13 +94,5 @@ verdict hearing_take(hearing *h, const uint8_t *data, long length, int64_t arriv
 int slots_hear(hearing *h, int64_t slot, int64_t start);
 /* The datagram of an own frame of the length that all have; out: LONGEST bytes. */
 void hearing_wrap(hearing *h, const uint8_t *frame, int64_t slot, int64_t late, uint8_t *out);
-
-/* socket.c */
-int64_t now_monotonic(void);
-void stamps_look(stamp_clock *s);
-void stamps_looked(stamp_clock *s, int64_t ahead, int64_t now);
-int64_t stamps_arrival(const stamp_clock *s,
-                       int64_t stamp); /* stamp < 0: the kernel has given none */
-void hearing_receive(hearing *h);      /* the next batch */
 
 #endif

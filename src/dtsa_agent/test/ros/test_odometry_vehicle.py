@@ -18,7 +18,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 
-from dtsa_agent.ros.udp_vehicle import turned
+from dtsa_agent.ros.odometry_vehicle import turned
 
 AGENT = "dtsa_agent.ros.agent_node"
 STEP_S = 0.02

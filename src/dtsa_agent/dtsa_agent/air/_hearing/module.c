@@ -1,5 +1,5 @@
-/* The binding of what an agent on a network hears to Python; _hearing.pyi says what each method
- * does. In the limited API. */
+/* The binding of what an agent hears to Python: it waits, reads the port, and lets the hearing take
+ * in what has arrived; _hearing.pyi says what each method does. In the limited API. */
 #define Py_LIMITED_API 0x030A0000
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -17,38 +17,51 @@ static const int64_t SECOND = 1000000000,
 typedef struct object {
     PyObject head;
     hearing *h;
+    PyObject *capsule; /* keeps the port */
+    air_port *port;
+    arrived batch[BURST];
+    int count, at; /* of the batch; of these looked at */
 } object;
 
 static hearing *of(PyObject *self) { return ((object *)self)->h; }
+static air_port *port_of(PyObject *self) { return ((object *)self)->port; }
+
+static int64_t now_monotonic(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (int64_t)t.tv_sec * SECOND + t.tv_nsec;
+}
 
 static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
 {
-    const char *header, *key, *address;
-    Py_ssize_t header_length, key_length, address_length;
-    int id, anchor_every, port;
+    const char *header, *key;
+    Py_ssize_t header_length, key_length;
+    int id, anchor_every;
     long long slot_ns, flight, limit, began, offset, drift;
     unsigned long long seed, session;
     hearing *h = PyMem_Calloc(1, sizeof *h);
-    PyObject *self = NULL;
+    PyObject *self = NULL, *capsule;
+    air_port *port;
     (void)unused;
     if (!h) return PyErr_NoMemory();
-    if (!PyArg_ParseTuple(args, "iiiLKy#y#KLdiiLLLLiy#i", &h->agents, &id, &anchor_every, &slot_ns,
+    if (!PyArg_ParseTuple(args, "iiiLKy#y#KLdiiLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
                           &seed, &header, &header_length, &key, &key_length, &session, &flight,
                           &h->position_step, &h->length, &h->own_bytes, &limit, &began, &offset,
-                          &drift, &h->socket, &address, &address_length, &port))
+                          &drift, &capsule))
         goto failed;
+    port = PyCapsule_GetPointer(capsule, DTSA_PORT);
+    if (!port) goto failed;
     if (h->agents < 1 || h->agents > DTSA_AGENTS_MAX || id < 1 || id > h->agents ||
         header_length != AGREED || key_length > (Py_ssize_t)sizeof h->key || h->length > LONGEST ||
-        h->length <= HEADER + DTSA_TAG_BYTES || h->own_bytes < 0 || address_length != 4 ||
-        drift <= -SECOND || !(h->position_step > 0.0) ||
+        h->length <= HEADER + DTSA_TAG_BYTES || h->own_bytes < 0 || drift <= -SECOND ||
+        !(h->position_step > 0.0) ||
         !dtsa_timebase_init(&h->base, h->agents, anchor_every, slot_ns, id, seed)) {
         PyErr_SetString(PyExc_ValueError, "what is heard: a value is out of range");
         goto failed;
     }
     memcpy(h->header, header, AGREED);
     memcpy(h->key, key, (size_t)key_length);
-    memcpy(&h->address.sin_addr.s_addr, address, 4);
-    h->address.sin_port = htons((uint16_t)port);
     h->self = id - 1;
     h->key_length = (int)key_length;
     h->session = session;
@@ -61,7 +74,10 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     }
     self = ((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
     if (self) {
-        ((object *)self)->h = h;
+        object *o = (object *)self;
+        o->h = h;
+        o->port = port;
+        o->capsule = Py_NewRef(capsule);
         return self;
     }
     hearing_close(h);
@@ -75,6 +91,7 @@ static void drop(PyObject *self)
     PyTypeObject *type = Py_TYPE(self);
     if (of(self)) hearing_close(of(self));
     PyMem_Free(of(self));
+    Py_XDECREF(((object *)self)->capsule);
     ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
     Py_DECREF(type);
 }
@@ -125,7 +142,7 @@ static PyObject *await_frame(PyObject *self, PyObject *const *args, Py_ssize_t c
     int64_t left = v[0] - now_monotonic();
     if (left > PATIENCE) left = PATIENCE;
     if (left > 0) {
-        struct pollfd end = {of(self)->socket, POLLIN, 0};
+        struct pollfd end = {port_of(self)->descriptor, POLLIN, 0};
         const struct timespec most = {0, left};
         Py_BEGIN_ALLOW_THREADS;
         ppoll(&end, 1, &most, NULL);
@@ -160,25 +177,27 @@ static int append(PyObject **list, PyObject *made)
 static PyObject *or_none(PyObject *list) { return list ? list : Py_NewRef(Py_None); }
 
 /* Up to a frame with which another time is taken over: the agent begins anew before it hears on. */
-static PyObject *heard(hearing *h)
+static PyObject *heard(object *o)
 {
+    hearing *h = o->h;
     PyObject *taken = NULL, *refused = NULL;
     int restarted = 0, fault = 0, full;
-    if (h->at == h->count) hearing_receive(h);
-    full = h->count == BURST;
-    while (h->at < h->count && !restarted && !fault) {
-        const int i = h->at++;
-        const arrived *a = &h->batch[i];
-        const long length = (long)h->vector[i].msg_len;
+    if (o->at == o->count) {
+        o->count = o->port->receive(o->port, o->batch);
+        o->at = 0;
+    }
+    full = o->count == BURST;
+    while (o->at < o->count && !restarted && !fault) {
+        const arrived *a = &o->batch[o->at++];
         said s;
         if (a->own) continue;
-        const verdict v = hearing_take(h, a->data, length, a->arrival, &s, &restarted);
+        const verdict v = hearing_take(h, a->data, a->length, a->arrival, &s, &restarted);
         if (v == TAKEN)
-            fault = append(&taken, heard_frame(h, &s, a->data, length, a->arrival));
+            fault = append(&taken, heard_frame(h, &s, a->data, a->length, a->arrival));
         else
             fault = append(&refused,
                            Py_BuildValue("(iLNL)", (int)v, v == OWN_NAME ? (long long)s.slot : 0LL,
-                                         bytes(a->data, length),
+                                         bytes(a->data, a->length),
                                          (long long)clock_local(&h->clock, a->arrival)));
     }
     if (fault) {
@@ -187,13 +206,13 @@ static PyObject *heard(hearing *h)
         return NULL;
     }
     return Py_BuildValue("(NNNN)", or_none(taken), or_none(refused), PyBool_FromLong(restarted),
-                         PyBool_FromLong(full || h->at < h->count));
+                         PyBool_FromLong(full || o->at < o->count));
 }
 
 static PyObject *take(PyObject *self, PyObject *unused)
 {
     (void)unused;
-    return heard(of(self));
+    return heard((object *)self);
 }
 
 static PyObject *hear_by(PyObject *self, PyObject *const *args, Py_ssize_t count)
@@ -202,7 +221,7 @@ static PyObject *hear_by(PyObject *self, PyObject *const *args, Py_ssize_t count
     if (!whole(args, count, 2, v)) return NULL;
     const int came = slept_until(due(of(self), v[0], v[1]));
     if (came < 0) return NULL;
-    return came ? heard(of(self)) : Py_NewRef(Py_None);
+    return came ? heard((object *)self) : Py_NewRef(Py_None);
 }
 
 static PyObject *take_one(PyObject *self, PyObject *args)
@@ -292,24 +311,14 @@ static PyObject *status(PyObject *self, PyObject *unused)
 {
     const hearing *h = of(self);
     (void)unused;
-    return Py_BuildValue("(iIIILII)", h->base.state, h->base.restarts, h->corrected,
-                         h->base.aligner.corrections, (long long)h->delay.error, h->stamps.steps,
-                         h->unreadable);
+    return Py_BuildValue("(iIIIL)", h->base.state, h->base.restarts, h->corrected,
+                         h->base.aligner.corrections, (long long)h->delay.error);
 }
 
 static PyObject *listening(PyObject *self, void *unused)
 {
     (void)unused;
     return PyBool_FromLong(of(self)->base.state == DTSA_LISTENING);
-}
-
-/* What stamps are taken to be after looks at both clocks; for tests. */
-static PyObject *stamped(PyObject *self, PyObject *args)
-{
-    long long ahead, now, stamp;
-    if (!PyArg_ParseTuple(args, "LLL", &ahead, &now, &stamp)) return NULL;
-    stamps_looked(&of(self)->stamps, ahead, now);
-    return PyLong_FromLongLong(stamps_arrival(&of(self)->stamps, stamp));
 }
 
 /* ---- the module ---- */
@@ -331,7 +340,6 @@ static PyMethodDef METHODS[] = {
     {"local_ns", FAST(local_ns)},
     {"wrap", wrap, METH_VARARGS, NULL},
     {"status", status, METH_NOARGS, NULL},
-    {"stamped", stamped, METH_VARARGS, NULL},
     {0},
 };
 
@@ -343,8 +351,8 @@ static PyType_Slot SLOTS[] = {{Py_tp_new, make},
                               {Py_tp_getset, FIELDS},
                               {0, NULL}};
 
-static PyType_Spec SPEC = {"dtsa_agent.air.udp._hearing.Hearing", sizeof(object), 0,
-                           Py_TPFLAGS_DEFAULT, SLOTS};
+static PyType_Spec SPEC = {"dtsa_agent.air._hearing.Hearing", sizeof(object), 0, Py_TPFLAGS_DEFAULT,
+                           SLOTS};
 
 static int fill_module(PyObject *module)
 {
@@ -357,7 +365,7 @@ static int fill_module(PyObject *module)
 PyMODINIT_FUNC PyInit__hearing(void)
 {
     static PyModuleDef_Slot slots[] = {{Py_mod_exec, fill_module}, {0, NULL}};
-    static struct PyModuleDef def = {PyModuleDef_HEAD_INIT, .m_name = "dtsa_agent.air.udp._hearing",
+    static struct PyModuleDef def = {PyModuleDef_HEAD_INIT, .m_name = "dtsa_agent.air._hearing",
                                      .m_slots = slots};
     return PyModuleDef_Init(&def);
 }

@@ -14,11 +14,12 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from waiting import wait_for
 
-from dtsa_agent.air.udp import AgentSettings, MulticastSocket, UdpSettings, sockets
-from dtsa_agent.air.udp.clock import OwnClock
-from dtsa_agent.air.udp.datagram import HEADER, NOT_OURS, Wrapping, flight_ns
-from dtsa_agent.air.udp.hearing import REASONS, STATES, Hearing, make_hearing
-from dtsa_agent.air.udp.plain_hearing import PlainHearing
+from dtsa_agent.air.clock import OwnClock
+from dtsa_agent.air.datagram import HEADER, NOT_OURS, Wrapping, flight_ns
+from dtsa_agent.air.hearing import REASONS, STATES, Hearing, make_hearing
+from dtsa_agent.air.plain_hearing import PlainHearing
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings, _socket, sockets
 from dtsa_agent.air.udp.sockets import StampClock
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.agents.authentication import Authenticator
@@ -27,6 +28,23 @@ KEY = bytes.fromhex("8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4")
 OPEN = SwarmConfig(agents=5, policy="tdma", slot_ms=10.0)
 SEALED = dataclasses.replace(OPEN, auth=True, auth_session=3, seed=2**63 - 1)
 SLOT_NS, OWN, UDP = OPEN.slot_ns, 2, UdpSettings(interface="lo", group="239.255.80.80:20080")
+
+
+class NoPort:
+    """A port through which nothing comes."""
+
+    flight_time_ns, byte_time_ns = UDP.flight_time_ns, UDP.byte_time_ns
+
+    def __init__(self) -> None:
+        self.compiled = _socket.open_port(-1, bytes(4), 9)
+
+    def send(self, data: bytes) -> bool:
+        """See DatagramPort."""
+        return False
+
+    def counts(self) -> dict[str, int]:
+        """See DatagramPort."""
+        return {}
 
 
 class Both:
@@ -38,7 +56,7 @@ class Both:
         with monkeypatch.context() as patched:
             patched.setattr(time, "monotonic_ns", lambda: self.now)
             own = AgentSettings(id=OWN, clock_offset_ns=offset_ns, clock_drift_ppb=drift_ppb)
-            self.compiled = make_hearing(config, own, UDP, self.wrapping, -1, ("127.0.0.1", 9))
+            self.compiled = make_hearing(config, own, self.wrapping, NoPort())
             clock = OwnClock(offset_ns, drift_ppb)
         flight = flight_ns(config, UDP.flight_time_ns, UDP.byte_time_ns)
         self.plain = PlainHearing(config, OWN, self.wrapping, flight, clock)
@@ -166,15 +184,15 @@ def test_noise_is_refused_for_the_same_reason(
 def test_stamps_are_believed_as_the_plain_statement_says(monkeypatch: pytest.MonkeyPatch, looks: list[Any]) -> None:
     ahead, now = 10**18, 10**12
     monkeypatch.setattr(sockets, "_look", lambda: (ahead, now))
-    compiled, plain = Both(OPEN, 0, 0, monkeypatch).compiled, StampClock()
-    compiled.stamped(ahead, now, -1)
-    before = compiled.status()[5]
+    port, plain = NoPort().compiled, StampClock()
+    _socket.stamped(port, ahead, now, -1)
+    before = _socket.counts(port)[1]
     for moved, later, age in looks:
         ahead, now = ahead + moved, now + later
         stamp = None if age is None else now + age + ahead
         plain.look()
-        assert compiled.stamped(ahead, now, -1 if stamp is None else stamp) == plain.arrival_ns(stamp)
-        assert compiled.status()[5] - before == plain.steps
+        assert _socket.stamped(port, ahead, now, -1 if stamp is None else stamp) == plain.arrival_ns(stamp)
+        assert _socket.counts(port)[1] - before == plain.steps
 
 
 @pytest.mark.parametrize("drift", [0, 50_000, -1_000_000])
@@ -186,9 +204,9 @@ def test_slots_start_by_the_own_clock(monkeypatch: pytest.MonkeyPatch, drift: in
     assert before <= late + later - first <= after
 
 
-def hearing_of(config: SwarmConfig, end: MulticastSocket) -> Hearing:
+def hearing_of(config: SwarmConfig, port: UdpPort) -> Hearing:
     """What an agent hears by a socket."""
-    return make_hearing(config, AgentSettings(id=OWN), UDP, Wrapping(config, None), end.fileno(), end.address)
+    return make_hearing(config, AgentSettings(id=OWN), Wrapping(config, None), port)
 
 
 def arrived_at(watcher: MulticastSocket, count: int) -> int:
@@ -208,7 +226,7 @@ def arrived_at(watcher: MulticastSocket, count: int) -> int:
 
 def test_it_reads_its_socket_and_leaves_out_what_it_has_said_itself() -> None:
     group = UdpSettings(interface="lo", group=f"239.255.79.79:{20_000 + os.getpid() % 10_000}")
-    with MulticastSocket(group) as end, MulticastSocket(group) as other, MulticastSocket(group) as watcher:
+    with UdpPort(group) as end, MulticastSocket(group) as other, MulticastSocket(group) as watcher:
         hearing = hearing_of(OPEN, end)
         assert hearing.take() == (None, None, False, False)
 
@@ -251,7 +269,7 @@ def test_an_own_frame_of_another_length_is_refused(monkeypatch: pytest.MonkeyPat
 
 
 def test_it_sleeps_until_a_slot_and_a_while_at_most() -> None:
-    with MulticastSocket(UDP) as end:
+    with UdpPort(UDP) as end:
         hearing = hearing_of(OPEN, end)
         now = time.monotonic_ns()
         hearing.hear_slot(100, hearing.local_ns(now))
@@ -268,8 +286,10 @@ def test_values_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
     values = {
         "agents": 5, "id": 2, "anchor_every": 3, "slot_ns": SLOT_NS, "seed": 1, "header": bytes(8), "key": b"",
         "session": 0, "flight_ns": 0, "position_step": 0.002, "length": 45, "own_bytes": 0, "limit_ns": 1,
-        "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0, "socket": -1, "address": bytes(4), "port": 1,
+        "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0, "port": NoPort().compiled,
     }  # fmt: skip
     Hearing(*values.values())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="out of range"):
         Hearing(*(values | wrong).values())  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="Capsule"):
+        Hearing(*(values | {"port": None}).values())  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-/* Datagrams, slots and delays of one agent; no socket and no clock is read here. */
+/* Datagrams, slots and delays of one agent. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -8,7 +8,7 @@
 enum { UNIT = 10000, DOUBTS = 9, SHARE = 64, STEP = 1000000, NAMED = 8 };
 static const int64_t PPB = 1000000000;
 
-int64_t floor_div(int64_t a, int64_t b) { return a / b - (a % b < 0); }
+static int64_t floor_div(int64_t a, int64_t b) /* b > 0 */ { return a / b - (a % b < 0); }
 
 static int64_t limited(int64_t value, int64_t limit)
 {
@@ -231,9 +231,6 @@ int hearing_open(hearing *h)
     h->delay.sums = h->memory + 4 * n;
     h->delay.known = (uint8_t *)(h->memory + 5 * n);
     for (size_t k = 0; k < n; k++) h->last[k] = -1;
-    stamps_look(&h->stamps);
-    h->stamps.usable = 1;
-    h->stamps.steps = 0;
     return 1;
 }
 

@@ -1,4 +1,7 @@
-"""One agent on a network: its loop, which waits for its slots and for frames and does one thing at a time."""
+"""One agent with a clock of its own: its loop, which waits for its slots and for frames and does one thing at a time.
+
+What carries its datagrams is a port (:class:`.port.DatagramPort`); the loop knows no network.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +25,11 @@ from dtsa_agent.stop import Stop
 
 from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, flight_ns
 from .hearing import OF_OWN_NAME, REASONS, STATES, make_hearing
+from .port import DatagramPort
 from .precision import give_back_memory, going_first, wake_precisely
 from .prepared import Prepared
 from .record import Heard, SlotRecord, Watcher
-from .settings import AgentSettings, UdpSettings
-from .sockets import MulticastSocket
+from .settings import AgentSettings
 from .tally import Tally
 from .vehicle import SimulatedVehicle, Vehicle
 
@@ -39,26 +42,26 @@ _SAID = 64  # own frames that are remembered
 _Frame = tuple[int, int, bytes, bytes, int]  # sender, slot, frame, datagram, arrival by the own clock
 
 
-class UdpAgent:
-    """An agent whose frames go over a network.
+class AirAgent:
+    """An agent that begins its slots by its own clock, and whose frames go over a port.
 
     It listens, takes the time of the first group that it hears, or begins one of its own; from then on it decides a
     little before each slot, as soon as it has heard whom it expects, and sends when its slot starts.
 
     :param own: this agent.
     :param config: the settings that all agents share.
-    :param udp: the network.
+    :param port: what carries its datagrams; the caller keeps it open while the agent flies.
     :param watcher: is told what happens; None: nobody is.
     :param vehicle: what it flies; None: a simulated one.
     :param prepared: what follows from ``config``, if it is known already.
-    :raises ConfigError: for an id or a policy that cannot fly here, a missing key, or a network that cannot be used.
+    :raises ConfigError: for an id or a policy that cannot fly here, or a missing key.
     """
 
     def __init__(
         self,
         own: AgentSettings,
         config: SwarmConfig,
-        udp: UdpSettings,
+        port: DatagramPort,
         watcher: Watcher | None = None,
         vehicle: Vehicle | None = None,
         prepared: Prepared | None = None,
@@ -66,7 +69,7 @@ class UdpAgent:
         if own.id > config.agents:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
         check_joinable(config.policy)
-        self.own, self.config, self.udp = own, config, udp
+        self.own, self.config, self._port = own, config, port
         scenario, header = (None, b"") if prepared is None else (prepared.scenario, prepared.header)
         wrapping = Wrapping(config, authenticator(config), header)
         self.swarm: AbstractSwarm = make_swarm(config, scenario, local=[own.id])
@@ -77,7 +80,7 @@ class UdpAgent:
         self.tally = Tally()
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
-        flight = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
+        flight = flight_ns(config, port.flight_time_ns, port.byte_time_ns)
         self._latest_send_ns = latest_send_ns(self._slot_ns, flight)
         self._too_long_ns = too_long_ns(config)
         self._ordinary = ""  # why it has no real-time priority
@@ -92,15 +95,8 @@ class UdpAgent:
         self._leaves_by: int | None = None  # CLOCK_MONOTONIC, ns
         self._signals = 0
         self._gone = False  # it has said on the air that it leaves
-        self._socket = MulticastSocket(udp)
-        self.hearing = make_hearing(config, own, udp, wrapping, self._socket.fileno(), self._socket.address)
+        self.hearing = make_hearing(config, own, wrapping, port)
         self._late_ns = self.hearing.late_ns
-
-    def __enter__(self) -> UdpAgent:
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        self._socket.close()
 
     def run(self, stop: Stop) -> None:
         """Flies until a signal comes or its time is over; with policy ``lease`` it first says that it leaves.
@@ -137,7 +133,7 @@ class UdpAgent:
                 if hearing.sleep_until(self.slot, 0):
                     self._send()
             else:
-                # One wake-up a slot: frames wait in the socket, and the kernel has noted when they arrived.
+                # One wake-up a slot: frames wait in the port, which has noted when they arrived.
                 found = hearing.listen(self.slot + 1, self._lead_ns)
                 if found is not None:
                     self._go_on(self._take_in(found))
@@ -308,7 +304,7 @@ class UdpAgent:
             self.tally.unsent += 1
             return
         datagram = self.hearing.wrap(frame, self.slot, late)
-        self._socket.send(datagram)
+        self._port.send(datagram)
         self._said.append(datagram)
         self.tally.sent(late)
         if self._record is not None:
@@ -334,7 +330,7 @@ class UdpAgent:
 
     def summary(self) -> dict[str, Any]:
         """What came of it, as plain values."""
-        state, restarts, corrected, alignments, error_ns, clock_steps, unreadable = self.hearing.status()
+        state, restarts, corrected, alignments, error_ns = self.hearing.status()
         swarm, away = self.swarm, self.swarm.goal[:, 0] - self.swarm.position[:, 0]
         refused: Counter[str] = Counter(self.tally.refused)
         refused.update({"malformed": self.swarm.malformed, "foreign": self.swarm.foreign})
@@ -353,9 +349,7 @@ class UdpAgent:
             "flight_time_error_us": error_ns / 1e3,
             "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
             "not_taken_in": {name: count for name, count in sorted(refused.items()) if count},
-            "unsendable": self._socket.unsendable,
-            "unreadable": unreadable,
-            "clock_steps": clock_steps,
+            **self._port.counts(),
             "position_m": [round(float(x), 4) for x in swarm.position[:, 0]],
             "arrived": bool(np.sqrt((away * away).sum()) <= self.config.r_min and swarm.final[0]),
         }

@@ -1,8 +1,7 @@
-"""What an agent hears, compiled: one call a slot sleeps, reads the socket, and says whose frames have come."""
+"""What an agent hears, compiled: one call a slot sleeps, reads the port, and says whose frames have come."""
 
 from __future__ import annotations
 
-import socket
 import time
 
 from dtsa_agent.core.frame import position_step
@@ -23,7 +22,8 @@ from .datagram import (
     Wrapping,
     flight_ns,
 )
-from .settings import AgentSettings, UdpSettings
+from .port import DatagramPort
+from .settings import AgentSettings
 
 __all__ = ["OF_OWN_NAME", "REASONS", "STATES", "Hearing", "make_hearing"]
 
@@ -35,20 +35,15 @@ OF_OWN_NAME = REASONS.index(OWN_ID)
 STATES = (LISTENING, ALONE, JOINED)
 
 
-def make_hearing(
-    config: SwarmConfig, own: AgentSettings, udp: UdpSettings, wrapping: Wrapping, end: int, address: tuple[str, int]
-) -> Hearing:
+def make_hearing(config: SwarmConfig, own: AgentSettings, wrapping: Wrapping, port: DatagramPort) -> Hearing:
     """What one agent hears.
 
     :param config: the settings that all agents share.
     :param own: this agent.
-    :param udp: the network.
     :param wrapping: whose header and key count.
-    :param end: file descriptor of the socket that is read; the caller keeps it open.
-    :param address: from which this agent sends.
+    :param port: what is read; the caller keeps it open.
     """
     key, session = wrapping.sealed_with
-    host, port = address
     return Hearing(
         config.agents,
         own.id,
@@ -58,7 +53,7 @@ def make_hearing(
         wrapping.header,
         key,
         session,
-        flight_ns(config, udp.flight_time_ns, udp.byte_time_ns),
+        flight_ns(config, port.flight_time_ns, port.byte_time_ns),
         position_step(config.extent_m),
         wrapping.length,
         config.own_bytes,
@@ -66,7 +61,5 @@ def make_hearing(
         time.monotonic_ns(),
         own.clock_offset_ns,
         own.clock_drift_ppb,
-        end,
-        socket.inet_aton(host),
-        port,
+        port.compiled,
     )

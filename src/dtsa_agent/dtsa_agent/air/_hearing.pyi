@@ -1,7 +1,11 @@
-"""What an agent on a network hears: its socket, whose datagrams they are, what time they say it is. Compiled.
+"""What an agent hears through its port: whose datagrams they are, what time they say it is. Compiled.
 
 Times are ns. The plain statement of the same is :mod:`.plain_hearing`.
 """
+
+from typing import Any
+
+_Port = Any  # a capsule, see _hearing/port.h
 
 _Heard = tuple[int, int, bytes, bytes, int]  # sender, slot, frame without its tag, datagram, arrival by the own clock
 _Refused = tuple[int, int, bytes, int]  # number of the reason, slot (of one in the own name), datagram, arrival
@@ -13,7 +17,7 @@ class Hearing:
     def __new__(
         cls, agents: int, id: int, anchor_every: int, slot_ns: int, seed: int, header: bytes, key: bytes, session: int,
         flight_ns: int, position_step: float, length: int, own_bytes: int, limit_ns: int, clock_began_ns: int,
-        clock_offset_ns: int, clock_drift_ppb: int, socket: int, address: bytes, port: int, /,
+        clock_offset_ns: int, clock_drift_ppb: int, port: _Port, /,
     ) -> Hearing: ...  # fmt: skip
 
     # Sleeps until so long before a slot, a while at most. None: it is not that time yet; else as `take`.
@@ -33,7 +37,5 @@ class Hearing:
     def local_ns(self, monotonic_ns: int, /) -> int: ...
     # The datagram of an own frame, not sealed yet, with what it says of the others; how late it leaves.
     def wrap(self, frame: bytes, slot: int, late_ns: int, /) -> bytes: ...
-    # -> state, restarts, corrected, corrections, error of the time under way, clock steps, unreadable
-    def status(self) -> tuple[int, int, int, int, int, int, int]: ...
-    # When a datagram arrived, by its stamp (-1: none), after a look at both clocks; for tests.
-    def stamped(self, ahead_ns: int, now_ns: int, stamp_ns: int, /) -> int: ...
+    # -> state, restarts, corrected, corrections, error of the time under way
+    def status(self) -> tuple[int, int, int, int, int]: ...

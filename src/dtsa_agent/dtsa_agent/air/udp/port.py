@@ -1,0 +1,28 @@
+"""A multicast group as the port of an agent."""
+
+from __future__ import annotations
+
+import socket
+
+from . import _socket
+from .settings import UdpSettings
+from .sockets import MulticastSocket
+
+
+class UdpPort(MulticastSocket):
+    """See the module; a :class:`~dtsa_agent.air.port.DatagramPort`.
+
+    :param settings: interface, group and times under way.
+    :raises ConfigError: if the interface cannot be used.
+    """
+
+    def __init__(self, settings: UdpSettings) -> None:
+        super().__init__(settings)
+        self.flight_time_ns, self.byte_time_ns = settings.flight_time_ns, settings.byte_time_ns
+        host, number = self.address
+        self.compiled = _socket.open_port(self.fileno(), socket.inet_aton(host), number)
+
+    def counts(self) -> dict[str, int]:
+        """Datagrams that the network has not taken, failed reads, and how often the clock has been set."""
+        unreadable, clock_steps = _socket.counts(self.compiled)
+        return {"unsendable": self.unsendable, "unreadable": unreadable, "clock_steps": clock_steps}
