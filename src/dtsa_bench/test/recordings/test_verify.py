@@ -21,6 +21,7 @@ from dtsa_bench.recordings.bag.reader import Bag, Message
 from dtsa_bench.recordings.bag.recover import recover
 from dtsa_bench.recordings.bag.run import load_run
 from dtsa_bench.recordings.verify import Result, verify_bag
+from dtsa_bench.recordings.verify.rebuild import first_agent
 
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs")
@@ -96,6 +97,7 @@ def test_a_flight_of_real_nodes_is_what_the_protocol_gives(flight: Path) -> None
     assert result.checked["digest of all messages"] == 1
     assert result.checked["summary.json"] > 20
     assert not result.safety["all_agents_chose_alike"]
+    assert set(result.skipped) == {"/swarm/markers", "/swarm/configuration", "/swarm/status"}
     done = dtsa("verify", str(flight))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "everything is what the protocol gives" in done.stdout
@@ -236,6 +238,24 @@ def test_a_missing_message_is_found_without_any_digest(flight: Path, tmp_path: P
         assert not result.ok, topic
         assert result.difference is not None
         assert result.difference.slot is not None
+
+
+def test_an_answer_that_names_nobody_is_nobodys(flight: Path, tmp_path: Path) -> None:
+    def without_ids(messages: list[Message]) -> list[Message]:
+        answers = [i for i, m in enumerate(messages) if m.topic == "/swarm/transmission"]
+        at = answers[len(answers) // 2]
+        with Bag(flight / "bag") as bag:
+            said = bag.decode(messages[at])
+            assert first_agent(messages[at].data) == said.agent[0] > 0
+            said.agent = said.agent[:0]
+            kind = "dtsa_msgs/msg/Transmission"
+            messages[at] = messages[at]._replace(data=bytes(bag.typestore.serialize_cdr(said, kind)))
+        assert first_agent(messages[at].data) == first_agent(b"") == 0
+        return messages
+
+    difference = result_of(flight, tmp_path, without_ids).difference
+    assert difference is not None
+    assert (difference.what, difference.recorded) == ("transmission.agent", "[]")
 
 
 @pytest.mark.parametrize(
