@@ -104,11 +104,11 @@ def mutants(record: Row) -> str:
         [name, *(str(n) for n in (row["found"], row["equivalent"], lost.count(name)))] for name, row in modules.items()
     ]
     found, equivalent = (sum(row[key] for row in modules.values()) for key in ("found", "equivalent"))
-    before = len(record.get("failed_before_they_passed", ()))
+    led_to = sum("test" in row for row in record["figures"]["survivors"])
     return (
-        f"{found} of {found + equivalent + len(lost)} are found ([its record](../evidence/mutants.json)); {before} of "
-        "the items failed at first, and got a test or a note.\n\n"
-        f"{markdown(('module', 'found', 'nobody can tell', 'not found'), lines)}\n"
+        f"{found} of {found + equivalent + len(lost)} are found ([its record](../evidence/mutants.json)), {led_to} of them "
+        f"by tests to which earlier runs of the soak had led; of {equivalent} nobody can tell the difference, {len(lost)} "
+        f"were not found.\n\n{markdown(('module', 'found', 'nobody can tell', 'not found'), lines)}\n"
     )
 
 
