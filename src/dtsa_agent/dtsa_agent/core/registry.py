@@ -252,7 +252,7 @@ POLICIES = Registry(
         PolicyRow(
             "lease",
             "lease",
-            "the owner; who has nothing to say lends its turn, in its own frame, to who has",
+            "the owner; an owner with nothing to say leases its slot, in its own frame, to an agent that has",
             "works; no two senders by construction",
             may_join=True,
             says_leaving=True,
