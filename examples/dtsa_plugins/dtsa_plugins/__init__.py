@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.plugins.entry_points import Table
+from dtsa_agent.core.plugins.table import Table
 from dtsa_agent.core.settings.config import SwarmConfig
 
 Array = NDArray[np.float64]

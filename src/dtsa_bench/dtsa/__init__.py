@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         SlotOutcome,
         SwarmConfig,
     )
-    from dtsa_agent.core.plugins.entry_points import Table
+    from dtsa_agent.core.plugins.table import Table
     from dtsa_agent.core.registry import REASON_TEXTS as REASONS
     from dtsa_bench.drawing.palette import agent_colour
     from dtsa_bench.recordings.bag.errors import BagError, UnusableBag

@@ -18,7 +18,8 @@ from dtsa_agent.core import (
     SwarmConfig,
 )
 from dtsa_agent.core.agents.authentication import AuthenticatedSwarm, Authenticator
-from dtsa_agent.core.plugins.entry_points import Table, make_swarm
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.plugins.table import Table
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES
 
 KEY = bytes(range(16))

@@ -139,7 +139,7 @@ class Channel:
         """Make the settings of a slot the present ones."""
         if slot < 0:
             raise LocalProtocolError(f"slot {slot}: slots count from 0")
-        epoch: Epoch = self._timeline.at(slot)
+        epoch: Epoch[ChannelConfig] = self._timeline.at(slot)
         self._first, self._end = epoch.first, _FOREVER if epoch.end is None else epoch.end
         self._medium = Medium(epoch.config, self._source)
         self._losses = self._medium.losses

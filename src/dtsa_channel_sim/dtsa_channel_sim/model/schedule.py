@@ -4,19 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 
 from .topology import LinkLoss, format_partition, parse_partition
 
-if TYPE_CHECKING:
-    from .config import ChannelConfig
-
 _NS_PER_S = 1_000_000_000
 _SLOT = Setting("slot", "int", None, "a slot", minimum=0, maximum=2**53)
 _SECONDS = Setting("at_s", "float", None, "seconds after the start of slot 0", unit="s", minimum=0, maximum=1e9)
+
+_Config = TypeVar("_Config", bound="Changing")
+
+
+class Changing(Protocol):
+    """Settings of a channel, which a schedule may change: :class:`.config.ChannelConfig`."""
+
+    @property
+    def agents(self) -> int:
+        """Number of agents."""
+
+    @property
+    def slot_ns(self) -> int:
+        """Length of a slot, ns."""
+
+    @property
+    def schedule(self) -> tuple[Change, ...]:
+        """Changes at known slots."""
+
+    def changed(self: _Config, values: Mapping[str, Any]) -> _Config:
+        """These settings with some changed, without the schedule.
+
+        :param values: names and values of changeable settings.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +58,7 @@ class Change:
         object.__setattr__(self, "values", tuple(sorted(self.values, key=lambda pair: pair[0])))
 
     @classmethod
-    def from_dict(cls, entry: object, config: ChannelConfig, name: str) -> Change:
+    def from_dict(cls, entry: object, config: Changing, name: str) -> Change:
         """Return an entry ``{slot | at_s: ..., until | until_s: ..., loss: ..., jam: ...}``, validated.
 
         Seconds count from the start of slot 0; the change comes with the first slot that starts then or
@@ -72,7 +93,7 @@ class Change:
         return result
 
 
-def _normal(config: ChannelConfig, name: str, value: object, entry: str) -> tuple[str, Any]:
+def _normal(config: Changing, name: str, value: object, entry: str) -> tuple[str, Any]:
     """Return one changed setting as the configuration stores it; the combination is checked later."""
     spec = next((spec for spec in settings_of(type(config)) if spec.name == name and spec.changeable), None)
     if spec is None:
@@ -110,5 +131,5 @@ def listed(value: object, name: str) -> Sequence[Any]:
     return value
 
 
-def _changeable(config: ChannelConfig) -> str:
+def _changeable(config: Changing) -> str:
     return ", ".join(spec.name for spec in settings_of(type(config)) if spec.changeable)

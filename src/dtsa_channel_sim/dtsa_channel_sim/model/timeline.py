@@ -5,18 +5,17 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Generic, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 
-from .schedule import Change
+from .schedule import Change, Changing
 
-if TYPE_CHECKING:
-    from .config import ChannelConfig
+_Config = TypeVar("_Config", bound=Changing)
 
 
 @dataclass(frozen=True, slots=True)
-class Epoch:
+class Epoch(Generic[_Config]):
     """A stretch of slots with the same settings.
 
     :param first: its first slot.
@@ -26,10 +25,10 @@ class Epoch:
 
     first: int
     end: int | None
-    config: ChannelConfig
+    config: _Config
 
 
-class Timeline:
+class Timeline(Generic[_Config]):
     """Settings by slot, a pure function of the configuration and of the changes.
 
     Entries of the schedule may overlap: the one that began last counts (of two that begin together, the later
@@ -42,12 +41,12 @@ class Timeline:
 
     __slots__ = ("_base", "_changes", "_configs", "_first", "_slots")
 
-    def __init__(self, config: ChannelConfig) -> None:
+    def __init__(self, config: _Config) -> None:
         self._base = config.changed({})
         self._first: list[int] = []  # slot of each change, ascending
         self._changes: list[Change] = []
         self._slots: list[int] = [0]  # slots at which settings change, ascending
-        self._configs: list[ChannelConfig] = [self._base]
+        self._configs: list[_Config] = [self._base]
         for change in scheduled_changes(config):
             self.add(change)
 
@@ -76,14 +75,14 @@ class Timeline:
         self._changes = changes
         self._slots, self._configs = slots, configs
 
-    def at(self, slot: int) -> Epoch:
+    def at(self, slot: int) -> Epoch[_Config]:
         """Return the stretch that a slot belongs to."""
         i = bisect_right(self._slots, slot) - 1
         end = self._slots[i + 1] if i + 1 < len(self._slots) else None
         return Epoch(self._slots[i], end, self._configs[i])
 
 
-def scheduled_changes(config: ChannelConfig) -> Iterable[Change]:
+def scheduled_changes(config: Changing) -> Iterable[Change]:
     """Turn entries of the schedule, which may end, into changes that stay, at most one per slot.
 
     :param config: the settings with their schedule.
@@ -105,7 +104,7 @@ def scheduled_changes(config: ChannelConfig) -> Iterable[Change]:
             yield Change(edge, values)
 
 
-def check_schedule(config: ChannelConfig) -> None:
+def check_schedule(config: Changing) -> None:
     """Tries every state that the channel will be in.
 
     :param config: the settings with their schedule.

@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dtsa_agent.core.compiled import COMPILED
 from dtsa_agent.core.frame import decode_frame
@@ -29,50 +28,10 @@ from dtsa_agent.core.swarms.outcome import SlotOutcome
 from dtsa_agent.core.swarms.swarm import Swarm
 
 from .guard import Guarded
+from .table import Table
 from .unslotted import SILENT, Wakes
 
 _PLUGIN_REASON = REASONS.index("plugin")
-
-
-class Table:
-    """What one observer knows; arrays are read-only windows on its table and are always up to date.
-
-    Positions are m, velocities m/s, frame map, with shape (3, N); agent ``id`` is column ``id - 1``.
-    """
-
-    __slots__ = (
-        "agent",
-        "config",
-        "estimate_position",
-        "estimate_velocity",
-        "goal",
-        "in_ap",
-        "last_turn",
-        "own_position",
-        "own_velocity",
-        "scenario",
-        "sent_intent",
-        "sent_position",
-        "sent_slot",
-        "sent_velocity",
-    )
-
-    def __init__(self, swarm: AbstractSwarm, row: int) -> None:
-        self.agent = int(swarm.observer[row]) + 1  # id of the observer, 0: one that hears everything
-        self.config = swarm.config
-        self.scenario = swarm.scenario
-        self.sent_position = _window(swarm.sent_position[row])  # last heard (own: last sent) state
-        self.sent_velocity = _window(swarm.sent_velocity[row])
-        self.sent_intent = _window(swarm.sent_intent[row])  # commanded velocity, zero unless frames carry it
-        self.sent_slot = _window(swarm.sent_slot[row])  # (N,) slot of that state, -1: never heard
-        self.last_turn = _window(swarm.last_turn[row])  # (N,) slot of the last turn; h = slot - 1 - last_turn
-        self.in_ap = _window(swarm.in_ap[row])  # (N,) A_p
-        self.estimate_position = _window(swarm.estimate_position[row])  # as the estimator last filled them
-        self.estimate_velocity = _window(swarm.estimate_velocity[row])
-        here = row < len(swarm.ids)
-        self.own_position = _window(swarm.position[:, row]) if here else None  # (3,) own true state
-        self.own_velocity = _window(swarm.velocity[:, row]) if here else None
-        self.goal = _window(swarm.goal[:, row]) if here else None
 
 
 _REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
@@ -316,9 +275,3 @@ def plug_ins_of(swarm: AbstractSwarm) -> PluginSwarm | None:
     while isinstance(swarm, SwarmWrapper) and not isinstance(swarm, PluginSwarm):
         swarm = swarm.inner
     return swarm if isinstance(swarm, PluginSwarm) else None
-
-
-def _window(array: NDArray[Any]) -> NDArray[Any]:
-    window: NDArray[Any] = array.view()
-    window.flags.writeable = False
-    return window

@@ -12,7 +12,7 @@ from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
 from dtsa_agent.core.swarms.outcome import SlotOutcome
 
 if TYPE_CHECKING:
-    from .entry_points import Table
+    from .table import Table
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from dtsa_agent.core.registry import POLICIES
 from .guard import Guarded
 
 if TYPE_CHECKING:
-    from .entry_points import Table
+    from .table import Table
 
 SILENT = -1  # in place of a time
 ANSWER_NS = 50_000_000  # beyond two slots: a radio that has said nothing of a frame by then has not sent it
