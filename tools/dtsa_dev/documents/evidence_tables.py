@@ -106,9 +106,9 @@ def mutants(record: Row) -> str:
     found, equivalent = (sum(row[key] for row in modules.values()) for key in ("found", "equivalent"))
     led_to = sum("test" in row for row in record["figures"]["survivors"])
     return (
-        f"{found} of {found + equivalent + len(lost)} are found ([its record](../evidence/mutants.json)), {led_to} of them "
-        f"by tests to which earlier runs of the soak had led; of {equivalent} nobody can tell the difference, {len(lost)} "
-        f"were not found.\n\n{markdown(('module', 'found', 'nobody can tell', 'not found'), lines)}\n"
+        f"{found} of {found + equivalent + len(lost)} are found ([its record](../evidence/mutants.json)), {led_to} of "
+        f"them by tests to which earlier runs of the soak had led; of {equivalent} nobody can tell the difference, "
+        f"{len(lost)} were not found.\n\n{markdown(('module', 'found', 'nobody can tell', 'not found'), lines)}\n"
     )
 
 

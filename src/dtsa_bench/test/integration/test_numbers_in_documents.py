@@ -13,7 +13,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_dev.soak import mutants
 
 from dtsa_agent import plugin_watch
-from dtsa_agent.air.udp import datagram, delay, slots
+from dtsa_agent.air import datagram, delay, slots
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.agents import authentication, pacing
 from dtsa_agent.core.plugins import unslotted
@@ -27,7 +27,7 @@ from dtsa_agent.crazyflie.positions import motion_capture
 from dtsa_agent.crazyflie.safety import landing_places, rules
 from dtsa_agent.crazyflie.settings import radio_budget
 from dtsa_agent.crazyflie.vehicle import landing
-from dtsa_agent.ros import membership, realtime, reporter, udp_vehicle
+from dtsa_agent.ros import membership, odometry_vehicle, realtime, reporter
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process import loop, runs
 from dtsa_agent.ros.common.wire import checks, covariances, intake
@@ -85,7 +85,7 @@ def constant(path: str, name: str) -> int:
 
 
 PYTHONS = "3.{} to 3.{}".format(*re.findall(r"\(3, (\d+)\)", (ROOT / "tools" / "dtsa").read_text(encoding="utf-8")))
-VIEW, UDP = "src/dtsa_bench/dtsa_bench/pages/view/assets", "src/dtsa_agent/dtsa_agent/air/udp/_hearing"
+VIEW, PORT = "src/dtsa_bench/dtsa_bench/pages/view/assets", "src/dtsa_agent/dtsa_agent/air/_hearing/port.h"
 
 # What pages say with numbers that code has.
 FIGURES: dict[str, list[str]] = {
@@ -159,7 +159,7 @@ FIGURES: dict[str, list[str]] = {
         f"are off by more than {ms(ALIGN['limit_ns'])}",
         f"It wakes once a slot, {pacing.LEAD:g} slots before the next one starts",
         f"{pacing.BETWEEN:g} slots ahead at the latest",
-        f"takes in {constant(f'{UDP}/hearing.h', 'BURST')} datagrams at most",
+        f"takes in {constant(PORT, 'BURST')} datagrams at most",
         f"more than {pacing.MOST_EARLY} frames of slots that are still to come",
         f"at most {agent_recorder._MOST_REFUSED / json_bag._FLUSH_S:g} a second",
         f"largest of the last {merge._END}",
@@ -202,9 +202,9 @@ FIGURES: dict[str, list[str]] = {
         f"the queue of {receiver.QUEUE}, the log that ends after {span(receiver.ACTIVITY_S)} of silence",
     ],
     "docs/how-to/vehicles.md": [
-        f"(at most {udp_vehicle._HOLD_MPS:g} m/s)",
-        f"({udp_vehicle._SLACK_M:g} m and `fastest_mps` times the time in between)",
-        f"the velocity 0 {word(udp_vehicle._STOPS)} times within {udp_vehicle._STOPS_S:g} s",
+        f"(at most {odometry_vehicle._HOLD_MPS:g} m/s)",
+        f"({odometry_vehicle._SLACK_M:g} m and `fastest_mps` times the time in between)",
+        f"the velocity 0 {word(odometry_vehicle._STOPS)} times within {odometry_vehicle._STOPS_S:g} s",
     ],
     "docs/reference/channel.md": [
         f"has {airtime.OVERHEAD_BITS} + 8 (n + {airtime.HEADER_BYTES}) bits",
