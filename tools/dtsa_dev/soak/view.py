@@ -27,7 +27,7 @@ from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim.model.verdict import SUCCESS
 
 from .checks import met
-from .chromium import CHROMIUM, Browser
+from .chromium import CHROMIUM, MISSING, browsing
 from .flights import PATIENCE_S, command, dtsa, end_all, until
 from .item import Item, Soak
 
@@ -87,7 +87,7 @@ def _flight(directory: Path, mode: str, looker: str, seed: int) -> dict[str, Any
         done = dtsa(*words)
         met(done.returncode == 0 or _cut_short(out), f"the flight fails: {done.stderr.strip()[-300:]}")
     else:
-        met(looker != _PAGE or CHROMIUM is not None, "no Chromium on this machine")
+        met(looker != _PAGE or CHROMIUM is not None, MISSING)
         _watched(words, looker, directory)
     summary: dict[str, Any] = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     return summary
@@ -102,7 +102,7 @@ def _watched(words: Sequence[str], looker: str, directory: Path) -> None:
             met(_said(directory).startswith("view: "), f"no page: {_said(directory)[-300:]}")
             url = _said(directory).split()[1]
             if looker == _PAGE:
-                with Browser(directory) as browser:
+                with browsing() as browser:
                     browser.open(url)
                     process.wait(PATIENCE_S)
             else:
@@ -152,7 +152,7 @@ def serving(server: ViewServer) -> Iterator[str]:
 
 def _frames(directory: Path) -> dict[str, Any]:
     """Frames a second of many agents, of a recorded run that is played."""
-    met(CHROMIUM is not None, "no Chromium on this machine")
+    met(CHROMIUM is not None, MISSING)
     words = ("--agents", str(_MANY), "--processes", "1", "--timeout-s", str(_MANY_S), *_FLIGHT[2:])
     done = dtsa("fly", "--out", str(directory / "out"), *words)
     met(done.returncode == 0, f"the flight fails: {done.stderr.strip()[-300:]}")
@@ -164,7 +164,7 @@ def _frames(directory: Path) -> dict[str, Any]:
       await new Promise(done => setTimeout(done, {1000 * _FRAMES_S}));
       return 1000 * (dtsa.live.drawn - before) / (performance.now() - begin);
     }})()"""
-    with serving(ViewServer([track], "recorded")) as url, Browser(directory) as browser:
+    with serving(ViewServer([track], "recorded")) as url, browsing() as browser:
         browser.open(url)
         browser.wait_for(f"dtsa.views.length === 1 && dtsa.views[0].run.time >= {_MANY_S - 0.5}")
         rate = float(browser.run(script))
@@ -193,12 +193,12 @@ def _endless() -> tuple[dict[str, Any], Iterator[Moment]]:
 
 def _memory(directory: Path) -> dict[str, Any]:
     """Bytes of a page that has as many moments as it keeps, ten minutes of a flight, and later."""
-    met(CHROMIUM is not None, "no Chromium on this machine")
+    met(CHROMIUM is not None, MISSING)
     info, moments = _endless()
     track = Track("endless")
     track.begin(info)
     kept: list[int] = []
-    with serving(ViewServer([track], "endless")) as url, Browser(directory) as browser:
+    with serving(ViewServer([track], "endless")) as url, browsing() as browser:
         browser.open(url)
         sent = 0
         for part in _KEPT:

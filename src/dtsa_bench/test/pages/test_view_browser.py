@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("aiohttp")
 
 import aiohttp
-from dtsa_dev.soak.chromium import CHROMIUM, Browser
+from dtsa_dev.soak.chromium import CHROMIUM, MISSING, browsing
 from dtsa_dev.soak.view import serving
 from metronome import flown_again_when_overloaded
 from view_helpers import AGENTS, PATIENCE_S, lossy_bag, numbers, track_of, viewed_flight
@@ -35,7 +35,7 @@ FIGURES = """(() => ({
 }))()"""
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_chromium_plays_a_bag_and_shows_what_an_agent_believes(tmp_path: Path) -> None:
     track = track_of(lossy_bag(tmp_path))
     info = track.info[1]
@@ -50,7 +50,7 @@ def test_chromium_plays_a_bag_and_shows_what_an_agent_believes(tmp_path: Path) -
         ordered.append(given)
         return f"ordered: {given.kind}"
 
-    with serving(ViewServer([track, mission], "some-token", order)) as url, Browser(tmp_path) as browser:
+    with serving(ViewServer([track, mission], "some-token", order)) as url, browsing() as browser:
         browser.open(url)
         browser.wait_for("dtsa.views.length === 2 && dtsa.views[0].run.record.count >= 150")
         browser.run("dtsa.clock.set(1.0); if (dtsa.clock.playing) dtsa.clock.toggle(); dtsa.clock.set(1.0)")
@@ -112,7 +112,7 @@ def environment(process: int) -> dict[str, str]:
 
 
 @pytest.mark.ros
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 @flown_again_when_overloaded
 def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path) -> None:
     from fly_helpers import pid_of
@@ -121,7 +121,7 @@ def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path)
 
     words = ("--mode", "realtime", "--policy", "lease", "--agents", "3", "--slot-ms", "40", "--tail-s", "90")
     page = viewed_flight(tmp_path / "run", *words, "--control")
-    with Browser(tmp_path) as browser, page as (process, url), ExitStack() as afterwards:
+    with browsing() as browser, page as (process, url), ExitStack() as afterwards:
         browser.open(url)
         browser.wait_for("dtsa.views.length === 1 && dtsa.views[0].run.record.count > 20")
         domain = int(environment(pid_of(process.pid, 2))["ROS_DOMAIN_ID"])

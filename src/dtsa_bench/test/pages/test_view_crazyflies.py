@@ -19,7 +19,7 @@ pytest.importorskip("aiohttp")
 
 from bridge_helpers import end_process, fake_fleet, settings
 from builtin_interfaces.msg import Duration
-from dtsa_dev.soak.chromium import CHROMIUM, Browser
+from dtsa_dev.soak.chromium import CHROMIUM, MISSING, browsing
 from dtsa_dev.soak.view import serving
 from dtsa_msgs.srv import Arm, Takeoff
 from metronome import flown_again_when_overloaded
@@ -41,13 +41,13 @@ def all_are(state: str) -> str:
     return f"(found => found.length === {COUNT} && found.every(state => state === '{state}'))({STATES})"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 @flown_again_when_overloaded
 def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Path) -> None:
     """Without a run: the bridge alone."""
     from dtsa_bench.pages.view.graph import GraphSource
 
-    with ros_domain() as domain, fake_fleet(tmp_path, COUNT) as fleet, Browser(tmp_path) as browser:
+    with ros_domain() as domain, fake_fleet(tmp_path, COUNT) as fleet, browsing() as browser:
         config = tmp_path / "swarm.yaml"
         # Nobody streams commands; the browser takes the processor from all.
         safety: dict[str, Any] = {"link_age_s": 3.0, "emergency_watchdog": False}
