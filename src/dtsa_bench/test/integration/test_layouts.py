@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(not LAYOUTS.is_dir(), reason="the layouts are pa
 
 @pytest.fixture(scope="module")
 def make() -> ModuleType:
-    """The script that writes the layouts."""
+    """The script that fits the layouts to a number of agents."""
     spec = importlib.util.spec_from_file_location("make_layouts", LAYOUTS / "make.py")
     assert spec is not None
     assert spec.loader is not None
@@ -73,12 +73,27 @@ def panels(node: Any) -> list[str]:
 
 
 def test_files_are_what_the_script_writes(make: ModuleType) -> None:
-    assert json.loads((LAYOUTS / "foxglove_swarm.json").read_text(encoding="utf-8")) == make.foxglove()
-    assert (LAYOUTS / "plotjuggler_swarm.xml").read_text(encoding="utf-8") == make.plotjuggler()
+    assert make.FOXGLOVE.read_text(encoding="utf-8") == make.foxglove()
+    assert make.PLOTJUGGLER.read_text(encoding="utf-8") == make.plotjuggler()
+
+
+def test_layouts_that_were_made_for_fewer_agents_grow_again(
+    make: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = make.foxglove(), make.plotjuggler()
+    monkeypatch.setattr(make, "FOXGLOVE", tmp_path / "layout.json")
+    monkeypatch.setattr(make, "PLOTJUGGLER", tmp_path / "layout.xml")
+    for agents in (12, 1, 70):
+        make.FOXGLOVE.write_text(wanted[0], encoding="utf-8")
+        make.PLOTJUGGLER.write_text(wanted[1], encoding="utf-8")
+        fewer = make.foxglove(agents), make.plotjuggler(agents)
+        make.FOXGLOVE.write_text(fewer[0], encoding="utf-8")
+        make.PLOTJUGGLER.write_text(fewer[1], encoding="utf-8")
+        assert (make.foxglove(), make.plotjuggler()) == wanted
 
 
 def test_every_foxglove_panel_is_shown_and_every_path_exists(make: ModuleType) -> None:
-    layout = make.foxglove()
+    layout = json.loads(make.foxglove())
     assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
     fields: dict[str, set[str]] = {}  # that the scripts make, by topic
     for script in layout["userNodes"].values():
@@ -112,7 +127,7 @@ def test_every_foxglove_panel_is_shown_and_every_path_exists(make: ModuleType) -
 
 
 def test_no_limit_of_an_axis_is_text(make: ModuleType) -> None:
-    for config in make.foxglove()["configById"].values():
+    for config in json.loads(make.foxglove())["configById"].values():
         for limit in ("minXValue", "maxXValue", "minYValue", "maxYValue"):
             assert isinstance(config.get(limit, 0), (int, float)), limit  # Lichtblick takes "" for 0
 
@@ -175,9 +190,12 @@ def test_no_topic_has_numbers_that_plotjuggler_refuses() -> None:
 
 
 def test_other_numbers_of_agents(make: ModuleType) -> None:
-    assert "/cf70/odom" in json.dumps(make.foxglove(70))
-    assert "/cf3/odom" not in json.dumps(make.foxglove(2))
-    assert ElementTree.fromstring(make.plotjuggler(1)) is not None
+    assert "/cf70/odom" in make.foxglove(70)
+    assert "/cf3/odom" not in make.foxglove(2)
+    for agents, pairs in ((1, 1), (3, 2), (70, 5)):  # with one agent a pair stays, from which others are made again
+        names = [curve.get("name", "") for curve in ElementTree.fromstring(make.plotjuggler(agents)).iter("curve")]
+        assert sum(name.startswith("age of") for name in names) == agents
+        assert sum(name.startswith("distance") for name in names) == pairs
 
 
 def test_nonsense_is_refused() -> None:
