@@ -17,6 +17,7 @@ setup(
             *(f"**/*.{suffix}" for suffix in ASSETS),
             "**/*.LICENSE",
             "**/*.in",
+            "**/*.msg",
         ],
         "dtsa": ["py.typed"],
     },

@@ -20,6 +20,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 _TOP = ("README.md", "LICENSE", "NOTICE", "CHANGELOG.md", "CITATION.cff")
 _PACKAGES = ("dtsa_agent", "dtsa_channel_sim", "dtsa_bench")
+_MESSAGES = "dtsa_bench/dtsa_bench/recordings/bag/messages"  # bags are written without ROS, too
 _LEFT_OUT = shutil.ignore_patterns("__pycache__", "*.so", "*.egg-info", "build", "test", "urdf", "rviz", "launch")
 
 
@@ -34,6 +35,7 @@ def lay_out(folder: Path) -> None:
         shutil.copy2(HERE / name, folder)
     for name in _PACKAGES:
         shutil.copytree(ROOT / "src" / name, folder / "src" / name, ignore=_LEFT_OUT)
+    shutil.copytree(ROOT / "src" / "dtsa_msgs" / "msg", folder / "src" / _MESSAGES)
 
 
 @contextmanager

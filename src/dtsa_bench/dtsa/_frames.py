@@ -35,6 +35,6 @@ def _pandas() -> Any:
         import pandas
     except ImportError:
         raise ConfigError(
-            "pandas", None, "an installed pandas: tables are its data frames (pip install pandas)"
+            "pandas", None, "an installed pandas: tables are its data frames (pip install 'dtsa[tables]', or pandas)"
         ) from None
     return pandas

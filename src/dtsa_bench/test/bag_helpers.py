@@ -38,19 +38,7 @@ def definition(name: str) -> schema.Definition:
     try:
         return schema.installed(name)
     except BagError:
-        store = typestore()
-        text, _ = store.generate_msgdef(name, ros_version=2)
-        if name.startswith("dtsa_msgs/"):
-
-            def text_of(kind: str) -> str:
-                package, _, short = kind.split("/")
-                path = MESSAGES / f"{short}.msg"
-                if package == "dtsa_msgs":
-                    return path.read_text(encoding="utf-8")
-                return store.generate_msgdef(kind, ros_version=2)[0].split(schema.SEPARATOR)[0]
-
-            text = schema.concatenate(name, text_of)
-        return schema.Definition(name, text, store.hash_rihs01(name))
+        return schema.brought(name, MESSAGES)
 
 
 def cdr(kind: str, **fields: Any) -> bytes:

@@ -21,6 +21,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "simulate": (
         ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),
         ("--moving 2 --policy lease --json", "the same as JSON"),
+        ("--agents 12 --picture flight.png", "with a picture of the paths"),
     ),
     "sweep": (
         ("--list", "what comes with the package"),

@@ -5,14 +5,16 @@ from __future__ import annotations
 import sys
 
 _WORKSPACE = "build the workspace and source it: colcon build && . install/setup.bash"
+_ROS = "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout"
 _HOW = {
     **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
     **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard"), "pip install {}"),
-    **dict.fromkeys(("pyarrow", "pandas"), 'pip install {}, or "dtsa[tables]"'),
-    "distributed": 'pip install {}, or "dtsa[cluster]"',
-    "aiohttp": 'pip install {}, or "dtsa[view]"',
-    "rclpy": "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout",
-    "yaml": "apt install python3-yaml",
+    **dict.fromkeys(("pyarrow", "pandas"), "pip install 'dtsa[tables]', or {}"),
+    "distributed": "pip install 'dtsa[cluster]', or {}",
+    "aiohttp": "pip install 'dtsa[view]', or {}",
+    "cflib": "pip install 'dtsa[crazyflie]', or {}",
+    **dict.fromkeys(("rclpy", "ament_index_python", "geometry_msgs", "nav_msgs", "std_msgs", "tf2_msgs"), _ROS),
+    "yaml": "apt install python3-yaml, or pip install pyyaml",
     **dict.fromkeys(("numpy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
 }
 

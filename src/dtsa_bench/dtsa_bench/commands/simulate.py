@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dtsa_bench.simulation.simulate import Flight
 
 DESCRIPTION = """\
 Flies one run without ROS, as fast as this machine allows, over the same core as the nodes. For equal options
@@ -22,6 +27,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--out", metavar="DIR", help="directory for summary.json and config.json; default: only printed"
     )
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+    parser.add_argument("--picture", metavar="FILE.png", help="draw the paths from above")
     parser.add_argument(
         "--core", metavar="X", default="compiled",
         help="compiled, or reference: the protocol's specification in plain Python, much slower [compiled]",
@@ -40,13 +46,42 @@ def run(args: argparse.Namespace) -> int:
     config = run_config(args)
     check_key(config.swarm)  # before anything is made
     make_scenario(config.swarm)
+    picture = None if args.picture is None else _checked(Path(args.picture))
     directory = None if args.out is None else new_directory(args.out)
-    summary = simulate(config, core=args.core).summary()
+    flight = simulate(config, core=args.core, trace=picture is not None)
+    summary = flight.summary()
     text = json.dumps(summary, indent=2) + "\n"
     if directory is not None:
         _write(directory, text, json.dumps(config.to_dict(), indent=2) + "\n")
     print(text if args.json else describe(summary), end="")
+    if picture is not None:
+        _draw(picture, flight, summary)
     return 0
+
+
+def _checked(picture: Path) -> Path:
+    """A file that a picture can be written to.
+
+    :param picture: what was asked for.
+    :raises ConfigError: if its name or its directory does not fit.
+    """
+    from dtsa_agent.core.errors import ConfigError
+
+    if picture.suffix.lower() != ".png" or picture.is_dir() or not picture.parent.is_dir():
+        raise ConfigError("picture", str(picture), "a file *.png in a directory that exists")
+    return picture
+
+
+def _draw(picture: Path, flight: Flight, summary: dict[str, Any]) -> None:
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_bench.drawing.flight_paths import draw_flight
+
+    assert flight.trace is not None
+    try:
+        draw_flight(picture, flight.run, flight.scenario, flight.trace.positions(), summary)
+    except OSError as error:
+        raise ConfigError("picture", str(picture), f"a file that can be written ({error.strerror})") from error
+    print(f"picture: {picture}", file=sys.stderr)
 
 
 def _write(directory: Path, summary: str, config: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -163,3 +164,17 @@ def test_what_prints_results_prints_them_as_json() -> None:
     for command in ("demo", "fly", "simulate", "sweep", "soak", "benchmark", "verify", "recover", "export"):
         parser = command_parser(build_parser(command)[0], command)
         assert any("--json" in action.option_strings for action in parser._actions), command
+
+
+def test_simulate_draws_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = ["simulate", "--agents", "4", "--timeout-s", "3", "--json"]
+    picture = tmp_path / "flight.png"
+    assert cli.main([*plain, "--picture", str(picture)]) == 0
+    drawn = json.loads(capsys.readouterr().out)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert cli.main(plain) == 0
+    without = json.loads(capsys.readouterr().out)
+    times = {"wall_time_s": 0, "realtime_factor": 0}
+    assert {**drawn, **times} == {**without, **times}
+    for wrong in ("flight.svg", "missing/flight.png"):
+        assert said([*plain, "--picture", str(tmp_path / wrong)], capsys).startswith("dtsa: error: picture: got")

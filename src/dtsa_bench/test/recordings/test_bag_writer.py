@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from bag_helpers import SECOND, SyntheticRun, definition, synthetic_bag, typestore
+from bag_helpers import MESSAGES, SECOND, SyntheticRun, definition, synthetic_bag, typestore
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
@@ -165,6 +165,16 @@ def test_hashes_agree_with_an_independent_computation(name: str) -> None:
     except BagError as error:
         pytest.skip(f"not installed: {error}")
     assert installed.type_hash == typestore().hash_rihs01(name)
+
+
+@pytest.mark.parametrize("name", ["dtsa_msgs/msg/Slot", "nav_msgs/msg/Odometry"])
+def test_definitions_without_ros_have_the_same_hash_and_the_projects_own_text(name: str) -> None:
+    brought = schema.brought(name, MESSAGES)
+    assert brought.type_hash == typestore().hash_rihs01(name)
+    own, _, rest = brought.text.partition(schema.SEPARATOR)
+    assert "MSG: builtin_interfaces/Time" in rest
+    if name == "dtsa_msgs/msg/Slot":
+        assert own.rstrip("\n") == (MESSAGES / "Slot.msg").read_text(encoding="utf-8").rstrip("\n")
 
 
 def test_definition_lists_each_dependency_once_and_keeps_comments() -> None:

@@ -1,11 +1,14 @@
 """Message definitions and type hashes for the schemas of a bag.
 
 The texts are the original `.msg` files from the ament index: the Python messages of Jazzy do not carry
-them, and a regenerated text would lose comments and defaults.
+them, and a regenerated text would lose comments and defaults. Where there is no ROS, the project's own
+`.msg` files are those that the distribution `dtsa` brings along (`messages`), and rosbags makes the texts of
+those of ROS. The hashes are the same.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 from collections.abc import Callable
@@ -15,6 +18,7 @@ from pathlib import Path
 
 from .errors import BagError
 
+_BROUGHT = Path(__file__).resolve().parent / "messages"  # made by tools/package/backend.py; a checkout has none
 SEPARATOR = "=" * 80
 PRIMITIVES = frozenset(
     [
@@ -96,6 +100,8 @@ def installed(name: str) -> Definition:
     :param name: "package/msg/Type".
     :raises BagError: if the package or its type description is not installed.
     """
+    if importlib.util.find_spec("ament_index_python") is None and _BROUGHT.is_dir():
+        return brought(name, _BROUGHT)
     description = _file(name, ".json")
     hashes = json.loads(description.read_text(encoding="utf-8"))["type_hashes"]
     type_hash = next((entry["hash_string"] for entry in hashes if entry["type_name"] == name), None)
@@ -103,6 +109,25 @@ def installed(name: str) -> Definition:
         raise BagError(f"message type {name}: {description} holds no hash of it")
     text = concatenate(name, lambda kind: _file(kind, ".msg").read_text(encoding="utf-8"))
     return Definition(name, text, type_hash)
+
+
+def brought(name: str, folder: Path) -> Definition:
+    """Definition and RIHS01 hash of a message type where there is no ROS.
+
+    :param name: "package/msg/Type".
+    :param folder: with the `.msg` files of dtsa_msgs.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    own = {f"dtsa_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.msg"))}
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for kind, text in own.items():
+        store.register(get_types_from_msg(text, kind))
+
+    def text_of(kind: str) -> str:
+        return own[kind] if kind in own else store.generate_msgdef(kind, ros_version=2)[0].partition(SEPARATOR)[0]
+
+    return Definition(name, concatenate(name, text_of), store.hash_rihs01(name))
 
 
 def _file(name: str, suffix: str) -> Path:
