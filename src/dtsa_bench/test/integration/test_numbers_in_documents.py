@@ -95,7 +95,6 @@ FIGURES: dict[str, list[str]] = {
         f"for {word(pace._STALL_SLOTS)} slots and {ms(pace._STALL_NS)} at least",
         f"or {span(realtime_channel._PATIENCE_NS / 1e9)} "
         f"({word(realtime_channel._PATIENCE_SLOTS)} slots, if that is more) after its end",
-        f"an agent that hangs after {realtime_channel.LOST_AFTER_S:g} s",
         f"A frame is settled {live_air._GRACE:g} slots after it has left the air",
         f"in the order of time, {live_air._GRACE:g} slots behind the clock",
         f"at most {pacing.LEAD:g} slots ahead",
@@ -109,6 +108,9 @@ FIGURES: dict[str, list[str]] = {
         f"When {word(realtime._DOUBTS)} frames in a row do not fit",
         f"(nice {agent_parameters.AGENTS_NICE}, parameter",
         f"(nice {agent_parameters.CHANNEL_NICE})",
+    ],
+    "docs/how-to/real-time.md": [
+        f"an agent that hangs after {realtime_channel.LOST_AFTER_S:g} s",
         f"{word(ending._FACTOR)} times `--timeout-s`, at least {ending._LEAST_S:g}",
         "after (K M + 1) N slots at the latest",  # RealtimeNode._ended; test_nodes leaves a flight so
     ],
