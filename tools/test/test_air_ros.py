@@ -1,4 +1,4 @@
-"""ROS nodes on hosts of their own, in one DDS domain; four hosts, and discovery by multicast: `tools/dtsa soak air`."""
+"""Integration: ROS nodes on hosts of their own, in one DDS domain; more hosts and multicast: `tools/dtsa soak air`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Environments of a checkout: one for each kind of machine and Python, and never one taken away that is in use."""
+"""Integration: environments of a checkout: one for each machine and Python, none taken away that is in use."""
 
 from __future__ import annotations
 

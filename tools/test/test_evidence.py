@@ -1,4 +1,4 @@
-"""What pages quote of measurements is what their records say."""
+"""Integration: what pages quote of measurements is what their records say."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def test_a_change_is_made_in_a_copy_and_found_or_not(tmp_path: Path, monkeypatch
     assert (tmp_path / "found" / path).read_text("utf-8") == change.applied(before)
     # The same change beside tests of something else.
     module = mutants.MODULES["authentication"]
-    other = mutants.Module(module.sources, ("dtsa_agent/test/crazyflie/test_units.py",))
+    other = mutants.Module(module.sources, ("dtsa_agent/test/crazyflie/test_conversions.py",))
     monkeypatch.setitem(mutants.MODULES, "authentication", other)
     (tmp_path / "lost").mkdir()
     with pytest.raises(NotMet, match="survived: src/dtsa_agent"):

@@ -1,4 +1,4 @@
-"""Whole flights on the compiled core and on the specification: equal in every frame, decision, digest and position."""
+"""Integration: whole flights on both statements: equal in every frame, decision, digest and position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stand-in for the `ros2` command on machines that have the wheels of ROS only."""
+"""Integration: the stand-in for the `ros2` command on machines that have the wheels of ROS only."""
 
 from __future__ import annotations
 

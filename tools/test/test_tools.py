@@ -1,4 +1,4 @@
-"""The set-up of a machine: what it asks for, what it remembers, what it rebuilds, and the `ros2` stand-in."""
+"""Integration: the set-up of a machine: what it asks for, remembers and rebuilds, and the `ros2` stand-in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The extent of the field: what frames and gossip can say, and what is refused because they cannot."""
+"""Integration: the extent of the field: what frames and gossip can say, and what is refused because they cannot."""
 
 from __future__ import annotations
 

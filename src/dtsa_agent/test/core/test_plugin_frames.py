@@ -1,4 +1,4 @@
-"""What plug-ins may say in frames, and what they are told of each slot."""
+"""Integration: what plug-ins may say in frames, and what they are told of each slot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Swarms around swarms: what a wrapper does not change is as in the swarm inside, bit for bit."""
+"""Integration: swarms around swarms: what a wrapper does not change is as in the swarm inside, bit for bit."""
 
 from __future__ import annotations
 

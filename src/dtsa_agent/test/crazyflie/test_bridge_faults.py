@@ -1,4 +1,4 @@
-"""Faults in flight: the real cflib over UDP, simulated Crazyflies that fail, and the bridge that must react."""
+"""Integration: faults in flight: cflib over UDP, simulated Crazyflies that fail, and the bridge that must react."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bridges over simulated Crazyradios: gaps of the air in flight, links that cflib closes, the emergency stop."""
+"""Integration: bridges over simulated Crazyradios: gaps of the air, links that cflib closes, the emergency stop."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from process_helpers import addresses, segments_of
 from rclpy.node import Node
 
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError, RemoteProtocolError
-from dtsa_agent.ros.common.process.node_process import SUPERVISOR, ending, in_real_time
+from dtsa_agent.ros.common.process.node_process import SUPERVISOR, in_real_time
 from dtsa_agent.ros.common.workarounds.dds import (
     PEERS,
     PROFILE,
@@ -25,6 +25,7 @@ from dtsa_agent.ros.common.workarounds.dds import (
     clean_shared_memory,
     limit_to_machine,
 )
+from dtsa_agent.ros.common.workarounds.kept_nodes import ending
 
 SHARED_MEMORY = Path("/dev/shm")
 
@@ -55,7 +56,7 @@ def test_a_node_lasts_as_long_as_its_process_where_others_are_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[DtsaError], lasts: bool
 ) -> None:
     kept: list[Node] = []
-    monkeypatch.setattr("dtsa_agent.ros.common.process.node_process._KEPT", kept)
+    monkeypatch.setattr("dtsa_agent.ros.common.workarounds.kept_nodes._KEPT", kept)
     with ros_graph(tmp_path) as graph:
         node = Node("ending", context=graph.node.context)
         with pytest.raises(error), ending(node):

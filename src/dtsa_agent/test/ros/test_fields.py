@@ -1,4 +1,4 @@
-"""Messages that are packed and unpacked without rclpy say what rclpy says."""
+"""Integration: messages that are packed and unpacked without rclpy say what rclpy says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The agents' nodes as real processes: parameters, answers, ends. The test plays the channel."""
+"""Integration: the agents' nodes as real processes: parameters, answers, ends. The test plays the channel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nodes among other nodes: logs, namespaces, ordinary executors, names of frames."""
+"""Integration: nodes among other nodes: logs, namespaces, ordinary executors, names of frames."""
 
 from __future__ import annotations
 

@@ -25,9 +25,10 @@ from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.graph.parameters import to_parameters
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_agent.ros.common.process.node_process import init_ros, keep_node
+from dtsa_agent.ros.common.process.node_process import init_ros
 from dtsa_agent.ros.common.process.priority import give_way_by, take_place, take_priority
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
+from dtsa_agent.ros.common.workarounds.kept_nodes import keep_node
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.options import new_directory
 from dtsa_bench.simulation.simulate import may_share

@@ -1,4 +1,4 @@
-"""The command line as people use it: help with examples, misspelt words, completion; and nothing half done is left."""
+"""Integration: the command line as people use it: help, misspelt words, completion; nothing half done is left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens where a package is not installed: one line that names it, exit code 2."""
+"""Integration: what happens where a package is not installed: one line that names it, exit code 2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dtsa bridge --backend sim`: simulated Crazyflies, the bridge, a flight, and nothing left behind."""
+"""Integration: `dtsa bridge --backend sim`: simulated Crazyflies, the bridge, a flight, and nothing left behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Missions: the agents' nodes, the bridge, the real cflib and simulated Crazyflies, from take-off to landing."""
+"""Integration: missions: the agents' nodes, the bridge, cflib, simulated Crazyflies, from take-off to landing."""
 
 from __future__ import annotations
 

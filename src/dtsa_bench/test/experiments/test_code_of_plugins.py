@@ -1,4 +1,4 @@
-"""Rows of a sweep are used again for equal code only, that of plug-ins included."""
+"""Integration: rows of a sweep are used again for equal code only, that of plug-ins included."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sweeps that come with the package, and what their reports claim."""
+"""Integration: the sweeps that come with the package, and what their reports claim."""
 
 from __future__ import annotations
 

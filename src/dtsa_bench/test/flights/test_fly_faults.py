@@ -1,4 +1,4 @@
-"""Nodes that send garbage: they are named, and everything ends. What else may fail is in test_soak.py."""
+"""Integration: nodes that send garbage: they are named, and everything ends. What else may fail is in test_soak.py."""
 
 from __future__ import annotations
 

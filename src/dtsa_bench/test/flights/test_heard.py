@@ -1,4 +1,4 @@
-"""Whatever is appended to frames, in whatever mode: everybody hears everybody, and the bag says so."""
+"""Integration: whatever is appended to frames, in whatever mode: everybody hears everybody, and the bag says so."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Strangers that publish into a live flight change nothing; nodes that do not fit together do not begin one."""
+"""Integration: strangers that publish into a flight change nothing; nodes that do not fit together begin none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Observers of the channel: who is told what, in which order, and what happens when one of them fails."""
+"""Integration: observers of the channel: who is told what, in which order, and what happens when one of them fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flights in real time that a machine cannot keep up with, or whose channel stands still: they end, and say so."""
+"""Integration: flights in real time that a machine cannot keep up with, or whose channel stops: they end and say so."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agent processes that die, hang, leave and come back while a flight in real time is under way."""
+"""Integration: agent processes that die, hang, leave and come back while a flight in real time is under way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agents over UDP: real sockets on the loopback interface, bags of their own, merged and judged."""
+"""Integration: agents over UDP: real sockets on the loopback interface, bags of their own, merged and judged."""
 
 from __future__ import annotations
 

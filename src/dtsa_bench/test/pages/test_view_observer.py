@@ -1,4 +1,4 @@
-"""What a flight tells a page, and when: sent while nobody waits for the channel, gathered no more often than sent."""
+"""Integration: what a flight tells a page, and when: sent while nobody waits for the channel, gathered as rarely."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recorder that is killed: whatever byte its file ends at, what is recovered is a run up to a complete slot."""
+"""Integration: a recorder that is killed: wherever its file ends, what is recovered is a run up to a complete slot."""
 
 from __future__ import annotations
 

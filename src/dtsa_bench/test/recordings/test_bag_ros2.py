@@ -1,4 +1,4 @@
-"""The bags in a full installation of Jazzy: its own tools must take them."""
+"""Integration: the bags in a full installation of Jazzy: its own tools must take them."""
 
 from __future__ import annotations
 

@@ -6,6 +6,10 @@ closes the link. After 100 missing acknowledgements it closes the link, too, unl
 
 Checked against cflib 0.1.34, whose names beginning with an underscore are used here: the queues of the driver, of the
 shared radio, and the bits of the safelink.
+
+Upstream: crazyflie-lib-python, issue 63 (links that close after missing acknowledgements), and crazyflie-link-cpp,
+issue 24 (set-points that are repeated although newer ones wait).
+Delete when: cflib can send a set-point without repeating it, and tells a sender that there is no room.
 """
 
 from __future__ import annotations

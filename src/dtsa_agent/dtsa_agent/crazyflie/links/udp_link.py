@@ -6,6 +6,9 @@ second for its thread when it closes: the emergency watchdog of a Crazyflie in f
 over which something was heard stays open, as over the air; that nothing is heard any more is noticed by the log's age.
 
 Imported only where cflib is; checked against cflib 0.1.34, whose public methods alone are used.
+
+Upstream: not reported; cflib's links over UDP are for simulators.
+Delete when: cflib's driver goes on after an error of the socket, and closes without waiting.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,24 +16,21 @@ from typing import Any
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from dtsa_agent.core.errors import ConfigError, DtsaError, LocalProtocolError
+from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.workarounds._endless import mend
 from dtsa_agent.ros.common.workarounds.dds import by_udp, clean_shared_memory, limit_to_machine
-from dtsa_agent.stop import in_time
+from dtsa_agent.ros.common.workarounds.kept_nodes import leave_kept_nodes
 
 from .loop import Stop
 
 _PR_SET_PDEATHSIG = 1
 _REALTIME = re.compile(rf"""^\s*["']?mode["']?\s*:\s*["']?{names.MODES[1]}\b""", re.MULTILINE)
 SUPERVISOR = "DTSA_SUPERVISOR"  # process id of the supervisor that started this node, if one did
-_LONGEST_END_S = 20.0  # of a node; the middleware was seen to stand still when others left in the same moment
 _MIDDLEWARE = "libfastrtps"  # Fast DDS 2
-_KEPT: list[Node] = []  # nodes that last as long as their process
 
 
 def follow_supervisor() -> bool:
@@ -87,39 +84,6 @@ def init_ros(args: list[str] | None, context: Context | None = None, domain_id: 
     mend(_MIDDLEWARE)
 
 
-def keep_node(node: Node) -> None:
-    """Lets a node last as long as its process, in place of destroying it: where one that it talked with may be dead.
-
-    Who is killed may hold a lock in the shared memory of others. Fast DDS 2.14 gives such memory up in the thread that
-    receives; a thread that destroys the node waits for the lock meanwhile, and the process crashes.
-
-    :param node: the node.
-    """
-    _KEPT.append(node)
-
-
-@contextmanager
-def ending(node: Node) -> Iterator[None]:
-    """Destroys a node at the end of the context; keeps it when that ends because others are dead or hang.
-
-    :param node: the node.
-    """
-    try:
-        yield
-    except LocalProtocolError:
-        keep_node(node)
-        raise
-    except BaseException:
-        _destroy(node)
-        raise
-    _destroy(node)
-
-
-def _destroy(node: Node) -> None:
-    with in_time(_LONGEST_END_S):
-        node.destroy_node()
-
-
 def run_node(
     name: str, body: Callable[[Stop, bool], int | None], args: Sequence[str] | None = None, real_time: bool = False
 ) -> int:
@@ -138,10 +102,7 @@ def run_node(
         clean_shared_memory()  # of the process, killed, whose place this one may take
     with Stop() as stop:
         code = _run(name, body, args, stop, supervised)
-    if _KEPT:  # nor is the interpreter taken apart with them
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    leave_kept_nodes(code)
     return code
 
 

@@ -5,7 +5,11 @@
  * two clocks to the largest time. It overflows; pthread_cond_timedwait refuses the negative time
  * without giving the mutex free, and is asked again, for ever: who should be waited for waits for
  * the mutex. Fast DDS does that when a participant is removed while another one is noticed to come
- * or go (its issue 6513). Here such a wait is one without an end. */
+ * or go. Here such a wait is one without an end.
+ *
+ * Upstream: Fast DDS, issue 6513.
+ * Delete when: the wheels' Fast DDS is compiled with libstdc++ 10 or newer, or waits without a
+ * limit where it has none. `test_endless.py` shows the defect. */
 #define _GNU_SOURCE
 #define Py_LIMITED_API 0x030A0000
 #define PY_SSIZE_T_CLEAN

@@ -1,4 +1,11 @@
-"""Fast DDS on one machine: no socket beyond loopback, and nothing left behind in shared memory."""
+"""Fast DDS on one machine: no socket beyond loopback, and nothing left behind in shared memory.
+
+Upstream: rmw_fastrtps, pull request 653 (adds LOCALHOST, which listens on all interfaces); Fast DDS, issue 6535 (a
+sender waits for an idle port in shared memory); Fast DDS, issues 2790, 5053 and 5469 (what killed processes leave in
+shared memory, and that a process which is started again hears nothing).
+Delete when: rmw_fastrtps binds LOCALHOST to loopback alone, for the profiles; Fast DDS removes what dead processes have
+left and opens such ports anew, for `clean_shared_memory`. `test_dds.py` shows each of them.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,9 @@
 
 Called through ``ctypes``: one function of rcl, with the message information that it fills in. Where that cannot be had
 (another middleware, another distribution) there is no sender, and its numbers have to tell (:class:`OnePublisher`).
+
+Upstream: rclpy, issue 1465 (`publisher_gid` in the information of a message; done in pull request 1466).
+Delete when: the distribution that is used is one after Jazzy whose rclpy has it.
 """
 
 from __future__ import annotations
