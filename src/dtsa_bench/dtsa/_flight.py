@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASONS
+from dtsa_bench.drawing.card import as_html, as_text
+from dtsa_bench.drawing.top_view import top_view
 from dtsa_bench.experiments.sweep.spec import run_config as _run_config
 from dtsa_bench.runs.config import RunConfig
-from dtsa_bench.simulation.simulate import Flight as _Flight
+from dtsa_bench.runs.metrics import CRASHED
+from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of_it, what_flew
 from dtsa_bench.simulation.simulate import Trace
 from dtsa_bench.simulation.simulate import simulate as _simulate
 from dtsa_channel_sim import OUTCOMES
@@ -31,17 +34,30 @@ class Flight:
     config: RunConfig
     summary: dict[str, Any]  # the results, with the keys of summary.json; units are in the names
     observer: int  # id of the agent whose table the trace follows
-    _flight: _Flight
+    moving: NDArray[np.bool_]  # (N,) which agents move; the others hover
+    start: NDArray[np.float64]  # (3, N) m, frame map: where the agents start
+    _kept: Trace | None
 
-    @property
-    def moving(self) -> NDArray[np.bool_]:
-        """(N,) which agents move; the others hover."""
-        return self._flight.scenario.moving
+    def __repr__(self) -> str:
+        return as_text(f"Flight: {what_flew(self.config)}", self._rows())
 
-    @property
-    def start(self) -> NDArray[np.float64]:
-        """(3, N) m, frame map: where the agents start."""
-        return self._flight.scenario.start
+    def _repr_html_(self) -> str:
+        title = f"Flight: {what_flew(self.config)}"
+        picture = ""
+        if self._kept is not None:
+            crash = self.summary["collided_pair"] if self.summary["end"] == CRASHED else None
+            picture = top_view(self.path, self.moving, title, ids=True, crash=crash)
+        folded = ("all settings", setting_rows(self.config)), ("all results", result_rows(self.summary))
+        return as_html(title, self._rows(), picture=picture, folded=folded)
+
+    def _rows(self) -> list[tuple[str, str]]:
+        more = "summary, config"
+        if self._kept is None:
+            kept = "in memory, without what happened in its slots (trace=False)"
+        else:
+            kept = f"in memory, with what happened in its slots and what agent {self.observer} knew"
+            more += ", slots, states, decisions, ages_by_observer; dtsa.plot_trajectories(flight)"
+        return [*what_came_of_it(self.summary, self.config), ("kept", kept), ("more", more)]
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -135,9 +151,9 @@ class Flight:
 
     @property
     def _trace(self) -> Trace:
-        if self._flight.trace is None:
+        if self._kept is None:
             raise ConfigError("trace", False, "True in simulate(): this flight did not keep what happened in its slots")
-        return self._flight.trace
+        return self._kept
 
 
 def run_config(**settings: Any) -> RunConfig:
@@ -167,4 +183,5 @@ def simulate(config: RunConfig | None = None, *, trace: bool = True, observer: i
     if not 1 <= observer <= run.swarm.agents:
         raise ConfigError("observer", observer, f"1 to {run.swarm.agents}")
     flight = _simulate(run, trace=trace, observer=observer)
-    return Flight(run, flight.summary(), observer, flight)
+    scenario = flight.scenario
+    return Flight(run, flight.summary(), observer, scenario.moving, scenario.start, flight.trace)

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.core.errors import DtsaError
+from dtsa_bench.drawing.card import as_html, as_text
+from dtsa_bench.drawing.top_view import top_view
 from dtsa_bench.recordings.bag.place import find_file
 from dtsa_bench.recordings.bag.run import RecordedRun, load_run
 from dtsa_bench.recordings.tables.ages import follow_run
@@ -17,6 +20,8 @@ from dtsa_bench.recordings.tables.export import ages_table, arrow_table
 from dtsa_bench.recordings.tables.followed import Followed
 from dtsa_bench.recordings.verify import Result, verify_bag
 from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.runs.metrics import CRASHED
+from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of_it, what_flew
 
 from ._frames import data_frame, from_arrow
 
@@ -36,6 +41,41 @@ class Recording:
     def __init__(self, path: str | Path) -> None:
         self.file: Path = find_file(path)  # the .mcap file
         self._run: RecordedRun = load_run(path)
+
+    def __repr__(self) -> str:
+        return as_text(self._title, self._rows())
+
+    def _repr_html_(self) -> str:
+        crash = self.summary.get("collided_pair") if self.summary.get("end") == CRASHED else None
+        picture = top_view(self.path, self.moving, self._title, ids=True, crash=crash) if len(self.path) else ""
+        config, summary = self._usable_config, self.summary
+        folded = [("all settings", setting_rows(config))] if config is not None else []
+        folded += [("all results", result_rows(summary))] if summary else []
+        return as_html(self._title, self._rows(), picture=picture, folded=folded)
+
+    @property
+    def _usable_config(self) -> RunConfig | None:
+        try:
+            return self.config
+        except DtsaError:
+            return None
+
+    @property
+    def _title(self) -> str:
+        config = self._usable_config
+        what = f"{self._run.agents} agents" if config is None else what_flew(config)
+        return f"Recording {self.name}: {what}"
+
+    def _rows(self) -> list[tuple[str, str]]:
+        run, config = self._run, self._usable_config
+        rows = [] if config is None else what_came_of_it(self.summary, config)
+        counts = (
+            f"{len(run.slots)} slots, {len(run.frames.slot)} frames, {len(run.decisions.slot)} slots with decisions"
+        )
+        rows.append(("recorded", f"{counts}; missing: {run.missing}" if run.missing else counts))
+        rows += [("note", note) for note in self._followed.notes]
+        more = "summary, config, slots, frames, receptions, decisions, states, ages; dtsa.plot_ages(recording)"
+        return [*rows, ("kept", str(self.file)), ("more", more)]
 
     @property
     def name(self) -> str:

@@ -13,7 +13,7 @@ FROM_SWARM = ("agents", "slot_ns", "seed")  # settings of the channel that follo
 LOCKSTEP, REALTIME = MODES = ("lockstep", "realtime")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class RunLimits(Settings):
     """What ends a run, and what counts as a crash."""
 
@@ -29,7 +29,7 @@ class RunLimits(Settings):
     stop_on_crash: bool = setting(True, "a crash ends the run, as in the paper")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class RunConfig(Settings):
     """Everything that decides what happens in a run. Equal configurations give equal flights, bit for bit."""
 

@@ -16,7 +16,7 @@ _PPB = 1_000_000_000
 _BLOCK = 1024
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class ClockConfig(Settings):
     """How far the agents' clocks are from the channel's.
 

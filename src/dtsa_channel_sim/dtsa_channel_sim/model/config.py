@@ -20,7 +20,7 @@ from .topology import LinkLoss, format_partition, parse_matrix, parse_partition
 _SLOT_MS = Setting("slot_ms", "float", None, "length of a slot", unit="ms", minimum=1e-6, maximum=1e6)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class ChannelConfig(Settings):
     """Everything that the channel's behaviour depends on. Models and formulas: docs/reference/channel.md.
 

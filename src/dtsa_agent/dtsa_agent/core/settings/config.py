@@ -23,7 +23,7 @@ MOST_ROUNDS = 15  # from one anchor that nobody gives away to the next: so far l
 MAX_EXTENDED_AGENTS = EXTENDED_SENDER_MAX  # ids have 8 bits in extended frames
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class SwarmConfig(Settings):
     """Everything that all agents of one swarm must agree on.
 

@@ -282,6 +282,15 @@ class Settings:
     def __post_init__(self) -> None:
         check(self)
 
+    def __repr__(self) -> str:
+        """The settings without those that have their defaults, for classes whose dataclass leaves it to this one."""
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.not_default().items())})"
+
+    def not_default(self) -> dict[str, Any]:
+        """The settings that have no default, and those that differ from it."""
+        values = ((spec, getattr(self, spec.name)) for spec in settings_of(type(self)))
+        return {spec.name: value for spec, value in values if spec.required or value != spec.default}
+
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain values; :meth:`from_dict` reads them back."""
         return {spec.name: _plain(getattr(self, spec.name)) for spec in settings_of(type(self))}

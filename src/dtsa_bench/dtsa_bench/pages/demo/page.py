@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dtsa_bench.drawing.palette import AGENT_COLOURS, agent_colour, ink_on
+from dtsa_bench.drawing.top_view import half_width, top_view
 from dtsa_bench.experiments.batch.table import write_whole
 from dtsa_bench.pages.report.data import pack
 from dtsa_bench.pages.report.page import asset, filled, whole_page
@@ -22,7 +23,6 @@ from .table import HEAD, rows
 from .text import INTRO, LIVE_NOTE, TITLE, lines, sentence
 
 _SCALE = 2000  # steps a metre of the positions on the page
-_SIDE = 100.0  # of a top view, in its own units
 
 
 def write_page(path: Path, steps: Sequence[Step], flights: Flights, commands: Sequence[tuple[str, str]]) -> None:
@@ -63,14 +63,9 @@ def _played(flown: Flown) -> dict[str, Any]:
         "position": pack(place.astype("<i2")),
         "agents": place.shape[2],
         "moving": [bool(moves) for moves in flown.moving],
-        "extent": round(_extent(flown) * _SCALE),
+        "extent": round(half_width(flown.position) * _SCALE),
         "slot_s": flown.slot_s,
     }
-
-
-def _extent(flown: Flown) -> float:
-    """Half width of what a top view shows, m."""
-    return 1.13 * float(np.abs(flown.position[:, :2]).max())
 
 
 def _step(step: Step, flights: Flights) -> str:
@@ -82,31 +77,8 @@ def _step(step: Step, flights: Flights) -> str:
 
 
 def _top_view(flown: Flown, name: str) -> str:
-    """A flight from above as SVG; the script moves what has the class `craft`."""
-    extent = _extent(flown)
-    place = np.round((flown.position[:, :2] * [[1], [-1]] / extent + 1) * _SIDE / 2, 2)
-    thin = max(1, len(place) // 80)
-    parts = []
-    for k in range(place.shape[2]):
-        way = np.unique(np.concatenate((np.arange(0, len(place), thin), [len(place) - 1])))
-        points = " ".join(f"{x:g},{y:g}" for x, y in place[way, :, k])
-        x, y = place[-1, :, k]
-        if flown.moving[k]:
-            x0, y0 = place[0, :, k]
-            parts.append(f'<polyline class="halo" points="{points}"/>')
-            parts.append(f'<polyline class="way" style="--c:{agent_colour(k + 1)}" points="{points}"/>')
-            parts.append(f'<circle class="start" style="--c:{agent_colour(k + 1)}" cx="{x0:g}" cy="{y0:g}" r="2.4"/>')
-        kind = f'style="--c:{agent_colour(k + 1)}" class="craft' if flown.moving[k] else 'class="craft hover'
-        parts.append(f'<circle {kind}" cx="{x:g}" cy="{y:g}" r="2.8"/>')
-    metre = _SIDE / 2 / extent
-    parts.append(
-        f'<path class="scale" d="M{96 - metre:g} 97.5h{metre:g}"/>'
-        f'<text class="scale" x="{96 - metre / 2:g}" y="95.5">1 m</text>'
-    )
-    return (
-        f'<svg class="view" viewBox="0 0 100 100" role="img" aria-label="{html.escape(name)}, seen from above">'
-        f"{''.join(parts)}</svg>"
-    )
+    """A flight from above; the script moves what has the class `craft`."""
+    return top_view(flown.position, flown.moving, name)
 
 
 def _paths(step: Step, flights: Flights) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from dtsa_bench.drawing.card import as_html, as_text
 from dtsa_bench.recordings.rules.judge import Judge
 
 
@@ -51,7 +52,7 @@ class Mismatch(Exception):
         self.difference = difference
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, repr=False)
 class Result:
     """What was checked, how often, what was not and why, and the first difference if there is one."""
 
@@ -66,6 +67,32 @@ class Result:
     broken_off: bool = False  # the recorder was stopped before it had finished: checked up to there
     unheard: str = ""  # why the agents did not hear each other; empty: they did
     difference: Difference | None = None
+
+    def __repr__(self) -> str:
+        return as_text(self._title, self._rows())
+
+    def _repr_html_(self) -> str:
+        return as_html(self._title, self._rows())
+
+    @property
+    def _title(self) -> str:
+        verdict = "everything is what the protocol gives" if self.ok else "NOT what the protocol gives"
+        cut = self.broken_off and self.ok
+        return f"{self.bag}: {verdict}" + (
+            f", up to slot {self.slots - 1}, where the recording breaks off" if cut else ""
+        )
+
+    def _rows(self) -> list[tuple[str, str]]:
+        pace = self.simulated_s / self.wall_time_s if self.wall_time_s else 0.0
+        took = f"{self.simulated_s:.2f} s in {self.wall_time_s:.2f} s ({pace:.0f} x)"
+        rows = [("checked", f"{self.mode}, {self.slots} slots, {took}")]
+        if self.checked:
+            rows.append(("equal", ", ".join(f"{count} {what}" for what, count in self.checked.items())))
+        rows += [("not checked", f"{what}: {why}") for what, why in self.skipped.items()]
+        for what, value in self.safety.items():
+            rows.append((what.replace("_", " "), f"{value:.3f}" if isinstance(value, float) else str(value)))
+        rows += [("hearing", self.unheard)] if self.unheard else []
+        return rows if self.difference is None else [*rows, ("first difference", str(self.difference))]
 
     @property
     def ok(self) -> bool:
