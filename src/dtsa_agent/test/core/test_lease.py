@@ -18,17 +18,22 @@ from dtsa_agent.core.frame_extended import (
     decode_extended,
     encode_extended,
 )
+from dtsa_agent.core.reference.lease.decide import takes_open
 from dtsa_agent.core.reference.lease.issue import open_block
 from dtsa_agent.core.reference.lease.memory import HANDED, NEVER, Lease, Memory
 from dtsa_agent.core.reference.rules import Rules
+from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
 
+STATEMENTS = pytest.mark.parametrize("statement", [Swarm, ReferenceSwarm], ids=["C", "Python"])
 OWN = {"position": (0.0, 0.0, 0.0), "velocity": (0.0, 0.0, 0.0), "intent": (0.0, 0.0, 0.0)}
 
 
-def make(agents: int = 12, movers: int = 6, local: list[int] | None = None, **settings: Any) -> Swarm:
+def make(
+    agents: int = 12, movers: int = 6, local: list[int] | None = None, statement: Any = Swarm, **settings: Any
+) -> Swarm:
     """Agents that stand still; the first ``movers`` ids have something to say."""
     config = SwarmConfig(agents=agents, **{"policy": "lease", "avoider": "none", **settings})
-    swarm = Swarm(config, still(agents), local=local)
+    swarm: Swarm = statement(config, still(agents), local=local)
     swarm.active[:] = 0
     swarm.goal[0, np.array(swarm.ids) <= movers] = FAR
     return swarm
@@ -67,10 +72,11 @@ class Air:
         return sum(sum(b > 0 for b in self.frames[t].leases) for t in range(first, last) if t in self.frames)
 
 
+@STATEMENTS
 @pytest.mark.parametrize("loss", [0.0, 0.3])
-def test_all_moving_is_tdma_bit_for_bit(loss: float) -> None:
-    lease = Air(make(10, 10), loss).run(600)
-    tdma = Air(make(10, 10, policy="tdma", frame="extended"), loss).run(600)
+def test_all_moving_is_tdma_bit_for_bit(loss: float, statement: Any) -> None:
+    lease = Air(make(10, 10, statement=statement), loss).run(600)
+    tdma = Air(make(10, 10, policy="tdma", frame="extended", statement=statement), loss).run(600)
     assert lease.sent == tdma.sent == [(slot % 10 + 1,) for slot in range(600)]
     np.testing.assert_array_equal(lease.swarm.sent_slot, tdma.swarm.sent_slot)
     np.testing.assert_array_equal(lease.swarm.sent_position, tdma.swarm.sent_position)
@@ -88,15 +94,17 @@ def test_idle_agents_give_their_turns_to_movers() -> None:
     assert reasons <= {"own", "anchor", "leased"}
 
 
+@STATEMENTS
 @pytest.mark.parametrize("movers", [0, 12])
-def test_nothing_to_give_or_nobody_to_take(movers: int) -> None:
-    air = Air(make(12, movers)).run(600)
+def test_nothing_to_give_or_nobody_to_take(movers: int, statement: Any) -> None:
+    air = Air(make(12, movers, statement=statement)).run(600)
     assert air.leases(0, 600) == 0
 
 
-def test_no_leases_above_the_share() -> None:
-    assert Air(make(12, 8, lease_share=0.5)).run(600).leases(0, 600) == 0
-    assert Air(make(12, 6, lease_share=0.5)).run(600).leases(0, 600) > 0
+@STATEMENTS
+def test_no_leases_above_the_share(statement: Any) -> None:
+    assert Air(make(12, 8, lease_share=0.5, statement=statement)).run(600).leases(0, 600) == 0
+    assert Air(make(12, 6, lease_share=0.5, statement=statement)).run(600).leases(0, 600) > 0
 
 
 def test_who_may_get_another_goal_gives_away_little_by_little() -> None:
@@ -108,8 +116,9 @@ def test_who_may_get_another_goal_gives_away_little_by_little() -> None:
     assert air.leases(1000, 1200) > air.leases(200, 400) > 0
 
 
-def test_deaf_agents_give_nothing_away() -> None:
-    air = Air(make(12, 6)).run(600)
+@STATEMENTS
+def test_deaf_agents_give_nothing_away(statement: Any) -> None:
+    air = Air(make(12, 6, statement=statement)).run(600)
     air.run(300, jam=True)
     # What is still said at first was given away before the jam.
     later = [slot for slot in range(600 + 16 * 12, 900) if slot in air.frames and any(air.frames[slot].leases)]
@@ -315,6 +324,16 @@ def test_every_agent_needs_a_table_of_its_own() -> None:
         Swarm(SwarmConfig(policy="lease"), shared_table=True)
 
 
+def test_the_chance_of_an_open_turn_halves_five_times_at_most() -> None:
+    rules = Rules(agents=12, slot_s=0.01, anchor_every=5, main_every=15)
+    taken = {}
+    for attempts in (4, 5, 6, 200):
+        memory = Memory(rules, woke=0, attempts=attempts, probation=True)
+        taken[attempts] = {slot for slot in range(6000) if takes_open(memory, 3, slot)}
+    assert taken[5] == taken[6] == taken[200]
+    assert 1.5 * len(taken[5]) < len(taken[4]) < 2.5 * len(taken[5])
+
+
 def test_open_turns_visit_all_owners() -> None:
     for agents in range(2, 255):
         period = SwarmConfig(agents=agents, moving=0, policy="lease").open_period
@@ -500,8 +519,9 @@ def test_small_swarms_that_hear_late_relay_no_turn_that_nobody_gave_away(agents:
     assert 0 < max(relayed) < (every + 2) * agents
 
 
-def test_who_may_get_another_goal_keeps_its_turn_of_every_second_round() -> None:
-    swarm = make(12, 4)
+@STATEMENTS
+def test_who_may_get_another_goal_keeps_its_turn_of_every_second_round(statement: Any) -> None:
+    swarm = make(12, 4, statement=statement)
     swarm.final[:] = 0
     air = Air(swarm).run(12 * 60)
     for slot in range(12 * 40, 12 * 60):

@@ -171,3 +171,40 @@ def test_a_relay_of_somebody_else_changes_no_entry(statement: Any) -> None:
     flight.run(max(0, turn - flight.slot + 1))
     assert flight.chosen[turn] == [lessee] * 12
     assert flight.sent[turn] == (lessee,)
+
+
+@STATEMENTS
+def test_who_hears_nobody_gives_no_turns_of_the_dead_away(statement: Any) -> None:
+    flight = Flight(statement, 6, 6).run(60)
+    flight.swarm.present[3] = 0
+    flight.run(1600)
+    assert any(any(flight.frames[slot].leases) for slot in flight.own(5, 1500))  # turns of agent 4
+    jam = flight.slot
+    flight.run(60, deaf={agent: set(range(1, 7)) for agent in range(1, 7)})
+    said = [flight.frames[slot] for slot in range(jam + 12, jam + 60) if slot in flight.frames]
+    assert len([frame for frame in said if frame.own.sender == 5]) == 8
+    assert not any(any(frame.leases) for frame in said)
+
+
+@STATEMENTS
+def test_an_own_entry_holds_nothing_that_was_sent_in_an_open_turn_unheard(statement: Any) -> None:
+    """Two that wake in one slot take the first OPEN turn, and nobody hears them."""
+    flight = Flight(statement, 24, 4).run(600)
+    woke, both = flight.slot, [11, 17]
+    flight.swarm.goal[0, both] = FAR
+    while len(flight.run(1).sent[-1]) < 2:
+        assert flight.slot < woke + 200
+    assert flight.sent[-1] == (12, 18)
+    assert all(flight.swarm.sent_slot[k, k] < woke for k in both)
+    flight.run(400)
+    assert all(flight.swarm.sent_slot[k, k] >= woke for k in both)  # heard by now
+
+
+@STATEMENTS
+def test_a_relay_leaves_out_own_turns_that_the_same_frame_names(statement: Any) -> None:
+    flight = Flight(statement, 12, 3).run(600)
+    naming = {slot: frame for slot, frame in flight.frames.items() if any(frame.leases)}
+    assert len(naming) > 50
+    for slot, frame in naming.items():
+        turns = [slot + ahead for ahead, _ in frame.relay]
+        assert not [turn for turn in turns if turn % 12 == frame.own.sender - 1]
