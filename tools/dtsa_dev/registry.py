@@ -9,11 +9,15 @@ COMMANDS = {
     "prove": "policy lease explored state by state, for all patterns of loss",
     "protocol": "the slot protocols alone, without flight: the tables of docs/evidence/protocol.md",
     "embedded": "the protocol on a simulated microcontroller: the same bits, and what it costs",
+    "docs": "the documentation as a site, built strictly or served",
     "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
 }
+#: Sets of requirements that a command needs beyond those of every machine.
+NEEDS = {"docs": ("docs",)}
 EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "soak": (("--list", "what there is"), ("kill --sample", "a few minutes' part of one")),
     "benchmark": (("--json", "all parts, as JSON"),),
+    "docs": (("", "into runs/site"), ("--serve", "on http://127.0.0.1:8000, built again after each change")),
     "prove": (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only")),
     "embedded": (("", "needs a cross compiler and QEMU, see docs/evidence/embedded.md"),),
     "protocol": (("", "all tables, into runs/protocol"), ("--seeds 3 --slots 6000", "fewer and shorter runs")),

@@ -15,6 +15,7 @@ EXTRAS = {
     "cluster": "experiments on several machines",
     "test": "the test suite",
     "dev": "linting and type checks",
+    "docs": "the documentation as a site",
 }
 
 

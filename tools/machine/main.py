@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dtsa_dev.registry import COMMANDS as DEVELOPERS
+from dtsa_dev.registry import NEEDS
 
 from machine import layout, prepare, processes, wheels, workspace
 from machine.layout import SetupError
@@ -41,7 +42,7 @@ Removes what the build made for this kind of machine and this Python; what proce
 # When a worker dies, pytest-xdist would give its files to a new one, lose some of them, and wait for those for ever.
 SIDE_BY_SIDE = ("--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0")
 MOST_WORKERS = 4
-TEST_EXTRAS = {"test", "dev", "cflib", "benchmark", "cluster"}
+TEST_EXTRAS = {"test", "dev", "docs", "cflib", "benchmark", "cluster"}
 BENCH = layout.SOURCES / "dtsa_bench"
 
 
@@ -69,7 +70,7 @@ def main(arguments: list[str]) -> int:
         if command not in known:
             words = [*known, *OWN_COMMANDS]
             raise SetupError(f"command: got {command!r}; allowed: {', '.join(words)}{_hint(command, words)}", code=2)
-        prepare.prepare(set())
+        prepare.prepare(set(NEEDS.get(command, ())))
         return start(python(), ["-m", module_of(command), command, *rest])
     except SetupError as error:
         print(f"dtsa: error: {error}", file=sys.stderr)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, field
 from functools import cache
@@ -33,6 +33,8 @@ from dtsa_bench.flights.flight import run_environment
 from dtsa_bench.runs.config import RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 from dtsa_channel_sim.ros import channel_node
+
+from .markdown import table
 
 _EVERY_NODE = re.compile(r"/tf|/rosout|/parameter_events|.*/(\w*parameters?(_\w+)?|get_type_description)$")
 _ELSEWHERE = (SwarmConfig, ChannelConfig, RunLimits, ClockConfig)  # settings that have tables of their own
@@ -63,9 +65,9 @@ def node_tables(name: str) -> str:
     :param name: one of :data:`NODES`.
     """
     found = _interface(name)
-    parts = [_table(("topic", "type", "", "quality of service"), sorted(found.topics))]
+    parts = [table(("topic", "type", "", "quality of service"), sorted(found.topics))]
     if found.services:
-        parts.append(_table(("service", "type"), sorted(found.services)))
+        parts.append(table(("service", "type"), sorted(found.services)))
     known = {spec.name for cls in _ELSEWHERE for spec in settings_of(cls)}
     rows = [
         (f"`{key}`", _shown(value), _allowed(info), info.description)
@@ -73,7 +75,7 @@ def node_tables(name: str) -> str:
         if key.rpartition(".")[2] not in known and not key.startswith(("use_sim_time", "start_type", "qos_overrides"))
     ]
     if rows:
-        parts.append(_table(("parameter", "default", "allowed", "meaning"), rows))
+        parts.append(table(("parameter", "default", "allowed", "meaning"), rows))
     return "\n".join(parts)
 
 
@@ -156,8 +158,3 @@ def _allowed(info: Any) -> str:
     for span in (*info.integer_range, *info.floating_point_range):
         return f"{span.from_value:g} to {span.to_value:g}"
     return str(info.additional_constraints)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *([cell.replace("|", r"\|") for cell in row] for row in rows)]
-    return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |").replace("|  |", "| |") for line in lines)

@@ -24,6 +24,8 @@ from dtsa_agent.crazyflie.settings.config import BatterySettings, RobotSettings,
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
+from .markdown import table
+
 NODES = ("agent", "agent, real time", "swarm_host", "crazyflie_agents", "channel", "recorded_channel")
 _BLOCK = re.compile(r"(<!-- settings: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 _HEAD = ("setting", "default", "unit", "allowed", "meaning")
@@ -36,13 +38,13 @@ def rewritten(text: str) -> str:
     :raises ConfigError: if a table has a name that is none of :data:`TABLES`.
     """
 
-    def table(found: re.Match[str]) -> str:
+    def renewed(found: re.Match[str]) -> str:
         name = found["name"]
         if name not in TABLES:
             raise ConfigError("settings", name, ", ".join(TABLES))
         return f"{found[1]}{TABLES[name]()}{found[3]}"
 
-    return _BLOCK.sub(table, text)
+    return _BLOCK.sub(renewed, text)
 
 
 def settings_table(cls: type[Settings], groups: Iterable[str] = (), skip: Sequence[str] = ()) -> str:
@@ -58,7 +60,7 @@ def settings_table(cls: type[Settings], groups: Iterable[str] = (), skip: Sequen
         for s in settings_of(cls)
         if s.name not in skip and (not wanted or s.group in wanted)
     ]
-    return _table(_HEAD, rows)
+    return table(_HEAD, rows)
 
 
 def grouped_tables(cls: type[Settings]) -> str:
@@ -85,12 +87,7 @@ def model_values(kind: str) -> str:
             owners = [getattr(model, part) if part else model for model in models]
             values = [f"{getattr(owner, spec.name):g}" for owner in owners]
             rows.append((f"`{spec.name}`", *values, _unit(spec), _allowed(spec), spec.help))
-    return _table(("value", *(f"`{model.name}`" for model in models), "unit", "allowed", "meaning"), rows)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *([cell.replace("|", r"\|") for cell in row] for row in rows)]
-    return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |").replace("|  |", "| |") for line in lines)
+    return table(("value", *(f"`{model.name}`" for model in models), "unit", "allowed", "meaning"), rows)
 
 
 def _default(spec: Setting) -> str:

@@ -1,0 +1,113 @@
+"""Pages of the site that are made from the code while it is built: commands, messages, the library."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import dtsa
+from dtsa_agent.core.plugins import kinds
+from dtsa_bench.commands import cli, examples, registry
+
+from .. import registry as developers
+from .markdown import table
+
+_TYPES = Path(__file__).resolve().parents[3] / "src" / "dtsa_msgs"
+_SETTINGS = ("RunConfig", "SwarmConfig", "ChannelConfig", "ClockConfig", "RunLimits")
+_GROUPS = {
+    "One flight": ("simulate", "run_config", "Flight"),
+    "Many flights": ("sweep", "SweepResult"),
+    "Recorded runs": ("read_bag", "Recording", "verify", "Verification", "Difference"),
+    "What a plug-in is given": ("register", "Table"),
+    "Figures": (*(name for name in dtsa.__all__ if name.startswith("plot_")), "agent_colour"),
+    "One agent, one channel": ("Agent", "Decision", "SlotOutcome", "Channel", "Verdict"),
+    "Settings": _SETTINGS,
+    "Errors": (
+        "DtsaError", "ConfigError", "PluginError", "LocalProtocolError", "RemoteProtocolError", "BagError",
+        "UnusableBag",
+    ),
+}  # fmt: skip
+
+
+def commands() -> str:
+    """The page of commands: what `--help` of each says, with its examples."""
+    developers.add_commands()
+    parts = [_command(name, text) for name, text in registry.COMMANDS.items()]
+    rows = [(f"[`{name}`](#{name})", text) for name, text in registry.COMMANDS.items()]
+    only = ", ".join(f"`{name}`" for name in developers.COMMANDS)
+    return (
+        "# Commands\n\n"
+        "In a checkout a command is `tools/dtsa COMMAND`; where the distribution is installed it is `dtsa COMMAND`.\n"
+        f"A checkout alone has the developers' commands: {only}. Exit codes: 0 done, 1 the command failed,\n"
+        "2 wrong input, 130 interrupted. `tools/dtsa --help` also lists the commands that concern the machine.\n\n"
+        f"{table(('command', 'what it does'), rows)}\n{''.join(parts)}"
+    )
+
+
+def _command(name: str, text: str) -> str:
+    whole, _ = cli.build_parser(name)
+    parser = cli.command_parser(whole, name)
+    parts = [f"## {name}\n\n{parser.description or text}\n\n"]
+    lines = [f"dtsa {name} {words}".rstrip() + f"    # {what}\n" for words, what in examples.EXAMPLES.get(name, ())]
+    parts += ["```sh\n", *lines, "```\n\n"] if lines else []
+    for group in parser._action_groups:
+        rows = [_argument(parser, action) for action in group._group_actions if action.help != argparse.SUPPRESS]
+        parts += [table((group.title or "", "meaning"), rows), "\n"] if rows else []
+    return "".join(parts)
+
+
+def _argument(parser: argparse.ArgumentParser, action: argparse.Action) -> tuple[str, str]:
+    formatter = parser._get_formatter()
+    meaning = formatter._expand_help(action) if action.help else ""
+    return f"`{formatter._format_action_invocation(action)}`", meaning.replace("<", "&lt;")
+
+
+def messages() -> str:
+    """The page of messages and services: each definition with its comments."""
+    parts = [
+        "# Messages and services\n\n"
+        "Package `dtsa_msgs`, as `ros2 interface show` prints it. Which node publishes what: [nodes](nodes.md). Which\n"
+        "topics a bag has: [bags](bag.md).\n\n"
+    ]
+    for path in (*sorted(_TYPES.glob("msg/*.msg")), *sorted(_TYPES.glob("srv/*.srv"))):
+        text = path.read_text(encoding="utf-8").rstrip()
+        parts.append(f"## {path.stem}\n\n`dtsa_msgs/{path.suffix[1:]}/{path.stem}`\n\n```text\n{text}\n```\n\n")
+    return "".join(parts)
+
+
+def library() -> str:
+    """The page of the public names of `dtsa`, from their docstrings.
+
+    :raises ValueError: if a public name stands nowhere on the page.
+    """
+    grouped = {name for names in _GROUPS.values() for name in names}
+    if missing := set(dtsa.__all__) - grouped - {"REASONS", "__version__"}:
+        raise ValueError(f"public names of dtsa that no group of the page has: {', '.join(sorted(missing))}")
+    return "".join(_library())
+
+
+def _library() -> Iterator[str]:
+    yield "# The library `dtsa`\n\n"
+    yield "How it is used, with examples: [Use it from Python](../how-to/python.md). Each name is `dtsa.NAME`. "
+    yield "`dtsa.REASONS` says in words\nwhy an agent decided as it did, by the reason's name.\n\n"
+    for title, names in _GROUPS.items():
+        yield f"## {title}\n\n"
+        if names is _SETTINGS:
+            yield "Their fields, with default, unit and range: [settings](settings.md), [channel](channel.md).\n\n"
+        for name in names:
+            yield _entry(f"{getattr(dtsa, name).__module__}.{getattr(dtsa, name).__qualname__}", names is not _SETTINGS)
+        if "Table" in names:
+            yield "What a plug-in is, by kind ([plug-ins](plug-ins.md) says which methods do what):\n\n"
+            for kind in _kinds():
+                yield _entry(f"{kinds.__name__}.{kind}", True)
+
+
+def _kinds() -> list[str]:
+    text = Path(kinds.__file__).read_text(encoding="utf-8")
+    return re.findall(r"^class (\w+)\(Protocol\)", text, re.MULTILINE)
+
+
+def _entry(identifier: str, members: bool) -> str:
+    return f"::: {identifier}\n" + ("" if members else "    options: {members: false}\n") + "\n"
