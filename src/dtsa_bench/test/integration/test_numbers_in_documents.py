@@ -166,7 +166,7 @@ FIGURES: dict[str, list[str]] = {
         f"at most {agent_recorder._MOST_REFUSED / json_bag._FLUSH_S:g} a second",
         f"largest of the last {merge._END}",
     ],
-    "docs/tutorials/crazyflie-mission.md": [
+    "docs/how-to/crazyflie-missions.md": [
         f"For {ground_station.STOPPING_S[0]:g} to {ground_station.STOPPING_S[1]:g} s the agents",
         f"{1 / mission_recorder.PERIOD_S:g} times a second the latest of commands",
         f"more than {places.PLACE_M:g} m from where it would begin",
