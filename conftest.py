@@ -88,12 +88,12 @@ def machine(locks: Path, alone: bool) -> Iterator[None]:
 
     The locks are POSIX's, which belong to one process: what a worker has forked does not hold them when it has died.
 
-    :param locks: directory of the workers' locks. Who waits at the door lets nobody past, so that each gets its turn.
+    :param locks: directory of the workers' locks. `turn` is held while `room` is waited for, so that each worker gets its turn.
     :param alone: whether no other test may run meanwhile.
     """
     with (locks / "room").open("a+") as room:
-        with (locks / "door").open("a+") as door:
-            fcntl.lockf(door, fcntl.LOCK_EX)
+        with (locks / "turn").open("a+") as turn:
+            fcntl.lockf(turn, fcntl.LOCK_EX)
             fcntl.lockf(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
         yield
 

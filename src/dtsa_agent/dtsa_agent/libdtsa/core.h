@@ -13,7 +13,7 @@
 #define DTSA_SIMD
 #endif
 
-/* ---- a table: what one observer believes about everybody ---- */
+/* ---- a table: what one observer knows of everybody ---- */
 
 typedef struct dtsa_table {
     const dtsa_config *config;
@@ -114,7 +114,7 @@ void gossip_learn(dtsa_table *table, int64_t sampled, const gossip_entry *entry)
 /* The same, of the table's own agent: somebody has heard it. */
 void gossip_confirm(dtsa_table *table, int64_t sampled, const gossip_entry *entry);
 
-/* avoider/avoider.c: command of one agent from others' states as believed, docs/reference/avoiders.md.
+/* avoider/avoider.c: command of one agent from others' states as estimated, docs/reference/avoiders.md.
  * `ages` may be NULL. */
 int avoid_scratch_doubles(int n);
 

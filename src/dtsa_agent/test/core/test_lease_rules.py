@@ -95,8 +95,8 @@ def test_without_adoption_and_when_leaving_nobody_is_claimed(statement: Any, set
         assert {frame.c_s for frame in flight.frames.values()} == {0}
     flight.swarm.present[4] = 2
     flight.run(30)
-    (farewell,) = [frame for frame in flight.frames.values() if frame.leaving]
-    assert farewell.c_s == 0
+    (leaving,) = [frame for frame in flight.frames.values() if frame.leaving]
+    assert leaving.c_s == 0
 
 
 @STATEMENTS

@@ -126,7 +126,7 @@ def _check_source(args: argparse.Namespace) -> None:
 def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
     from dtsa_agent.air.udp.settings import UdpSettings
     from dtsa_agent.keys import check_key
-    from dtsa_bench.pages.view.air import AirSource
+    from dtsa_bench.pages.view.network_listener import NetworkListener
     from dtsa_bench.pages.view.track import Track
     from dtsa_bench.runs.options import given
 
@@ -137,7 +137,7 @@ def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
     config = swarm_of(args)
     check_key(config)
     track = Track(f"{udp.group} on {udp.interface}")
-    return [track], [AirSource(track, config, udp)], None
+    return [track], [NetworkListener(track, config, udp)], None
 
 
 def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callable[[Order], str] | None]:

@@ -30,7 +30,7 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.stop import Stop
 from dtsa_bench.commands.cli import main
 from dtsa_bench.pages.report.data import run_data
-from dtsa_bench.pages.view.air import AirSource
+from dtsa_bench.pages.view.network_listener import NetworkListener
 from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.writer import BagWriter
@@ -73,7 +73,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     flying: list[helpers.Flying] = []
     sniffing = helpers.Sniffing(CONFIG, udp)
     stranger, track = helpers.Stranger(group), Track("listener")
-    source = AirSource(track, CONFIG, udp)
+    source = NetworkListener(track, CONFIG, udp)
     listening = threading.Thread(target=source.run)
     listening.start()
 

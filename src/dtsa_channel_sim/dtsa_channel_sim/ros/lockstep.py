@@ -133,7 +133,7 @@ class LockstepChannel(RosChannel):
             fresh = self.answers.add(message)
         except Unusable as error:
             self.intake.drop(error.reason, str(error))
-            if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent is to blame
+            if error.reason not in (OTHER_RUN, OTHER_SENDER):  # a stranger's: no agent of this run sent it
                 self._complaint, self._complaint_time = str(error), time.monotonic()
             return False
         if fresh:

@@ -46,7 +46,7 @@ _PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports 
 _RECOVERY_NS = 4 * _NS
 LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _AHEAD = 100  # slots: a report from farther in the future is none
-_AFTERLIFE = 10  # slots: a report for a later one was made after its agent had been given up
+_RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
 _KEEP_NS = 10 * _NS  # an agent may tell so late that it took in a frame
 # What one pass of the loop does at most: frames, reports. Then it looks at the clock and at signals again.
 _FRAMES, _REPORTS = 64, 2
@@ -148,7 +148,7 @@ class RealtimeChannel(RosChannel):
         """
         self.answers.track[:, :, agent - 1] = place
         self.lose(agent)
-        self._given_up[agent] = -_AFTERLIFE
+        self._given_up[agent] = -_RETURN_SLOTS
 
     def lose(self, agent: int) -> None:
         """Takes note that an agent is gone."""
@@ -165,7 +165,7 @@ class RealtimeChannel(RosChannel):
 
     def _welcome(self, slot: int, book: Answers) -> None:
         """Takes agents back that were lost and have reported for a slot."""
-        again = [a for a in sorted(self.lost) if book.answered[a - 1] and slot > self._given_up[a] + _AFTERLIFE]
+        again = [a for a in sorted(self.lost) if book.answered[a - 1] and slot > self._given_up[a] + _RETURN_SLOTS]
         if again:
             self.lost.difference_update(again)
             self.returned.update(again)
@@ -270,7 +270,7 @@ class RealtimeChannel(RosChannel):
         return True
 
     def _resume(self, now: int) -> None:
-        """After a stall: what was handed over meanwhile is too late for the air, and nobody is to blame for silence."""
+        """After a stall: what was handed over meanwhile is too late for the air, and silence counts for no agent."""
         self._settle(now)
         begun, ended = self.pace.last_stall
         self._recovered_ns = ended + (_RECOVERY_NS if ended - begun > self._patience_ns else self._patience_ns)

@@ -107,14 +107,14 @@ class Udp:
     :param group: theirs.
     :param key: theirs.
     :param processes: theirs.
-    :param ears: hears them.
+    :param listener: hears them.
     """
 
     def __init__(
         self, swarm: SwarmConfig, group: str, key: str, processes: Sequence[subprocess.Popen[bytes]],
-        ears: MulticastSocket,
+        listener: MulticastSocket,
     ) -> None:  # fmt: skip
-        self._ears, self.processes, self.swarm = ears, processes, swarm
+        self._listener, self.processes, self.swarm = listener, processes, swarm
         self.pids = [process.pid for process in processes]
         self._wrapping = Wrapping(swarm, Authenticator.from_hex(key, swarm.auth_session))
         self.heard: set[int] = set()
@@ -122,7 +122,7 @@ class Udp:
     def late(self) -> list[int]:
         """How late the frames left that have come since the last call, ns."""
         found = []
-        for datagram in self._ears.receive(256):
+        for datagram in self._listener.receive(256):
             said = self._wrapping.read(datagram.data)
             if not said.fault:
                 self.heard.add(said.sender)
@@ -158,10 +158,10 @@ def over_udp(swarm: SwarmConfig, directory: Path) -> Iterator[Udp]:
     group = f"239.255.{draw.randrange(256)}.{draw.randrange(1, 255)}:{draw.randrange(20_000, 30_000)}"
     key = secrets.token_hex(32)
     with (
-        MulticastSocket(UdpSettings(interface="lo", group=group)) as ears,
+        MulticastSocket(UdpSettings(interface="lo", group=group)) as listener,
         _agents(swarm, group, key, directory) as all_of,
     ):
-        udp = Udp(swarm, group, key, all_of, ears)
+        udp = Udp(swarm, group, key, all_of, listener)
 
         def all_speak() -> bool:
             udp.late()

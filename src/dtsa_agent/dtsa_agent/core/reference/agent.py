@@ -123,8 +123,8 @@ class Agent:
 
 
 @dataclass(slots=True)
-class Ear:
-    """Who hears: a table, and the agent that it belongs to (None: a table of a mere observer, or a shared one)."""
+class Receiver:
+    """A table that takes frames in, and its agent (None: the table of a mere observer, or a shared one)."""
 
     table: Table
     agent: Agent | None = None
@@ -160,22 +160,22 @@ def parse(data: bytes, slot: int, rules: Rules) -> tuple[Frame | ExtendedFrame, 
     return frame, sampled
 
 
-def hear(ears: Sequence[Ear], frame: Frame | ExtendedFrame, sampled: int, rules: Rules) -> None:
+def hear(receivers: Sequence[Receiver], frame: Frame | ExtendedFrame, sampled: int, rules: Rules) -> None:
     """Some observers take in a frame.
 
-    :param ears: those that received it.
+    :param receivers: those that received it.
     :param frame: what it said.
     :param sampled: the slot in which it was sent, see :func:`parse`.
     :param rules: what all agree on.
     """
-    for ear in ears:
+    for receiver in receivers:
         own = frame.own if isinstance(frame, ExtendedFrame) else frame
-        row = ear.table.rows[own.sender - 1]
+        row = receiver.table.rows[own.sender - 1]
         wakes = not row.in_ap and own.c_r != 0
         if row.sent_slot < sampled:
-            ear.table.learn(own, sampled)
-        if isinstance(frame, ExtendedFrame) and ear.table.observer != own.sender:
+            receiver.table.learn(own, sampled)
+        if isinstance(frame, ExtendedFrame) and receiver.table.observer != own.sender:
             for entry in frame.gossip:
-                gossip.learn(ear.table, sampled - entry.age, entry, rules)
-            if rules.policy == "lease" and ear.agent is not None:
-                listen(ear.agent.memory, ear.agent.index, ear.table, sampled, frame, wakes)
+                gossip.learn(receiver.table, sampled - entry.age, entry, rules)
+            if rules.policy == "lease" and receiver.agent is not None:
+                listen(receiver.agent.memory, receiver.agent.index, receiver.table, sampled, frame, wakes)

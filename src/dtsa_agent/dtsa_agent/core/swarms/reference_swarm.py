@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.core.frame import position_step
 from dtsa_agent.core.reference import estimators, vehicle
-from dtsa_agent.core.reference.agent import Agent, Ear, Foreign, hear, parse
+from dtsa_agent.core.reference.agent import Agent, Foreign, Receiver, hear, parse
 from dtsa_agent.core.reference.arithmetic import Vector
 from dtsa_agent.core.reference.lease.memory import DEAF
 from dtsa_agent.core.reference.rules import Rules
@@ -156,7 +156,7 @@ class ReferenceSwarm(AbstractSwarm):
         self._look()
         sender = data[1] if self.config.extended else int.from_bytes(data[1:3], "little")
         reached = [row for row in range(len(self.tables)) if self._hears(row, sender, mask)]
-        hear([self._ear(row) for row in reached], frame, sampled, self.rules)
+        hear([self._receiver(row) for row in reached], frame, sampled, self.rules)
         for row in reached:
             self._publish(row)
         return True
@@ -170,9 +170,9 @@ class ReferenceSwarm(AbstractSwarm):
         here = self.shared or row >= len(self.agents) or bool(self.present[row])
         return received and here
 
-    def _ear(self, row: int) -> Ear:
+    def _receiver(self, row: int) -> Receiver:
         own = not self.shared and row < len(self.agents)
-        return Ear(self.tables[row], self.agents[row] if own else None)
+        return Receiver(self.tables[row], self.agents[row] if own else None)
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
         self._look()

@@ -63,7 +63,7 @@ class Vehicle:
         self._log = log
         self._publish = on_state
         self._moved = False  # something that makes it fly was sent since it was armed
-        self._deaf = False  # a rule took the controls: streamed commands do not count until the next take-off
+        self._overruled = False  # a rule took the controls: streamed commands do not count until the next take-off
         self._paused = False  # held because it is not seen: streamed commands do not count until it is
         self.known = KnownState(robot, station, log)
         self.link = Link(
@@ -149,7 +149,7 @@ class Vehicle:
         """Connect in the background; `done` is called when it has worked out or not."""
         with self.lock:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
-            self._deaf = self._paused = self.guarded = False
+            self._overruled = self._paused = self.guarded = False
             self.landing.heard()
             self.controls.reset()
             self.onboard.forget()
@@ -195,7 +195,7 @@ class Vehicle:
         """Stream a command; False when it is not for the present state."""
         with self.lock:
             early = setpoint.stamp < self.controls.guard_until
-            if self.state not in ACCEPTS_COMMANDS or self._deaf or self._paused or early:
+            if self.state not in ACCEPTS_COMMANDS or self._overruled or self._paused or early:
                 self.refused += 1
                 return False
             self._moved = True
@@ -206,9 +206,9 @@ class Vehicle:
 
     def not_led(self) -> str:
         """Why it takes no orders to fly somewhere; empty if it does."""
-        if self.state == State.FLYING and not self._deaf:
+        if self.state == State.FLYING and not self._overruled:
             return ""
-        return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._deaf else "")
+        return f"{self.name} is {self.standing}" + (f" ({self.action})" if self._overruled else "")
 
     def fly(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
         """Give an order to the high-level commander; parameters as of `Controls.fly`. The lock is held."""
@@ -255,7 +255,7 @@ class Vehicle:
             z = 0.0 if self.last is None else max(self.last.position[2], 0.0)
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
-            self._deaf, self._moved = False, True
+            self._overruled, self._moved = False, True
             self.controls.see_again()
             on_ground = self.state == State.ARMED
             self.machine.takeoff(f"take-off to {height:.2f} m")
@@ -306,7 +306,7 @@ class Vehicle:
                 return
             self.action = f"hold: {reason}"
             if self.known.wrong:
-                self._deaf = True
+                self._overruled = True
                 self.landing.stand_blindly()
                 return
             self._paused = until_seen
@@ -346,7 +346,7 @@ class Vehicle:
                 return f"{self.name} is {self.standing}"
             if self.state == State.ARMED and not self._moved:
                 return self.arm(False)  # a landing would start the motors
-            self._deaf = True
+            self._overruled = True
             if self.state == State.LANDING and (not self.known.wrong or self.controls.sinks_blindly):
                 return ""
             self.action = f"land: {reason}"
@@ -371,7 +371,7 @@ class Vehicle:
             if self.state in (State.DISCONNECTED, State.CONNECTING):
                 return
             self.action = f"emergency stop: {reason}"
-            self._deaf = True
+            self._overruled = True
             self.landing.cancel()
             self.controls.stop()
 

@@ -10,8 +10,8 @@ int avoid_scratch_doubles(int n);
 
 /* Commanded velocity of agent `self` (0-based).
  * position, velocity, goal: own true state and goal, 3 each (m, m/s, frame map).
- * others_p, others_v: (3, n) planes, what this agent believes about everybody now; entry `self` is
- * ignored, and so is whoever's believed position is not finite. age_s: (n) seconds since each one's
+ * others_p, others_v: (3, n) planes, where this agent takes everybody to be now; entry `self` is
+ * ignored, and so is whoever's estimated position is not finite. age_s: (n) seconds since each one's
  * state was sampled, or NULL (no margins). scratch: avoid_scratch_doubles(n) doubles, contents
  * undefined. command: 3, output. */
 void avoid_command(int kind, const dtsa_avoid_params *params, int n, int self,

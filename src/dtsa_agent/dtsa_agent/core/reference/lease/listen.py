@@ -49,7 +49,7 @@ def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: Exte
 
 
 def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, was_absent: bool) -> None:
-    """Probation begins where somebody may think me dead, and ends where the one who would, knows better.
+    """Probation begins where another agent may take this one for dead, and ends where that agent has heard it.
 
     :param was_absent: the sender was thought dead until now.
     """

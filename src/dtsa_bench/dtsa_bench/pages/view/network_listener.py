@@ -1,4 +1,4 @@
-"""Agents on a network as a source of moments: one who listens, and knows only what frames say."""
+"""Agents on a network as a source of moments: a listener to their group, which knows only what frames say."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class HeardRun:
         self._moments.event(slot, "lost", text)
 
 
-class AirSource:
+class NetworkListener:
     """Listens to the agents on a network without taking part.
 
     :param track: where the moments go.

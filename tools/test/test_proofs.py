@@ -1,4 +1,4 @@
-"""Integration: libdtsa outside of Python: fuzzed, and on a microcontroller."""
+"""Integration: libdtsa outside of Python: fuzzed, proved, and on a microcontroller."""
 
 from __future__ import annotations
 
