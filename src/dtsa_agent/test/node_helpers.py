@@ -56,8 +56,11 @@ class Graph:
             self.executor.spin_once(timeout_sec=0.05)
 
     def ask(self, client: Client, request: Any) -> Any:
-        """Answer of a service. Asked again every few seconds: a server that has not found its client yet drops answers,
-        and on a busy machine that takes a while."""
+        """Answer of a service.
+
+        Asked again every few seconds: a server that has not found its client yet drops answers, and on a busy machine
+        that takes a while.
+        """
         answers = [client.call_async(request)]
         next_time = time.monotonic() + 5
 

@@ -84,7 +84,7 @@ class AirAgent:
         self._latest_send_ns = latest_send_ns(self._slot_ns, flight)
         self._too_long_ns = too_long_ns(config)
         self._ordinary = ""  # why it has no real-time priority
-        self.slot = -1  # the slot that is open
+        self.slot = -1  # the present slot
         self._first = 0  # slot with which it began, or began anew
         self._awaits = False  # the slot's sender is another one, and has not been heard yet
         self._waiting = b""  # frame of this slot, ready to be sent

@@ -42,10 +42,7 @@ from rclpy.task import Future
 from dtsa_agent.core.agents.joining import Listeners, check_joinable
 from dtsa_agent.core.agents.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins.entry_points import plug_ins_of
-from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, generator
-from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.priority import take_priority
@@ -55,7 +52,9 @@ from dtsa_agent.ros.common.wire.slot_fields import SlotFields
 from dtsa_agent.ros.common.wire.stamps import header_of, time_of
 
 from .handed_over import HandedOver
+from .leaving import Leaving
 from .reporter import Reporter
+from .send_times import SendTimes
 from .slot_clocks import SlotClocks
 from .swarm_node import SwarmNode
 
@@ -70,7 +69,7 @@ _BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
 
 
 class RealtimeNode(SwarmNode):
-    """A :class:`SwarmNode` whose agents open their slots by themselves.
+    """A :class:`SwarmNode` whose agents begin their slots by themselves.
 
     The time line is the channel's: ns from the start of slot 0. An agent's slot starts when its own clock says so; that
     is off by an offset and a drift, and by what the agent has learned from others' frames. As on a vehicle, where a
@@ -117,15 +116,12 @@ class RealtimeNode(SwarmNode):
         self._own_or_nobody = {0, *self.swarm.ids}
         self._awaits = False  # somebody here takes another one for the slot's sender, and has not heard it yet
         self.unsent = 0  # frames that would have left half a slot late or more
-        self._slotted = not self.config.policy_row.unslotted
+        slotted = not self.config.policy_row.unslotted
         parts = plug_ins_of(self.swarm) if self.config.policy_row.listens else None
         self._handed = None if parts is None else HandedOver(parts)
-        self._clocks = SlotClocks(self.slot_ns, offset_ns, drift_ppb, align and self._slotted)
+        self._clocks = SlotClocks(self.slot_ns, offset_ns, drift_ppb, align and slotted)
         self._lengths: NDArray[np.uint8] = np.zeros(count, dtype=np.uint8)  # bytes sent in the present slot
-        self._free_ns = [0] * count  # when each radio has done with its last frame; of policies without slots
-        self._jitter_ns = jitter_ns
-        self._random = [generator(self.config.seed, STREAM_CLOCKS, agent) for agent in self.swarm.ids]
-        self._fixed_ns, self._per_byte_ns = flight_time_ns
+        self._send_times = SendTimes(self.swarm, jitter_ns, flight_time_ns, not slotted and self._handed is None)
         self._priority = priority  # still to be taken
         self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3).T
         self._called = False  # was there when the channel asked who is
@@ -134,9 +130,7 @@ class RealtimeNode(SwarmNode):
         self._timeless: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         self._first = 0  # slot with which this process began, or began anew
         self._too_long_ns = too_long_ns(self.config)
-        self._leaves_by: int | None = None  # slot: leaving; ends then at the latest
-        self._gone: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)  # who has said on the air that it leaves
-        self._signals = 0
+        self._leaving = Leaving(self.swarm)
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
         self._complete = False  # the step before took in all that was waited for: no need to look for more
         self._early: list[SlotFields] = []  # frames of a slot that is still to come here
@@ -185,15 +179,10 @@ class RealtimeNode(SwarmNode):
         """Whether to end now because of a signal: the second one, or when all agents here have left after the first."""
         if not stop:
             return False
-        swarm = self.swarm
-        if self._leaves_by is None:
-            if not self.config.policy_row.says_leaving or self.slot < self._first:
-                return True
-            self._signals = stop.count
-            self._leaves_by = self.slot + (self.config.main_every + 1) * self.config.agents
-            for index in range(len(swarm.ids)):
-                swarm.leave(index)
-        if stop.count == self._signals and self.slot <= self._leaves_by and (swarm.present == PRESENT_LEAVING).any():
+        leaving = self._leaving
+        if not leaving.begun and (self.slot < self._first or not leaving.begin(stop.count, self.slot)):
+            return True
+        if leaving.goes_on(stop.count, self.slot):
             return not self.loop.subscription.get_publisher_count()
         self._reporter.publish(self.run_id)
         for publisher in (self._air, self._telemetry):
@@ -351,7 +340,7 @@ class RealtimeNode(SwarmNode):
     def _began_ns(self, message: SlotFields) -> int:
         """When the transmission of a frame began, by its arrival and length: ns on the channel's time line."""
         arrival = message.time_ns - names.TIME_ZERO_NS
-        return arrival - self._fixed_ns - self._per_byte_ns * int(message.length[0])
+        return arrival - self._send_times.under_way_ns(int(message.length[0]))
 
     def _lateness(self, message: SlotFields) -> NDArray[np.int64]:
         """How much later than each agent expects a frame has begun, ns."""
@@ -363,8 +352,7 @@ class RealtimeNode(SwarmNode):
         swarm = self.swarm
         if slot > self._first:
             self.agents.on_slot_end()
-        if self._leaves_by is not None:
-            swarm.present[~self._gone] = PRESENT_LEAVING
+        self._leaving.mark()
         senders = self.agents.on_slot(slot)
         starts = self._clocks.starts(slot)
         offsets = self._send(slot, senders, starts)
@@ -380,18 +368,6 @@ class RealtimeNode(SwarmNode):
         if self._reporter.due():
             self._reporter.publish(self.run_id)
 
-    def _still_sends(self, index: int, begin_ns: int, length: int) -> bool:
-        """Whether a radio is still busy with its last frame; it takes the next one if not.
-
-        With slots it never is, and a radio that listens knows by itself.
-        """
-        if self._slotted or self._handed is not None:
-            return False
-        if begin_ns < self._free_ns[index]:
-            return True
-        self._free_ns[index] = begin_ns + self._fixed_ns + self._per_byte_ns * length
-        return False
-
     def _send(self, slot: int, senders: Sequence[int], starts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Hands the frames of a slot over to the channel, before anything else is done.
 
@@ -399,22 +375,20 @@ class RealtimeNode(SwarmNode):
         :param starts: (L,) ns, start of each agent's slot, from the channel's start of the slot.
         :returns: (L,) ns, the same, but of the transmission where there is one.
         """
-        swarm = self.swarm
+        swarm, began = self.swarm, self._zero + slot * self.slot_ns
         offsets = starts.copy()
         self._lengths[:] = 0
         for index in senders:
             data = swarm.frame(index)
-            jitter = self._jitter_ns * self._random[index].standard_normal() if self._jitter_ns else 0.0
-            now = time.monotonic_ns() - self._zero - slot * self.slot_ns
-            due = starts[index] + swarm.send_offset_ns[index]
-            offset = max(int(due + jitter), now)
-            if offset - due > self.slot_ns // 2 or self._still_sends(index, slot * self.slot_ns + offset, len(data)):
-                # The turn is as good as over: speaking now would disturb whoever has the next one.
+            due = began + int(starts[index] + swarm.send_offset_ns[index])
+            start = self._send_times.start_ns(index, due, len(data))
+            if start is None:
                 swarm.drop(index)
                 self.unsent += 1
                 if self._handed is not None:
                     self._handed.not_sent(index, slot)
                 continue
+            offset = start - began
             offsets[index], self._lengths[index] = offset, len(data)
             if self._handed is not None:
                 self._handed.note(index, slot, slot * self.slot_ns + offset)
@@ -422,6 +396,5 @@ class RealtimeNode(SwarmNode):
             self._air.publish(
                 Frame(header=header, run=self.run_id, slot=slot, agent=swarm.ids[index], data=array("B", data))
             )
-            if swarm.present[index] == PRESENT_LEAVING:
-                self._gone[index] = decode_extended(self.config.protocol_part(data, sealed=True)).leaving
+            self._leaving.sent(index, data)
         return offsets

@@ -46,7 +46,7 @@ class AgentGroup:
         self.swarm = swarm
         self.newcomers = Newcomers(len(swarm.ids))
         self.refused = 0  # frames that reached an agent and were not taken in, over all agents
-        self.slot = -1  # the slot that is open, -1: none
+        self.slot = -1  # the present slot, -1: none
 
     def on_slot(self, slot: int) -> tuple[int, ...]:
         """Decides for a slot that begins now.

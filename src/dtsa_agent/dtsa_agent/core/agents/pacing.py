@@ -1,4 +1,4 @@
-"""When an agent that opens its slots by itself decides, and after how long it begins anew."""
+"""When an agent that begins its slots by itself decides, and after how long it begins anew."""
 
 from __future__ import annotations
 

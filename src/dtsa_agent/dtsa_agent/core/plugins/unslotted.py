@@ -1,4 +1,4 @@
-"""Policies that are not bound to slots, for agents that open slots one after the other by their own clocks."""
+"""Policies that are not bound to slots, for agents that begin slots one after the other by their own clocks."""
 
 from __future__ import annotations
 

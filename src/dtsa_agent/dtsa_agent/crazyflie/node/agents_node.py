@@ -50,7 +50,7 @@ STOP_HERE = "/all/stop_here"  # of the ground station: nobody flies on to its go
 
 
 class StationNode(RealtimeNode):
-    """Agents that open their slots by the station's clock and whose vehicles are flown elsewhere.
+    """Agents that begin their slots by the station's clock and whose vehicles are flown elsewhere.
 
     :param node: the ROS node.
     :param swarm: the agents that live here.

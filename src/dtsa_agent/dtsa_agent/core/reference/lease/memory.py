@@ -153,9 +153,10 @@ class Memory:
         return turns[:room]
 
     def start(self, slot: int) -> None:
-        """The first slot. Whoever begins with slot 0 begins with everybody else; whoever comes later may have lived
+        """The first slot.
 
-        before, and may have given turns away that it knows nothing of.
+        An agent that begins with slot 0 begins with everybody else. One that comes later may have flown before, and may
+        have given turns away that it knows nothing of.
         """
         n = self.rules.agents
         self.started = True
