@@ -281,11 +281,11 @@ class RosChannel:
         try:
             self._observers.close()
         finally:
-            self._see_off()
+            self._wait_until_told()
             self._processes.close()
             self.loop.close()
 
-    def _see_off(self) -> None:
+    def _wait_until_told(self) -> None:
         """Waits until all nodes know that the run is over, or have left."""
         deadline = time.monotonic() + self._end_s
         while self.node.context.ok() and time.monotonic() < deadline:

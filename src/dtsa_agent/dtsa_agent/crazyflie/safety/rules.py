@@ -8,7 +8,7 @@
 | commands | age of the last streamed command | hold the place, then land |
 | heartbeat | the ground station's heartbeat, once heard | stop all motors |
 | positions | age of the last pose from motion capture in flight | hold the place, then land |
-| estimate | where a flying vehicle believes to be, if that cannot be | stop where it is, then sink |
+| estimate | where a flying vehicle takes itself to be, if that cannot be | stop where it is, then sink |
 | distance | two flying vehicles too close | land both |
 | supervisor | tumbled, crashed, locked | stop sending to it |
 

@@ -1,4 +1,23 @@
-"""One Crazyflie as the bridge knows it: link, state machine, orders, and the age of everything."""
+"""One Crazyflie as the bridge knows it: link, state machine, orders, and the age of everything.
+
+A set-point's way from the graph to the motors, and who may stop it:
+
+1. **Topic.** `node/inputs.py` subscribes to each vehicle's `cmd_*` topics, in a thread of their own (`command_thread`).
+   It turns a message into a :class:`Setpoint` in the world's frame, dated by its publication, and refuses one that is
+   too fast or leads out of the fence (`motion/limits.py`).
+2. **Whether it counts now** is decided here, in :meth:`Vehicle.command`, under the vehicle's lock. It does not count
+   unless the state machine says armed or flying, after a rule of `safety` has taken the controls (`_overruled`, until
+   the next take-off), while motion capture does not see the vehicle (`_paused`), or while a take-off or go-to is flown
+   to its end (`controls.guard_until`). One that does not count is counted in `refused`.
+3. **The stream.** `motion/controls.py` notes its time, ends whatever else was flown (a braking, an order that is being
+   repeated), and lays it into the link's outbox (`links/outbox.py`): one place, so a newer one replaces it.
+4. **The link's worker** (`links/link.py`) sends orders first, then the newest set-point, then positions, by cflib.
+5. **When the stream stops.** `safety/rules.py` looks at the command's age 50 times a second: first :meth:`Vehicle.hold`,
+   then :meth:`Vehicle.land`. Both brake by a stream of zero velocity, then give an order to the firmware's high-level
+   commander. The order goes out before the end of the stream, or the motors would stop for a moment.
+
+Orders (take-off, go-to, landing, trajectories) take the same way from step 2 on, by :meth:`Vehicle.fly`.
+"""
 
 from __future__ import annotations
 
