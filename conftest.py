@@ -88,7 +88,7 @@ def machine(locks: Path, alone: bool) -> Iterator[None]:
 
     The locks are POSIX's, which belong to one process: what a worker has forked does not hold them when it has died.
 
-    :param locks: directory of the workers' locks. A worker that waits for `room` holds `turn`, so that each gets its turn.
+    :param locks: directory of the workers' locks. A worker that waits for `room` holds `turn`, so each gets its turn.
     :param alone: whether no other test may run meanwhile.
     """
     with (locks / "room").open("a+") as room:

@@ -2,12 +2,12 @@
 
 This module owns the order in which a flight ends; each step is elsewhere, and has a limit of its own:
 
-1. **Why.** The run is over (all have arrived, or its limits), or :class:`.ending.EarlyEnd` is true: a signal, or no more
-   wall time. Or an error: a node has died, the recorder cannot write. Ctrl-C reaches this process alone
+1. **Why.** The run is over (all have arrived, or its limits), or :class:`.ending.EarlyEnd` is true: a signal, or no
+   more wall time. Or an error: a node has died, the recorder cannot write. Ctrl-C reaches this process alone
    (`children.Children.start`), and sets a flag (`dtsa_agent/stop.py`): the slot that goes on is carried out whole.
 2. **The channel** leaves its loop and publishes the END message, by which agents end by themselves.
-3. **The bag.** `channel.close()` (in :func:`_run`) closes the observers first, the recorder among them: from here on the
-   bag is whole, whatever happens to processes. Then it waits up to ``END_S`` until all nodes have heard of the end.
+3. **The bag.** `channel.close()` (in :func:`_run`) closes the observers first, the recorder among them: from here on
+   the bag is whole, whatever happens to processes. Then it waits up to ``END_S`` until all nodes have heard of the end.
 4. **The processes.** `children.stop()` waits 3 s for them, sends SIGTERM, waits 1 s, sends SIGKILL; after a signal from
    the user 0.3 s each.
 5. **The results:** summary and picture, from the metrics of this process; no picture after an early end. Then an error

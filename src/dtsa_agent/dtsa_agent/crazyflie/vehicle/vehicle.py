@@ -12,9 +12,9 @@ A set-point's way from the graph to the motors, and who may stop it:
 3. **The stream.** `motion/controls.py` notes its time, ends whatever else was flown (a braking, an order that is being
    repeated), and lays it into the link's outbox (`links/outbox.py`): one place, so a newer one replaces it.
 4. **The link's worker** (`links/link.py`) sends orders first, then the newest set-point, then positions, by cflib.
-5. **When the stream stops.** `safety/rules.py` looks at the command's age 50 times a second: first :meth:`Vehicle.hold`,
-   then :meth:`Vehicle.land`. Both brake by a stream of zero velocity, then give an order to the firmware's high-level
-   commander. The order goes out before the end of the stream, or the motors would stop for a moment.
+5. **When the stream stops.** `safety/rules.py` looks at the command's age 50 times a second: :meth:`Vehicle.hold` comes
+   first, then :meth:`Vehicle.land`. Both brake by a stream of zero velocity, then give an order to the firmware's
+   high-level commander. The order goes out before the end of the stream, or the motors would stop for a moment.
 
 Orders (take-off, go-to, landing, trajectories) take the same way from step 2 on, by :meth:`Vehicle.fly`.
 """
