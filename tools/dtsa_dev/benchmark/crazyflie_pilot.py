@@ -87,7 +87,7 @@ class Pilot:
 
         :param step: waits until something is so.
         :param height: m above the floor.
-        :param seconds: duration.
+        :param seconds: s that it takes.
         """
         self._call(step, "arm", arm=True)
         step("arming", lambda: self._all(Status.STATE_ARMED))

@@ -127,7 +127,7 @@ def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0
 
     :param agents: N.
     :param policy: a policy that lets all agents share a table.
-    :param most_slots: the flight is cut off after so many.
+    :param most_slots: slots after which the flight is cut off.
     :param least_s: short flights are repeated for so long; the fastest counts, others were disturbed.
     """
     config = SwarmConfig(agents=agents, moving=agents - agents % 2, policy=policy)

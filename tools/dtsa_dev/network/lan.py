@@ -31,7 +31,7 @@ class Lan:
         """Carries frames.
 
         :param until: asked about fifty times a second: whether to stop.
-        :param seconds: it stops after this time whatever happens.
+        :param seconds: s after which it stops, whatever happens.
         :returns: whether it was asked to stop.
         """
         end = time.monotonic() + seconds

@@ -99,7 +99,7 @@ class Switch:
         """Carries frames.
 
         :param until: asked about a hundred times a second: whether to stop.
-        :param seconds: it stops after this time whatever happens.
+        :param seconds: s after which it stops, whatever happens.
         :returns: whether it was asked to stop.
         """
         end, ask = self.now_ns + round(seconds * _SECOND), 0

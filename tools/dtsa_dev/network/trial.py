@@ -49,9 +49,9 @@ class Trial:
     :param swarm: the settings that all agents share.
     :param channel: the medium, without what follows from the swarm.
     :param links: what links do beside it.
-    :param seconds: from when all have begun.
-    :param drift_ppm: largest drift of a clock, either way.
-    :param spread_s: processes start within this time, in any order.
+    :param seconds: s from when all have begun.
+    :param drift_ppm: ppm, largest drift of a clock, either way.
+    :param spread_s: s within which processes start, in any order.
     :param seed: of order, drifts and offsets.
     """
 
@@ -119,7 +119,7 @@ class Flight:
     def carry(self, seconds: float) -> None:
         """Time goes on.
 
-        :param seconds: how long.
+        :param seconds: s, how long.
         :raises NotFlown: if a process has ended by itself.
         """
         self.switch.run(self._broken, seconds)

@@ -228,7 +228,7 @@ def explore(program: Path, world: World, limit_s: float = 3600.0) -> Explored:
 
     :param program: from :func:`build`.
     :param world: the world.
-    :param limit_s: wall-clock time after which it is an error.
+    :param limit_s: s of wall-clock time after which it is an error.
     :raises DtsaError: if the program fails.
     """
     command = [str(program), *world.words()]

@@ -169,7 +169,7 @@ def run_case(case: Case, protocol: str, seed: int, slots: int) -> Result:
     :param case: the row.
     :param protocol: the column.
     :param seed: its seed.
-    :param slots: length of steady and stop-and-go runs.
+    :param slots: slots that steady and stop-and-go runs last.
     """
     random = np.random.default_rng([seed, 4])
     ids = [int(k) + 1 for k in random.permutation(case.agents)]

@@ -13,7 +13,7 @@ def slot_cost_us(agents: int = 70, movers: int = 70, rounds: int = 5, slots: int
     """Time of a slot on one thread, us: decide for all agents, encode one frame, decode it at all others. No flight.
 
     :param agents: number of agents N.
-    :param movers: how many have something to say.
+    :param movers: number of agents that have something to say.
     :param rounds: measured so often; the fastest counts, others were disturbed.
     :param slots: slots per round.
     """

@@ -78,7 +78,7 @@ def random_misfortune(seed: int, slots: int, most_agents: int = 16, **settings: 
     """Everything that can go wrong, at random.
 
     :param seed: seed of all of it.
-    :param slots: length of the run it is meant for.
+    :param slots: slots that the run lasts for which it is meant.
     :param most_agents: upper bound of the swarm's size.
     :param settings: of the swarm, on top of the random ones.
     """

@@ -26,7 +26,7 @@ def run_soak(soak: Soak, directory: Path, minutes: float, sample: bool = False) 
 
     :param soak: the soak.
     :param directory: where the journal is; made if it does not exist.
-    :param minutes: no item begins later than this.
+    :param minutes: min after which no item begins.
     :param sample: only the items of the sample.
     :returns: the record of the soak, see :func:`record_of`.
     :raises KeyboardInterrupt: on Ctrl-C and SIGTERM; finished items are kept.

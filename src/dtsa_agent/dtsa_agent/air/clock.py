@@ -11,7 +11,7 @@ class OwnClock:
     """What an agent's clock shows.
 
     :param offset_ns: ns, by how much it is ahead of CLOCK_MONOTONIC when it is made.
-    :param drift_ppb: parts per billion by which it runs fast.
+    :param drift_ppb: ppb (parts per billion) by which it runs fast.
     """
 
     __slots__ = ("_began", "_drift", "_offset")

@@ -42,7 +42,7 @@ def flight_ns(config: SwarmConfig, flight_time_ns: int, byte_time_ns: int) -> in
 
     :param config: what all agents share.
     :param flight_time_ns: of :class:`.port.DatagramPort`.
-    :param byte_time_ns: likewise.
+    :param byte_time_ns: ns for each byte, of the same.
     """
     return flight_time_ns + byte_time_ns * (HEADER + config.frame_length)
 
@@ -89,7 +89,7 @@ class Wrapping:
         """The datagram of a frame.
 
         :param frame: the frame, not sealed yet.
-        :param slot: in which it is sent.
+        :param slot: number of the slot in which it is sent.
         :param late_ns: ns, how much later than its slot it leaves.
         :param peers: whom its sender hears how late, :data:`PEERS` at most.
         """

@@ -29,8 +29,8 @@ class Leaving:
     def begin(self, signals: int, slot: int) -> bool:
         """From now on the agents leave; False: their policy has no way to say so.
 
-        :param signals: how many have come so far.
-        :param slot: the present one.
+        :param signals: number of signals that have come so far.
+        :param slot: number of the present slot.
         """
         config = self._swarm.config
         if not config.policy_row.says_leaving:
@@ -43,8 +43,8 @@ class Leaving:
     def goes_on(self, signals: int, slot: int) -> bool:
         """Whether somebody still has to say it; not after another signal, nor for ever.
 
-        :param signals: how many have come so far.
-        :param slot: the present one.
+        :param signals: number of signals that have come so far.
+        :param slot: number of the present slot.
         """
         in_time = signals == self._signals and self._by is not None and slot <= self._by
         return in_time and bool((self._swarm.present == PRESENT_LEAVING).any())

@@ -204,7 +204,7 @@ class OdometryVehicle:
 def turned(q: tuple[float, float, float, float], v: Any) -> Any:
     """A vector of the body in the map's axes.
 
-    :param q: attitude, x, y, z, w.
+    :param q: (4,) attitude as a quaternion x, y, z, w, body in map.
     :param v: (3,), in the body's axes.
     """
     axis, w = np.array(q[:3]), q[3]

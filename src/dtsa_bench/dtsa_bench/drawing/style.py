@@ -54,7 +54,7 @@ def colour(name: object, index: int) -> str:
     """The colour of a series.
 
     :param name: its name; schemes have a colour of their own.
-    :param index: its place among the series of the figure.
+    :param index: index among the series of the figure, from 0.
     """
     return COLOURS.get(str(name), CYCLE[index % len(CYCLE)])
 
@@ -70,8 +70,8 @@ def panels(count: int, width: float = 3.3, height: float = 3.1, columns: int = 3
     """A figure with some panels side by side.
 
     :param count: number of panels.
-    :param width: of a panel, inches.
-    :param height: of a panel, inches.
+    :param width: inches, of a panel.
+    :param height: inches, of a panel.
     :param columns: largest number in a row.
     """
     across = min(count, columns)

@@ -49,7 +49,7 @@ class Mean:
 def median_interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, float]:
     """Two of the values between which the true median lies, whatever the distribution (sign test).
 
-    :param values: independent ones.
+    :param values: (n,) independent values of any one unit.
     :param level: probability that it does, at least; with fewer than six values it is less than 0.95.
     :raises ValueError: without values.
     """
@@ -89,7 +89,7 @@ def wilson(count: int, total: int, level: float = LEVEL) -> Share:
 def bootstrap_mean(values: Iterable[float], level: float = LEVEL, resamples: int = RESAMPLES) -> Mean:
     """The mean with a percentile bootstrap interval. The resampling is seeded: equal values, equal interval.
 
-    :param values: one value a run; those that are not finite are left out.
+    :param values: (n,) one value a run, of any one unit; those that are not finite are left out.
     :param level: probability of the interval.
     :param resamples: number of resamples.
     """

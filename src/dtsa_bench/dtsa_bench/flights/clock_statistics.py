@@ -67,7 +67,7 @@ class ClockStatistics(ChannelObserver):
         """Takes in what one process says of some slots; nothing of slots that have been summed up.
 
         :param slot: (m,) as its agents count, ascending.
-        :param ids: (n,) of the agents.
+        :param ids: (n,) ids of the agents.
         :param offsets_ns: (m n) ns, of each agent's slot from the channel's; of its transmission, if it sends.
         :param lengths: (m n) bytes of each frame, 0: silent.
         """

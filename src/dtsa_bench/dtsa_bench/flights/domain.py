@@ -24,7 +24,7 @@ _SPREAD = 37  # runs that start at the same time look at different domains first
 def ros_domain(wanted: int | None = None, *, shared: bool = False) -> Iterator[int]:
     """Takes a domain for as long as the context lasts, and removes what dead processes have left in shared memory.
 
-    :param wanted: take this one; None: any that is free.
+    :param wanted: number of the domain, 0 to 232; None: any that is free.
     :param shared: others may be on the wanted one already, such as motion capture; but no other run.
     :raises ConfigError: if the wanted one is in use.
     :raises DtsaError: if all are in use.

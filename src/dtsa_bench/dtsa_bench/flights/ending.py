@@ -10,7 +10,7 @@ _LEAST_S, _FACTOR = 120.0, 10.0
 def wall_limit_s(given: float | None, timeout_s: float) -> float:
     """How long a flight may take by the clock on the wall, s.
 
-    :param given: what the user allows; None: ten times the limit in simulated time, two minutes at least.
+    :param given: s that the user allows; None: ten times the limit in simulated time, two minutes at least.
     :param timeout_s: the limit in simulated time, s.
     """
     return max(_LEAST_S, _FACTOR * timeout_s) if given is None else given
@@ -21,7 +21,7 @@ class EarlyEnd:
 
     :param stop: the signal flag.
     :param wall_s: s of wall time that the flight may take.
-    :param elapsed_s: how many it has taken so far.
+    :param elapsed_s: says how many s it has taken so far.
     """
 
     def __init__(self, stop: object, wall_s: float, elapsed_s: Callable[[], float]) -> None:

@@ -86,7 +86,7 @@ END_S = 1.0  # wall time in which the nodes are to hear of the end; those that h
 def run_environment(domain: int, logs: Path, shared_memory: bool = True) -> dict[str, str]:
     """Variables for the processes of a run; this process gets those that its own node needs.
 
-    :param domain: ROS domain.
+    :param domain: ROS domain, 0 to 232.
     :param logs: directory for ROS's logs.
     :param shared_memory: whether this process and those that it starts use it: not in real time, nor if they are many.
     """

@@ -99,9 +99,9 @@ def of_datagrams(agents: int, slots: int, sent: int, heard: int, not_taken_in: M
 
     :param agents: number of agents that were there.
     :param slots: slots that one of them has flown.
-    :param sent: datagrams that they have sent.
-    :param heard: datagrams that they have taken in.
-    :param not_taken_in: those that they have not, by reason.
+    :param sent: number of datagrams that they have sent.
+    :param heard: number of datagrams that they have taken in.
+    :param not_taken_in: number of those that they have not, by reason.
     """
     found = Hearing(agents)
     found.slots, found.sent, found.taken_in = slots, sent, heard

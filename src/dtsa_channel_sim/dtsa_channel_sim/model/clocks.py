@@ -34,7 +34,7 @@ class AgentClock:
     """One agent's clock: local = channel + offset + channel * drift.
 
     :param offset_ns: ns, what the clock shows at the channel's time 0.
-    :param drift_ppb: parts per billion by which it runs fast.
+    :param drift_ppb: ppb (parts per billion) by which it runs fast.
     :param jitter_ns: ns, standard deviation of the time of a single event.
     :param seed: seed of the jitter.
     :param agent: id of the agent.

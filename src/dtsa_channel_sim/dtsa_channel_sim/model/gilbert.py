@@ -41,11 +41,11 @@ class GilbertElliott:
 
         share = (loss - p_good) / (p_bad - p_good), r = 1 / burst_length, p = r share / (1 - share).
 
-        :param loss: mean loss, from p_good to p_bad.
+        :param loss: mean share of frames lost, from p_good to p_bad.
         :param burst_length: mean length of a bad phase, slots; at least 1 / (1 - share), the length of the
             runs that independent losses have.
-        :param p_good: loss in the good state.
-        :param p_bad: loss in the bad state, more than p_good.
+        :param p_good: share of frames lost in the good state, 0 to 1.
+        :param p_bad: share of frames lost in the bad state, more than p_good, up to 1.
         :raises ConfigError: when no such chain exists.
         """
         if p_bad <= p_good:

@@ -183,7 +183,7 @@ def link_matrix(
 ) -> NDArray[np.float64] | None:
     """Return the loss of every link, (N, N), row = sender, column = receiver; None when no link is special.
 
-    :param matrix: the base, empty for zeros.
+    :param matrix: (N, N) loss of each link, row = sender, 0 to 1; empty for zeros.
     :param links: entries laid over it, later ones over earlier ones.
     """
     if not matrix and not links:

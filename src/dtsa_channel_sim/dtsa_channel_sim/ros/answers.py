@@ -137,9 +137,9 @@ class Answers:
         """Takes in what some agents have reported, in real time; it has been checked.
 
         :param at: their indices.
-        :param count: how many they are.
+        :param count: number of agents.
         :param offset_ns: (n,) ns, start of each agent's slot or transmission, from the channel's start of the slot.
-        :param motion: track, velocity, command and goal of these agents, as in a report.
+        :param motion: track (m), velocity, command (m/s) and goal (m) of these agents, as in a report.
         :param decided: chosen, reason, digest and score.
         """
         track, velocity, command, goal = motion

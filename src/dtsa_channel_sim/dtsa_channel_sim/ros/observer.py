@@ -85,7 +85,7 @@ class ChannelObserver:
         """The channel stood still, in real time only.
 
         :param from_ns: ns from the start of slot 0.
-        :param to_ns: likewise.
+        :param to_ns: ns from the start of slot 0.
         """
 
     def all_answered(self, slot: int, answers: Answers) -> None:
@@ -100,7 +100,7 @@ class ChannelObserver:
 
         :param slot: the slot.
         :param answers: what the agents answered to it; valid during the call.
-        :param frames: the frames by sender.
+        :param frames: the frames by the sender's id.
         :param verdict: who received what.
         """
 

@@ -44,7 +44,7 @@ class Pace:
         """Whether the run is so far behind for so long that it will not catch up.
 
         :param now_ns: ns from the start of slot 0.
-        :param done_ns: how far the run should have come at least, had it kept up, as far as it has come.
+        :param done_ns: ns from the start of slot 0: when a run that keeps up has come as far as this one at the latest.
         """
         if now_ns - done_ns < _BEHIND_NS:
             self._behind_since_ns = None

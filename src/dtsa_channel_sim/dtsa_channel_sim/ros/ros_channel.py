@@ -46,7 +46,7 @@ class RosChannel:
     :param node: the ROS node.
     :param channel: the medium.
     :param steps: control instants in a slot.
-    :param waiting: messages that may wait to be read, for each agent.
+    :param waiting: number of messages that may wait to be read, for each agent.
     :param referee: ends the run; None: a signal does.
     :param swarm_namespace: namespace of the swarm's topics.
     :param startup_s: s of wall time that all agents have to answer for the first time.
@@ -300,7 +300,7 @@ def put_frames(message: Slot, senders: list[int], frames: list[bytes], received:
     """Puts frames that somebody received into a slot message.
 
     :param message: the message.
-    :param senders: their senders.
+    :param senders: ids of their senders.
     :param frames: the frames.
     :param received: (F, N) bool, who received which.
     """

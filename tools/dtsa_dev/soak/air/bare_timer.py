@@ -18,7 +18,7 @@ def late_ns(slot_ns: int, seconds: float) -> list[int]:
     """How late it wakes, ns, in each slot.
 
     :param slot_ns: ns, from one wake-up to the next.
-    :param seconds: how long.
+    :param seconds: s, how long.
     """
     wake_precisely()
     found, begin = [], time.monotonic_ns()

@@ -132,7 +132,7 @@ class Udp:
     def listen(self, seconds: float) -> list[int]:
         """How late the frames of a time left, ns.
 
-        :param seconds: how long.
+        :param seconds: s, how long.
         """
         found, end = [], time.monotonic() + seconds
         while time.monotonic() < end:

@@ -134,7 +134,7 @@ class MulticastSocket:
     def receive(self, most: int) -> list[Datagram]:
         """What has arrived, in this order; empty if nothing has.
 
-        :param most: datagrams at a time.
+        :param most: number of datagrams at a time.
         """
         arrived: list[tuple[bytes, list[tuple[int, int, bytes]], int, Any]] = []  # as the system gives them
         try:

@@ -47,7 +47,7 @@ class Authenticator:
         """An authenticator from a key in hexadecimal digits, as settings carry it.
 
         :param text: 32 to 64 hexadecimal digits.
-        :param session: see the class.
+        :param session: number of the flight, 0 to 2^64 - 1; see the class.
         :raises ConfigError: if it is none, or one that can be guessed; the key itself is not in the message.
         """
         try:
@@ -61,7 +61,7 @@ class Authenticator:
     def begin(self, session: int) -> None:
         """From now on frames are those of another session.
 
-        :param session: see the class.
+        :param session: number of the flight, 0 to 2^64 - 1; see the class.
         :raises ConfigError: for one that is not usable.
         """
         if not 0 <= session < 2**64:

@@ -30,7 +30,7 @@ class Listeners:
     """Agents that do not know yet where the slots of the swarm lie.
 
     :param config: the settings that all agents share.
-    :param ids: of the agents.
+    :param ids: ids of the agents.
     :param now_ns: (L,) what their clocks show.
     :raises ConfigError: for a policy with which nobody can come late.
     """

@@ -159,7 +159,7 @@ def whole_ns(policy: Guarded, answer: object, method: str, least: int, allowed: 
     :param policy: whose answer it is.
     :param answer: its answer.
     :param method: what has answered.
-    :param least: the smallest that is allowed.
+    :param least: ns, the smallest that is allowed.
     :param allowed: says so.
     :raises PluginError: if it is none, or smaller.
     """

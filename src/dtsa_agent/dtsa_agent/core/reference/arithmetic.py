@@ -94,7 +94,7 @@ def quantise(value: float, step: float, bits: int) -> int:
 
     :param value: the number; infinite ones saturate.
     :param step: one step, in the number's unit.
-    :param bits: size of the integer.
+    :param bits: bits of the integer, its sign among them.
     """
     top = (1 << (bits - 1)) - 1
     steps = value / step
@@ -109,7 +109,7 @@ def signed(value: int, bits: int) -> int:
     """The signed integer whose two's complement is ``value``.
 
     :param value: its lowest bits count.
-    :param bits: how many.
+    :param bits: how many bits it has.
     """
     top = 1 << (bits - 1)
     return ((value & (2 * top - 1)) ^ top) - top

@@ -20,7 +20,7 @@ def age_s(row: Row, rules: Rules, slot: int, step: int = 0) -> float:
     :param row: what is known of the agent.
     :param rules: what all agree on.
     :param slot: the slot i.
-    :param step: control instant within it.
+    :param step: index of the control instant within it, 0 to S - 1.
     """
     return 0.0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.slot_s + step * rules.dt
 

@@ -17,7 +17,7 @@ def collect(table: Table, self_index: int, slot: int, room: int, rules: Rules) -
     :param table: what the sender knows.
     :param self_index: its own number, id - 1: nobody gossips about itself.
     :param slot: the slot in which it sends.
-    :param room: free sections.
+    :param room: number of free sections.
     :param rules: what all agree on.
     """
     later = 2 + rules.agents // 16

@@ -18,7 +18,7 @@ class Choice:
 def oldest(h: Sequence[int], members: Sequence[int]) -> int:
     """The member with the largest h, then the lowest id; -1 without members.
 
-    :param h: counters of all agents.
+    :param h: (N,) slots, counters of all agents.
     :param members: indices, ascending.
     """
     return max(members, key=lambda k: h[k], default=-1)  # the first of several
@@ -29,8 +29,8 @@ def select(
 ) -> Choice:
     """The next sender (eq:pfs, eq:secondary).
 
-    :param g: priorities of all agents.
-    :param h: counters of all agents.
+    :param g: (N,) priorities of all agents, without a unit.
+    :param h: (N,) slots, counters of all agents.
     :param in_ap: who is in A_p.
     :param epsilon: least relative difference that counts.
     :param selection: ``candidates`` or ``pairwise``.

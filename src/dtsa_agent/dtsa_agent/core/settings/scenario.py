@@ -43,7 +43,7 @@ def plug_in_random(config: SwarmConfig, agent: int, name: str) -> np.random.Gene
     """Random numbers of one instance of a plug-in: the same in nodes, simulator and verifier.
 
     :param config: what its factory was given; the run's seed counts.
-    :param agent: what its factory was given.
+    :param agent: id, as its factory was given it.
     :param name: the plug-in's name.
     """
     return generator(config.seed, STREAM_PLUG_INS, agent, *name.encode())

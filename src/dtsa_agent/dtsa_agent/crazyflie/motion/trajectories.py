@@ -68,7 +68,7 @@ class Trajectory:
     """A trajectory in a Crazyflie's memory.
 
     :param number: by which it is started, 0 to 9.
-    :param offset: pieces before it in the memory.
+    :param offset: number of pieces before it in the memory.
     :param pieces: what it consists of.
     :raises ValueError: it does not fit, or jumps.
     """
@@ -168,7 +168,7 @@ def why_not(
     """Why a trajectory must not be started; empty if it may.
 
     :param here: m, world, where the vehicle is.
-    :param timescale: it takes that many times as long as it says.
+    :param timescale: factor: it takes that many times as long as it says.
     :param reverse: from its end to its beginning.
     :param relative: moved so that it begins where the vehicle is.
     """

@@ -79,7 +79,7 @@ def place_aside(here: Vector, others: Sequence[Other], low: Vector, high: Vector
     """The nearest place (m, world) beside all others, at the same height, with a clear way; None: there is none.
 
     :param here: m, world: where it is.
-    :param low: lower corner of the room, m, world. :param high: upper corner.
+    :param low: lower corner of the room, m, world. :param high: m, upper corner.
     """
     taken = [place for other in others for place in other.places]
     level = [p for other in others if other.flies for p in other.places if p[2] > here[2] - LEVEL_M]
@@ -114,7 +114,7 @@ def _passes(begin: Vector, end: Vector, place: Vector) -> bool:
 class LandingPlaces:
     """Says to each that lands what it does; one at a time moves aside, and no place is given away twice.
 
-    :param low: lower corner of the room, m, world. :param high: upper corner.
+    :param low: lower corner of the room, m, world. :param high: m, upper corner.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:

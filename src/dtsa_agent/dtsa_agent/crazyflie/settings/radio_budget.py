@@ -88,7 +88,7 @@ def exchange_s(rate: str, up: int = UP_BYTES, down: int = DOWN_BYTES, *, shared:
 def exchange_rate(command_hz: float, log_hz: float) -> float:
     """Exchanges per second that one Crazyflie wants.
 
-    :param command_hz: rate of the streamed commands. :param log_hz: rate of the log block.
+    :param command_hz: Hz, rate of the streamed commands. :param log_hz: Hz, rate of the log block.
     """
     return EXCHANGES * (max(command_hz, log_hz) + WATCHDOG_HZ + ORDERS_HZ)
 

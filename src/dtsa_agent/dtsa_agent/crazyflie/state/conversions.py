@@ -166,7 +166,7 @@ def to_map(place: Vector, origin: Vector) -> Vector:
 def outside_by(place: Vector, low: Vector, high: Vector) -> list[tuple[float, str]]:
     """How far a place is outside a box along each axis, m (negative: inside), with the axis's name.
 
-    :param place: m. :param low: lower corner, m, same frame. :param high: upper corner.
+    :param place: m. :param low: lower corner, m, same frame. :param high: m, upper corner.
     """
     return [(max(a - p, p - b), axis) for p, a, b, axis in zip(place, low, high, "xyz", strict=True)]
 
@@ -179,7 +179,7 @@ def place_text(place: Vector) -> str:
 def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
     """A vector of the world as the body sees it.
 
-    :param q: orientation of the body (x, y, z, w). :param v: any vector, world.
+    :param q: orientation of the body (x, y, z, w). :param v: (3,) any vector, in the world's axes.
     """
     x, y, z, w = -q[0], -q[1], -q[2], q[3]
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
@@ -193,6 +193,6 @@ def rotate_inverse(q: Quaternion, v: Vector) -> Vector:
 def rotate(q: Quaternion, v: Vector) -> Vector:
     """A vector of the body as the world sees it; the inverse of `rotate_inverse`.
 
-    :param q: orientation of the body (x, y, z, w). :param v: any vector, body.
+    :param q: orientation of the body (x, y, z, w). :param v: (3,) any vector, in the body's axes.
     """
     return rotate_inverse((-q[0], -q[1], -q[2], q[3]), v)

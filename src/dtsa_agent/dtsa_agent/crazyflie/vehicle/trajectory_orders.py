@@ -80,7 +80,7 @@ class TrajectoryOrders:
     def start(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> str:
         """Fly a trajectory of its memory, then hold its end; why not, or an empty text.
 
-        :param timescale: it takes that many times as long as it says.
+        :param timescale: factor: it takes that many times as long as it says.
         :param reverse: from its end to its beginning.
         :param relative: moved so that it begins where the vehicle is.
         """

@@ -314,7 +314,7 @@ class Mission:
     def land(self, urgent: Sequence[int]) -> None:
         """Land whoever is in the air and wait until all stand.
 
-        :param urgent: once it is not empty, all motors are stopped at once.
+        :param urgent: numbers of signals; once it is not empty, all motors are stopped at once.
         """
         self.exchanging = False
         flying = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)

@@ -22,7 +22,7 @@ class Cameras:
     """Tells where everybody is.
 
     :param port: UDP port on this machine.
-    :param count: size of the fleet.
+    :param count: number of Crazyflies in the fleet.
     """
 
     def __init__(self, port: int, count: int) -> None:

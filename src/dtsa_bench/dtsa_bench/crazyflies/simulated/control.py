@@ -27,7 +27,7 @@ def check_fault(request: dict[str, Any], count: int) -> tuple[str, list[int]]:
     """Name and indices (from 0) that a request is about.
 
     :param request: `fault` and `cf` (an id from 1, a list of ids, or "all"), and the fault's own numbers.
-    :param count: size of the fleet.
+    :param count: number of Crazyflies in the fleet.
     :raises ConfigError: it is not understood.
     """
     fault = request.get("fault")

@@ -24,7 +24,7 @@ def free_port() -> int:
 def free_base_port(count: int, first: int | None = None) -> int:
     """Base port of a fleet: it, the `count` - 1 after it, and the control port before it are free now.
 
-    :param count: vehicles.
+    :param count: number of vehicles.
     :param first: the lowest base port that will do; None: any, so that two who look at the same time seldom agree.
     :raises ConfigError: there are not so many free ports in a row.
     """

@@ -20,7 +20,7 @@ _END_S = 10.0
 class FleetError(DtsaError):
     """The simulated Crazyflies do not start.
 
-    :param code: how their process has ended.
+    :param code: exit code of their process.
     """
 
     def __init__(self, code: int) -> None:

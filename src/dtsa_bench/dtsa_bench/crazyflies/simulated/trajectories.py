@@ -38,7 +38,7 @@ class Trajectory:
 
     :param start: s, when it began.
     :param pieces: what it consists of.
-    :param timescale: it takes that many times as long as it says.
+    :param timescale: factor: it takes that many times as long as it says.
     :param reverse: from its end to its beginning.
     :param shift: m, by which it was moved to where it was started.
     """

@@ -36,7 +36,7 @@ def run_all(
     :param plan: all runs.
     :param work: how a run is done.
     :param journal: of the plan; gets every row as soon as it is there. None: rows are kept in memory alone.
-    :param jobs: processes on this machine.
+    :param jobs: number of processes on this machine.
     :param cluster: address of a Dask scheduler (``tcp://HOST:PORT``) instead.
     :param progress: called after every chunk.
     :returns: all rows by key.
@@ -69,7 +69,7 @@ def chunks_of(tasks: Sequence[Task], workers: int, largest: float | None = None)
 
     :param tasks: the runs.
     :param workers: number of workers.
-    :param largest: cost of a bundle; None: CHUNK_COST.
+    :param largest: largest cost of a bundle, in us of a core; None: CHUNK_COST.
     """
     fair = sum(task.cost for task in tasks) / (4.0 * max(1, workers))
     limit = min(CHUNK_COST if largest is None else largest, fair)

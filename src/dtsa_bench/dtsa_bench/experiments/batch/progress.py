@@ -24,7 +24,7 @@ def run_batch(
     :param plan: all runs.
     :param work: how a run is done.
     :param directory: where the journal is; made if it does not exist.
-    :param jobs: processes on this machine; None: one a core.
+    :param jobs: number of processes on this machine; None: one a core.
     :param cluster: address of a Dask scheduler instead.
     :returns: all rows by key.
     :raises KeyboardInterrupt: on Ctrl-C and SIGTERM; what was finished is kept.

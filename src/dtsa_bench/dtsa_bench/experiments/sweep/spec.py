@@ -182,7 +182,7 @@ def make_sweep(
     :param content: what the file says.
     :param name: of the sweep.
     :param seeds: number of seeds, instead of the file's.
-    :param first_seed: first of them.
+    :param first_seed: first of the seeds.
     :param base: settings that win over the file's base.
     :raises ConfigError: naming what is not usable.
     """

@@ -128,7 +128,7 @@ def messages(buffer: bytes, chunk: int = 0) -> Iterator[Entry]:
     """All whole messages in uncompressed records, as they were written.
 
     :param buffer: the records.
-    :param chunk: offset of their chunk in the file.
+    :param chunk: bytes, offset of their chunk in the file.
     """
     position, size = 0, len(buffer)
     unpack, head = _MESSAGE.unpack_from, _MESSAGE.size

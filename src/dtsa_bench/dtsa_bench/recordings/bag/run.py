@@ -120,7 +120,7 @@ class RecordedRun:
 def missing_slots(slots: NDArray[np.int64]) -> str:
     """The holes in slots that should count from 0, as "slots 158 to 313"; empty: there are none.
 
-    :param slots: ascending.
+    :param slots: (M,) numbers of slots, ascending.
     """
     known = np.concatenate(([-1], slots))
     holes = [(int(known[k]) + 1, int(known[k + 1]) - 1) for k in np.flatnonzero(np.diff(known) > 1)]

@@ -172,7 +172,7 @@ class BagWriter:
     ) -> None:
         """Record one message.
 
-        :param channel: what `add_topic` gave.
+        :param channel: number of the channel, as `add_topic` gave it.
         :param data: the message as CDR, with its encapsulation header.
         :param log_time_ns: ns, simulated time of reception, 1 s or later.
         :param publish_time_ns: ns, simulated time of transmission.

@@ -43,7 +43,7 @@ class Judge:
         """A slot in which frames were sent.
 
         :param slot: its number; slots come in ascending order.
-        :param frames: the frames as they were on the air, by sender.
+        :param frames: the frames as they were on the air, by the sender's id.
         :param unsent: frames, without tags, that were too late to be sent; turns given away in them are given away.
         :param unrecorded: agents whose frame was too late to be sent and is not known. Such an agent keeps to what it
             gave away, and may relay it: until those turns are over, slots that seem wrong are counted, not judged.

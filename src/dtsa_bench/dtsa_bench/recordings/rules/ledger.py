@@ -21,7 +21,7 @@ class Ledger:
     """Who gave which turn to whom, and whether all kept to it.
 
     :param agents: number of agents N.
-    :param anchor_every: M.
+    :param anchor_every: M: every M-th turn of an owner is an anchor.
     :param main_every: K M; 0: M.
     """
 
@@ -103,7 +103,7 @@ class Ledger:
     def read(self, slot: int, sender: int, data: bytes) -> None:
         """Takes note of what a frame gives away, whether or not it got on the air.
 
-        :param slot: in which it was made.
+        :param slot: number of the slot in which it was made.
         :param sender: id.
         :param data: the frame.
         """
@@ -151,8 +151,8 @@ class Ledger:
 def last_lessee(handed: dict[int, tuple[int, int]], lessee: int) -> int:
     """Whose turn it is after it has been handed on, each agent once.
 
-    :param handed: to whom each handed it on, and when.
-    :param lessee: whose it was at first.
+    :param handed: by the id of each: to which id it handed the turn on, and in which slot.
+    :param lessee: id of the agent whose it was at first.
     """
     return lessees(handed, lessee)[-1]
 
@@ -160,8 +160,8 @@ def last_lessee(handed: dict[int, tuple[int, int]], lessee: int) -> int:
 def lessees(handed: dict[int, tuple[int, int]], first: int) -> list[int]:
     """Whose a turn was, one after the other.
 
-    :param handed: to whom each handed it on, and when.
-    :param first: whose it was at first.
+    :param handed: by the id of each: to which id it handed the turn on, and in which slot.
+    :param first: id of the agent whose it was at first.
     """
     chain = [first]
     while chain[-1] in handed and len(chain) <= len(handed):

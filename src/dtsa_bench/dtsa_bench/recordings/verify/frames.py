@@ -114,7 +114,7 @@ class SentFrames:
     def check_overlaps(self, late: int = 0) -> dict[str, int]:
         """Whether deliveries and verdicts agree, and nobody has heard two frames at one time, or while it sent.
 
-        :param late: frames that the channel dropped; they were not on the air.
+        :param late: number of frames that the channel dropped; they were not on the air.
         :returns: how often what was found right.
         :raises Mismatch: at the first frame for which that is not so.
         """

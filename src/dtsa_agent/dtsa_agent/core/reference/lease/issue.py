@@ -133,9 +133,9 @@ def open_block(agents: int, every: int, wakers: float, resting: int, settled: in
     S turns of those that rest lie in so many; half as many more where all of them are settled; fewer while many wake,
     so that each of them finds two. It has no factor in common with N, or the same few owners would always pay.
 
-    :param agents: N.
-    :param every: S.
-    :param wakers: w.
+    :param agents: N, number of agents.
+    :param every: S, number of turns of those that rest of which one is an OPEN turn.
+    :param wakers: w, about as many agents as woke in the last N slots.
     :param resting: number of those that rest.
     :param settled: number of those of them that know that they will rest.
     """
@@ -294,7 +294,7 @@ def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> 
     """To whom a turn is worth most, the lowest id of several; -1: nobody is able.
 
     :param turn: the turn to be given away.
-    :param but: an agent that is not asked.
+    :param but: index of an agent that is not asked.
     """
     able = [k for k in range(memory.rules.agents) if who.able[k] and k != but]
     return max(able, key=lambda k: worth(memory, who, k, turn), default=-1)  # the first of several

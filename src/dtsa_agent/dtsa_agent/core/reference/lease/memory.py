@@ -140,7 +140,7 @@ class Memory:
 
         :param slot: T, the slot of the frame, the sender's own turn.
         :param c_s: number of agents before the sender that it gives turns away for.
-        :param room: at most so many.
+        :param room: at most so many turns.
         """
         turns, own = [], True
         for j in range(1, self.rules.main_every + 1):

@@ -96,7 +96,7 @@ def lockstep_qos(writers: int = 1) -> Any:
 def named(ids: Iterable[int]) -> str:
     """Agents as the user knows them: ``cf3``, or ``cf1 .. cf6`` for many in a row.
 
-    :param ids: of the agents.
+    :param ids: ids of the agents.
     """
     listed = sorted(ids)
     parts, start = [], 0

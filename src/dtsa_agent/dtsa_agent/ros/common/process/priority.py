@@ -86,7 +86,7 @@ def take_place(priority: int, nice: int, inherited: bool = True) -> str:
     """Real-time priority for this process where it may have it, nice otherwise.
 
     :param priority: 1 (low) to 99; 0: none.
-    :param nice: as for :func:`give_way_by`.
+    :param nice: nice level, -20 to 19, as for :func:`give_way_by`.
     :param inherited: as for :func:`take_priority`.
     :returns: why neither, or an empty text.
     """

@@ -113,8 +113,8 @@ def check_numbers(name: str, values: Iterable[float], largest: float = FARTHEST_
     """Finite numbers of a size that can be.
 
     :param name: what they are.
-    :param values: the numbers.
-    :param largest: magnitude.
+    :param values: numbers of any unit.
+    :param largest: largest magnitude, of the same unit.
     :raises Unusable: if there are others.
     """
     for value in values:

@@ -16,8 +16,8 @@ UNKNOWN = 1e6  # nothing is known about this value
 def diagonal(linear: float, angular: float) -> NDArray[np.float64]:
     """A covariance without correlations, (36,).
 
-    :param linear: variance of each of the first three values.
-    :param angular: variance of each of the last three values.
+    :param linear: variance of each of the first three values, m^2 or (m/s)^2.
+    :param angular: variance of each of the last three values, rad^2 or (rad/s)^2.
     """
     return np.diag([linear] * 3 + [angular] * 3).ravel()
 

@@ -55,8 +55,8 @@ class Intake:
 def add_counts(total: dict[str, int], more: Mapping[str, int]) -> None:
     """Adds counts by reason.
 
-    :param total: changed in place.
-    :param more: what is added.
+    :param total: counts by reason; changed in place.
+    :param more: counts by reason that are added.
     """
     for reason, count in more.items():
         total[reason] = total.get(reason, 0) + count

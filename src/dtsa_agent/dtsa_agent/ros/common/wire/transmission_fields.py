@@ -126,7 +126,7 @@ def read_transmission(data: bytes, most: int, steps: int) -> TransmissionFields 
     """What a message says; None if it is not laid out as agents write it in lockstep.
 
     :param data: the message as CDR.
-    :param most: agents that it can be of at most.
+    :param most: number of agents that it can be of at most.
     :param steps: control instants in a slot.
     """
     if len(data) < _AT_COUNT.size:

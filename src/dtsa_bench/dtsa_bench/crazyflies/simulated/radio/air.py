@@ -17,7 +17,7 @@ class RadioAir:
 
     :param radios: dongles and Crazyflies; their ids are 1 to this number.
     :param loss: share of packets that a receiver loses to noise.
-    :param seed: of the losses.
+    :param seed: seed of the losses.
     """
 
     def __init__(self, radios: int, loss: float, seed: int) -> None:
