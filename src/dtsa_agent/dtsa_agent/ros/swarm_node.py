@@ -269,6 +269,7 @@ class SwarmNode:
 def parse_ids(value: Any, agents: int) -> list[int]:
     """Ids from a parameter: a list of numbers, or an empty one for all.
 
+    :param agents: number of agents.
     :raises ConfigError: if there are others.
     """
     ids = [int(item) for item in value] or list(range(1, agents + 1))

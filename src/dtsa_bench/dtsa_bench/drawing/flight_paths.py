@@ -152,7 +152,10 @@ def heading(summary: dict[str, Any]) -> str:
 
 
 def view_extent(scenario: Scenario, positions: Sequence[Array]) -> float:
-    """Half width, m, of a square that shows all starts, ends and paths."""
+    """Half width, m, of a square that shows all starts, ends and paths.
+
+    :param positions: (T, 3, N) m of each flight, frame map.
+    """
     reach = max(
         [float(np.abs(scenario.start[:2]).max()), *(float(np.abs(p[:, :2]).max()) for p in positions if p.size)]
     )

@@ -108,7 +108,10 @@ class Flight:
 
 
 def split(agents: int, processes: int) -> list[list[int]]:
-    """Ids of the agents of each process, as evenly as possible."""
+    """Ids of the agents of each process, as evenly as possible.
+
+    :param processes: number of processes.
+    """
     return [
         list(range(agents * index // processes + 1, agents * (index + 1) // processes + 1))
         for index in range(processes)

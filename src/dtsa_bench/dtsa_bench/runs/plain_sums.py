@@ -53,7 +53,10 @@ class PlainSums:
         self._error_sum = self._error_max = 0.0
 
     def drop(self, index: int) -> None:
-        """A mover that is lost counts no more."""
+        """A mover that is lost counts no more.
+
+        :param index: its index, 0 to N - 1.
+        """
         self._moving[index] = False
 
     def update(self, slot: int, track: Array, tables: AbstractSwarm | None) -> int:

@@ -33,7 +33,10 @@ class Airtime:
         return -(-bits * 1_000_000_000 // self.bitrate)
 
     def total_ns(self, length: int) -> int:
-        """Return the time from the order to send until the last bit has left, ns."""
+        """Return the time from the order to send until the last bit has left, ns.
+
+        :param length: bytes of the frame.
+        """
         return self.ramp_up_ns + self.on_air_ns(length)
 
     def shortest_slot_ns(self, length: int, *, guard_ns: int, link_delay_ns: int = 0, decide_ns: int = 0) -> int:

@@ -51,7 +51,10 @@ class AgentClock:
             raise ConfigError("drift_ppb", self.drift_ppb, "a whole number between -1e9 and 1e9")
 
     def to_local(self, channel_ns: int) -> int:
-        """Return what the clock shows at a time of the channel's clock, both in ns."""
+        """Return what the clock shows at a time of the channel's clock, both in ns.
+
+        :param channel_ns: ns.
+        """
         return channel_ns + self.offset_ns + channel_ns * self.drift_ppb // _PPB
 
     def to_channel(self, local_ns: int) -> int:
@@ -59,6 +62,8 @@ class AgentClock:
 
         The exact inverse as far as there is one: a fast clock skips some readings, a slow one shows some
         twice.
+
+        :param local_ns: ns.
         """
         # to_local(c) >= l  <=>  c (1e9 + drift) >= (l - offset) 1e9, because floor(x) >= n <=> x >= n.
         return -(-(local_ns - self.offset_ns) * _PPB // (_PPB + self.drift_ppb))

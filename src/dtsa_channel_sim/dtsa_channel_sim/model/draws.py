@@ -41,7 +41,12 @@ def generator(seed: int, *key: int) -> np.random.Generator:
 
 
 def sender_factors(seed: int, stream: int, agents: int) -> list[np.uint64]:
-    """Return one odd 64-bit constant per sender, indexed by id (index 0 is not used)."""
+    """Return one odd 64-bit constant per sender, indexed by id (index 0 is not used).
+
+    :param seed: seed of all losses.
+    :param stream: number of what is drawn.
+    :param agents: number of agents.
+    """
     bits = generator(seed, stream, _FACTORS).bit_generator.random_raw(agents + 1)
     return [np.uint64(int(word) | 1) for word in bits]
 
@@ -82,7 +87,10 @@ class WordBlocks:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def block(self, number: int) -> Words:
-        """Return all words of a block, (rows, N)."""
+        """Return all words of a block, (rows, N).
+
+        :param number: of the block, from 0.
+        """
         block = self._blocks.get(number)
         if block is None:
             # Raw output: NumPy keeps it the same from version to version, other than that of its

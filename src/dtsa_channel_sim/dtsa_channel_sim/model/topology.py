@@ -101,7 +101,11 @@ def format_partition(groups: Sequence[Sequence[int]]) -> str:
 
 
 def group_numbers(groups: Sequence[Sequence[int]], agents: int) -> NDArray[np.int32]:
-    """Return the number of each agent's group, (N,), zeros without a partition."""
+    """Return the number of each agent's group, (N,), zeros without a partition.
+
+    :param groups: ids of each group.
+    :param agents: number of agents.
+    """
     numbers = np.zeros(agents, dtype=np.int32)
     for number, group in enumerate(groups):
         numbers[np.asarray(group) - 1] = number
@@ -127,6 +131,7 @@ class LinkLoss:
     def from_dict(cls, entry: object, agents: int, name: str) -> LinkLoss:
         """Return the entry ``{from: ids, to: ids, loss: p, both_ways: false}``, validated.
 
+        :param agents: number of agents.
         :raises ConfigError: naming the part that is wrong.
         """
         if isinstance(entry, LinkLoss):
@@ -158,6 +163,7 @@ def parse_matrix(value: object, agents: int, name: str = "loss_matrix") -> tuple
     """Return an (N, N) matrix of losses as tuples; empty stays empty. The diagonal is not used and set to 0.
 
     :param value: rows of numbers, row = sender, column = receiver.
+    :param agents: number of agents.
     :raises ConfigError: when its shape or a number is wrong.
     """
     if value is None:
@@ -185,6 +191,7 @@ def link_matrix(
 
     :param matrix: (N, N) loss of each link, row = sender, 0 to 1; empty for zeros.
     :param links: entries laid over it, later ones over earlier ones.
+    :param agents: number of agents.
     """
     if not matrix and not links:
         return None

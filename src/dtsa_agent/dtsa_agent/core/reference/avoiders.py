@@ -39,7 +39,10 @@ class Avoidance:
     stretch_z: float
 
     def margin(self, age_s: float) -> float:
-        """Extra distance to a neighbour whose state is some seconds old, m."""
+        """Extra distance to a neighbour whose state is some seconds old, m.
+
+        :param age_s: s, how old the state is.
+        """
         return max(0.0, min(self.margin_max, self.margin_rate * age_s))
 
 
@@ -75,7 +78,10 @@ def command(avoider: str, scene: Scene, params: Avoidance) -> Vector:
 
 
 def limited(v: Vector, v_max: float) -> Vector:
-    """A velocity shortened to v_max."""
+    """A velocity shortened to v_max.
+
+    :param v: (3,) m/s.
+    """
     return scaled(v_max / norm(v), v) if dot(v, v) > v_max * v_max * (1.0 + 1e-12) else v
 
 
@@ -122,7 +128,10 @@ def orca_half_space(scene: Scene, other: Neighbour, params: Avoidance) -> HalfSp
 
 
 def apart(scene: Scene, other: Neighbour, r: Vector) -> Vector:
-    """There is no nearest way out: straight away from the other one; from one point, along x in the order of ids."""
+    """There is no nearest way out: straight away from the other one; from one point, along x in the order of ids.
+
+    :param r: (3,) m, to the other one.
+    """
     distance = norm(r)
     if distance > 0.0:
         return scaled(-1.0 / distance, r)

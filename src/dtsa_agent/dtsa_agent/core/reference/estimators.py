@@ -26,12 +26,20 @@ def age_s(row: Row, rules: Rules, slot: int, step: int = 0) -> float:
 
 
 def hold(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Vector]:
-    """Position and velocity as last heard."""
+    """Position and velocity as last heard.
+
+    :param slot: number of the slot.
+    :param step: index of the control instant within it, 0 to S - 1.
+    """
     return row.position, row.velocity
 
 
 def linear(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Vector]:
-    """On with the velocity last heard: p + (i - m) t_s v (eq:estimate)."""
+    """On with the velocity last heard: p + (i - m) t_s v (eq:estimate).
+
+    :param slot: number of the slot.
+    :param step: index of the control instant within it, 0 to S - 1.
+    """
     age, p, v = age_s(row, rules, slot, step), row.position, row.velocity
     return (p[0] + v[0] * age, p[1] + v[1] * age, p[2] + v[2] * age), v
 
@@ -40,6 +48,9 @@ def intent(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Ve
     """Towards the commanded velocity c, as an unsaturated vehicle answers it.
 
     After k control periods: velocity c + (v - c) q^k, position p + c a + (v - c) dt (q + .. + q^k).
+
+    :param slot: number of the slot.
+    :param step: index of the control instant within it, 0 to S - 1.
     """
     age = age_s(row, rules, slot, step)
     ago = 0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.steps + step

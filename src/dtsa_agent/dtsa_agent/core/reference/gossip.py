@@ -32,7 +32,11 @@ def collect(table: Table, self_index: int, slot: int, room: int, rules: Rules) -
 
 
 def newest_of_age(table: Table, self_index: int, slot: int, age: int, chosen: list[int], rules: Rules) -> list[int]:
-    """The newest state of somebody not yet chosen that is ``age`` slots old or older and can be said; or nobody's."""
+    """The newest state of somebody not yet chosen that is ``age`` slots old or older and can be said; or nobody's.
+
+    :param self_index: index of the agent itself, 0 to N - 1.
+    :param slot: number of the slot.
+    """
     fit = [
         k
         for k, row in enumerate(table.rows)

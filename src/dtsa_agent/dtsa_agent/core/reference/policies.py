@@ -53,7 +53,10 @@ def choose(table: Table, slot: int, rules: Rules, weights: Weights | None = None
 
 
 def choose_by_priority(table: Table, slot: int, rules: Rules, weights: Weights) -> Choice:
-    """The agent of A_p with the most urgent extrapolated state (eq:estimate, eq:permission_d_p_ang, eq:pfs)."""
+    """The agent of A_p with the most urgent extrapolated state (eq:estimate, eq:permission_d_p_ang, eq:pfs).
+
+    :param slot: number of the slot.
+    """
     estimate = estimators.intent if rules.estimator == "intent" else estimators.linear
     believed = [estimate(row, rules, slot) for row in table.rows]
     weights.g = priorities([p for p, _ in believed], [v for _, v in believed], rules.slot_s)

@@ -49,7 +49,10 @@ def select(
 
 
 def candidates(g: Sequence[float], members: Sequence[int], epsilon: float) -> list[int]:
-    """Those of A_p with g >= (1 - epsilon) max g: eq:pfs does not tell them from the greatest."""
+    """Those of A_p with g >= (1 - epsilon) max g: eq:pfs does not tell them from the greatest.
+
+    :param members: indices of A_p.
+    """
     floor = (1.0 - epsilon) * max(g[k] for k in members)
     return [k for k in members if g[k] >= floor]
 
@@ -58,6 +61,11 @@ def select_pairwise(g: Sequence[float], h: Sequence[int], members: Sequence[int]
     """The paper's text read literally: one scan in id order that keeps the significantly greater of two.
 
     The comparison (eq:pfs) is not transitive, so the winner depends on the order of the ids.
+
+    :param g: (N,) priorities of all agents, without a unit.
+    :param h: (N,) slots, counters of all agents.
+    :param members: indices of A_p.
+    :param epsilon: share of the greatest g that does not tell two apart.
     """
     best, reason = members[0], "priority"
     for k in members[1:]:

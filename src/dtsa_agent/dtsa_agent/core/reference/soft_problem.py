@@ -23,7 +23,10 @@ class HalfSpace:
     bound: float
 
     def lack(self, x: Vector) -> float:
-        """How far a point is outside; negative: it is inside."""
+        """How far a point is outside; negative: it is inside.
+
+        :param x: (3,) the point: m/s for ``orca``, m for ``bvc``.
+        """
         return self.bound - dot(self.normal, x)
 
 
@@ -38,7 +41,11 @@ class Pass:
 
 
 def evaluate(x: Vector, wish: Vector, spaces: Sequence[HalfSpace], rho: float) -> Pass:
-    """f, its gradient and its curvature: identity + rho sum n n^T over the violated half-spaces."""
+    """f, its gradient and its curvature: identity + rho sum n n^T over the violated half-spaces.
+
+    :param x: (3,) the point: m/s for ``orca``, m for ``bvc``.
+    :param wish: (3,) x0, of the same unit.
+    """
     away = minus(x, wish)
     value, gradient = 0.5 * dot(away, away), list(away)
     rows = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

@@ -396,7 +396,10 @@ class Link:
         self.outbox.close()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the worker to end (s); False if it has not."""
+        """Wait for the worker to end (s); False if it has not.
+
+        :param timeout: s, how long it waits.
+        """
         self._thread.join(timeout)
         return not self._thread.is_alive()
 

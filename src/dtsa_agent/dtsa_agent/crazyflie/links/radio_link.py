@@ -194,11 +194,17 @@ class Heard:
         self._lock = threading.Lock()
 
     def age(self, now: float) -> float:
-        """Seconds since something was acknowledged, or came over another way than the air; infinite before that."""
+        """Seconds since something was acknowledged, or came over another way than the air; infinite before that.
+
+        :param now: s, monotonic.
+        """
         return now - self._acknowledged
 
     def acknowledge(self, now: float) -> bool:
-        """Something was acknowledged, or came, at a time (s, monotonic); whether that ends a gap."""
+        """Something was acknowledged, or came, at a time (s, monotonic); whether that ends a gap.
+
+        :param now: s, monotonic.
+        """
         gap = self.age(now) > GAP_S
         if gap:
             self.since = now

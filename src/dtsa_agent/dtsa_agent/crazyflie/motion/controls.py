@@ -56,11 +56,17 @@ class Controls:
         self.delivery.cancel()
 
     def command_age(self, now: float) -> float:
-        """Seconds since the last streamed command; infinite before the first one."""
+        """Seconds since the last streamed command; infinite before the first one.
+
+        :param now: s, monotonic.
+        """
         return now - self._command_time
 
     def led_for(self, now: float) -> float | None:
-        """Seconds since the last of the streamed commands that lead it, or did until they broke off; None: none do."""
+        """Seconds since the last of the streamed commands that lead it, or did until they broke off; None: none do.
+
+        :param now: s, monotonic.
+        """
         if not (self.streaming or self.held) or self._command_time == -math.inf:
             return None
         return now - self._command_time

@@ -202,7 +202,10 @@ class Tracker:
         return before.count >= MOVED_AGAIN and not flying
 
     def due(self, now: float) -> bool:
-        """Whether the last pose may be sent, at the rate that is allowed."""
+        """Whether the last pose may be sent, at the rate that is allowed.
+
+        :param now: s, monotonic.
+        """
         if now < self._next_send:
             return False
         # Almost a period of credit: poses at exactly this rate come early and late, and shall all be sent.
@@ -220,11 +223,17 @@ class Tracker:
             self.latencies.append(wall - seen.stamp)
 
     def age(self, now: float) -> float:
-        """Seconds since the last pose that was believed; infinite before the first."""
+        """Seconds since the last pose that was believed; infinite before the first.
+
+        :param now: s, monotonic.
+        """
         return math.inf if self.last is None else now - self.last.time
 
     def numbers(self, now: float) -> PositionNumbers:
-        """Everything for the diagnostics."""
+        """Everything for the diagnostics.
+
+        :param now: s, monotonic.
+        """
         recent = sum(1 for t in self._times.copy() if now - t <= WINDOW_S)
         delays = sorted(self.latencies.copy())
         return PositionNumbers(

@@ -90,7 +90,11 @@ def euler_from_log(roll: float, pitch: float, yaw: float) -> Vector:
 
 
 def rates_from_log(roll: float, pitch: float, yaw: float) -> Vector:
-    """Body rates in rad/s (REP-103) from `stateEstimateZ.rate{Roll,Pitch,Yaw}`: mrad/s, pitch inverted."""
+    """Body rates in rad/s (REP-103) from `stateEstimateZ.rate{Roll,Pitch,Yaw}`: mrad/s, pitch inverted.
+
+    :param roll: as logged, mrad/s.
+    :param yaw: as logged, mrad/s.
+    """
     return roll * 0.001, -pitch * 0.001, yaw * 0.001
 
 
@@ -109,17 +113,32 @@ class Setpoint:
 
 
 def velocity_world(velocity: Vector, yaw_rate: float, stamp: float) -> Setpoint:
-    """Velocity in m/s along the world's axes, yaw rate in rad/s -> the firmware's degrees per second."""
+    """Velocity in m/s along the world's axes, yaw rate in rad/s -> the firmware's degrees per second.
+
+    :param velocity: (3,) m/s, world.
+    :param yaw_rate: rad/s.
+    :param stamp: s, monotonic, of the command.
+    """
     return Setpoint(VELOCITY_WORLD, (*_finite(velocity), math.degrees(*_finite((yaw_rate,)))), stamp)
 
 
 def position(place: Vector, yaw: float, stamp: float) -> Setpoint:
-    """Place in m (world), yaw in rad -> the firmware's degrees."""
+    """Place in m (world), yaw in rad -> the firmware's degrees.
+
+    :param place: (3,) m, world.
+    :param stamp: s, monotonic, of the command.
+    """
     return Setpoint(POSITION, (*_finite(place), math.degrees(*_finite((yaw,)))), stamp)
 
 
 def hover(vx: float, vy: float, yaw_rate: float, height: float, stamp: float) -> Setpoint:
-    """Velocity in m/s along the body's heading, yaw rate in rad/s -> degrees/s, height in m above the floor."""
+    """Velocity in m/s along the body's heading, yaw rate in rad/s -> degrees/s, height in m above the floor.
+
+    :param vx: m/s, forwards.
+    :param vy: m/s, to the left.
+    :param yaw_rate: rad/s.
+    :param stamp: s, monotonic, of the command.
+    """
     vx, vy, yaw_rate, height = _finite((vx, vy, yaw_rate, height))
     return Setpoint(HOVER, (vx, vy, math.degrees(yaw_rate), height), stamp)
 
@@ -131,6 +150,9 @@ def full_state(
 
     Numbers beyond what the packet's 16 bits can say are kept at their limit: an overflow would send the Crazyflie the
     other way. An orientation of length zero (an unset message) means level, heading along x.
+
+    :param place: (3,) m, world.
+    :param stamp: s, monotonic, of the command.
     """
     vectors = [tuple(_saturate(v) for v in _finite(vector)) for vector in (place, velocity, acceleration)]
     roll_rate, pitch_rate, yaw_rate = (_saturate(v) for v in _finite(rates))
@@ -159,7 +181,11 @@ def to_world(place: Vector, origin: Vector) -> Vector:
 
 
 def to_map(place: Vector, origin: Vector) -> Vector:
-    """From the Crazyflies' own world to the frame `map`; the inverse of `to_world`."""
+    """From the Crazyflies' own world to the frame `map`; the inverse of `to_world`.
+
+    :param place: (3,) m, world.
+    :param origin: (3,) m, world, where the map's origin is.
+    """
     return place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
 
 

@@ -108,7 +108,10 @@ class StateMachine:
             self.go(S.LOST, reason)
 
     def observe(self, info: int) -> None:
-        """The supervisor's bits in a log packet."""
+        """The supervisor's bits in a log packet.
+
+        :param info: the bits, as the firmware logs them.
+        """
         if self.state in (S.DISCONNECTED, S.EMERGENCY):
             return
         for bit, reason in (

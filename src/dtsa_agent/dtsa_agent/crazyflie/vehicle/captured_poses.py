@@ -60,12 +60,19 @@ class CapturedPoses:
         return send
 
     def place(self, now: float) -> Vector | None:
-        """Where the vehicle is (m, world); None: it is not seen, or not any more."""
+        """Where the vehicle is (m, world); None: it is not seen, or not any more.
+
+        :param now: s, monotonic.
+        """
         last = self.tracker.last
         return None if last is None or now - last.time > FRESH_S else last.position
 
     def disagrees(self, believed: Vector, now: float) -> str:
-        """Why a vehicle may not start that believes to be there (m, world); empty if it may."""
+        """Why a vehicle may not start that believes to be there (m, world); empty if it may.
+
+        :param believed: (3,) m, world.
+        :param now: s, monotonic.
+        """
         seen = self.place(now)
         if seen is None:
             return f"is not seen by motion capture ({self.tracker.reason or 'no pose comes'})"

@@ -41,12 +41,18 @@ class KnownState:
 
     # -- its own log ------------------------------------------------------------------------------------------------
     def note(self, state: VehicleState, now: float) -> None:
-        """A log packet with values that were taken at a time (s, monotonic)."""
+        """A log packet with values that were taken at a time (s, monotonic).
+
+        :param now: s, monotonic.
+        """
         self.last = state
         self._log_times.append(now)
 
     def judge(self, state: VehicleState, now: float) -> None:
-        """Whether the estimate in a log packet can be true; if it cannot, the log says so once."""
+        """Whether the estimate in a log packet can be true; if it cannot, the log says so once.
+
+        :param now: s, monotonic.
+        """
         if not self._watch.wrong:
             self._trusted_height = max(state.position[2], 0.0)
         if self._watch.update(state, now, self.seen_at(now), flying=bool(state.info & IS_FLYING)):
@@ -58,7 +64,10 @@ class KnownState:
         return self._watch.wrong
 
     def wrong_s(self, now: float) -> float:
-        """For how long it has been wrong, s."""
+        """For how long it has been wrong, s.
+
+        :param now: s, monotonic.
+        """
         return now - self._watch.since
 
     @property
@@ -72,16 +81,25 @@ class KnownState:
         return self.last.position[2] if self.last is not None else 1.0
 
     def whereabouts(self, now: float) -> Vector | None:
-        """Where it is, as far as anybody knows, m, world; None: nobody does."""
+        """Where it is, as far as anybody knows, m, world; None: nobody does.
+
+        :param now: s, monotonic.
+        """
         seen = self.seen_at(now) if self.wrong else None
         return seen or (None if self.last is None else self.last.position)
 
     def log_age(self, now: float) -> float:
-        """Seconds since the last log packet; infinite before the first one."""
+        """Seconds since the last log packet; infinite before the first one.
+
+        :param now: s, monotonic.
+        """
         return now - self._log_times[-1] if self._log_times else math.inf
 
     def logged(self, now: float) -> float:
-        """Share of the last second's expected log packets that came, 0..1."""
+        """Share of the last second's expected log packets that came, 0..1.
+
+        :param now: s, monotonic.
+        """
         recent = sum(1 for t in self._log_times if now - t <= QUALITY_WINDOW_S)
         return min(1.0, recent / (self._robot.log_rate_hz * QUALITY_WINDOW_S))
 
@@ -97,15 +115,24 @@ class KnownState:
         return self._captured.see(position, orientation, frame, stamp, time.monotonic(), flying=flying)
 
     def seen_at(self, now: float) -> Vector | None:
-        """Where motion capture sees it (m, world); None: not at all, or not any more."""
+        """Where motion capture sees it (m, world); None: not at all, or not any more.
+
+        :param now: s, monotonic.
+        """
         return None if self._captured is None else self._captured.place(now)
 
     def unseen_s(self, now: float) -> float | None:
-        """Seconds since motion capture saw it; None: there is no motion capture."""
+        """Seconds since motion capture saw it; None: there is no motion capture.
+
+        :param now: s, monotonic.
+        """
         return None if self._captured is None else self._captured.tracker.age(now)
 
     def captured(self, now: float) -> PositionNumbers | None:
-        """What motion capture has done for it; None: there is none."""
+        """What motion capture has done for it; None: there is none.
+
+        :param now: s, monotonic.
+        """
         return None if self._captured is None else self._captured.tracker.numbers(now)
 
     def misplaced(self) -> str:
@@ -116,6 +143,9 @@ class KnownState:
         return f"{self._robot.name} {problem}" if problem else ""
 
     def sinking_height(self, now: float) -> float:
-        """Height (m) from which it sinks when its estimate is wrong."""
+        """Height (m) from which it sinks when its estimate is wrong.
+
+        :param now: s, monotonic.
+        """
         seen = self.seen_at(now)
         return self._trusted_height if seen is None else seen[2]

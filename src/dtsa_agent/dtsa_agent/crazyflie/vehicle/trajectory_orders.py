@@ -69,7 +69,10 @@ class TrajectoryOrders:
             return f"{vehicle.name}: {problem}" if problem else ""
 
     def planned(self, number: int, timescale: float, *, reverse: bool, relative: bool) -> Planned | None:
-        """Where a trajectory would lead it; None: it has none of that number, or does not know where it is."""
+        """Where a trajectory would lead it; None: it has none of that number, or does not know where it is.
+
+        :param timescale: factor: it takes that many times as long as it says.
+        """
         vehicle = self._vehicle
         with vehicle.lock:
             trajectory = vehicle.onboard.trajectories.get(number)
@@ -83,6 +86,7 @@ class TrajectoryOrders:
         :param timescale: factor: it takes that many times as long as it says.
         :param reverse: from its end to its beginning.
         :param relative: moved so that it begins where the vehicle is.
+        :param number: of the trajectory, 0 to 9.
         """
         vehicle = self._vehicle
         with vehicle.lock:

@@ -206,7 +206,10 @@ class Vehicle:
         return self.state.name.lower()
 
     def log_age(self, now: float) -> float:
-        """Seconds since the last log packet; infinite before the first one."""
+        """Seconds since the last log packet; infinite before the first one.
+
+        :param now: s, monotonic.
+        """
         return self.known.log_age(now)
 
     # -- orders -----------------------------------------------------------------------------------------------------
@@ -289,7 +292,10 @@ class Vehicle:
             return ""
 
     def go_to(self, place: tuple[float, float, float], yaw: float, duration: float, relative: bool) -> str:
-        """Fly to a place (m, world; relative: an offset) within a duration (s); why not, or an empty text."""
+        """Fly to a place (m, world; relative: an offset) within a duration (s); why not, or an empty text.
+
+        :param yaw: rad, world.
+        """
         with self.lock:
             if problem := self.not_led():
                 return problem
@@ -402,7 +408,10 @@ class Vehicle:
             self.machine.emergency(self.action)
 
     def notify_setpoints_stop(self, remain_ms: int) -> str:
-        """End the stream of setpoints and hold; why not, or an empty text."""
+        """End the stream of setpoints and hold; why not, or an empty text.
+
+        :param remain_ms: ms for which the last set-point stays valid.
+        """
         with self.lock:
             if self.state not in ACCEPTS_COMMANDS:
                 return f"{self.name} is {self.standing}"
@@ -415,7 +424,10 @@ class Vehicle:
             return ""
 
     def lose(self, reason: str, now: float) -> None:
-        """It is silent. Nothing may be heard, but a landing is ordered all the same, unless it is known to land."""
+        """It is silent. Nothing may be heard, but a landing is ordered all the same, unless it is known to land.
+
+        :param now: s, monotonic.
+        """
         with self.lock:
             was_in_air = self.state in IN_AIR
             self.machine.silent(reason)
@@ -426,7 +438,10 @@ class Vehicle:
                 self.landing.repeat_blindly(now)
 
     def tick(self, now: float) -> None:
-        """Called 50 times a second: goes on braking, and sends again what has not been answered."""
+        """Called 50 times a second: goes on braking, and sends again what has not been answered.
+
+        :param now: s, monotonic.
+        """
         with self.lock:
             if self._paused and (unseen := self.known.unseen_s(now)) is not None:
                 self._paused = unseen > self.station.safety.position_age_s
@@ -441,7 +456,10 @@ class Vehicle:
                 self.link.order(order)
 
     def keep_alive(self, now: float, watchdog: bool) -> None:
-        """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
+        """What has to be sent regularly: the emergency stop watchdog, and blind landings.
+
+        :param now: s, monotonic.
+        """
         with self.lock:
             self.landing.repeat(now)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.

@@ -157,6 +157,7 @@ class Mission:
     def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
         """Call a service.
 
+        :param timeout: s, how long it waits.
         :raises MissionError: it does not answer or says no.
         """
         client = self._clients[name]
@@ -175,6 +176,7 @@ class Mission:
     def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
         """Wait until something is so.
 
+        :param timeout: s, how long it waits.
         :raises MissionError: it takes too long, or the user interrupts.
         """
         end = time.monotonic() + timeout

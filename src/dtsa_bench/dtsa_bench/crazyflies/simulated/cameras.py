@@ -57,5 +57,8 @@ def read_picture(datagram: bytes) -> tuple[float, list[tuple[int, float, float, 
 
 
 def half_turn(yaw: float) -> tuple[float, float]:
-    """The z and w of the quaternion of a heading (rad)."""
+    """The z and w of the quaternion of a heading (rad).
+
+    :param yaw: rad, the heading.
+    """
     return math.sin(yaw / 2), math.cos(yaw / 2)

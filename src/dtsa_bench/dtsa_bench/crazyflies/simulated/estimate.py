@@ -37,7 +37,10 @@ class Estimate:
             self.position, self.velocity, self.acceleration = (x, y, z), velocity, acceleration
 
     def variance(self, t: float) -> float:
-        """Variance of the position in m^2: large after a reset, then small."""
+        """Variance of the position in m^2: large after a reset, then small.
+
+        :param t: s, the fleet's clock.
+        """
         if self.filter is not None:
             return self.filter.variance
         return VARIANCE_REST + VARIANCE_RESET * math.exp(-(t - self.reset_time) / CONVERGE_S)

@@ -122,7 +122,10 @@ class Firmware:
 
     # -- commands from the radio ------------------------------------------------------------------------------------
     def stream(self, data: bytes, t: float) -> None:
-        """A packet of the generic commander: a streamed setpoint."""
+        """A packet of the generic commander: a streamed setpoint.
+
+        :param t: s, the fleet's clock.
+        """
         self.setpoints_received += 1
         kind = data[0] if data else -1
         if kind == 0:
@@ -131,7 +134,10 @@ class Firmware:
             self._accept(DECODERS[kind][1](data[1:], t))
 
     def manual(self, data: bytes, t: float) -> None:
-        """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled."""
+        """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled.
+
+        :param t: s, the fleet's clock.
+        """
         if len(data) < 14:
             return
         *_, thrust = struct.unpack_from("<3fH", data)
@@ -153,7 +159,10 @@ class Firmware:
             self._report("stream ended")
 
     def high_level(self, data: bytes, t: float) -> int:
-        """A packet of the high-level commander; 0, or an error number of the firmware's."""
+        """A packet of the high-level commander; 0, or an error number of the firmware's.
+
+        :param t: s, the fleet's clock.
+        """
         kind = data[0] if data else -1
         lengths = {3: 2, 6: 9, 7: 15, 8: 15, 12: 24, 13: 10}
         if len(data) < lengths.get(kind, math.inf):

@@ -98,7 +98,10 @@ class Peer:
         return None if reply is None else crtp.pack(port, channel, reply)
 
     def log_packets(self, tick: int, t: float) -> Iterator[bytes]:
-        """Log data that is due in this tick of 10 ms."""
+        """Log data that is due in this tick of 10 ms.
+
+        :param t: s, the fleet's clock.
+        """
         due = [(i, b) for i, b in self.blocks.items() if b.period and (tick - b.phase) % b.period == 0]
         if due:
             values = log_values(self.estimate, self.firmware, t)

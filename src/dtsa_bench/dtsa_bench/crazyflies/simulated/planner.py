@@ -98,7 +98,11 @@ class Planner:
         self.state = IDLE
 
     def takeoff(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
-        """Climb to `height` (m above the floor) within `duration` (s), from rest; False: only an idle planner does."""
+        """Climb to `height` (m above the floor) within `duration` (s), from rest; False: only an idle planner does.
+
+        :param t: s, the fleet's clock.
+        :param yaw: rad, world.
+        """
         if self.state != IDLE:
             return False
         self._from_rest(t, here, height, yaw, duration)
@@ -106,7 +110,11 @@ class Planner:
         return True
 
     def land(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
-        """Sink to `height` within `duration`, from rest, then stop the motors; False: it is landing already."""
+        """Sink to `height` within `duration`, from rest, then stop the motors; False: it is landing already.
+
+        :param t: s, the fleet's clock.
+        :param yaw: rad, world.
+        """
         if self.state == LANDING:
             return False
         self._from_rest(t, here, height, yaw, duration)
@@ -114,7 +122,11 @@ class Planner:
         return True
 
     def go_to(self, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
-        """Fly to a place within `duration` and hold it, beginning with speed and acceleration as they are."""
+        """Fly to a place within `duration` and hold it, beginning with speed and acceleration as they are.
+
+        :param t: s, the fleet's clock.
+        :param yaw: rad, world.
+        """
         self._plan(t, here, place, yaw, duration)
         self.state = FLYING
 
@@ -133,11 +145,17 @@ class Planner:
         self.path = Path(t, duration, axes, Goal(place, yaw=yaw))
 
     def finished(self, t: float) -> bool:
-        """True once the last path has been flown (or there is none)."""
+        """True once the last path has been flown (or there is none).
+
+        :param t: s, the fleet's clock.
+        """
         return self.path is None or t >= self.path.start + self.path.duration
 
     def goal(self, t: float) -> Goal | None:
-        """What to hold now; None while idle, which a landing that is over makes it."""
+        """What to hold now; None while idle, which a landing that is over makes it.
+
+        :param t: s, the fleet's clock.
+        """
         if self.state == LANDING and self.finished(t):
             self.state = IDLE
         if self.state == IDLE or self.path is None:

@@ -85,7 +85,10 @@ class Supervisor:
             self.emergency = reason
 
     def watchdog(self, t: float) -> None:
-        """A packet of the emergency stop watchdog came."""
+        """A packet of the emergency stop watchdog came.
+
+        :param t: s, the fleet's clock.
+        """
         self._watchdog = t
 
     def update(self, t: float, *, setpoint_age: float, thrust: bool) -> None:

@@ -118,11 +118,17 @@ class TrajectoryMemory:
         return 0
 
     def compressed(self, number: int) -> bool:
-        """Whether a trajectory was defined as compressed."""
+        """Whether a trajectory was defined as compressed.
+
+        :param number: of the trajectory, 0 to 255.
+        """
         return self.defined.get(number, (POLYNOMIALS,))[0] == COMPRESSED
 
     def pieces(self, number: int) -> tuple[Piece, ...] | None:
-        """The pieces of a trajectory as they are in the memory now; None: there are none that could be flown."""
+        """The pieces of a trajectory as they are in the memory now; None: there are none that could be flown.
+
+        :param number: of the trajectory, 0 to 255.
+        """
         if number not in self.defined:
             return None
         kind, offset, count = self.defined[number]

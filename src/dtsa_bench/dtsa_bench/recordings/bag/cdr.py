@@ -110,6 +110,7 @@ def odometry_cdr(
     """CDR of a single Odometry message; see `OdometryPacker`, which is faster for many.
 
     :param position: m, (3,). :param velocity: m/s, (3,).
+    :param stamp_ns: ns, of its header.
     """
     columns = np.array([position, velocity], dtype=np.float64)[:, :, None]
     return OdometryPacker([child_frame], frame).pack(stamp_ns, columns[0], columns[1])[0]

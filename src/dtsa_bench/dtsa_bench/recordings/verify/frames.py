@@ -64,7 +64,11 @@ class SentFrames:
         self._unjudged.setdefault(sender, deque()).append(sent)
 
     def get(self, slot: int, sender: int) -> Sent | None:
-        """A frame; None if it has not gone out."""
+        """A frame; None if it has not gone out.
+
+        :param slot: number of the slot.
+        :param sender: its id.
+        """
         return self._sent.get((slot, sender))
 
     def all(self) -> list[Sent]:
@@ -77,13 +81,17 @@ class SentFrames:
         return sum(int(sent.received.sum()) for sent in self._sent.values() if sent.received is not None)
 
     def place(self, slot: int, position: NDArray[np.float64]) -> None:
-        """Where all are at a slot's start, (3, N) m; kept only where the channel asks for it."""
+        """Where all are at a slot's start, (3, N) m; kept only where the channel asks for it.
+
+        :param position: (3, N) m, frame map.
+        """
         if self.config.range_m or self.config.capture_db:
             self._positions[slot] = position.copy()
 
     def deliver(self, slot: int, sender: int, data: bytes, received: Mask) -> Sent:
         """A frame reaches some.
 
+        :param slot: number of the slot.
         :raises Mismatch: nobody has sent it, it has been delivered already, or to its own sender.
         """
         sent = self._sent.get((slot, sender))
@@ -103,6 +111,9 @@ class SentFrames:
     def judged(self, slot: int, sender: int, received: Mask, lost: int, collided: int) -> None:
         """The channel's verdict on a sender's next frame.
 
+        :param slot: number of the slot.
+        :param lost: number of receivers that lost it.
+        :param collided: number of receivers at which it collided.
         :raises Mismatch: there is no such frame.
         """
         waiting = self._unjudged.get(sender)

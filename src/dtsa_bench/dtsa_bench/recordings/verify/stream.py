@@ -58,14 +58,20 @@ class Streams:
         return queue.popleft()
 
     def at_hand(self, topic: str, until_ns: int) -> list[Message]:
-        """Messages of a topic that have been read already, up to a time."""
+        """Messages of a topic that have been read already, up to a time.
+
+        :param until_ns: ns, log time, up to and with this.
+        """
         queue, found = self._queues.get(topic, deque()), []
         while queue and queue[0].log_time_ns <= until_ns:
             found.append(queue.popleft())
         return found
 
     def first(self, topic: str, time_ns: int) -> list[Message]:
-        """All messages of a topic at one time, left in their queue."""
+        """All messages of a topic at one time, left in their queue.
+
+        :param time_ns: ns, log time.
+        """
         while not self._ended and self._pull():
             queue = self._queues.get(topic)
             if queue and queue[-1].log_time_ns > time_ns:

@@ -47,7 +47,10 @@ def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> C
 
 
 def watch_goal(memory: Memory, slot: int, far_from_goal: bool) -> None:
-    """Notes since when the agent is idle, or that it wakes."""
+    """Notes since when the agent is idle, or that it wakes.
+
+    :param slot: number of the slot.
+    """
     if not far_from_goal:
         if memory.idle_since == NEVER:
             memory.idle_since = slot
@@ -59,7 +62,11 @@ def watch_goal(memory: Memory, slot: int, far_from_goal: bool) -> None:
 
 
 def own_right_is_near(memory: Memory, self_index: int, slot: int) -> bool:
-    """Whether the agent may send by a right of its own within the next N / 2 slots."""
+    """Whether the agent may send by a right of its own within the next N / 2 slots.
+
+    :param self_index: index of the agent itself, 0 to N - 1.
+    :param slot: number of the slot.
+    """
     for turn in range(slot + 1, slot + memory.rules.agents // 2 + 1):
         lease = memory.leases.get(turn)
         if lease is not None and lease.lessee == self_index + 1:
@@ -74,6 +81,9 @@ def takes_open(memory: Memory, self_index: int, slot: int) -> bool:
 
     w agents woke lately; a frames of its own in OPEN turns were not known to be heard. So many that woke together get
     out of each other's way.
+
+    :param self_index: index of the agent itself, 0 to N - 1.
+    :param slot: number of the slot.
     """
     if memory.woke == NEVER or own_right_is_near(memory, self_index, slot):
         return False

@@ -52,6 +52,8 @@ def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame
     """Probation begins where another agent may take this one for dead, and ends where that agent has heard it.
 
     :param was_absent: the sender was thought dead until now.
+    :param self_index: index of the agent itself, 0 to N - 1.
+    :param slot: number of the slot.
     """
     distance = (frame.own.sender - 1 - self_index) % memory.rules.agents
     if not memory.rules.adoption or frame.leaving:
@@ -66,7 +68,11 @@ def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame
 
 
 def hear_gossip(memory: Memory, self_index: int, table: Table, alive: int, entry: Gossip) -> None:
-    """Somebody says that an agent lived in a slot."""
+    """Somebody says that an agent lived in a slot.
+
+    :param self_index: index of the agent itself, 0 to N - 1.
+    :param alive: number of the slot in which it lived.
+    """
     k = entry.agent - 1
     if k == self_index:
         if memory.woke != NEVER and alive >= memory.woke:
@@ -81,6 +87,7 @@ def end_slot(memory: Memory, self_index: int, slot: int, sent: bool, reason: str
 
     :param sent: the agent itself sent in it.
     :param reason: why it decided as it did.
+    :param self_index: index of the agent itself, 0 to N - 1.
     """
     if sent:
         if reason == "open":
@@ -93,7 +100,10 @@ def end_slot(memory: Memory, self_index: int, slot: int, sent: bool, reason: str
 
 
 def note_silence(memory: Memory, slot: int) -> None:
-    """Silence where somebody was expected that is not known to be gone."""
+    """Silence where somebody was expected that is not known to be gone.
+
+    :param slot: number of the slot.
+    """
     k = memory.expected
     if k < 0 or memory.missed[k] >= MISSED or memory.absent(k, slot):
         return
@@ -108,6 +118,9 @@ def end_probation(memory: Memory, self_index: int, slot: int) -> None:
     """Probation ends after an own main anchor: leases of an earlier life reach no farther.
 
     With adoption others may have given turns away, too; everybody who might has spoken twice after 2 K M N slots.
+
+    :param self_index: index of the agent itself, 0 to N - 1.
+    :param slot: number of the slot.
     """
     if memory.owner(slot) == self_index and memory.is_main(slot):
         memory.anchored = True

@@ -58,6 +58,8 @@ class Memory:
         """Slots without a sign of life after which an agent is thought absent: six times as many as it may be silent.
 
         Who rests may speak in its main anchors only, and so may who was never heard.
+
+        :param k: index of the agent, 0 to N - 1.
         """
         rests = self.resting[k] or self.heard[k] == NEVER
         return max(1000, 6 * (self.rules.main_every if rests else self.rules.anchor_every) * self.rules.agents)
@@ -87,11 +89,18 @@ class Memory:
         return (slot // n + slot % n) % self.rules.main_every == 0
 
     def alive(self, k: int) -> bool:
-        """Whether an agent was heard of lately."""
+        """Whether an agent was heard of lately.
+
+        :param k: index of the agent, 0 to N - 1.
+        """
         return self.heard[k] >= 0 and self.now - self.heard[k] <= self.patience(k)
 
     def absent(self, k: int, slot: int) -> bool:
-        """Whether an agent is thought dead: no sign of life for long, or it said that it leaves."""
+        """Whether an agent is thought dead: no sign of life for long, or it said that it leaves.
+
+        :param k: index of the agent, 0 to N - 1.
+        :param slot: number of the slot.
+        """
         sign = self.born if self.heard[k] == NEVER else self.heard[k]
         return slot - sign > self.patience(k)
 
@@ -168,7 +177,10 @@ class Memory:
             self.woke = slot
 
     def roll(self, self_index: int, slot: int) -> None:
-        """A slot begins: earlier turns are over; the estimates of how many woke and of missed frames fall."""
+        """A slot begins: earlier turns are over; the estimates of how many woke and of missed frames fall.
+
+        :param self_index: index of the agent itself, 0 to N - 1.
+        """
         for turn in [turn for turn in self.leases if turn < slot]:
             del self.leases[turn]
         self.now = self.heard[self_index] = slot

@@ -67,7 +67,10 @@ def clock_topic(swarm_namespace: str) -> str:
 
 
 def slot_time_ns(slot: int, slot_ns: int) -> int:
-    """Simulated time at which a slot starts, ns."""
+    """Simulated time at which a slot starts, ns.
+
+    :param slot_ns: ns, length of a slot.
+    """
     return TIME_ZERO_NS + slot * slot_ns
 
 

@@ -54,7 +54,11 @@ class Layout:
         return self
 
     def sequence(self, count: int, size: int) -> Layout:
-        """Adds the number of elements of a sequence, and the elements as :meth:`elements` does."""
+        """Adds the number of elements of a sequence, and the elements as :meth:`elements` does.
+
+        :param count: number of elements.
+        :param size: bytes of an element.
+        """
         return self.numbers("I").elements(count, size)
 
     def struct(self) -> struct.Struct:

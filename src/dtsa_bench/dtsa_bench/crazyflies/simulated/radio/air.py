@@ -28,8 +28,9 @@ class RadioAir:
     def send(self, channel: int, rate: str, sender: int, start_ns: int, length: int) -> OnAir:
         """A transmission begins.
 
+        :param channel: number of the radio channel, 0 to 125.
         :param sender: id of the radio.
-        :param start_ns: when it turns to sending.
+        :param start_ns: ns, when it turns to sending.
         :param length: bytes of payload.
         """
         air = start_ns + esb.TURN_NS
@@ -41,7 +42,10 @@ class RadioAir:
         return frame
 
     def heard(self, channel: int, frame: OnAir) -> set[int]:
-        """Ids of the radios that can decode a transmission that has ended, if they listen."""
+        """Ids of the radios that can decode a transmission that has ended, if they listen.
+
+        :param channel: number of the radio channel, 0 to 125.
+        """
         self._judged += 1
         others = [f for f in self._by_channel[channel] if f is not frame and f.end_ns > frame.start_ns]
         received = self._medium.judge(self._judged, frame, others).received

@@ -34,7 +34,10 @@ class Agenda:
         self._count = 0
 
     def at(self, when_ns: int, action: Callable[[], None]) -> None:
-        """Do something at a time."""
+        """Do something at a time.
+
+        :param when_ns: ns, the time.
+        """
         self._count += 1
         heapq.heappush(self._heap, (when_ns, self._count, action))
 
@@ -44,7 +47,10 @@ class Agenda:
         return self._heap[0][0] if self._heap else None
 
     def run(self, until_ns: int) -> None:
-        """Do all that is due."""
+        """Do all that is due.
+
+        :param until_ns: ns, up to and with this time.
+        """
         while self._heap and self._heap[0][0] <= until_ns:
             heapq.heappop(self._heap)[2]()
 
@@ -91,7 +97,10 @@ class Dongle:
         self._ard, self._arc, self._ack, self._carrier = 0xA0, 3, True, False
 
     def request(self, number: int, value: int, index: int, data: bytes, now: int) -> None:
-        """A vendor request from the host; what is not known is ignored."""
+        """A vendor request from the host; what is not known is ignored.
+
+        :param now: ns, the time.
+        """
         self._busy_ns = max(now, self._busy_ns) + round(self._settings.request_ms * 1e6)
         if number == SET_CHANNEL and value <= 125:
             self._channel = value
@@ -136,7 +145,10 @@ class Dongle:
 
     # -- a packet ---------------------------------------------------------------------------------------------------
     def transfer(self, packet: bytes, now: int, answer: Callable[[bytes], None]) -> None:
-        """Send a packet; `answer` gets what the host reads. Without acknowledgements there is nothing to read."""
+        """Send a packet; `answer` gets what the host reads. Without acknowledgements there is nothing to read.
+
+        :param now: ns, the time.
+        """
         self.packets += 1
         half = round(self._settings.usb_ms * 0.5e6)
         start = max(now, self._busy_ns) + half
