@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,7 @@ def modules(place: Path) -> Iterator[str]:
         if path.suffix in (".py", ".c", ".js") and "test" not in parts and not {"build", "install"} & set(parts):
             names = [*parts[:-1], path.stem.strip("_")]
             yield from names
-            yield from map("_".join, zip(names, names[1:], strict=False))
+            yield from map("_".join, pairwise(names))
 
 
 def room(test: Path, place: Path) -> Path:

@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dtsa_dev.soak.chromium import CHROMIUM, MISSING, browsing
 from dtsa_dev.soak.flights import children
 from PIL import Image
 
 from dtsa_bench.drawing.palette import AGENT_COLOURS
-from dtsa_bench.pages import browser
+from dtsa_bench.pages import browser as opener
 from dtsa_bench.pages.demo import live
 from dtsa_bench.pages.demo.animation import SLOTS, draw_animation
 from dtsa_bench.pages.demo.flown import Flown
@@ -124,6 +125,30 @@ def test_picture_and_page(flights: dict[str, Flown], tmp_path: Path) -> None:
         assert step.title in page
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_chromium_shows_and_plays_the_page(flights: dict[str, Flown], tmp_path: Path) -> None:
+    write_page(tmp_path / "demo.html", STEPS, flights, [])
+    first, count = window([flights["loss-dtsa"]])
+    kinds = ["none", "", "both"]  # by number of senders; who hovers is another one
+    with browsing() as browser:
+        browser.open((tmp_path / "demo.html").as_uri())
+        of_dtsa = "document.querySelectorAll('#c .flight')[1].querySelectorAll('.strip i')"
+        shown = browser.run(f"[...{of_dtsa}].map(one => one.className)")
+        wanted = [kinds[len(sent)] for sent in flights["loss-dtsa"].senders[first : first + count]]
+        assert [kind.replace("hover", "") for kind in shown] == wanted
+        turns = sum(len(part.cells) for part in killed_windows(flights["killed-lease"]))
+        assert browser.run("document.querySelectorAll('.turn i').length") == turns
+        assert browser.run("document.querySelectorAll('.chart path[stroke-width]').length") == 2
+        assert browser.run("document.querySelectorAll('.view').length") == 8
+        browser.run("document.querySelector('#b .play button').click()")
+        browser.wait_for("parseFloat(document.querySelector('#b output').textContent) > 0.1")
+        assert browser.run("document.querySelectorAll('#b .strip .now').length") == 3
+        browser.run("document.querySelector('#b .play button').click()")
+        assert browser.run("document.querySelector('#b .play button').textContent") == "▶ play"
+        assert browser.run("document.querySelectorAll('#b .wave').length") > 0
+        assert browser.complaints() == []
+
+
 def test_animation_is_small_and_moves(flights: dict[str, Flown], tmp_path: Path) -> None:
     path = tmp_path / "demo.gif"
     draw_animation(path, flights, slots := 20)
@@ -183,14 +208,14 @@ def test_the_agent_is_killed_once_and_the_flight_ends_when_it_is_back(monkeypatc
     ],
 )
 def test_a_page_opens_where_somebody_looks(environment: dict[str, str], platform: str, looks: bool) -> None:
-    assert browser.somebody_looks(environment, platform) is looks
+    assert opener.somebody_looks(environment, platform) is looks
 
 
 def test_no_open_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(browser.webbrowser, "open", lambda url: opened.append(url) or True)
-    assert not browser.open_page(Path("page.html"), False)
-    assert browser.open_page(Path("page.html"), True)
+    monkeypatch.setattr(opener.webbrowser, "open", lambda url: opened.append(url) or True)
+    assert not opener.open_page(Path("page.html"), False)
+    assert opener.open_page(Path("page.html"), True)
     assert len(opened) == 1
     assert opened[0].startswith("file:///")
 

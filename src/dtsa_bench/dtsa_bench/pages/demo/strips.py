@@ -23,7 +23,6 @@ class Cell:
     y: int
     colours: tuple[str, ...]  # one a sender; none: nobody sent
     label: str
-    slot: int
     senders: tuple[int, ...]
 
 
@@ -42,7 +41,7 @@ def cell(flown: Flown, slot: int, x: int, y: int) -> Cell:
     """One slot of a flight as a cell at a place."""
     senders = flown.senders[slot] if slot < len(flown.senders) else ()
     colours = tuple(agent_colour(agent) if flown.moving[agent - 1] else HOVER for agent in senders)
-    return Cell(x, y, colours, str(senders[0]) if len(senders) == 1 else "", slot, senders)
+    return Cell(x, y, colours, str(senders[0]) if len(senders) == 1 else "", senders)
 
 
 def window(flights: Sequence[Flown]) -> tuple[int, int]:

@@ -29,8 +29,8 @@ PALETTE = {
 SCRIPTS = ("core.js", "plot.js", "scene.js", "slots.js", "player.js", "page.js")
 
 
-_NOTE = "This report draws itself with JavaScript; please allow it for this file."
-_BODY = f'<noscript><p class="note">{_NOTE}</p></noscript>\n<div id="report"></div>'
+NOTE = '<noscript><p class="note">This page draws itself with JavaScript; please allow it for this file.</p></noscript>'
+_BODY = f'{NOTE}\n<div id="report"></div>'
 
 
 def filled(text: str, parts: Mapping[str, str]) -> str:

@@ -1,98 +1,90 @@
 "use strict";
-/* Plays the flights of a step side by side: who flies where, and who sends in which slot. */
-const DATA = JSON.parse(document.getElementById("data").textContent);
-const ROOT = document.documentElement, SVG = "http://www.w3.org/2000/svg", RATE = 12; // slots a second
-ROOT.dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-document.getElementById("theme").addEventListener("click", () => { ROOT.dataset.theme = ROOT.dataset.theme === "dark" ? "light" : "dark"; });
-
-function bytes(text) {
-  const raw = atob(text), out = new Uint8Array(raw.length);
-  for (let i = 0; i < raw.length; i++) out[i] = raw.charCodeAt(i);
-  return out.buffer;
-}
-const luminance = colour => [1, 3, 5].map(at => parseInt(colour.slice(at, at + 2), 16) / 255)
-  .map(part => part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4)
-  .reduce((sum, part, index) => sum + part * [0.2126, 0.7152, 0.0722][index], 0);
-const colourOf = agent => DATA.colours[(agent - 1) % DATA.colours.length];
+/* The flights of a step side by side: who flies where, and who sends in which slot. */
+const RATE = 12, VIEW = 100; // slots a second; side of a top view, in its own units
+document.getElementById("theme").addEventListener("click", () => setTheme(theme.dark ? "light" : "dark"));
 
 class Flight {
   constructor(node) {
-    this.node = node;
     Object.assign(this, DATA.flights[node.dataset.flight]);
-    this.position = new Int16Array(bytes(this.position));
-    this.craft = [...node.querySelectorAll(".craft")];
-    this.cells = [...node.querySelectorAll(".strip i")];
-    this.view = node.querySelector(".view");
-    this.waves = [];
+    this.last = this.senders.length - 1;
+    this.svg = node.querySelector(".view"); this.craft = [...node.querySelectorAll(".craft")]; this.waves = [];
+    if (this.position) this.position = new Int16Array(bytes(this.position));
+  }
+
+  /* A slot as a cell: who sent in it, and whether it is still to come. */
+  paint(cell, slot, now = Infinity) {
+    const senders = this.senders[slot] ?? [], [one] = senders, flies = agent => this.moving[agent - 1];
+    const kind = !one ? "none" : senders.length > 1 ? "both" : flies(one) ? "" : "hover";
+    cell.className = `${kind}${slot > now || slot > this.last ? " ahead" : ""}${slot === now ? " now" : ""}`;
+    cell.textContent = senders.length > 1 ? "×" : one ?? "";
+    cell.title = `slot ${slot}: ${senders.join(" and ") || "nobody"}`;
+    const colours = senders.map(agent => flies(agent) ? agentColor(agent, true) : "var(--resting)");
+    for (const [name, value] of [["--c", colours[0]], ["--d", colours[1]], ["--t", kind ? "" : PALETTE.inks[PALETTE.agents.indexOf(colours[0])]]])
+      if (kind === "hover" || !value) cell.style.removeProperty(name); else cell.style.setProperty(name, value);
   }
 
   place(slot, agent) { // in the units of the top view
     const at = slot * 2 * this.agents + agent;
-    return [this.position[at], -this.position[at + this.agents]].map(value => (value / this.extent + 1) * 50);
+    return [this.position[at], -this.position[at + this.agents]].map(value => ((value / this.extent + 1) * VIEW / 2).toFixed(2));
+  }
+
+  /* Who is where, and who sends. */
+  show(slot) {
+    slot = Math.min(slot, this.last);
+    this.craft.forEach((craft, agent) => { const [x, y] = this.place(slot, agent); craft.setAttribute("cx", x); craft.setAttribute("cy", y); });
+    this.waves.forEach(wave => wave.remove());
+    this.waves = this.senders[slot].flatMap(agent => [5, 8].map(r => {
+      const [cx, cy] = this.place(slot, agent - 1), colour = this.moving[agent - 1] ? agentColor(agent, true) : "var(--soft)";
+      return el("circle", {class: this.senders[slot].length > 1 ? "wave bad" : "wave", style: `--c:${colour}`, cx, cy, r});
+    }));
+    this.svg.append(...this.waves);
+  }
+}
+
+/* A flight in a row: its top view, and a strip of slots. */
+class Strip {
+  constructor(node) {
+    this.node = node; this.flight = new Flight(node);
+    this.cells = Array.from({length: DATA.count}, () => el("i"));
+    node.querySelector(".strip").append(...this.cells);
+    this.fill(+node.dataset.first);
+  }
+
+  fill(first, now) {
+    this.cells.forEach((cell, index) => this.flight.paint(cell, first + index, now));
+    this.node.querySelector(".from").textContent = first; this.node.querySelector(".to").textContent = first + DATA.count - 1;
   }
 
   show(slot) {
-    slot = Math.min(slot, this.senders.length - 1);
-    const first = slot - slot % DATA.count;
-    this.cells.forEach((cell, index) => this.paint(cell, first + index, slot));
-    this.node.querySelector(".from").textContent = first;
-    this.node.querySelector(".to").textContent = first + DATA.count - 1;
-    this.craft.forEach((craft, agent) => {
-      const [x, y] = this.place(slot, agent);
-      craft.setAttribute("cx", x.toFixed(2)); craft.setAttribute("cy", y.toFixed(2));
-    });
-    this.waves.forEach(wave => wave.remove());
-    this.waves = this.senders[slot].flatMap(agent => [5, 8].map(radius => this.wave(slot, agent, radius)));
-  }
-
-  wave(slot, agent, radius) {
-    const wave = document.createElementNS(SVG, "circle"), [x, y] = this.place(slot, agent - 1);
-    wave.setAttribute("class", this.senders[slot].length > 1 ? "wave bad" : "wave");
-    wave.setAttribute("cx", x); wave.setAttribute("cy", y); wave.setAttribute("r", radius);
-    wave.style.setProperty("--c", this.moving[agent - 1] ? colourOf(agent) : "var(--soft)");
-    this.view.append(wave);
-    return wave;
-  }
-
-  paint(cell, slot, now) {
-    const senders = this.senders[slot] || [], one = senders.length === 1;
-    cell.className = !senders.length ? "none" : !one ? "both" : this.moving[senders[0] - 1] ? "" : "hover";
-    if (slot > now || slot >= this.senders.length) cell.classList.add("ahead");
-    if (slot === now) cell.classList.add("now");
-    cell.textContent = one ? senders[0] : senders.length ? "×" : "";
-    cell.title = `slot ${slot}: ${senders.join(" and ") || "nobody"}`;
-    const colours = senders.map(agent => this.moving[agent - 1] ? colourOf(agent) : "var(--resting)");
-    cell.style.setProperty("--c", colours[0] || ""); cell.style.setProperty("--d", colours[1] || "");
-    cell.style.setProperty("--t", one && this.moving[senders[0] - 1] && luminance(colours[0]) > 0.2 ? "#10151b" : "#fff");
-    if (one && !this.moving[senders[0] - 1]) { cell.style.removeProperty("--c"); cell.style.removeProperty("--t"); }
+    const now = Math.min(slot, this.flight.last);
+    this.fill(now - now % DATA.count, now);
+    this.flight.show(slot);
   }
 }
 
 for (const step of document.querySelectorAll(".step")) {
-  const flights = [...step.querySelectorAll(".flight")].map(node => new Flight(node));
-  if (!flights.length) continue;
-  const [button, slider, shown] = step.querySelectorAll(".play button, .play input, .play output");
-  const last = Math.max(...flights.map(flight => flight.senders.length)) - 1;
-  let playing = false, at = 0;
-  slider.max = last;
-  const show = slot => {
-    at = slot; slider.value = Math.floor(slot);
-    shown.textContent = `${(Math.floor(slot) * flights[0].slot_s).toFixed(2)} s`;
-    flights.forEach(flight => flight.show(Math.floor(slot)));
-  };
-  const play = on => {
-    playing = on; button.textContent = on ? "❚❚ pause" : "▶ play";
-    if (!on) return;
-    if (at >= last) at = 0;
-    let before = performance.now();
-    const next = now => {
-      if (!playing) return;
-      at += RATE * (now - before) / 1000; before = now;
-      show(Math.min(at, last));
-      if (at >= last) play(false); else requestAnimationFrame(next);
-    };
-    requestAnimationFrame(next);
-  };
-  button.addEventListener("click", () => play(!playing));
-  slider.addEventListener("input", () => { play(false); show(+slider.value); });
+  for (const turns of step.querySelectorAll(".turns")) {
+    const flight = new Flight(turns), {first, rounds} = turns.dataset;
+    turns.querySelectorAll(".turn").forEach((turn, own) => {
+      for (let round = 0; round < rounds; round++) { const cell = el("i"); flight.paint(cell, (+first + round) * flight.moving.length + own); turn.append(cell); }
+    });
+  }
+  const strips = [...step.querySelectorAll(".flight")].map(node => new Strip(node));
+  if (!strips.length) continue;
+  const [button, range, shown] = step.querySelectorAll(".play button, .play input, .play output");
+  const slot_s = strips[0].flight.slot_s, last = Math.max(...strips.map(strip => strip.flight.last)), time = newClock(() => last * slot_s);
+  range.max = last; time.speed = RATE * slot_s;
+  time.listeners.push(now => {
+    const slot = Math.floor(now / slot_s + 1e-6);
+    range.value = slot; shown.textContent = `${(slot * slot_s).toFixed(2)} s`; button.textContent = time.playing ? "❚❚ pause" : "▶ play";
+    strips.forEach(strip => strip.show(slot));
+  });
+  button.addEventListener("click", () => time.toggle());
+  range.addEventListener("input", () => { if (time.playing) time.toggle(); time.set(range.value * slot_s); });
 }
+
+DURATION = DATA.chart.end_s;
+document.querySelector(".chart").append(lineChart({
+  time: DATA.chart.time, unit: "how far off the others are thought to be (mm)", label: "Error over time", digits: 1, suffix: "mm", height: 215,
+  series: DATA.chart.series.map((one, index) => ({...one, width: 2, color: () => theme.color(index ? "two" : "one")})),
+}));

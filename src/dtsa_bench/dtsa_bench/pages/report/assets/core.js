@@ -29,7 +29,7 @@ const recordingOf = run => run.record ??= new Recording(run);
 
 /* An element: el("div", {class: "a", onclick: f}, child, "text"). Text is never read as HTML. */
 function el(name, attributes, ...children) {
-  const svg = ["svg", "g", "path", "line", "rect", "text", "polyline"].includes(name);
+  const svg = ["svg", "g", "path", "line", "rect", "text", "polyline", "circle"].includes(name);
   const node = svg ? document.createElementNS("http://www.w3.org/2000/svg", name) : document.createElement(name);
   for (const [key, value] of Object.entries(attributes || {})) {
     if (key.startsWith("on")) node.addEventListener(key.slice(2), value);
@@ -78,14 +78,14 @@ function heatColor(level) {
   return stops[low].map((value, i) => Math.round(value + part * (stops[low + 1][i] - value)));
 }
 
-/* ---- time: one clock for all runs ---- */
-let DURATION = Math.max(0.001, ...RUNS.map(run => run.duration_s)); // grows while a run is under way
-const clock = {
+/* ---- time ---- */
+/* A clock that can be played; end: says where it ends. */
+const newClock = end => ({
   time: 0, playing: false, speed: 1, listeners: [], turn: 0,
-  set(time) { this.time = Math.min(DURATION, Math.max(0, time)); this.tell(); },
+  set(time) { this.time = Math.min(end(), Math.max(0, time)); this.tell(); },
   tell() { for (const listener of this.listeners) listener(this.time); },
   listen(listener) { this.listeners.push(listener); listener(this.time); },
-  get over() { return this.time >= DURATION - 1e-9; },
+  get over() { return this.time >= end() - 1e-9; },
   /* Goes on from where it stands; only from the very end it begins again. */
   toggle() {
     this.playing = !this.playing;
@@ -98,13 +98,15 @@ const clock = {
       // A hidden page is not drawn: then time stands still.
       const time = this.time + this.speed * Math.min(0.25, Math.max(0, now - before) / 1000);
       before = now;
-      if (time >= DURATION) this.playing = false;
+      if (time >= end()) this.playing = false;
       this.set(time);
       if (this.playing) requestAnimationFrame(step);
     };
     requestAnimationFrame(step);
   },
-};
+});
+let DURATION = Math.max(0.001, ...RUNS.map(run => run.duration_s)); // grows while a run is under way
+const clock = newClock(() => DURATION); // one for all runs
 
 /* ---- redrawing: on new sizes, themes and before printing ---- */
 const redraws = [];
