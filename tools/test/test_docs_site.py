@@ -1,4 +1,4 @@
-"""The documentation becomes a site: whole, without a network, and not with dead links or pages that nobody finds."""
+"""Integration: the documentation becomes a site: whole, without a network, no dead links, no page that nobody finds."""
 
 from __future__ import annotations
 
