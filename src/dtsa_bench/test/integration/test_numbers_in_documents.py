@@ -37,7 +37,7 @@ from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
 from dtsa_bench.crazyflies.simulated.radio import receiver
 from dtsa_bench.flights import agent_parameters, clock_statistics, ending
 from dtsa_bench.pages.demo import live
-from dtsa_bench.pages.view import air, moments, server, track, vehicles
+from dtsa_bench.pages.view import moments, network_listener, server, track, vehicles
 from dtsa_bench.recordings.bag import metadata, writer
 from dtsa_bench.recordings.merge import agent_recorder, json_bag, merge
 from dtsa_bench.runs import hearing
@@ -149,7 +149,7 @@ FIGURES: dict[str, list[str]] = {
         f"more than {constant(f'{VIEW}/bodies.js', 'SOFTWARE_AGENTS')} agents, the scene draws",
         f"within {word(constant(f'{VIEW}/crazyflies.js', 'SURE_MS') / 1000)} seconds",
         f"has not told for {word(vehicles._SILENT_S)} seconds is called silent",
-        f"after {word(air._SILENCE_NS / 1e9)} seconds in which no other came",
+        f"after {word(network_listener._SILENCE_NS / 1e9)} seconds in which no other came",
         f"carried out by the flight itself {often(loop.HOUSEKEEPING_S)} a second at most",
         f"(`collision_m`, {RunLimits().collision_m:g} m across)",
     ],
