@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.drawing.card import as_html, as_text
 from dtsa_bench.experiments.batch.journal import Journal
 from dtsa_bench.experiments.batch.pool import run_all
-from dtsa_bench.experiments.sweep.aggregate import MEASURES, Group, Table, collected, write_table
+from dtsa_bench.experiments.sweep.aggregate import Table, collected, write_table
 from dtsa_bench.experiments.sweep.columns import COMMON, VALUES
 from dtsa_bench.experiments.sweep.spec import Sweep, load_preset, make_sweep
+from dtsa_bench.experiments.sweep.text import table_html, table_text
 from dtsa_bench.experiments.sweep.work import work_of
 
 from ._frames import data_frame
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SEEDS = 30
+_SHOWN = ("age_mean_slots", "age_mean_ms", "min_distance_m")
+_MOST, _MOST_IN_NOTEBOOKS = 6, 60  # settings that are shown
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,45 @@ class SweepResult:
 
     name: str
     axes: tuple[str, ...]
+    out: Path | None  # directory in which results.csv and results.json are; None: nothing was written
+    command: str  # the call that makes it again
     _table: Table
+    _code: str
+
+    def __repr__(self) -> str:
+        groups = len(self._table.groups)
+        left = f"\n... {groups - _MOST} more" if groups > _MOST else ""
+        return as_text(self._title, self._rows(), table_text(self._table, shown=_SHOWN, most=_MOST) + left)
+
+    def _repr_html_(self) -> str:
+        return as_html(self._title, self._rows(), table=table_html(self._table, _SHOWN, _MOST_IN_NOTEBOOKS))
+
+    @property
+    def _title(self) -> str:
+        sweep = self._table.sweep
+        seeds = f"{len(sweep.seeds)} seeds" if len(sweep.seeds) > 1 else "1 seed"
+        return f"Sweep {self.name}: {self._table.runs} flights, {len(sweep.cells)} settings, {seeds}"
+
+    def _rows(self) -> list[tuple[str, str]]:
+        base = ", ".join(f"{name} {value}" for name, value in self._table.sweep.spec.base.items())
+        where = "in memory (out=DIR keeps it)" if self.out is None else f"{self.out}: results.csv, results.json"
+        more = "table(), runs(), write_paper(DIR); dtsa.plot_lines, dtsa.plot_bars, dtsa.plot_matrix"
+        return [*([("base", base)] if base else []), ("kept", where), ("more", more)]
+
+    def write_paper(self, directory: str | Path, figures: str = "pdf") -> list[Path]:
+        """Writes figures, `table.tex` (booktabs) and `table.csv` for a paper; `table.json` says how they were made.
+
+        Figures and the LaTeX table say so, too: command, seeds, date, commit, versions.
+
+        :param directory: where; made if needed.
+        :param figures: pdf, svg or png. The figures are those of the preset; of other sweeps crashes and ages.
+        :returns: the files.
+        :raises ConfigError: for another format, or a directory that cannot be made.
+        """
+        from dtsa_bench.experiments.paper import write_paper  # draws with Matplotlib
+
+        place = Path(directory)
+        return [place / name for name in write_paper(self._table, place, figures, self._code, self.command)]
 
     def runs(self) -> pd.DataFrame:
         """A row a flight: the axes, seed, status, reason, collided, and its results with their units in the names.
@@ -50,26 +92,9 @@ class SweepResult:
 
         :raises ConfigError: if pandas is missing.
         """
-        rows = [_row(group) for group in self._table.groups]
+        rows = [group.flat() for group in self._table.groups]
         names = list(dict.fromkeys(name for row in rows for name in row))
         return data_frame({name: [row[name] for row in rows] for name in names})
-
-
-def _row(group: Group) -> dict[str, Any]:
-    share = group.crashed
-    row: dict[str, Any] = {
-        **group.labels,
-        "runs": len(group.rows),
-        "failed": group.failed,
-        "timed_out": group.timed_out,
-        "crashed": share.value,
-        "crashed_low": share.low,
-        "crashed_high": share.high,
-    }
-    for name in MEASURES:
-        mean = group.mean(name)
-        row |= {name: mean.value, f"{name}_low": mean.low, f"{name}_high": mean.high, f"{name}_count": mean.count}
-    return row
 
 
 def _refuse_registered(plan: Sweep, field: str, value: object) -> None:
@@ -124,6 +149,8 @@ def sweep(
         content: dict[str, Any] = {"axes": plain, "base": dict(base or {}), "seeds": chosen}
         plan = make_sweep(content, "sweep", first_seed=first_seed)
 
+    given = {"preset": preset, "axes": axes, "base": base, "seeds": seeds, "first_seed": first_seed}
+    said = ", ".join(f"{name}={value!r}" for name, value in given.items() if value is not None)
     if jobs > 1 or out is not None:
         _refuse_registered(plan, "jobs" if jobs > 1 else "out", jobs if jobs > 1 else str(out))
 
@@ -138,4 +165,5 @@ def sweep(
         with closing(Journal(Path(out), plan, work.code())) as journal:
             table = Table(plan, collected(plan, run_all(plan, work, journal, jobs=jobs, progress=advance)))
         write_table(Path(out), table, work.code())
-    return SweepResult(plan.name, plan.axes, table)
+    place = None if out is None else Path(out)
+    return SweepResult(plan.name, plan.axes, place, f"dtsa.sweep({said})", table, work.code())

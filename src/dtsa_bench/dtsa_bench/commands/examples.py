@@ -28,6 +28,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--preset paper-12,paper-18 --seeds 30", "the paper's experiments"),
         ("--preset loss --set slot_ms=20 --out runs/slow", "with a setting changed"),
         ("--file own.yaml --json", "a sweep of your own, its groups as JSON"),
+        ("--preset loss --paper pdf", "with figures and tables for a paper"),
     ),
     "new-plugin": (("my-policy --out plugins/my-policy", "then as its README.md says"),),
     "replay": (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -17,8 +18,7 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Flies every combination of a sweep's axes with every seed, without ROS, on all cores or on a Dask cluster, and
 writes results.csv, results.json, figures (PNG and SVG) and report.html. Interrupted, it goes on where it
-stopped when the same
-command is given again. Sweeps of your own: docs/how-to/sweep.md."""
+stopped when the same command is given again. Sweeps of your own: docs/how-to/sweep.md."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,6 +38,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting of the base")
     parser.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
     parser.add_argument("--no-report", action="store_true", help="only results.csv and results.json")
+    parser.add_argument(
+        "--paper", metavar="FORMAT",
+        help="also write DIR/paper: figures (pdf, svg or png), table.tex and table.csv, which say how they were made",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the contents of results.json instead of tables")
 
 
@@ -58,6 +62,10 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.json and args.preset and "," in args.preset:
         raise ConfigError("json", args.preset, "one preset at a time: what is printed is one JSON document")
+    if args.paper:
+        from dtsa_bench.experiments.paper import check_format
+
+        check_format(args.paper)
     sweeps = _sweeps(args)
     base = Path(args.out) if args.out else Path("runs")
     code = 0
@@ -117,13 +125,20 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     if args.json:
         print((directory / "results.json").read_text(encoding="utf-8"), end="")
     else:
-        print(table_text(table))
+        print(table_text(table, shutil.get_terminal_size((0, 0)).columns))
         if claims := claims_text(table):
             print(f"\n{claims}\n")
+    command = f"{program()} {shlex.join(sys.argv[1:])}"
+    if args.paper:
+        from dtsa_bench.experiments.paper import write_paper
+
+        files = write_paper(table, directory / "paper", args.paper, work.code(), command)
+        if not args.json:
+            print(f"paper: {directory / 'paper'}: {', '.join(files)}")
     if not args.no_report:
         from dtsa_bench.pages.report.sweep import write_report
 
-        path = write_report(table, directory, work.code(), f"{program()} {shlex.join(sys.argv[1:])}")
+        path = write_report(table, directory, work.code(), command)
         if not args.json:
             print(f"report: {path}")
     if not args.json:

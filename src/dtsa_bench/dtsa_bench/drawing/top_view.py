@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .palette import DASHES, agent_colour, agent_turn
 
 _SIDE = 100.0  # of the picture, in its own units
+_WITHOUT, _WITH_IDS = "0 0 100 100", "-4 -4 108 108"
 _LINE = 1.1  # width of a path
 _MOST_POINTS, _MOST_OF_ONE, _LEAST_OF_ONE = 8000, 80, 12  # of all paths, of one
 _LABELLED = 24  # agents that get their ids written
@@ -61,7 +62,7 @@ def top_view(
         parts.append(f'<circle {kind}" cx="{x:g}" cy="{y:g}" r="2.8"/>')
         if ids and agents <= _LABELLED:
             away = max(1.0, float(np.hypot(x0 - _SIDE / 2, y0 - _SIDE / 2)))
-            x, y = (_SIDE / 2 + (at - _SIDE / 2) * (1 + 5.2 / away) for at in (x0, y0))
+            x, y = (_SIDE / 2 + (at - _SIDE / 2) * (1 + 6.2 / away) for at in (x0, y0))
             parts.append(f'<text class="id" x="{x:.4g}" y="{y + 1.4:.4g}">{k + 1}</text>')
     if crash and all(agent in ends for agent in crash):
         x, y = np.mean([ends[agent] for agent in crash], axis=0)
@@ -71,10 +72,8 @@ def top_view(
         f'<path class="scale" d="M{96 - metre:g} 97.5h{metre:g}"/>'
         f'<text class="scale" x="{96 - metre / 2:g}" y="95.5">1 m</text>'
     )
-    return (
-        f'<svg class="view" viewBox="0 0 100 100" role="img" aria-label="{html.escape(name)}, seen from above">'
-        f"{''.join(parts)}</svg>"
-    )
+    box, label = _WITH_IDS if ids else _WITHOUT, f"{html.escape(name)}, seen from above"
+    return f'<svg class="view" viewBox="{box}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
 
 
 def _dash(agent: int) -> str:

@@ -82,7 +82,7 @@ def what_came_of_it(summary: Mapping[str, Any], run: RunConfig) -> list[tuple[st
     if "min_distance_m" in known:
         pair = " and ".join(map(str, known.get("min_distance_pair", ())))
         where = f" (agents {pair} at {known['min_distance_time_s']:.2f} s)" if pair else ""
-        limit = f"below {run.limits.collision_m:g} m two have crashed"
+        limit = f"closer than {run.limits.collision_m:g} m is a crash"
         rows.append(("distance", f"{known['min_distance_m']:.3f} m at least{where}; {limit}"))
     if "slots" in known:
         count = known["slots"]

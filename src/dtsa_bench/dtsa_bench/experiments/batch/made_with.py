@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 _SOURCES = str(Path(__file__).resolve().parent)
+_OURS = ":(top)src/dtsa_bench/dtsa_bench/__init__.py"
 
 
 def made_with() -> dict[str, Any]:
-    """The commit, and whether the tree differs from it; date, cores and Python."""
-    commit = _git("rev-parse", "HEAD")
+    """The commit of the checkout, and whether the tree differs from it; date, cores and Python."""
+    ours = _git("ls-files", "--error-unmatch", _OURS)  # an installation may lie in somebody else's repository
+    commit = _git("rev-parse", "HEAD") if ours else ""
     return {
         "commit": commit or "unknown",
         "tree_changed": bool(_git("status", "--porcelain", "--untracked-files=no")) if commit else None,

@@ -25,7 +25,7 @@ from dtsa_bench.drawing.style import (
     legend_above,
     panels,
 )
-from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES, Group, Table
+from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES, Group, Table, label_of
 
 Spec = Mapping[str, Any]
 _GOOD_TO_BAD = LinearSegmentedColormap.from_list("good-bad", ["#e8f4ee", "#f6e3b4", "#dd8a6f", "#a8402b"])
@@ -36,14 +36,6 @@ AXIS_LABELS = {
     "agents": "quadcopters", "moving": "moving quadcopters", "slot_ms": "slot length [ms]", "loss": "loss",
     "scheme": "", "policy": "", "scenario": "", "epsilon": "epsilon",
 }  # fmt: skip
-
-
-def label_of(measure: str) -> str:
-    """A measure with its unit."""
-    if measure == CRASHED:
-        return "flights that crashed"
-    spec = MEASURES[measure]
-    return f"{spec.label} [{spec.unit}]" if spec.unit else spec.label
 
 
 def point(group: Group, measure: str) -> tuple[float, float, float]:

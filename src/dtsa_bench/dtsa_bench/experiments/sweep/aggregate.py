@@ -48,6 +48,14 @@ MEASURES = {
 CRASHED = "crashed"  # a share, not a mean; may stand where a measure's name stands in figures
 
 
+def label_of(measure: str) -> str:
+    """A measure with its unit."""
+    if measure == CRASHED:
+        return "flights that crashed"
+    spec = MEASURES[measure]
+    return f"{spec.label} [{spec.unit}]" if spec.unit else spec.label
+
+
 class Group:
     """All runs of one cell.
 
@@ -88,6 +96,23 @@ class Group:
         if measure not in self._means:
             self._means[measure] = bootstrap_mean(self.values(measure).values())
         return self._means[measure]
+
+    def flat(self) -> Row:
+        """The group as one row of plain values: labels, how its flights ended, and means with their intervals."""
+        share = self.crashed
+        row: Row = {
+            **self.labels,
+            "runs": len(self.rows),
+            "failed": self.failed,
+            "timed_out": self.timed_out,
+            "crashed": share.value,
+            "crashed_low": share.low,
+            "crashed_high": share.high,
+        }
+        for name in MEASURES:
+            mean = self.mean(name)
+            row |= {name: mean.value, f"{name}_low": mean.low, f"{name}_high": mean.high, f"{name}_count": mean.count}
+        return row
 
 
 def _value(row: Row, spec: Measure) -> float:

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from matplotlib.figure import Figure
-
-from dtsa_bench.drawing.style import save, style, themed
+from dtsa_bench.drawing.style import save, themed
 from dtsa_bench.experiments.batch.table import write_whole
-from dtsa_bench.experiments.figures import charts, flights
-from dtsa_bench.experiments.figures.charts import label_of
-from dtsa_bench.experiments.statistics import LEVEL, Mean, Share, wilson
-from dtsa_bench.experiments.sweep.aggregate import MEASURES, Group, Table
+from dtsa_bench.experiments.figures.drawn import draw
+from dtsa_bench.experiments.statistics import LEVEL, wilson
+from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES, Group, Table, label_of
 from dtsa_bench.experiments.sweep.claims import Claim, claims_of
+from dtsa_bench.experiments.sweep.text import parts
 
-_DRAW: dict[str, Callable[[Table, Any], Figure]] = {
-    "bars": charts.bars, "lines": charts.lines, "matrix": charts.matrix, "trajectories": flights.trajectories,
-    "estimate": flights.estimate,
-}  # fmt: skip
 _HERE = Path(__file__).resolve().parent
 
 
@@ -36,11 +29,10 @@ def write_report(table: Table, directory: Path, code: str, command: str = "") ->
     sweep = table.sweep
     drawn = []
     for spec in sweep.figures:
-        with style():
-            figure = _DRAW[spec["kind"]](table, spec)
+        figure = draw(table, spec)
         drawn.append((save(figure, directory / "figures", spec["name"]), str(spec.get("caption", "")).strip()))
     title = html.escape(sweep.title)
-    parts = [
+    sections = [
         f"<h1>{title}</h1>",
         f"<p class=lead>{html.escape(sweep.text)}</p>" if sweep.text else "",
         _facts(table, code, command),
@@ -56,7 +48,7 @@ def write_report(table: Table, directory: Path, code: str, command: str = "") ->
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f'<meta name="color-scheme" content="light dark"><style>\n{css}</style></head>\n'
-        f"<body><main>\n{chr(10).join(part for part in parts if part)}\n</main></body></html>\n"
+        f"<body><main>\n{chr(10).join(part for part in sections if part)}\n</main></body></html>\n"
     )
     path = directory / "report.html"
     write_whole(path, page)
@@ -110,9 +102,9 @@ def _groups(table: Table) -> str:
         if not group.rows:
             continue
         cells = [f"<td class=label>{html.escape(str(group.labels[axis]))}</td>" for axis in table.sweep.axes]
-        cells.append(f"<td class={'bad' if group.crashed.count else 'good'}>{share_text(group.crashed)}</td>")
+        cells.append(f"<td class={'bad' if group.crashed.count else 'good'}>{_small(parts(group, CRASHED))}</td>")
         cells += [f"<td>{group.timed_out or ''}</td>", f"<td>{group.failed or ''}</td>"]
-        cells += [f"<td>{mean_text(group.mean(name), MEASURES[name].digits)}</td>" for name in measures]
+        cells += [f"<td>{_small(parts(group, name))}</td>" for name in measures]
         cells.append(f"<td>{_counted(group)}</td>")
         rows.append(f"<tr>{''.join(cells)}</tr>")
     content = f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
@@ -123,18 +115,10 @@ def _counted(group: Group) -> str:
     return f"{group.mean('min_distance_m').count}/{len(group.rows)}"
 
 
-def share_text(share: Share) -> str:
-    """k/n with its interval in percent."""
-    if not share.total:
-        return "–"
-    return f"{share} <small>{100 * share.low:.0f}–{100 * share.high:.0f} %</small>"
-
-
-def mean_text(mean: Mean, digits: int) -> str:
-    """A mean with its interval."""
-    if not mean.count:
-        return "–"
-    return f"{mean.value:.{digits}f} <small>{mean.low:.{digits}f}–{mean.high:.{digits}f}</small>"
+def _small(shown: tuple[str, str]) -> str:
+    """A value, with its interval in small print."""
+    value, interval = shown
+    return f"{value} <small>{interval}</small>" if interval else value
 
 
 def _left_out(table: Table) -> str:
