@@ -28,7 +28,7 @@ from dtsa_agent.ros.common.wire.covariances import POSE_COVARIANCE, TWIST_COVARI
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_agent.ros.common.wire.slot_fields import SlotFields, read_slot
 from dtsa_agent.ros.common.wire.stamps import time_of
-from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, transmission_layout
+from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, pack_transmission
 
 from .membership import Membership
 
@@ -76,7 +76,6 @@ class SwarmNode:
 
     def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
         self._agent_ids = array("H", self.swarm.ids)
-        self._layout = transmission_layout(len(self.swarm.ids), self.config.steps)
         self._bytes = b""  # the last answer
         self._publisher = self.node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
 
@@ -248,7 +247,7 @@ class SwarmNode:
             goal=goal if goal != self._goal else b"",
         )
         self._goal = goal
-        self._bytes = self._layout.pack(fields)
+        self._bytes = pack_transmission(fields, self.config.steps)
         self._publisher.publish(self._bytes)
 
     def _publish_odometry(self, stamp: Time) -> None:

@@ -18,7 +18,7 @@ from dtsa_agent.ros.common.wire import report_fields
 from dtsa_agent.ros.common.wire.report_fields import ReportFields, pack_report, read_report
 from dtsa_agent.ros.common.wire.slot_fields import SlotFields, _fields, _read_usual, read_slot
 from dtsa_agent.ros.common.wire.stamps import header_of, ns_of
-from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, read_transmission, transmission_layout
+from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, pack_transmission, read_transmission
 
 MOST, STEPS = 12, 2
 numbers = st.floats(allow_nan=False)
@@ -108,10 +108,10 @@ def damaged(data: bytes, cut: int, at: int, value: int) -> bytes:
 @given(transmissions())
 def test_transmissions(message: Transmission) -> None:
     told = fields_of(message)
-    assert read_transmission(bytes(serialize_message(message)), MOST, STEPS) == told
-    packed = transmission_layout(len(message.agent), STEPS).pack(told)
+    assert read_transmission(bytes(serialize_message(message)), STEPS) == told
+    packed = pack_transmission(told, STEPS)
     assert deserialize_message(packed, Transmission) == message
-    assert read_transmission(packed, MOST, STEPS) == told
+    assert read_transmission(packed, STEPS) == told
 
 
 @given(reports())
@@ -147,7 +147,7 @@ def test_what_is_damaged_says_what_it_says_by_rclpy_or_is_left_to_it(
         found = _read_usual(data)
         assert found is None or found == _fields(deserialize_message(data, Slot))
     else:
-        found = read_transmission(data, MOST, STEPS)
+        found = read_transmission(data, STEPS)
         assert found is None or found == fields_of(deserialize_message(data, Transmission))
 
 
@@ -157,6 +157,6 @@ def test_what_is_laid_out_in_another_way_is_left_to_rclpy() -> None:
     data = bytes(serialize_message(message))
     assert _read_usual(data) is None
     assert read_slot(data) == _fields(message)
-    assert read_transmission(data, MOST, STEPS) is None
+    assert read_transmission(data, STEPS) is None
     with pytest.raises(Exception, match="deserialize"):
         read_slot(data[:30])

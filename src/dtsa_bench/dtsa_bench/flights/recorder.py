@@ -10,8 +10,9 @@ from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
 from dtsa_agent.ros.common.wire.report_fields import ReportFields
-from dtsa_bench.recordings.bag.cdr import HEADER, SECOND, CdrBuilder, OdometryPacker
+from dtsa_bench.recordings.bag.cdr import CdrBuilder, OdometryPacker
 from dtsa_bench.recordings.bag.metadata import RUN_ID
 from dtsa_bench.recordings.bag.writer import BagWriter
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
@@ -194,4 +195,4 @@ def _parameter_event(time_ns: int, node: str, change: Change) -> bytes:
         message.text(value if isinstance(value, str) else "")
         message.number("I", 0, 0, 0, 0, 0)  # the five kinds of arrays
     message.number("I", 0)  # deleted_parameters
-    return HEADER + bytes(message.data)
+    return REPRESENTATION + bytes(message.data)

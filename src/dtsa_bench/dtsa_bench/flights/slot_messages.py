@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass
 from functools import lru_cache
-from struct import Struct
 
 import numpy as np
 from dtsa_msgs.msg import Transmission
@@ -15,39 +13,27 @@ from std_msgs.msg import Header
 
 from dtsa_agent.core import REASONS, Scenario
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.cdr import FRAME, REPRESENTATION, Layout
+from dtsa_agent.ros.common.wire.cdr import Message
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_agent.ros.common.wire.stamps import header_of
-from dtsa_bench.recordings.bag.cdr import COLLIDED, QUIET, SECOND, SENDING, WAITING, MarkerPacker
+from dtsa_bench.recordings.bag.cdr import COLLIDED, QUIET, SENDING, WAITING, MarkerPacker
 from dtsa_channel_sim.model.verdict import COLLISION, Verdict
 from dtsa_channel_sim.ros.answers import Answers
 
 _KNOWN = 256  # combinations of reasons whose texts are kept
-
-
-@dataclass(frozen=True, slots=True)
-class _Reasons:
-    """A decision message of agents with certain reasons: its layout, and what is the same in all of them."""
-
-    layout: Struct
-    names: tuple[int | bytes, ...]  # number of names, then length and text of each
-    index: bytes
+_RECEPTION = Message({
+    "run": "I", "slot": "I", "outcome": "B", "sender": "*H", "received": "*B", "lost": "*H", "collided": "*H",
+})  # fmt: skip
 
 
 @lru_cache(256)
-def _decision_layout(n: int, sizes: tuple[int, ...]) -> Struct:
-    """Of a decision message of n agents and names of these lengths."""
-    layout = Layout().header().numbers("II").sequence(n, 2).sequence(n, 2).numbers("I")
-    for size in sizes:
-        layout.sequence(size, 1)
-    return layout.sequence(n, 1).sequence(n, 1).sequence(n, 4).sequence(n, 8).struct()
-
-
-@lru_cache(256)
-def _reception_layout(senders: int, width: int) -> Struct:
-    """Of a reception message with this many senders and bytes of receivers for each."""
-    layout = Layout().header().numbers("IIB").sequence(senders, 2).sequence(senders * width, 1)
-    return layout.sequence(senders, 2).sequence(senders, 2).struct()
+def _decision(count: int) -> Message:
+    """Decision messages with this many names of reasons."""
+    texts = dict.fromkeys((f"name {place}" for place in range(count)), "*B")
+    return Message({
+        "run": "I", "slot": "I", "agent": "*H", "chosen": "*H", "names": "I", **texts, "index": "*B", "reason": "*B",
+        "digest": "*I", "score": "*d",
+    })  # fmt: skip
 
 
 class SlotMessages:
@@ -62,7 +48,7 @@ class SlotMessages:
         self._scenario, self._slot_ns, self._run_id = scenario, slot_ns, run_id
         self._agents = scenario.start.shape[1]
         self._ids = array("H", range(1, self._agents + 1)).tobytes()
-        self._reasons: dict[bytes, _Reasons] = {}
+        self._reasons: dict[bytes, tuple[list[bytes], bytes]] = {}
         self._markers = MarkerPacker([f"cf{agent}" for agent in range(1, self._agents + 1)])
 
     def _header(self, slot: int) -> Header:
@@ -100,28 +86,24 @@ class SlotMessages:
         :param slot: the slot.
         :param answers: what the agents answered to it.
         """
-        key, n = answers.reason.tobytes(), self._agents
+        key = answers.reason.tobytes()
         known = self._reasons.get(key)
         if known is None:
             if len(self._reasons) >= _KNOWN:  # in a long flight agents that disagree decide in ever new combinations
                 self._reasons.clear()
             known = self._reasons[key] = self._describe(answers.reason)
-        return known.layout.pack(
-            *self._begin(slot), slot, n, self._ids, n, answers.chosen.tobytes(), *known.names, n, known.index, n, key,
-            n, answers.digest.tobytes(), n, answers.score.tobytes(),
-        )  # fmt: skip
+        texts, index = known
+        return _decision(len(texts)).pack(names.slot_time_ns(slot, self._slot_ns), (
+            self._run_id, slot, self._ids, answers.chosen.tobytes(), len(texts), *texts, index, key,
+            answers.digest.tobytes(), answers.score.tobytes(),
+        ))  # fmt: skip
 
-    def _begin(self, slot: int) -> tuple[bytes | int, ...]:
-        """What stands before all else in a message about the start of a slot, and the run's id."""
-        seconds, ns = divmod(names.slot_time_ns(slot, self._slot_ns), SECOND)
-        return REPRESENTATION, seconds, ns, *FRAME, self._run_id
-
-    def _describe(self, reason: NDArray[np.uint8]) -> _Reasons:
-        n, used = self._agents, np.unique(reason)
+    @staticmethod
+    def _describe(reason: NDArray[np.uint8]) -> tuple[list[bytes], bytes]:
+        """The names of the reasons that agents have, and which of them each has."""
+        used = np.unique(reason)
         texts = [(REASONS[code] if code < len(REASONS) else str(code)).encode() + b"\0" for code in used]
-        layout = _decision_layout(n, tuple(len(text) for text in texts))
-        told = (item for text in texts for item in (len(text), text))
-        return _Reasons(layout, (len(texts), *told), np.searchsorted(used, reason).astype(np.uint8).tobytes())
+        return texts, np.searchsorted(used, reason).astype(np.uint8).tobytes()
 
     def reception(self, slot: int, verdict: Verdict) -> bytes:
         """A dtsa_msgs/Reception as CDR.
@@ -129,17 +111,14 @@ class SlotMessages:
         :param slot: the slot.
         :param verdict: the channel's verdict on it.
         """
-        count, width = len(verdict.senders), (self._agents + 7) // 8
-        nothing = (0,) * count
-        received = pack_received(verdict.mask(self._agents)) if count else b""
+        nothing = (0,) * len(verdict.senders)
+        received = pack_received(verdict.mask(self._agents)) if verdict.senders else b""
         sent, lost, collided = (
             array("H", numbers).tobytes()
             for numbers in (verdict.senders, verdict.lost or nothing, verdict.collided or nothing)
         )
-        return _reception_layout(count, width).pack(
-            *self._begin(slot + 1), slot, verdict.outcome,
-            count, sent, count * width, received, count, lost, count, collided,
-        )  # fmt: skip
+        time_ns = names.slot_time_ns(slot + 1, self._slot_ns)
+        return _RECEPTION.pack(time_ns, (self._run_id, slot, verdict.outcome, sent, received, lost, collided))
 
     def markers(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
         """A visualization_msgs/MarkerArray as CDR: the swarm at the start of a slot.

@@ -145,7 +145,7 @@ class LockstepChannel(RosChannel):
 
         :raises Unusable: if it is none.
         """
-        message = read_transmission(data, self.agents, self.answers.steps)
+        message = read_transmission(data, self.answers.steps)
         try:
             if message is None:
                 message = deserialize_message(data, Transmission)

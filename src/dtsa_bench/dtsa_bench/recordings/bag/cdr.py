@@ -13,13 +13,12 @@ from itertools import repeat
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
 from dtsa_agent.ros.common.wire.covariances import POSE_COVARIANCE, TWIST_COVARIANCE
 from dtsa_bench.drawing import palette
 
-HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian
 STAMP = struct.Struct("<iI")
 _VECTOR = struct.Struct("<3d")
-SECOND = 1_000_000_000
 
 # visualization_msgs/Marker
 SPHERE, CYLINDER, TEXT = 2, 3, 9
@@ -83,7 +82,7 @@ class OdometryPacker:
             position = message.number("d", *repeat(0.0, 3))
             message.number("d", 0.0, 0.0, 0.0, 1.0, *POSE_COVARIANCE)
             twist = message.number("d", *repeat(0.0, 6), *TWIST_COVARIANCE)
-            self._templates.append((bytearray(HEADER + message.data), position + 4, twist + 4))
+            self._templates.append((bytearray(REPRESENTATION + message.data), position + 4, twist + 4))
 
     def pack(self, stamp_ns: int, position: NDArray[np.float64], velocity: NDArray[np.float64]) -> list[bytes]:
         """One message a body.
@@ -145,7 +144,7 @@ class MarkerPacker:
                 stamps.append(stamp)
                 places.append(place)
                 colours.append(colour)
-        self._data = bytearray(HEADER + message.data)
+        self._data = bytearray(REPRESENTATION + message.data)
         body = memoryview(self._data)[4:]
         whole = len(body) // 8 * 8
         self._f8 = np.frombuffer(body[:whole], "<f8")
@@ -194,7 +193,7 @@ class MarkerPacker:
         message = CdrBuilder()
         message.number("I", 1)
         cls._add(message, 0, 0, "", 1.0, frame, DELETE_ALL)
-        return HEADER + bytes(message.data)
+        return REPRESENTATION + bytes(message.data)
 
     @staticmethod
     def _add(

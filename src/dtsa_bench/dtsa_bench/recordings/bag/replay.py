@@ -18,9 +18,10 @@ from importlib import import_module
 from typing import Any, Protocol
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.ros.common.wire.cdr import REPRESENTATION, SECOND
 
 from . import qos, schema
-from .cdr import HEADER, SECOND, STAMP, CdrBuilder
+from .cdr import STAMP, CdrBuilder
 from .errors import BagError
 from .reader import Bag, Message, Topic
 
@@ -269,7 +270,7 @@ class RosOutput:
     def clock(self, time_ns: int) -> None:
         """Publish `/clock`."""
         STAMP.pack_into(self._time.data, 0, *divmod(time_ns, SECOND))
-        self._clock.publish(HEADER + bytes(self._time.data))
+        self._clock.publish(REPRESENTATION + bytes(self._time.data))
 
 
 def ros_profile(profiles: Collection[qos.Profile]) -> Any:

@@ -17,9 +17,10 @@ from dtsa_agent.air.datagram import HEADER
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core import REASONS
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.wire.cdr import SECOND
 from dtsa_agent.ros.common.wire.packing import pack_received
 from dtsa_bench.recordings.bag import schema
-from dtsa_bench.recordings.bag.cdr import COLLIDED, SECOND, SENDING, WAITING, MarkerPacker, OdometryPacker
+from dtsa_bench.recordings.bag.cdr import COLLIDED, SENDING, WAITING, MarkerPacker, OdometryPacker
 from dtsa_bench.recordings.bag.errors import BagError
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 

@@ -1,4 +1,4 @@
-"""Layouts of messages as plain CDR, little endian, for what is written and read in every slot.
+"""Messages as plain CDR, little endian, for what is written and read in every slot.
 
 rclpy makes an object of every field of a message, one by one, which takes longer than all else that an agent does in a
 slot. A struct packs and unpacks all fields of a message at once.
@@ -7,83 +7,116 @@ slot. A struct packs and unpacks all fields of a message at once.
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from operator import itemgetter
+from typing import Any
 
 REPRESENTATION = b"\x00\x01\x00\x00"  # stands before each body: plain CDR, little endian
 FRAME = (4, b"map\0")  # frame_id of a header: length and text
-
-
-class Layout:
-    """Collects fields that lie one after the other, for a struct.
-
-    :param start: bytes from the start of the message's body to the first field, or the same modulo 8.
-    """
-
-    def __init__(self, start: int = 0) -> None:
-        self.end = start
-        self._format = "<"
-
-    def header(self) -> Layout:
-        """Adds what stands before a body, and a ``std_msgs/Header`` in frame ``map``: five values."""
-        self._format += "4s"
-        self.numbers("iII")
-        self._format += "4s"
-        self.end += 4
-        return self
-
-    def numbers(self, codes: str) -> Layout:
-        """Adds numbers.
-
-        :param codes: one letter each, as in :mod:`struct`.
-        """
-        for code in codes:
-            self._align(struct.calcsize(f"<{code}"))
-            self._format += code
-            self.end += struct.calcsize(f"<{code}")
-        return self
-
-    def elements(self, count: int, size: int) -> Layout:
-        """Adds the elements of a sequence, as bytes.
-
-        :param count: number of elements.
-        :param size: bytes of each.
-        """
-        if count:
-            self._align(size)
-        self._format += f"{count * size}s"
-        self.end += count * size
-        return self
-
-    def sequence(self, count: int, size: int) -> Layout:
-        """Adds the number of elements of a sequence, and the elements as :meth:`elements` does.
-
-        :param count: number of elements.
-        :param size: bytes of an element.
-        """
-        return self.numbers("I").elements(count, size)
-
-    def struct(self) -> struct.Struct:
-        """All these fields."""
-        return struct.Struct(self._format)
-
-    def _align(self, size: int) -> None:
-        gap = -self.end % size
-        self._format += "x" * gap
-        self.end += gap
-
-
-def sequence_at(data: bytes, at: int) -> tuple[bytes, int]:
-    """Elements of one byte each, and where the number of elements of the next sequence lies.
-
-    :param data: the message.
-    :param at: where the number of elements lies.
-    :raises struct.error: if the message ends before.
-    """
-    (count,) = _COUNT.unpack_from(data, at)
-    begin = at + _COUNT.size
-    end = begin + count
-    if end > len(data):
-        raise struct.error("a sequence that ends beyond its message")
-    return data[begin:end], end + -end % 4
-
-
+SECOND = 1_000_000_000  # ns
+_HEADER = 16  # bytes of a header in that frame
 _COUNT = struct.Struct("<I")
+_MOST_KEPT = 512  # layouts of messages of a kind
+
+
+class Message:
+    """Messages of numbers and of sequences of numbers, behind a header in frame ``map``.
+
+    Sequences are packed and read as the bytes of their elements. Messages whose sequences have the same lengths share
+    a struct; which one a message needs is known by its length, as a rule.
+
+    :param fields: by name, in the message's order: a letter as in :mod:`struct`, with ``*`` before that of a sequence.
+        There are two sequences or more.
+    """
+
+    def __init__(self, fields: Mapping[str, str]) -> None:
+        self.fields = tuple(fields)
+        self._codes = tuple(fields.values())
+        #: As arrays have it, by field.
+        self.kinds = tuple(f"<{code[-1]}" for code in self._codes)
+        self._sizes = tuple(struct.calcsize(kind) for kind in self.kinds)
+        sequences = [at for at, code in enumerate(self._codes) if code[0] == "*"]
+        self._sequences_of = itemgetter(*sequences)
+        # A header is five of a struct's values, a number one, a sequence two: number of elements, and these.
+        values = [5 + at + sum(before <= at for before in sequences) for at in range(len(self._codes))]
+        counts = [values[at] - 1 for at in sequences]
+        self._values_of, self._fixed_of = itemgetter(1, 2, *values), itemgetter(0, 3, 4, *counts)
+        told = [0, 1, 2, 3, 4, *values, *counts]
+        self._in_order = itemgetter(*(told.index(place) for place in range(len(told))))
+        self._layout = lru_cache(_MOST_KEPT)(self._make_layout)
+        self._known: dict[int, tuple[struct.Struct, tuple[Any, ...]]] = {}  # by the message's length
+
+    def _make_layout(self, lengths: Sequence[int]) -> tuple[struct.Struct, tuple[int, ...]]:
+        """A struct, and how many elements the sequences have.
+
+        :param lengths: bytes of each sequence.
+        """
+        layout, end, left, counts = "<4siII4s", _HEADER, iter(lengths), []
+        for code, size in zip(self._codes, self._sizes, strict=True):
+            if code[0] == "*":
+                length = next(left)
+                counts.append(length // size)
+                count = _gap(end, _COUNT.size) + "I"
+                end += struct.calcsize(f"<{count}")
+                elements = (_gap(end, size) if length else "") + f"{length}s"
+            else:
+                count, elements = "", _gap(end, size) + code
+            end += struct.calcsize(f"<{elements}")
+            layout += count + elements
+        return struct.Struct(layout), tuple(counts)
+
+    def pack(self, time_ns: int, values: Sequence[Any]) -> bytes:
+        """The message as CDR.
+
+        :param time_ns: ns, the header's stamp.
+        :param values: of the fields, in their order: numbers, and bytes of sequences.
+        """
+        layout, counts = self._layout(tuple([len(value) for value in self._sequences_of(values)]))
+        told = REPRESENTATION, *divmod(time_ns, SECOND), *FRAME, *values, *counts
+        return layout.pack(*self._in_order(told))
+
+    def read(self, data: bytes) -> tuple[Any, ...] | None:
+        """Seconds and ns of the header's stamp, and the values of the fields as :meth:`pack` takes them.
+
+        :param data: the message as CDR.
+        :returns: None if it is no message that is laid out like this.
+        """
+        known = self._known.get(len(data))
+        if known is not None:
+            found = known[0].unpack_from(data)
+            if self._fixed_of(found) == known[1]:
+                return self._values_of(found)
+        lengths = self._lengths(data)
+        if lengths is None:
+            return None
+        layout, counts = self._layout(lengths)
+        found, fixed = layout.unpack_from(data), (REPRESENTATION, *FRAME, *counts)
+        if self._fixed_of(found) != fixed:
+            return None
+        if len(self._known) >= _MOST_KEPT:
+            self._known.clear()
+        self._known[len(data)] = layout, fixed
+        return self._values_of(found)
+
+    def _lengths(self, data: bytes) -> tuple[int, ...] | None:
+        """Bytes of the sequences of a message; None if it ends before they do. rclpy leaves bytes behind them."""
+        body, at, lengths = memoryview(data)[len(REPRESENTATION) :], _HEADER, []
+        try:
+            for code, size in zip(self._codes, self._sizes, strict=True):
+                if code[0] == "*":
+                    at += -at % _COUNT.size
+                    (count,) = _COUNT.unpack_from(body, at)
+                    lengths.append(count * size)
+                    at += _COUNT.size
+                    at += (-at % size if count else 0) + count * size
+                else:
+                    at += -at % size + size
+        except struct.error:
+            return None
+        return tuple(lengths) if at <= len(body) else None
+
+
+def _gap(end: int, size: int) -> str:
+    """What stands in a struct between the end of a field and one that is aligned to its size."""
+    return "x" * (-end % size)

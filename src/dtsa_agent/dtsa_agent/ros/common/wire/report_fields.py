@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import struct
 from array import array
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,21 +11,14 @@ from dtsa_msgs.msg import Report
 from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 
-from .cdr import FRAME, REPRESENTATION
-from .stamps import SECOND, ns_of
+from .cdr import SECOND, Message
+from .stamps import ns_of
 
-_HEAD = struct.Struct("<4siII4sI")  # representation, header in frame map, run
-_COUNT = struct.Struct("<I")
-_BODY = len(REPRESENTATION)  # alignment counts from here
-_BEFORE = {  # the sequences before and behind the number of control instants, in the message's order
-    "agent": np.uint16, "slot": np.uint32, "offset_ns": np.int64, "length": np.uint8, "chosen": np.uint16,
-    "reason": np.uint8, "digest": np.uint32, "score": np.float64,
-}  # fmt: skip
-_BEHIND = {
-    "track": np.float64, "velocity": np.float64, "command": np.float64, "goal": np.float64, "heard_sender": np.uint16,
-    "heard_slot": np.uint32, "heard_in": np.uint32, "heard_ns": np.int64, "heard_by": np.uint8,
-}  # fmt: skip
-_SIZE = {name: np.dtype(kind).itemsize for name, kind in (_BEFORE | _BEHIND).items()}
+_REPORT = Message({
+    "run": "I", "agent": "*H", "slot": "*I", "offset_ns": "*q", "length": "*B", "chosen": "*H", "reason": "*B",
+    "digest": "*I", "score": "*d", "steps": "B", "track": "*d", "velocity": "*d", "command": "*d", "goal": "*d",
+    "heard_sender": "*H", "heard_slot": "*I", "heard_in": "*I", "heard_ns": "*q", "heard_by": "*B",
+})  # fmt: skip
 
 
 class ReportFields(NamedTuple):
@@ -62,19 +54,8 @@ def pack_report(time_ns: int, run: int, steps: int, sequences: Mapping[str, byte
     :param steps: control instants in a slot.
     :param sequences: the other fields, as their elements' bytes.
     """
-    data = bytearray(_HEAD.pack(REPRESENTATION, *divmod(time_ns, SECOND), *FRAME, run))
-    for name in _BEFORE:
-        _append(data, sequences[name], _SIZE[name])
-    data.append(steps)
-    for name in _BEHIND:
-        _append(data, sequences[name], _SIZE[name])
-    return bytes(data)
-
-
-def _append(data: bytearray, elements: bytes, size: int) -> None:
-    data += bytes(-(len(data) - _BODY) % _COUNT.size) + _COUNT.pack(len(elements) // size)
-    if elements:
-        data += bytes(-(len(data) - _BODY) % size) + elements
+    told = {**sequences, "run": run, "steps": steps}
+    return _REPORT.pack(time_ns, [told[name] for name in _REPORT.fields])
 
 
 def read_report(data: bytes) -> ReportFields:
@@ -88,36 +69,22 @@ def read_report(data: bytes) -> ReportFields:
 
 
 def _fields(message: Report) -> ReportFields:
-    kinds = {name: kind for name, kind in (_BEFORE | _BEHIND).items() if name != "agent"}
-    arrays = {name: np.frombuffer(getattr(message, name), kind) for name, kind in kinds.items()}
-    return ReportFields(ns_of(message.header.stamp), message.run, message.agent, steps=message.steps, **arrays)
+    told = (getattr(message, name) for name in _REPORT.fields)
+    return _made(ns_of(message.header.stamp), told)
 
 
 def _read_usual(data: bytes) -> ReportFields | None:
     """What a message says; None if it is not laid out as agents write it."""
-    found: dict[str, Any] = {}
-    try:
-        representation, seconds, ns, length, frame, run = _HEAD.unpack_from(data)
-        at = _read(data, _HEAD.size, _BEFORE, found)
-        steps = data[at]
-        at = _read(data, at + 1, _BEHIND, found)
-    except (struct.error, ValueError, IndexError):
+    found = _REPORT.read(data)
+    if found is None:
         return None
-    if (representation, length, frame) != (REPRESENTATION, *FRAME) or not at <= len(data) <= at + _BODY:
-        return None
-    found["agent"] = array("H", found["agent"].tobytes())
-    return ReportFields(seconds * SECOND + ns, run, steps=steps, **found)
+    seconds, ns, *told = found
+    return _made(seconds * SECOND + ns, told)
 
 
-def _read(data: bytes, at: int, kinds: Mapping[str, Any], found: dict[str, Any]) -> int:
-    """Reads sequences from a place on, and says where they end."""
-    for name, kind in kinds.items():
-        at += -(at - _BODY) % _COUNT.size
-        (count,) = _COUNT.unpack_from(data, at)
-        at += _COUNT.size
-        size = _SIZE[name]
-        if count:
-            at += -(at - _BODY) % size
-        found[name] = np.frombuffer(data, kind, count, at) if count else np.zeros(0, kind)
-        at += count * size
-    return at
+def _made(time_ns: int, told: Iterable[Any]) -> ReportFields:
+    """Fields in the message's order as a tuple, sequences as arrays."""
+    run, agent, *rest = told
+    arrays = (value if isinstance(value, int) else np.frombuffer(value, kind)
+              for value, kind in zip(rest, _REPORT.kinds[2:], strict=True))  # fmt: skip
+    return ReportFields(time_ns, run, array("H", bytes(agent)), *arrays)

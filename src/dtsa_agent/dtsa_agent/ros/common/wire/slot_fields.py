@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import struct
 from array import array
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 from dtsa_msgs.msg import Slot
 from rclpy.serialization import deserialize_message
 
-from .cdr import FRAME, REPRESENTATION, Layout, sequence_at
-from .stamps import SECOND, ns_of
+from .cdr import SECOND, Message
+from .stamps import ns_of
 
-_MOST = 254  # senders of a message that a struct reads
-_head = Layout().header().numbers("IIBII")
-_HEAD, _HEAD_END = _head.struct(), _head.end
+_SLOT = Message({
+    "run": "I", "slot": "I", "phase": "B", "heard_slot": "I",
+    "sender": "*H", "length": "*B", "data": "*B", "received": "*B",
+})  # fmt: skip
 
 
 class SlotFields(NamedTuple):
@@ -44,26 +43,13 @@ def read_slot(data: bytes) -> SlotFields:
 
 def _read_usual(data: bytes) -> SlotFields | None:
     """Reads a message that is laid out as channels write it; None: it is not."""
-    try:
-        representation, seconds, ns, *frame, run, slot, phase, heard_slot, count = _HEAD.unpack_from(data)
-        if representation != REPRESENTATION or tuple(frame) != FRAME or count > _MOST:
-            return None
-        senders = _senders(count)
-        sender, lengths, length = senders.unpack_from(data, _HEAD.size)
-        end = _HEAD.size + senders.size
-        frames, at = sequence_at(data, end + -end % 4)
-        received, _ = sequence_at(data, at)
-    except struct.error:
+    found = _SLOT.read(data)
+    if found is None:
         return None
-    if lengths != count:
+    seconds, ns, run, slot, phase, heard_slot, sender, length, frames, received = found
+    if len(sender) != 2 * len(length):
         return None
     return SlotFields(seconds * SECOND + ns, run, slot, phase, heard_slot, array("H", sender), length, frames, received)
-
-
-@lru_cache(_MOST + 1)
-def _senders(count: int) -> struct.Struct:
-    """Senders and lengths of frames."""
-    return Layout(_HEAD_END).elements(count, 2).sequence(count, 1).struct()
 
 
 def _fields(message: Slot) -> SlotFields:

@@ -7,7 +7,7 @@ from std_msgs.msg import Header
 
 from dtsa_agent.ros.common.graph import names
 
-SECOND = 1_000_000_000  # ns
+from .cdr import SECOND
 
 
 def time_of(time_ns: int) -> Time:
