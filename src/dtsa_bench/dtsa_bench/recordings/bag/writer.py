@@ -25,11 +25,10 @@ from dtsa_bench import __version__
 from dtsa_bench.runs.program import program
 
 from . import metadata, schema
-from .chunk_builder import write_quickly
-from .chunk_indexes import keep_small
 from .digest import KEY, BagDigest
 from .errors import BagError
 from .qos import Profile, dump, resolve
+from .workarounds import keep_small, write_quickly
 
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 from mcap.writer import CompressionType, Writer
 
 from dtsa_bench import __version__
-from dtsa_bench.recordings.bag.chunk_indexes import keep_small
 from dtsa_bench.recordings.bag.errors import BagError
+from dtsa_bench.recordings.bag.workarounds import keep_small
 
 _FLUSH_S = 0.5
 _CHUNK = 1 << 18  # bytes
