@@ -20,7 +20,8 @@ from dtsa_agent.core import REASONS
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASON_TEXTS
 from dtsa_bench.commands.cli import main
-from dtsa_bench.pages.report.data import pair_distances, run_data
+from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.pages.report.distances import pair_distances
 from dtsa_bench.pages.report.page import render, write_report
 from dtsa_bench.recordings.bag.errors import UnusableBag
 from dtsa_bench.recordings.bag.reader import Bag

@@ -13,7 +13,7 @@ import numpy as np
 from dtsa_bench.drawing.palette import AGENT_COLOURS, agent_colour, ink_on
 from dtsa_bench.drawing.top_view import half_width, top_view
 from dtsa_bench.experiments.batch.table import write_whole
-from dtsa_bench.pages.report.data import pack
+from dtsa_bench.pages.report.json_values import pack
 from dtsa_bench.pages.report.page import NOTE, PALETTE, asset, filled, whole_page
 
 from .flown import Flights, Flown, compared_s, of_step

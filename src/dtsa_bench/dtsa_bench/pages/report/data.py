@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,33 +11,20 @@ from numpy.typing import NDArray
 from dtsa_agent.core import Scenario
 from dtsa_bench.recordings.bag.metadata import RECOVERED_FROM
 from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.run import OUTCOMES, RecordedRun, load_run, swarm_section
+from dtsa_bench.recordings.bag.run import OUTCOMES, RecordedRun, load_run
 from dtsa_bench.recordings.tables.ages import follow_run
 from dtsa_bench.recordings.tables.followed import Ages
 from dtsa_bench.runs.hearing import recorded_problem, sentence
 
-BINS = 400  # steps of the charts over time
+from .distances import Distances, collision_m, crashes_of, distance_charts, pair_distances
+from .json_values import BINS, flatten, pack, reduce_bins, thin
+from .mission import mission_data
+
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
 SCENE_VALUES = 600_000  # most numbers in the replay: longer runs of larger swarms get fewer frames
-CRASHES = 50  # most that are shown
-PAIRS = 5  # closest pairs whose distance is drawn
-MISSION_VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
-MISSION_EVENTS = 1000  # most that are shown
 UNKNOWN = -32768  # in the replay: nobody knows where it was
-BLOCK = 512  # moments whose pair distances are computed at once
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Distances:
-    """Distances of all pairs of agents over time."""
-
-    time_s: Array  # (T,)
-    least: Array  # (T,) m, of all pairs
-    pairs: list[tuple[int, int]]  # ids, the closest first
-    series: list[Array]  # (T,) m, one a pair
-    crashes: list[tuple[int, int, int]]  # ids, and the first moment at which they were too close: index of time_s
 
 
 def run_data(path: str | Path) -> dict[str, Any]:
@@ -56,7 +38,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         version = bag.custom_data.get("version", "")
         recovered, file = RECOVERED_FROM in bag.custom_data, bag.path
     notes = ["This bag was recovered: its recorder was killed or its file was damaged."] if recovered else []
-    distances = pair_distances(run, _collision_m(run))
+    distances = pair_distances(run, collision_m(run))
     followed = follow_run(run)
     scenario, ages = followed.scenario, followed.ages
     notes += followed.notes
@@ -75,7 +57,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "notes": notes,
         "config": flatten(run.config),
         "agents": run.agents,
-        "crashes": _crashes(distances, run, summary),
+        "crashes": crashes_of(distances, run, summary),
         "moving": scenario.moving.tolist() if scenario else [True] * run.agents,
         "slot_s": run.slot_ns / 1e9,
         "duration_s": _duration_s(run),
@@ -85,116 +67,10 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "channel": _channel(run),
         "decisions": _reasons(run),
         "sent_for": _sent_for(run),
-        "distances": _distances(distances, run),
+        "distances": distance_charts(distances, run),
         "ages": _ages(ages, run),
         "table": _table(run, ages, distances, scenario),
     }
-
-
-def mission_data(path: str | Path) -> dict[str, Any] | None:
-    """What `mission.json` beside a bag says of a mission with Crazyflies; None: there is none.
-
-    :param path: run directory, bag directory or .mcap file.
-    """
-    place = Path(path)
-    for directory in (place, place.parent, place.parent.parent):
-        file = directory / "mission.json"
-        if (directory == place or directory / "bag" in (place, place.parent)) and file.is_file():
-            break
-    else:
-        return None
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        vehicles = [
-            [
-                str(name),
-                *(values.get(key) for key in MISSION_VALUES),
-                " → ".join(str(s["state"]) for s in values["states"]),
-            ]
-            for name, values in found["vehicles"].items()
-        ]
-        events = [[float(e["t_s"]), str(e["level"]), str(e["text"])] for e in found["events"]]
-        return {"cut_short": str(found["cut_short"]), "vehicles": vehicles, "events": events[:MISSION_EVENTS]}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
-
-
-def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:
-    """Settings as rows of section, name and value."""
-    rows: list[list[Any]] = []
-    for name, value in config.items():
-        if isinstance(value, Mapping) and not section:
-            rows.extend(flatten(value, str(name)))
-        else:
-            rows.append([section, str(name), value])
-    return rows
-
-
-def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | None:
-    """Distances at the recorded moments; None with fewer than two agents.
-
-    :param run: the run.
-    :param collision_m: m, below which two have crashed.
-    """
-    motion = run.motion
-    count = len(motion.ids)
-    if count < 2 or not len(motion.time_ns):
-        return None
-    first, second = np.triu_indices(count, 1)
-    least = np.empty(len(motion.time_ns))
-    closest = np.full(len(first), np.inf)
-    touched = np.full(len(first), -1)
-    for start in range(0, len(least), BLOCK):
-        place = motion.position[start : start + BLOCK]
-        apart = np.sqrt(((place[:, :, first] - place[:, :, second]) ** 2).sum(axis=1))
-        apart[np.isnan(apart)] = np.inf
-        least[start : start + BLOCK] = apart.min(axis=1)
-        np.minimum(closest, apart.min(axis=0), out=closest)
-        near = apart < collision_m
-        new = near.any(axis=0) & (touched < 0)
-        touched[new] = start + near[:, new].argmax(axis=0)
-    chosen = [k for k in np.argsort(closest, kind="stable")[:PAIRS] if math.isfinite(closest[k])]
-    series = []
-    for k in chosen:
-        gap = motion.position[:, :, first[k]] - motion.position[:, :, second[k]]
-        series.append(np.sqrt((gap**2).sum(axis=1)))
-    pairs = [(int(motion.ids[first[k]]), int(motion.ids[second[k]])) for k in chosen]
-    ids = motion.ids
-    crashes = [(int(ids[first[k]]), int(ids[second[k]]), int(touched[k])) for k in np.flatnonzero(touched >= 0)]
-    crashes.sort(key=lambda crash: crash[2])
-    return Distances((motion.time_ns - run.start_ns) / 1e9, least, pairs, series, crashes)
-
-
-def _collision_m(run: RecordedRun) -> float:
-    """Below this distance two agents have crashed, m."""
-    limits = run.config.get("limits", {})
-    return float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2
-
-
-def _crashes(distances: Distances | None, run: RecordedRun, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Who crashed, when and where; the first ones if there are many."""
-    if distances is None:
-        return []
-    found = list(distances.crashes)
-    pair = tuple(summary.get("collided_pair") or ())
-    motion = run.motion
-    places = {int(number): place for place, number in enumerate(motion.ids)}
-    if not found and len(pair) == 2 and set(pair) <= places.keys():
-        # They crashed within a slot, and only its ends were recorded.
-        gap = motion.position[:, :, places[pair[0]]] - motion.position[:, :, places[pair[1]]]
-        found = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
-    crashes = []
-    for one, other, moment in found[:CRASHES]:
-        a, b = (motion.position[moment, :, places[number]] for number in (one, other))
-        crashes.append(
-            {
-                "ids": [one, other],
-                "time_s": round(float(distances.time_s[moment]), 3),
-                "place": thin((a + b) / 2, 3),
-                "distance_m": round(float(np.linalg.norm(a - b)), 4),
-            }
-        )
-    return crashes
 
 
 def _duration_s(run: RecordedRun) -> float:
@@ -329,26 +205,6 @@ def _reasons(run: RecordedRun) -> dict[str, Any] | None:
     }
 
 
-def _distances(distances: Distances | None, run: RecordedRun) -> dict[str, Any] | None:
-    if distances is None:
-        return None
-    return {
-        "time": thin(reduce_bins(distances.time_s, np.mean)),
-        "least": thin(reduce_bins(distances.least, np.min), 4),
-        "pairs": [
-            {
-                "ids": list(pair),
-                "distance": thin(reduce_bins(series, np.nanmin), 4),
-                "least": round(float(np.nanmin(series)), 4),
-                "time": round(float(distances.time_s[int(np.nanargmin(series))]), 3),
-            }
-            for pair, series in zip(distances.pairs, distances.series, strict=True)
-        ],
-        "collision": _collision_m(run),
-        "r_min": float(swarm_section(run.config).get("r_min", 0.3) or 0.3),
-    }
-
-
 def _ages(ages: Ages | None, run: RecordedRun) -> dict[str, Any] | None:
     if ages is None or not len(ages.slot):
         return None
@@ -415,26 +271,3 @@ def _heard_share(run: RecordedRun, mine: NDArray[np.bool_]) -> float | None:
     if not mine.any() or (run.told is not None and not offered):
         return None
     return round(float(run.frames.received[mine].sum()) / max(1, offered), 4)
-
-
-def reduce_bins(values: NDArray[Any], how: Any) -> Array:
-    """(BINS or fewer,) from (T,): `how` applied to each of the bins; NaN where a bin holds nothing finite."""
-    count = min(BINS, len(values))
-    edges = np.linspace(0, len(values), count + 1).astype(int)
-    result = np.full(count, np.nan)
-    for index in range(count):
-        part = values[edges[index] : edges[index + 1]]
-        part = part[np.isfinite(part)]
-        if len(part):
-            result[index] = how(part)
-    return result
-
-
-def thin(values: NDArray[Any], digits: int = 4) -> list[float | None]:
-    """Rounded numbers for JSON; None for what is not finite."""
-    return [round(float(value), digits) if math.isfinite(value) else None for value in values]
-
-
-def pack(values: NDArray[Any]) -> str:
-    """The bytes of an array, base64, for the page's typed arrays."""
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import REASONS, AbstractSwarm, Scenario
-from dtsa_bench.pages.report.data import flatten, pack
+from dtsa_bench.pages.report.json_values import flatten, pack
 from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim import Change, ChannelConfig
 from dtsa_channel_sim.model.timeline import scheduled_changes

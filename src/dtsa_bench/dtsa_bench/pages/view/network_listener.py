@@ -29,7 +29,7 @@ from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import authenticator
-from dtsa_bench.pages.report.data import pack
+from dtsa_bench.pages.report.json_values import pack
 from dtsa_bench.recordings.rules.judge import Judge
 from dtsa_bench.runs.config import REALTIME, RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS

@@ -1,0 +1,132 @@
+"""How close agents came to each other in a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_bench.recordings.bag.run import RecordedRun, swarm_section
+
+from .json_values import reduce_bins, thin
+
+CRASHES = 50  # most that are shown
+PAIRS = 5  # closest pairs whose distance is drawn
+BLOCK = 512  # moments whose pair distances are computed at once
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Distances:
+    """Distances of all pairs of agents over time."""
+
+    time_s: Array  # (T,)
+    least: Array  # (T,) m, of all pairs
+    pairs: list[tuple[int, int]]  # ids, the closest first
+    series: list[Array]  # (T,) m, one a pair
+    crashes: list[tuple[int, int, int]]  # ids, and the first moment at which they were too close: index of time_s
+
+
+def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | None:
+    """Distances at the recorded moments; None with fewer than two agents.
+
+    :param run: the run.
+    :param collision_m: m, below which two have crashed.
+    """
+    motion = run.motion
+    count = len(motion.ids)
+    if count < 2 or not len(motion.time_ns):
+        return None
+    first, second = np.triu_indices(count, 1)
+    least = np.empty(len(motion.time_ns))
+    closest = np.full(len(first), np.inf)
+    touched = np.full(len(first), -1)
+    for start in range(0, len(least), BLOCK):
+        place = motion.position[start : start + BLOCK]
+        apart = np.sqrt(((place[:, :, first] - place[:, :, second]) ** 2).sum(axis=1))
+        apart[np.isnan(apart)] = np.inf
+        least[start : start + BLOCK] = apart.min(axis=1)
+        np.minimum(closest, apart.min(axis=0), out=closest)
+        near = apart < collision_m
+        new = near.any(axis=0) & (touched < 0)
+        touched[new] = start + near[:, new].argmax(axis=0)
+    chosen = [k for k in np.argsort(closest, kind="stable")[:PAIRS] if math.isfinite(closest[k])]
+    series = []
+    for k in chosen:
+        gap = motion.position[:, :, first[k]] - motion.position[:, :, second[k]]
+        series.append(np.sqrt((gap**2).sum(axis=1)))
+    pairs = [(int(motion.ids[first[k]]), int(motion.ids[second[k]])) for k in chosen]
+    ids = motion.ids
+    crashes = [(int(ids[first[k]]), int(ids[second[k]]), int(touched[k])) for k in np.flatnonzero(touched >= 0)]
+    crashes.sort(key=lambda crash: crash[2])
+    return Distances((motion.time_ns - run.start_ns) / 1e9, least, pairs, series, crashes)
+
+
+def collision_m(run: RecordedRun) -> float:
+    """Below this distance two agents have crashed, m.
+
+    :param run: the run.
+    """
+    limits = run.config.get("limits", {})
+    return float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2
+
+
+def crashes_of(distances: Distances | None, run: RecordedRun, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Who crashed, when and where; the first ones if there are many.
+
+    :param distances: of the run; None: there are none.
+    :param run: the run.
+    :param summary: its results.
+    """
+    if distances is None:
+        return []
+    found = list(distances.crashes)
+    pair = tuple(summary.get("collided_pair") or ())
+    motion = run.motion
+    places = {int(number): place for place, number in enumerate(motion.ids)}
+    if not found and len(pair) == 2 and set(pair) <= places.keys():
+        # They crashed within a slot, and only its ends were recorded.
+        gap = motion.position[:, :, places[pair[0]]] - motion.position[:, :, places[pair[1]]]
+        found = [(*pair, int(np.nanargmin((gap**2).sum(axis=1))))]
+    crashes = []
+    for one, other, moment in found[:CRASHES]:
+        a, b = (motion.position[moment, :, places[number]] for number in (one, other))
+        crashes.append(
+            {
+                "ids": [one, other],
+                "time_s": round(float(distances.time_s[moment]), 3),
+                "place": thin((a + b) / 2, 3),
+                "distance_m": round(float(np.linalg.norm(a - b)), 4),
+            }
+        )
+    return crashes
+
+
+def distance_charts(distances: Distances | None, run: RecordedRun) -> dict[str, Any] | None:
+    """Distances over time as a page shows them, and what they are compared with.
+
+    :param distances: of the run; None: there are none.
+    :param run: the run.
+    """
+    if distances is None:
+        return None
+    return {
+        "time": thin(reduce_bins(distances.time_s, np.mean)),
+        "least": thin(reduce_bins(distances.least, np.min), 4),
+        "pairs": [
+            {
+                "ids": list(pair),
+                "distance": thin(reduce_bins(series, np.nanmin), 4),
+                "least": round(float(np.nanmin(series)), 4),
+                "time": round(float(distances.time_s[int(np.nanargmin(series))]), 3),
+            }
+            for pair, series in zip(distances.pairs, distances.series, strict=True)
+        ],
+        "collision": collision_m(run),
+        "r_min": float(swarm_section(run.config).get("r_min", 0.3) or 0.3),
+    }
