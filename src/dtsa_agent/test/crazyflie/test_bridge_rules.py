@@ -248,6 +248,24 @@ def test_two_too_close_both_land_and_the_third_flies_on() -> None:
     assert verdicts(*close, min_distance_m=0.0) == []
 
 
+def test_what_is_exactly_at_a_limit_is_still_allowed() -> None:
+    """All numbers are ones that a float holds exactly."""
+    hold, land = Action.HOLD, Action.LAND
+    fence = {"geofence_tolerance_m": 0.25, "geofence_hard_m": 0.5}
+    for x, actions in ((1.75, []), (1.7501, [land]), (2.0, [land]), (2.0001, [land, Action.STOP])):
+        assert [v[1] for v in verdicts(vehicle(position=(x, 0, 0)), **fence)] == actions
+    assert verdicts(vehicle(battery=3.4), battery_s=0.0) == []
+    assert [v[1] for v in verdicts(vehicle(battery=3.2), battery_s=0.0)] == [Action.WARN]
+    assert verdicts(vehicle(log_age=0.5)) == []
+    for rule in ("command", "position"):
+        ages = {f"{rule}_age_s": 0.25, f"{rule}_land_s": 3.0}
+        for age, actions in ((0.25, []), (3.0, [hold]), (3.1, [hold, land])):
+            assert [v[1] for v in verdicts(vehicle(**{f"{rule}_age": age}), **ages)] == actions
+    apart = vehicle(), vehicle("cf2", position=(0.25, 0.0, 0.0))
+    assert verdicts(*apart, min_distance_m=0.25) == []
+    assert verdicts(vehicle(), heartbeat=1.0) == []
+
+
 def test_a_rule_speaks_again_after_it_had_ceased() -> None:
     monitor = SafetyMonitor(SafetySettings())
     ages = [0.3, 0.4, 0.02, 0.3]
