@@ -60,6 +60,21 @@ def add_parser(subparsers: Any) -> None:
         help="the page may kill and start agents and change the channel; land and stop Crazyflies",
     )
     add_options(group, FlightOptions, "flight", skip=(*_LATER, "startup_s", "processes", "domain", "pictures"))
+    _add_crazyflie_options(parser)
+    add_run_options(parser)
+    clocks = add_mode_options(parser)
+    kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
+    add_options(clocks, FlightOptions, "flight", skip=kept)
+    clocks.add_argument(
+        "--late",
+        metavar="cfK=S,...",
+        default=None,
+        help="real time: agents whose processes are started S seconds after slot 0 only [none]",
+    )
+    parser.set_defaults(run=run)
+
+
+def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:
     crazyflies = parser.add_argument_group("Crazyflies")
     crazyflies.add_argument(
         "--backend",
@@ -82,17 +97,6 @@ def add_parser(subparsers: Any) -> None:
         help="by the bridge that runs already (dtsa bridge) on the ROS domain of --domain or ROS_DOMAIN_ID, and goes "
         "on: for several missions in a row",
     )
-    add_run_options(parser)
-    clocks = add_mode_options(parser)
-    kept = {setting.name for setting in settings_of(FlightOptions)} - set(_LATER)
-    add_options(clocks, FlightOptions, "flight", skip=kept)
-    clocks.add_argument(
-        "--late",
-        metavar="cfK=S,...",
-        default=None,
-        help="real time: agents whose processes are started S seconds after slot 0 only [none]",
-    )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -10,8 +10,9 @@ from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.workarounds.dds import clean_shared_memory
+from dtsa_channel_sim.ros.attendance import LOST_AFTER_S
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
-from dtsa_channel_sim.ros.realtime_channel import LOST_AFTER_S, RealtimeChannel
+from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .children import Child, Children, NodeError, describe_end
 from .machine import tight

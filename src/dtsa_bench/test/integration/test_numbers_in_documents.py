@@ -43,7 +43,7 @@ from dtsa_bench.recordings.merge import agent_recorder, json_bag, merge
 from dtsa_bench.runs import hearing
 from dtsa_bench.runs.config import RunLimits
 from dtsa_channel_sim.model import airtime, medium
-from dtsa_channel_sim.ros import live_air, pace, realtime_channel, roll_call, roster
+from dtsa_channel_sim.ros import attendance, live_air, pace, realtime_channel, roll_call, roster
 from dtsa_channel_sim.ros.answer_limits import AnswerLimits
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -110,7 +110,7 @@ FIGURES: dict[str, list[str]] = {
         f"(nice {agent_parameters.CHANNEL_NICE})",
     ],
     "docs/how-to/real-time.md": [
-        f"an agent that hangs after {realtime_channel.LOST_AFTER_S:g} s",
+        f"an agent that hangs after {attendance.LOST_AFTER_S:g} s",
         f"{word(ending._FACTOR)} times `--timeout-s`, at least {ending._LEAST_S:g}",
         "after (K M + 1) N slots at the latest",  # RealtimeNode._ended; test_nodes leaves a flight so
     ],

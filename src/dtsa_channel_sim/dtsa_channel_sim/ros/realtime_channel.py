@@ -31,6 +31,7 @@ from dtsa_channel_sim.model.verdict import Verdict
 
 from .accounts import Accounts, Delivered
 from .answers import Answers
+from .attendance import Attendance
 from .live_air import Begun, LiveAir, Sent, slot_verdict
 from .pace import Pace
 from .roll_call import RollCall
@@ -44,9 +45,7 @@ _LEAD_NS = 300_000_000  # from the start message to slot 0
 _PATIENCE_SLOTS, _PATIENCE_NS = 10, 500_000_000  # an account waits for reports at least so long
 # After a stall the middleware repeats some messages only when its writers ask for acknowledgements, every 3 s.
 _RECOVERY_NS = 4 * _NS
-LOST_AFTER_S = 2.0  # an agent that others outlast by this is lost
 _AHEAD = 100  # slots: a report from farther in the future is none
-_RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up says that the agent is back
 _KEEP_NS = 10 * _NS  # an agent may tell so late that it took in a frame
 # What one pass of the loop does at most: frames, reports. Then it looks at the clock and at signals again.
 _FRAMES, _REPORTS = 64, 2
@@ -93,14 +92,12 @@ class RealtimeChannel(RosChannel):
         self.air = LiveAir(channel)
         self.pace = Pace(self.slot_ns)
         self.round_ms: float | None = None  # of a round of messages before slot 0, median
-        self.returned: set[int] = set()  # ids of those that were, and report again
+        self._attendance = Attendance(self.agents, self.lost)
         self._steps, self._slotted = steps, slotted
         self._zero = 0
         self._told = 0.0  # time.monotonic() of the last start message
-        self._given_up: dict[int, int] = {}  # slot in which an agent was taken for lost, by id
         self._leisure_ns = -(2**63)  # when there was time for all that is not the air
         self._settled: dict[int, list[FrameVerdict[Sent]]] = {}
-        self._heard_ns = np.zeros(self.agents, dtype=np.int64)
         self._recovered_ns = 0  # when all that was sent during the last stall should have come
         self._newest = -1  # slot: last one reported by anybody
         self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
@@ -148,28 +145,22 @@ class RealtimeChannel(RosChannel):
         """
         self.answers.track[:, :, agent - 1] = place
         self.lose(agent)
-        self._given_up[agent] = -_RETURN_SLOTS
+        self._attendance.expect_later(agent)
 
     def lose(self, agent: int) -> None:
         """Takes note that an agent is gone."""
-        if agent not in self.lost:
-            self.lost.add(agent)
-            self.returned.discard(agent)
-            self._given_up[agent] = self._now() // self.slot_ns
+        if self._attendance.lose(agent, self._now() // self.slot_ns):
             self._observers.agent_silent(agent)
+
+    @property
+    def returned(self) -> set[int]:
+        """Ids of the agents that were lost, and report again."""
+        return self._attendance.returned
 
     def last_place(self, agent: int) -> NDArray[np.float64]:
         """Where an agent has reported to be last, (3,) m."""
         place = self.accounts.last_place(agent)
         return self.answers.position[:, agent - 1] if place is None else place
-
-    def _welcome(self, slot: int, book: Answers) -> None:
-        """Takes agents back that were lost and have reported for a slot."""
-        again = [a for a in sorted(self.lost) if book.answered[a - 1] and slot > self._given_up[a] + _RETURN_SLOTS]
-        if again:
-            self.lost.difference_update(again)
-            self.returned.update(again)
-            self._observers.agents_back(again)
 
     # Before slot 0.
 
@@ -213,7 +204,7 @@ class RealtimeChannel(RosChannel):
         self._zero = time.monotonic_ns() + _LEAD_NS
         self._tell_start()
         self._observers.begun(self._zero / _NS)
-        self._heard_ns[:] = 0
+        self._attendance.begin()
         return True
 
     @property
@@ -274,7 +265,7 @@ class RealtimeChannel(RosChannel):
         self._settle(now)
         begun, ended = self.pace.last_stall
         self._recovered_ns = ended + (_RECOVERY_NS if ended - begun > self._patience_ns else self._patience_ns)
-        self._heard_ns[:] = np.maximum(self._heard_ns + ended - begun, self._recovered_ns)
+        self._attendance.excuse(ended - begun, self._recovered_ns)
         self._observers.stalled(begun, ended)
 
     def _falls_behind(self, now: int) -> bool:
@@ -330,7 +321,7 @@ class RealtimeChannel(RosChannel):
             self._note(begun, data)
         elif not self.air.listens:
             return  # too late: nobody hears it
-        self._heard_ns[agent - 1] = max(now, self._heard_ns[agent - 1])
+        self._attendance.hear((agent,), now)
 
     def _note(self, begun: Begun, data: bytes) -> None:
         """Takes note of a frame that goes on the air.
@@ -398,8 +389,7 @@ class RealtimeChannel(RosChannel):
         if len(message.slot) and message.slot[0] >= names.FIRST_CALL:
             return  # an answer to a call, which has come late
         self._newest = max(self._newest, self.accounts.add(message, now // self.slot_ns + _AHEAD))
-        heard = np.array(message.agent, dtype=np.intp) - 1
-        self._heard_ns[heard] = np.maximum(self._heard_ns[heard], now)
+        self._attendance.hear(message.agent, now)
         self._observers.report(message, data)
 
     def _due(self, now: int) -> bool:
@@ -436,14 +426,12 @@ class RealtimeChannel(RosChannel):
     def _completed(self, slot: int) -> Answers:
         """A slot's reports, those that are missing taken from the slot before."""
         book = self.accounts[slot]
-        if self.lost:
-            self._welcome(slot, book)
+        again = self._attendance.back(slot, book.answered) if self.lost else []
+        if again:
+            self._observers.agents_back(again)
         book.carry(self.answers)
-        # Compared with the others: if nobody is heard, it may be this process that got no time.
-        newest = int(self._heard_ns.max())
-        for agent in book.silent:
-            if newest - self._heard_ns[agent - 1] > LOST_AFTER_S * _NS:
-                self.lose(agent)
+        for agent in self._attendance.silent_too_long(book.silent):
+            self.lose(agent)
         return book
 
     def _verdict(self, slot: int) -> tuple[dict[int, bytes], Verdict]:

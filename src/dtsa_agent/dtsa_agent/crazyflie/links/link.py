@@ -81,6 +81,15 @@ class _Command:
         self._link.run(self.action)
 
 
+class _Opening:
+    """How far a connection has come, as cflib's threads say."""
+
+    def __init__(self) -> None:
+        self.heard = threading.Event()  # the Crazyflie has answered at all
+        self.settled = threading.Event()  # it is connected, or that has failed
+        self.failure = ""  # why it has failed; empty: it has not
+
+
 class Link:
     """One Crazyflie's connection, worker and log.
 
@@ -256,48 +265,21 @@ class Link:
         :raises LinkError: it did not work.
         """
         from cflib.crazyflie import Crazyflie
-        from cflib.crtp.crtpstack import CRTPPort
 
         self._drop()
         limit = min(self.robot.connect_timeout_s, REOPEN_TIMEOUT_S if again else math.inf)
         deadline = time.monotonic() + limit
-        settled = threading.Event()
-        failure: list[str] = []
         cf = Crazyflie(rw_cache=str(self._cache))
-        (cf.connected if again else cf.fully_connected).add_callback(lambda uri: settled.set())
-        heard = threading.Event()
-
-        def established(uri: str) -> None:
-            heard.set()
-            if again and self.guarded:
-                cf.supervisor.send_emergency_stop_watchdog()
-
-        cf.link_established.add_callback(established)
-
-        def broken(uri: str, message: str) -> None:
-            failure.append(message.partition("\n\n")[0].replace("\n", " "))
-            settled.set()
-            if self._cf is cf and self.connected:
-                self.connected = False
-                self._on_broken(f"link broken: {failure[-1]}")
-                self._reopen = True
-                self.outbox.put_order(self._open_again, urgent=True)
-
-        cf.connection_failed.add_callback(broken)
-        cf.connection_lost.add_callback(broken)
-        cf.add_port_callback(CRTPPort.SETPOINT_HL, self._answer)
-        cf.packet_received.add_callback(lambda packet: self._reached(cf))
-        cf.link_statistics.link_quality_updated.add_callback(self._quality)
-        cf.link_statistics.uplink_rssi_updated.add_callback(self._rssi)
+        opening = self._watch(cf, again)
         self._cf = cf
         cf.open_link(self.robot.uri)
         radio = RadioPort.of(cf)
-        if radio is not None and not heard.wait(FIRST_ANSWER_S) and not failure:
+        if radio is not None and not opening.heard.wait(FIRST_ANSWER_S) and not opening.failure:
             raise LinkError(f"nobody answers on the air within {FIRST_ANSWER_S:g} s")
-        if not settled.wait(max(0.0, deadline - time.monotonic())):
+        if not opening.settled.wait(max(0.0, deadline - time.monotonic())):
             raise LinkError(f"no answer within {limit:g} s")
-        if failure:
-            raise LinkError(failure[0])
+        if opening.failure:
+            raise LinkError(opening.failure)
         for name, value in self.robot.firmware_params.items() if not again else ():
             try:
                 cf.param.set_value(name, value)
@@ -311,6 +293,41 @@ class Link:
             cf.link_statistics.latency.stop()  # its pings would wait behind a stuck packet, and have the link closed
         self._radio = radio
         self.connected = True
+
+    def _watch(self, cf: Any, again: bool) -> _Opening:
+        """Takes note of all that cflib says about a connection, from its threads.
+
+        :param cf: the `Crazyflie` object, not connected yet.
+        :param again: as of `_connect`.
+        """
+        from cflib.crtp.crtpstack import CRTPPort
+
+        opening = _Opening()
+
+        def established(uri: str) -> None:
+            opening.heard.set()
+            if again and self.guarded:
+                cf.supervisor.send_emergency_stop_watchdog()
+
+        def broken(uri: str, message: str) -> None:
+            reason = message.partition("\n\n")[0].replace("\n", " ")
+            opening.failure = opening.failure or reason
+            opening.settled.set()
+            if self._cf is cf and self.connected:
+                self.connected = False
+                self._on_broken(f"link broken: {reason}")
+                self._reopen = True
+                self.outbox.put_order(self._open_again, urgent=True)
+
+        (cf.connected if again else cf.fully_connected).add_callback(lambda uri: opening.settled.set())
+        cf.link_established.add_callback(established)
+        cf.connection_failed.add_callback(broken)
+        cf.connection_lost.add_callback(broken)
+        cf.add_port_callback(CRTPPort.SETPOINT_HL, self._answer)
+        cf.packet_received.add_callback(lambda packet: self._reached(cf))
+        cf.link_statistics.link_quality_updated.add_callback(self._quality)
+        cf.link_statistics.uplink_rssi_updated.add_callback(self._rssi)
+        return opening
 
     def _answer(self, packet: Any) -> None:
         if len(packet.data) > 3:
