@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Flies one agent, with a simulated vehicle, whose frames go to a multicast group: one process a computer, no channel
-node, no start signal, no ROS. Who is first begins; groups that meet become one. Frames are sealed: the key is in the
+node, no start signal, no ROS. The first agent begins; groups that meet become one. Frames are sealed: the key is in the
 environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
 DEFAULT_POLICY = "lease"
 

@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
     """Adds the command's parser."""
     parser = subparsers.add_parser(
         "demo",
-        help="who speaks next, in nine recorded flights, a page and a picture; under a minute",
+        help="nine recorded flights that show who sends next, a page and a picture; under a minute",
         description="Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a "
         "channel that quadcopters share, and what goes wrong when messages are lost. They become one page and one "
         "picture. The first eight are the same on every machine; in the last one, in real time, a process is killed "

@@ -36,7 +36,7 @@ COMPLETED, CRASHED, TIMED_OUT, STOPPED = "completed", "crashed", "timed out", "s
 
 
 def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> AbstractSwarm:
-    """Tables that follow a flight from what the air carried, for whoever does not host all agents.
+    """Tables that follow a flight from what the air carried, for callers that do not host all agents.
 
     :param run: the run.
     :param scenario: its scenario.

@@ -60,7 +60,7 @@ class Wakings:
             return
         rests = (plan.pause > 0) | course.final
         self.goal[:] = np.where(rests, course.goal, np.nan)
-        # Who has flown through a goal without a rest has been flying all the time.
+        # An agent that has flown through a goal without a rest has been flying all the time.
         self._wake(self._moving & (course.changed == slot) & (self.woken < 0), slot)
 
     def _wake(self, who: NDArray[np.bool_], slot: int) -> None:

@@ -37,7 +37,7 @@ class SwarmConfig(Settings):
         minimum=0,
         maximum=MAX_AGENTS,
     )
-    policy: str = setting("dtsa", "who sends next", choices=POLICIES.names, open_choices=True)
+    policy: str = setting("dtsa", "rule by which agents decide who sends", choices=POLICIES.names, open_choices=True)
     estimator: str = setting("linear", "where the others are by now", choices=ESTIMATORS.names, open_choices=True)
     avoider: str = setting(
         "orca", "flight model: collision avoidance and vehicle", choices=AVOIDERS.names, open_choices=True
@@ -71,7 +71,7 @@ class SwarmConfig(Settings):
         maximum=100,
     )
     c_r: int = setting(1, "the constant C sent while not arrived (eq:remaining_t_slots)", minimum=1, maximum=255)
-    targets_known: bool = setting(True, "all know everyone's target: who has arrived is taken to stand there")
+    targets_known: bool = setting(True, "all know all targets: an agent that has arrived is taken to stand there")
 
     frame: str = setting(
         "auto",
@@ -95,7 +95,7 @@ class SwarmConfig(Settings):
     )
     anchor_rest: int = setting(
         3,
-        "lease: who knows that it will rest gives all but one of so many anchors away, K; K M is at most 15, and M "
+        "lease: an agent that knows that it will rest gives all but one of so many anchors away, K; K M is at most 15, M "
         "without open turns or adoption",
         minimum=1,
         maximum=MOST_ROUNDS,
@@ -138,7 +138,7 @@ class SwarmConfig(Settings):
     )
     permute: bool = setting(True, "ids are dealt out at random around the shape")
     places: str = setting(
-        "", "who begins where: for each agent, by id, the number of a place around the shape; empty: see permute"
+        "", "where each agent begins: by id, the number of a place around the shape; empty: see permute"
     )
     stagger_slots: int = setting(100, "staggered: slots between the starts of two pairs", minimum=0, maximum=100000)
     stops: int = setting(2, "waypoints, stop-and-go: goals on the way to the last one", minimum=1, maximum=100)

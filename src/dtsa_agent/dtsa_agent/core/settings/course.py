@@ -66,12 +66,12 @@ class Course:
 
     @property
     def active(self) -> NDArray[np.bool_]:
-        """Who flies now, (L,); the others hover."""
+        """The agents that fly now, (L,); the others hover."""
         return np.asarray(self._moving & (self.leg >= 0))
 
     @property
     def final(self) -> NDArray[np.bool_]:
-        """Who has no further goal after the present one, (L,)."""
+        """The agents that have no further goal after the present one, (L,)."""
         return np.asarray(~self._moving | (self.leg == len(self._goals) - 1))
 
     def advance(self, slot: int, position: Array) -> bool:

@@ -102,7 +102,7 @@ class Scenario:
             swarm.goal[:] = course.goal
             swarm.final[:] = course.final
         if self.goals_known:
-            # Who waits for its first slot stands at its start, and everybody knows that.
+            # An agent that waits for its first slot stands at its start, and all know that.
             swarm.known_goal[:] = np.where(self.plan.begin <= slot, self.target, self.start)
         swarm.active[:] = course.active
         if swarm.config.announce:
@@ -137,7 +137,7 @@ def make_scenario(config: SwarmConfig) -> Scenario:
             target[:, a], target[:, b] = places[:, b], places[:, a]
             moving[a] = moving[b] = True
         if config.movers % 2:
-            # Without a partner: whoever has none anyway, else the first of the next pair.
+            # Without a partner: the agent that has none anyway, else the first of the next pair.
             single = count - 1 if count % 2 else pairs[chosen[config.movers // 2]][0]
             target[:, single] = _far_point(config, places[:, single])
             moving[single] = True
