@@ -95,8 +95,8 @@ class SwarmConfig(Settings):
     )
     anchor_rest: int = setting(
         3,
-        "lease: an agent that knows that it will rest gives all but one of so many anchors away, K; K M is at most 15, M "
-        "without open turns or adoption",
+        "lease: an agent that knows that it will rest gives all but one of so many anchors away, K; K M is at most 15, "
+        "M without open turns or adoption",
         minimum=1,
         maximum=MOST_ROUNDS,
     )

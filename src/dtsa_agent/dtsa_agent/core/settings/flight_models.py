@@ -137,7 +137,7 @@ class FlightModel(Settings):
         :param position: own true position, (3,), m, frame map.
         :param velocity: own true velocity, (3,), m/s.
         :param goal: where it wants to go, (3,), m.
-        :param others_position: where it believes all agents to be, (3, N), m; positions that are not finite are ignored.
+        :param others_position: where it believes all agents to be, (3, N), m; what is not finite is ignored.
         :param others_velocity: their velocities, (3, N), m/s.
         :param age_s: age of each one's state, (N,), s; None: no margins.
         :param plain: the avoider of the specification, not the compiled one.
