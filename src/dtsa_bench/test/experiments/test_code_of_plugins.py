@@ -29,6 +29,7 @@ LAYOUTS = {
     "package": ("mine_rule/__init__.py", "mine_rule/helper.py", "mine_rule", "mine_rule.helper"),
     "modules": ("mine_rule.py", "mine_helper.py", "mine_rule\nmine_helper", "mine_helper"),
     "re-exported": ("mine_rule/__init__.py", "mine_parts/__init__.py", "mine_rule\nmine_parts", "mine_parts"),
+    "files alone": ("mine_rule.py", "mine_parts/__init__.py", "", "mine_parts"),  # as other builders install it
 }
 
 
@@ -42,7 +43,10 @@ def install(directory: Path, layout: str) -> Path:
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[dtsa.policies]\nmine = mine_rule:Mine\n")
-    (about / "top_level.txt").write_text(tops + "\n")
+    if tops:
+        (about / "top_level.txt").write_text(tops + "\n")
+    else:
+        (about / "RECORD").write_text(f"{rule},,\n{helper},,\nmine-1.0.dist-info/METADATA,,\n")
     return directory / helper
 
 

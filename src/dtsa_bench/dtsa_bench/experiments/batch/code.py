@@ -8,6 +8,7 @@ import marshal
 import platform
 from collections.abc import Iterator
 from functools import cache
+from importlib.metadata import Distribution
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +53,19 @@ def _packages_of(kind: str, name: str) -> Iterator[str]:
     found = {registry.factory(name).__module__}
     if name not in registry.registered:
         point = registry.plug_ins()[name]
-        found |= {point.module, *((point.dist and point.dist.read_text("top_level.txt")) or "").split()}
+        found |= {point.module, *_announced(point.dist)}
     yield from {module.partition(".")[0] for module in found} - {*PROJECT, "dtsa", _HERE}
+
+
+def _announced(installed: Distribution | None) -> set[str]:
+    """Top-level modules and packages of a distribution; builders other than setuptools list its files alone."""
+    if installed is None:
+        return set()
+    listed = installed.read_text("top_level.txt")
+    if listed is not None:
+        return set(listed.split())
+    sources = [path for path in installed.files or () if path.suffix == ".py" and path.parts[0] != ".."]
+    return {path.parts[0].removesuffix(".py") for path in sources}
 
 
 def _written_here(factory: Any) -> bytes:
