@@ -1,8 +1,8 @@
 """What the documentation quotes of measurements, made from their records.
 
 A quotation stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`QUOTED`, and its
-record ``docs/evidence/NAME.json``. The command ``python -m dtsa_dev.documents.evidence_tables docs/*/*.md`` rewrites
-all quotations of these files.
+record ``docs/evidence/NAME.json``; ``records`` is the list of all records. The command
+``python -m dtsa_dev.documents.evidence_tables docs/*/*.md`` rewrites all quotations of these files.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from dtsa_bench.experiments.batch.table import markdown
 Row = dict[str, Any]
 
 _BLOCK = re.compile(r"(<!-- evidence: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+LIST = "records"  # what a page asks for that lists them all
 _SIZES = (18, 70, 200)
 _PARTS = ("kernels", "avoidance", "slots", "flights", "nodes")  # of a benchmark, that are quoted
 
@@ -29,19 +30,48 @@ def rewritten(text: str, evidence: Path) -> str:
 
     :param text: the page, Markdown.
     :param evidence: the directory of records.
-    :raises ConfigError: if a quotation has a name that is none of :data:`QUOTED`.
+    :raises ConfigError: if a quotation has a name that is neither :data:`LIST` nor one of :data:`QUOTED`.
     """
 
     def quotation(found: re.Match[str]) -> str:
         name = found["name"]
+        if name == LIST:
+            return f"{found[1]}{records(evidence)}{found[3]}"
         if name not in QUOTED:
-            raise ConfigError("evidence", name, ", ".join(QUOTED))
+            raise ConfigError("evidence", name, ", ".join((*QUOTED, LIST)))
         record = evidence / f"{name}.json"
         if not record.exists():
             return found[0]
         return f"{found[1]}{QUOTED[name](json.loads(record.read_text(encoding='utf-8')))}{found[3]}"
 
     return _BLOCK.sub(quotation, text)
+
+
+def records(evidence: Path) -> str:
+    """The list of all records: what each looked at, with which command, when, on what.
+
+    :param evidence: the directory of records.
+    """
+    lines = []
+    for path in sorted(evidence.glob("*.json")):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        low, high = record.get("load_of_items", [record.get("machine", {}).get("load", 0)] * 2)
+        failed = len(record.get("failures", ()))
+        lines.append(
+            [
+                f"[{path.stem}](../evidence/{path.name})",
+                f"`tools/dtsa {'soak ' + record['soak'] if 'soak' in record else 'benchmark'}`",
+                record.get("promise", "Targets of speed.").rstrip(".") + ".",
+                f"{record['finished']} of {record['items']}{f', {failed} failed' * bool(failed)}"
+                if "items" in record
+                else "",
+                record["date"][:10],
+                f"`{record['commit'][:9]}`{' and changes' if record['tree_changed'] else ''}",
+                f"{record['cores']} cores, Python {record['python']}, load {low:.1f} to {high:.1f}",
+            ]
+        )
+    heads = ("record", "command", "what should hold", "items done", "date", "commit", "machine")
+    return f"{markdown(heads, lines)}\n"
 
 
 def speed(record: Row) -> str:
