@@ -153,7 +153,7 @@ FIGURES: dict[str, list[str]] = {
         f"carried out by the flight itself {often(loop.HOUSEKEEPING_S)} a second at most",
         f"(`collision_m`, {RunLimits().collision_m:g} m across)",
     ],
-    "docs/how-to/several-computers.md": [
+    "docs/reference/network.md": [
         f"| {datagram.HEADER}-.. | the frame",
         f"{word(delay.PEERS)} of those that its sender hears",
         f"in {datagram._UNIT_NS / 1000:g} us, little-endian",
@@ -270,7 +270,7 @@ def test_numbers_in_documents_are_those_of_the_code(page: str) -> None:
     assert not [figure for figure in FIGURES[page] if figure not in text]
 
 
-@pytest.mark.parametrize("name", ["explanation/real-time.md", "how-to/several-computers.md", "how-to/view.md"])
+@pytest.mark.parametrize("name", ["explanation/real-time.md", "reference/network.md", "how-to/view.md"])
 def test_what_is_too_long_a_stand_still_is_what_pages_say(name: str) -> None:
     assert "max(500, 3 M N) slots" in text_of(f"docs/{name}")
     for agents, anchor_every in ((2, 5), (40, 5), (70, 2)):
