@@ -137,6 +137,21 @@ def test_ctrl_c_at_the_very_beginning_gives_no_traceback() -> None:
         assert process.returncode in (0, 130, -signal.SIGINT)
 
 
+@pytest.mark.parametrize("before", [signal.SIG_DFL, signal.SIG_IGN])
+def test_ctrl_c_is_ignored_where_it_was_before(before: signal.Handlers) -> None:
+    program = "import signal; print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
+    command = [str(layout.ROOT / "tools" / "dtsa"), "shell", "-c", f"python -c '{program}'"]
+    ended = subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=120,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, before),
+    )
+    assert ended.stdout.strip() == str(before == signal.SIG_IGN)
+
+
 def test_an_environment_that_was_being_made_or_removed_is_made_anew(checkout: Path) -> None:
     subprocess.run([sys.executable, "-m", "venv", layout.VENV], check=True)
     assert wheels.usable()  # somebody else's is taken over
