@@ -18,6 +18,11 @@ pytest.importorskip("mkdocs")
 from dtsa_dev.registry import main
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGES = [
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *(ROOT / f"{name}.md" for name in ("REPRODUCTION", "CONTRIBUTING", "CHANGELOG")),
+]
+_ITEM = re.compile(r"(?P<indent> *)(?:[-*]|\d+\.) \S.*")
 _LINK = re.compile(r'<a [^>]*?href="([^"#]*)')
 _LOADED = re.compile(r'<(?:script|img|iframe)[^>]*? src="([^"]+)"|<link [^>]*?href="([^"]+)"')
 
@@ -63,6 +68,20 @@ def test_pages_made_from_the_code_are_in_the_search(site: Path) -> None:
     assert "flies every combination" in found["reference/commands.html#sweep"].lower()
     assert "reference/messages.html#report" in found
     assert any(place.startswith("reference/library.html#") and place.endswith(".Table") for place in found)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_lists_are_lists_on_the_site_as_in_the_repository(path: Path) -> None:
+    """MkDocs' Markdown wants an empty line before a list or a table, and four spaces before a list in a list."""
+    text = re.sub(r"^```.*?^```$", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for paragraph in re.split(r"\n\s*\n|^#.*$|^<!--.*-->$", text, flags=re.MULTILINE):
+        lines = paragraph.strip("\n").splitlines()
+        found = [_ITEM.match(line) for line in lines]
+        late = [line for line, item in zip(lines, found, strict=True) if item and not found[0] and lines[0][0] != " "]
+        assert not late, f"in a paragraph: {late[0]}"
+        near = [item[0] for item in found if item and len(item["indent"]) in (1, 2, 3)]
+        assert not near, f"too near to the margin: {near[0]}"
+        assert len({line.startswith("|") for line in lines}) <= 1, f"in a table's paragraph: {lines}"
 
 
 def test_dead_links_and_pages_that_nobody_finds_end_the_build(tmp_path: Path) -> None:
