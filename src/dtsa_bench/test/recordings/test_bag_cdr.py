@@ -22,7 +22,6 @@ from dtsa_bench.recordings.bag.cdr import (
     TEXT,
     MarkerPacker,
     OdometryPacker,
-    odometry_cdr,
 )
 
 COORDINATES = st.floats(-1e6, 1e6, allow_nan=False)
@@ -46,6 +45,12 @@ def odometry(time_ns: int, child: str, position: Any, velocity: Any, frame: str)
         pose=types[g + "PoseWithCovariance"](pose, COVARIANCE),
         twist=types[g + "TwistWithCovariance"](twist, COVARIANCE),
     )
+
+
+def odometry_cdr(time_ns: int, child: str, place: Any, speed: Any, frame: str = "map") -> bytes:
+    """One message of the packer."""
+    columns = np.array([place, speed], dtype=np.float64)[:, :, None]
+    return OdometryPacker([child], frame).pack(time_ns, columns[0], columns[1])[0]
 
 
 @settings(max_examples=60, deadline=None)

@@ -103,18 +103,6 @@ class OdometryPacker:
         return messages
 
 
-def odometry_cdr(
-    stamp_ns: int, child_frame: str, position: Sequence[float], velocity: Sequence[float], frame: str = "map"
-) -> bytes:
-    """CDR of a single Odometry message; see `OdometryPacker`, which is faster for many.
-
-    :param position: m, (3,). :param velocity: m/s, (3,).
-    :param stamp_ns: ns, of its header.
-    """
-    columns = np.array([position, velocity], dtype=np.float64)[:, :, None]
-    return OdometryPacker([child_frame], frame).pack(stamp_ns, columns[0], columns[1])[0]
-
-
 class MarkerPacker:
     """CDR of a `visualization_msgs/MarkerArray` of a swarm: sphere, name and target of each agent.
 

@@ -7,18 +7,12 @@ the verdicts in its bag must have in common can be checked all the same.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dtsa_agent.core import REASONS
-from dtsa_agent.core.agents.authentication import TAG_LENGTH, Authenticator
-from dtsa_agent.core.errors import RemoteProtocolError
-from dtsa_agent.core.frame import Frame, decode_frame, encode_frame
-from dtsa_agent.core.frame_extended import ExtendedFrame, decode_extended, encode_extended
 from dtsa_agent.keys import VARIABLE
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
@@ -33,6 +27,7 @@ from .frames import SentFrames
 from .intake import Intake
 from .lockstep import parameter_value
 from .odometry import Report, odometry_fault
+from .own_states import OwnStates
 from .rebuild import DECISION, RECEPTION, SLOT, TRANSMISSION
 from .result import Difference, Mismatch, Result
 from .stream import Streams
@@ -40,10 +35,8 @@ from .stream import Streams
 EVENTS = "/parameter_events"
 FRAME, REPORT = (f"{names.SWARM}/{topic}" for topic in (names.AIR_FRAME, names.REPORT))
 REALTIME = "realtime"
-_CHECKED = (SLOT, TRANSMISSION, FRAME, REPORT, DECISION, RECEPTION, EVENTS)
 _RUN = 0  # Slot.RUN
 _SECOND = 1_000_000_000
-_SLOT_MASK = 0xFFFFFFFF  # slots have 32 bits in frames
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -66,12 +59,7 @@ class RealtimeCheck:
         self.agents, self.slot_ns = self.run.swarm.agents, self.run.swarm.slot_ns
         kept = {SLOT, TRANSMISSION, DECISION, RECEPTION, EVENTS}
         self.streams = Streams(bag, kept.__contains__)
-        self._authenticator: Authenticator | None = None
-        if self.run.swarm.auth:
-            if key := os.environ.get(VARIABLE, ""):
-                self._authenticator = Authenticator.from_hex(key, self.run.swarm.auth_session)
-            else:
-                result.skipped["tags of frames"] = f"no key in {VARIABLE}"
+        self._own_states = OwnStates(self.run.swarm, result)
         self.frames = SentFrames(self.run.air, self.own_clocks)
         self.position = np.full((3, self.agents), np.nan)  # m, true, as last reported
         self._slots = np.full(self.agents, -1, dtype=np.int64)  # last slot that each has answered
@@ -205,7 +193,7 @@ class RealtimeCheck:
             self.position[:, agent - 1] = track[-1, :, k]
             self._places[agent - 1].append((slot, track[-1, :, k].copy(), float(np.linalg.norm(velocity[:, k]))))
             if frames[k]:
-                self._frame(slot, agent, frames[k], track[-1, :, k], velocity[:, k], command[:, k])
+                self._own_states.check(slot, agent, frames[k], track[-1, :, k], velocity[:, k], command[:, k])
                 self._sent(slot, agent, slot * self.slot_ns + int(offsets[k]), frames[k])
         if not self.own_clocks:
             self.frames.place(slot, self.position)
@@ -240,7 +228,7 @@ class RealtimeCheck:
     def _reports(self, summary: dict[str, Any]) -> None:
         """What the agents took in had been delivered to them, and what they reported is in the transmissions."""
         intake, untold = Intake(self.frames, self.run.air.link_delay_ns, self.result.slots), 0
-        replayable = self._authenticator is not None or not self.run.swarm.auth
+        replayable = self._own_states.has_key or not self.run.swarm.auth
         decisions = Decisions(self.run, self.frames) if replayable else None
         sense = CarrierSense(self.frames) if self.run.swarm.policy_row.listens else None
         for _, said in self.bag.typed([REPORT]):
@@ -272,45 +260,6 @@ class RealtimeCheck:
         else:
             self.result.count("frames that began in free air", sense.check(self._events))
         self.result.safety["frames_not_begun"] = sense.not_sent
-
-    def _frame(self, slot: int, agent: int, data: bytes, *state: NDArray[np.float64]) -> None:
-        """One frame: it decodes, names its sender and slot, and says where its sender really was."""
-        try:
-            found, right = self._own_state(data, slot, agent, *state)
-        except RemoteProtocolError as error:
-            self._fail("transmission.data", "a frame", str(error), "agents send what others can decode", slot, agent)
-        for name in ("sender", "slot", "position", "velocity", "intent"):
-            expected, recorded = getattr(right, name), getattr(found, name)
-            if expected != recorded:
-                why = "a frame names its sender and its slot" if name in ("sender", "slot") else (
-                    "the sender's own state, as the codec rounds it")  # fmt: skip
-                self._fail(f"frame.{name}", expected, recorded, why, slot, agent)
-        self.result.count("frames equal to their sender's state")
-
-    def _own_state(self, data: bytes, slot: int, agent: int, *state: NDArray[np.float64]) -> tuple[Frame, Frame]:
-        """The sender's own state in a frame, and what it should be."""
-        position, velocity, command = (tuple(vector.tolist()) for vector in state)
-        if self.run.swarm.auth:
-            data = self._opened(data, slot)
-        data = self.run.swarm.protocol_part(data)
-        extent = self.run.swarm.extent_m
-        if self.run.swarm.extended:
-            found = decode_extended(data, extent).own
-            right = Frame(agent, slot & _SLOT_MASK, found.c_r, position, velocity, command if found.intent else None)
-            return found, decode_extended(encode_extended(ExtendedFrame(right), extent), extent).own
-        found = decode_frame(data, extent)
-        right = Frame(agent, slot & _SLOT_MASK, found.c_r, position, velocity, command if found.intent else None)
-        return found, decode_frame(encode_frame(right, extent), extent)
-
-    def _opened(self, data: bytes, slot: int) -> bytes:
-        """A sealed frame without its tag, which is checked where the key is at hand."""
-        if self._authenticator is None:
-            return data[:-TAG_LENGTH]
-        opened = self._authenticator.open(data, slot)
-        if opened is None:
-            raise RemoteProtocolError("a tag that the key does not make")
-        self.result.count("tags")
-        return opened
 
     def _equal_time(self, what: str, expected: int, recorded: int, slot: int, agent: int | None = None) -> None:
         if expected != recorded:
