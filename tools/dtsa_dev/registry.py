@@ -11,10 +11,15 @@ COMMANDS = {
     "embedded": "the protocol on a simulated microcontroller: the same bits, and what it costs",
     "docs": "the documentation as a site, built strictly or served",
     "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
+    "release": "the distribution: source and wheels, installed and tried in fresh environments; nothing is uploaded",
 }
 #: Sets of requirements that a command needs beyond those of every machine.
-NEEDS = {"docs": ("docs",)}
+NEEDS = {"docs": ("docs",), "release": ("release",)}
 EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
+    "release": (
+        ("--out dist", "everything"),
+        ("--out dist --skip 3.12 --skip aarch64", "on a machine without that Python and without a cross compiler"),
+    ),
     "soak": (("--list", "what there is"), ("kill --sample", "a few minutes' part of one")),
     "benchmark": (("--json", "all parts, as JSON"),),
     "docs": (("", "into runs/site"), ("--serve", "on http://127.0.0.1:8000, built again after each change")),

@@ -16,6 +16,7 @@ EXTRAS = {
     "test": "the test suite",
     "dev": "linting and type checks",
     "docs": "the documentation as a site",
+    "release": "making the distribution",
 }
 
 

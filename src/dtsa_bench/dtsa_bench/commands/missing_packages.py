@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 
 _WORKSPACE = "build the workspace and source it: colcon build && . install/setup.bash"
@@ -13,7 +14,9 @@ _HOW = {
     "distributed": "pip install 'dtsa[cluster]', or {}",
     "aiohttp": "pip install 'dtsa[view]', or {}",
     "cflib": "pip install 'dtsa[crazyflie]', or {}",
-    **dict.fromkeys(("rclpy", "ament_index_python", "geometry_msgs", "nav_msgs", "std_msgs", "tf2_msgs"), _ROS),
+    **dict.fromkeys(
+        ("rclpy", "ament_index_python", "builtin_interfaces", "geometry_msgs", "nav_msgs", "std_msgs"), _ROS
+    ),
     "yaml": "apt install python3-yaml, or pip install pyyaml",
     **dict.fromkeys(("numpy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
 }
@@ -26,7 +29,16 @@ def explained(error: ImportError) -> str:
     """
     name = (error.name or "").split(".")[0]
     how = _HOW.get(name)
+    if name == "dtsa_msgs" and not _found("rclpy"):
+        how = _ROS  # there is nothing to build a workspace on
     return f"the Python package {name} is missing: {how.format(name)} (docs/how-to/install.md)" if how else ""
+
+
+def _found(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False
 
 
 def say_missing(program: str, error: ImportError) -> int:
