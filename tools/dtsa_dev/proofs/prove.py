@@ -134,7 +134,7 @@ _RELAYS = World(
 )
 MUTANTS = (
     Mutant(
-        "who comes later begins in probation", "lease.c",
+        "an agent that comes later begins in probation", "lease.c",
         "    a->probation = 1;\n    a->woke = slot;", "    a->woke = slot;", _RESTART,
     ),
     Mutant(
@@ -158,12 +158,12 @@ MUTANTS = (
         "== agent->self && lease_is_main(", "== agent->self && lease_is_anchor(",
         _RESTS,
     ),
-    Mutant("OPEN turns are for who wakes", "lease.c", "if (v->a->woke < 0 || own_right", "if (own_right", _OPEN),
+    Mutant("OPEN turns are for agents that wake", "lease.c", "if (v->a->woke < 0 || own_right", "if (own_right", _OPEN),
     Mutant(
-        "who hears itself claimed goes into probation", "lease.c", "distance <= e->c_s || ", "", _ADOPTS,
+        "an agent that hears itself claimed goes into probation", "lease.c", "distance <= e->c_s || ", "", _ADOPTS,
     ),
     Mutant(
-        "who is in probation claims nobody dead", "issue.c",
+        "an agent in probation claims no other one dead", "issue.c",
         "lease.adoption && !v.a->probation && ", "lease.adoption && ", _ADOPTS,
     ),
     Mutant(
@@ -178,7 +178,7 @@ MUTANTS = (
         "agent->table->config->lease.adoption && !v.a->probation", "!v.a->probation", World("dies", 2),
     ),
     Mutant(
-        "who has handed a turn on never takes it for its own again", "lease.c",
+        "an agent that has handed a turn on never takes it for its own again", "lease.c",
         "(given || handed)", "(given && !handed)", _HANDS,
     ),
 )  # fmt: skip
