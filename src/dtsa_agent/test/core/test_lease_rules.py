@@ -126,9 +126,8 @@ def test_who_missed_four_turns_is_given_none(statement: Any) -> None:
     assert not any(1 in frame.leases or 1 in [lessee for _, lessee in frame.relay] for frame in frames)
 
 
-@STATEMENTS
-def test_no_turn_is_handed_on_to_its_owner(statement: Any) -> None:
-    flight = Flight(statement, 12, 6)
+def handed_on(flight: Flight) -> int:
+    """Number of turns handed on by those to whom they were given, none to its owner, while some rest and others move."""
     handed = 0
     for stage in range(12):
         flight.swarm.goal[0, :] = 0.0
@@ -147,7 +146,18 @@ def test_no_turn_is_handed_on_to_its_owner(statement: Any) -> None:
                 assert lessee != turn % 12 + 1, (slot, turn)
                 handed += given.get(turn, 0) == frame.own.sender != lessee
                 given[turn] = lessee
-    assert handed > 20
+    return handed
+
+
+@STATEMENTS
+def test_no_turn_is_handed_on_to_its_owner(statement: Any) -> None:
+    assert handed_on(Flight(statement, 12, 6)) > 20
+
+
+@STATEMENTS
+@pytest.mark.parametrize("without", [{"open_every": 0}, {"adoption": False}], ids=["OPEN turns", "adoption"])
+def test_without_open_turns_or_adoption_nobody_hands_turns_on(statement: Any, without: dict[str, Any]) -> None:
+    assert handed_on(Flight(statement, 12, 6, **without)) == 0
 
 
 @STATEMENTS
