@@ -127,7 +127,7 @@ def test_who_missed_four_turns_is_given_none(statement: Any) -> None:
 
 
 def handed_on(flight: Flight) -> int:
-    """Number of turns handed on by those to whom they were given, none to its owner, while some rest and others move."""
+    """Number of turns handed on by those to whom they were given, none to its owner, while some rest and some move."""
     handed = 0
     for stage in range(12):
         flight.swarm.goal[0, :] = 0.0
