@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import tempfile
 import time
@@ -11,6 +12,7 @@ from typing import Any
 
 from dtsa_bench import __version__
 from dtsa_bench.runs.options import new_directory
+from machine import prepare
 
 from . import aarch64, parts
 from .build import ReleaseError, checked, make
@@ -34,6 +36,7 @@ def release(out: str, skipped: set[str], root: str | None, as_json: bool) -> int
     """
     pythons, with_aarch64 = parts.find(skipped)
     directory = new_directory(out)
+    signal.signal(signal.SIGTERM, prepare.interrupt)  # as Ctrl-C: what was begun is removed
     with tempfile.TemporaryDirectory(prefix="dtsa-release-") as name:
         work = Path(name)
         files = work / "files"
