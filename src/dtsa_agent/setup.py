@@ -22,7 +22,6 @@ COMPILE_FLAGS = [
 
 LIBRARY, SIMULATOR, BINDING = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/core/_kernel"
 HEARING, SOCKET = "dtsa_agent/air/_hearing", "dtsa_agent/air/udp/_socket"
-WORKAROUNDS = "dtsa_agent/ros/common/workarounds"
 OF_THE_LIBRARY = ("draw", "frame", "tag", "timebase")  # what an agent on a network uses without Python between
 
 

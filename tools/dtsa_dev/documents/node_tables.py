@@ -39,7 +39,7 @@ from .markdown import table
 _EVERY_NODE = re.compile(r"/tf|/rosout|/parameter_events|.*/(\w*parameters?(_\w+)?|get_type_description)$")
 _ELSEWHERE = (SwarmConfig, ChannelConfig, RunLimits, ClockConfig)  # settings that have tables of their own
 _AGENT = re.compile(r"/cf\d+/")
-_NODES: dict[str, tuple[Callable[[Sequence[str]], int], tuple[str, ...]]] = {
+NODES: dict[str, tuple[Callable[[Sequence[str]], int], tuple[str, ...]]] = {
     "agent": (agent_node.main, ("id:=1", "agents:=2")),
     "agent, real time": (agent_node.main, ("id:=1", "agents:=2", "mode:=realtime")),
     "swarm_host": (swarm_host.main, ("agents:=2",)),
@@ -47,7 +47,6 @@ _NODES: dict[str, tuple[Callable[[Sequence[str]], int], tuple[str, ...]]] = {
     "channel": (channel_node.main, ("agents:=2",)),
     "recorded_channel": (recorded_channel.main, ("agents:=2", "out:=flight")),
 }
-NODES = tuple(_NODES)
 
 
 @dataclass
@@ -81,7 +80,7 @@ def node_tables(name: str) -> str:
 
 @cache
 def _interface(name: str) -> Interface:
-    main, values = _NODES[name]
+    main, values = NODES[name]
     found = Interface()
     keep = Node.destroy_node
 

@@ -44,7 +44,6 @@ class Module:
 _CORE, _AGENT, _CHANNEL, _BENCH = (
     "dtsa_agent/dtsa_agent/core", "dtsa_agent/test", "dtsa_channel_sim/test", "dtsa_bench/test"
 )  # fmt: skip
-_CRAZYFLIE = "dtsa_agent/dtsa_agent/crazyflie"
 _CORE_TESTS, _BAG_TESTS = f"{_AGENT}/core", f"{_BENCH}/recordings"
 MODULES = {
     "medium": Module(

@@ -75,17 +75,6 @@ def test_quaternion_agrees_with_the_library(q: tuple[float, float, float, float]
     assert same == pytest.approx(1.0, abs=1e-4)
 
 
-def test_pitch_is_inverted_and_roll_and_yaw_are_not() -> None:
-    assert conversions.euler_from_log(10.0, 20.0, -90.0) == pytest.approx(
-        (math.radians(10), -math.radians(20), -math.pi / 2)
-    )
-    assert conversions.rates_from_log(1000, 500, -250) == pytest.approx((1.0, -0.5, -0.25))
-
-
-def test_gyro_is_in_degrees_per_second() -> None:
-    assert conversions.rates_from_gyro(180.0, -90.0, 1.0) == pytest.approx((math.pi, -math.pi / 2, math.radians(1)))
-
-
 def test_yaw_of_streamed_commands_is_in_degrees() -> None:
     assert conversions.velocity_world((0.5, -0.25, 0.125), math.pi / 2, 7.0).arguments == pytest.approx(
         (0.5, -0.25, 0.125, 90.0)

@@ -35,7 +35,7 @@ from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.writer import BagWriter
 from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, merge, verified
+from dtsa_bench.recordings.merge.merge import Merge, verified
 from dtsa_bench.recordings.merge.merged_messages import MergedMessages
 from dtsa_bench.recordings.merge.merged_run import MergedRun, lay
 from dtsa_bench.recordings.merge.merged_writer import write
@@ -221,7 +221,7 @@ def test_a_bag_that_lies_is_found(flight: Flight) -> None:
     bags = [read(path) for path in flight.bags]
     said = bags[0].slots[-20]
     said.chosen = 4 if said.chosen != 4 else 1
-    found = merge(bags)
+    found = Merge(bags).judge()
     assert not verified(found)
     assert [(one["agent"], one["slot"], one["field"]) for one in found["decisions_again"]["differences"]] == [
         (1, said.slot, "chosen")
@@ -229,7 +229,7 @@ def test_a_bag_that_lies_is_found(flight: Flight) -> None:
     bags = [read(path) for path in flight.bags]
     spoken = next(record for record in bags[1].slots[-60:] if record.datagram)
     spoken.datagram = spoken.datagram[:-5] + bytes([spoken.datagram[-5] ^ 1]) + spoken.datagram[-4:]
-    assert merge(bags)["frames_heard_not_as_sent"] > 0
+    assert Merge(bags).judge()["frames_heard_not_as_sent"] > 0
 
 
 def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> None:
@@ -239,13 +239,13 @@ def test_a_bag_cut_off_is_read_up_to_there(flight: Flight, tmp_path: Path) -> No
     bag = read(cut)
     assert bag.broken_off
     assert 0 < len(bag.slots) < len(read(flight.bags[0]).slots)
-    found = merge([bag, *(read(path) for path in flight.bags[1:])])
+    found = Merge([bag, *(read(path) for path in flight.bags[1:])]).judge()
     assert found["broken_off"] == ["cf1"]
     assert verified(found)
     for bad in (whole[:20], b"no bag", whole[:200] + b"\xff" * 40 + whole[240:]):
         cut.write_bytes(bad)
         with pytest.raises(DtsaError):
-            merge([read(cut)])
+            Merge([read(cut)]).judge()
 
 
 def test_a_merged_flight_is_kept_as_a_bag_like_others(flight: Flight) -> None:
@@ -357,13 +357,13 @@ def test_commands_for_other_bags_say_what_is_meant_for_these(
 def test_bags_that_do_not_belong_together_are_refused(flight: Flight) -> None:
     one = read(flight.bags[0])
     with pytest.raises(ConfigError, match="one process of cf1 at a time"):
-        merge([one, read(flight.bags[0])])
+        Merge([one, read(flight.bags[0])]).judge()
     other = read(flight.bags[1])
     other.swarm = dataclasses.replace(CONFIG, auth_session=8)
     with pytest.raises(ConfigError, match="auth_session 8, there 7"):
-        merge([one, other])
+        Merge([one, other]).judge()
     with pytest.raises(ConfigError, match="bags"):
-        merge([])
+        Merge([]).judge()
     alone = Merge([one])
     with pytest.raises(ConfigError, match="hear each other"):
         lay(alone, alone.judge())

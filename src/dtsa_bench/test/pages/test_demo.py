@@ -20,6 +20,7 @@ from dtsa_dev.soak.flights import children
 from PIL import Image
 
 from dtsa_bench.drawing.palette import AGENT_COLOURS
+from dtsa_bench.experiments.batch.table import markdown
 from dtsa_bench.pages import browser as opener
 from dtsa_bench.pages.demo import live
 from dtsa_bench.pages.demo.animation import SLOTS, draw_animation
@@ -29,7 +30,7 @@ from dtsa_bench.pages.demo.page import write_page
 from dtsa_bench.pages.demo.picture import draw_demo
 from dtsa_bench.pages.demo.story import KILLED, story
 from dtsa_bench.pages.demo.strips import cells, killed_windows, window
-from dtsa_bench.pages.demo.table import for_readme, for_terminal
+from dtsa_bench.pages.demo.table import HEAD, for_terminal, rows
 from dtsa_bench.simulation.simulate import simulate
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -73,7 +74,8 @@ def killed() -> Flown:
 
 def test_the_readme_has_the_numbers_of_the_demo(flights: dict[str, Flown]) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert for_readme(STEPS, flights) in text, for_readme(STEPS, flights)
+    table = markdown(HEAD, rows(STEPS, flights))
+    assert table in text, table
 
 
 def test_the_story_is_true(flights: dict[str, Flown]) -> None:

@@ -138,7 +138,6 @@ class Link:
         self._reopen = False
         self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
         self.reopened = 0  # times that a link which had ended by itself was opened again
-        self.past = 0  # packets sent past one that was stuck
         self._thread = threading.Thread(target=self._work, name=f"{robot.name}-worker", daemon=True)
         self._thread.start()
 
@@ -171,9 +170,7 @@ class Link:
         """Nothing can be sent as usual: the next order goes past what waits, blindly. Streamed commands wait."""
         order, cf, radio = self.outbox.take_order(), self._cf, self._radio
         if isinstance(order, _Command) and cf is not None and radio is not None:
-            packets = packets_of(cf, order.action) or []
-            self.past += len(packets)
-            radio.send_past(packets)
+            radio.send_past(packets_of(cf, order.action) or [])
         elif order is not None:
             order()
         else:

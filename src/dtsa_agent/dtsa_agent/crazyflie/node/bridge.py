@@ -24,7 +24,6 @@ from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
-ON_GROUND = frozenset({State.DISCONNECTED, State.CONNECTING, State.READY, State.EMERGENCY})
 LAND_WAIT = frozenset({State.ARMED, State.FLYING, State.LANDING})
 
 

@@ -84,25 +84,6 @@ def yaw_of(q: Quaternion) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def euler_from_log(roll: float, pitch: float, yaw: float) -> Vector:
-    """Roll, pitch, yaw in rad (REP-103) from `stateEstimate.{roll,pitch,yaw}`: degrees, pitch inverted."""
-    return math.radians(roll), -math.radians(pitch), math.radians(yaw)
-
-
-def rates_from_log(roll: float, pitch: float, yaw: float) -> Vector:
-    """Body rates in rad/s (REP-103) from `stateEstimateZ.rate{Roll,Pitch,Yaw}`: mrad/s, pitch inverted.
-
-    :param roll: as logged, mrad/s.
-    :param yaw: as logged, mrad/s.
-    """
-    return roll * 0.001, -pitch * 0.001, yaw * 0.001
-
-
-def rates_from_gyro(x: float, y: float, z: float) -> Vector:
-    """Body rates in rad/s from `gyro.{x,y,z}`: degrees per second, axes as in REP-103."""
-    return math.radians(x), math.radians(y), math.radians(z)
-
-
 @dataclass(frozen=True, slots=True)
 class Setpoint:
     """One streamed command, ready for the radio: a method of cflib's commander and its arguments."""

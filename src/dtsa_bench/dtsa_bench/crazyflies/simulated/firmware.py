@@ -118,7 +118,6 @@ class Firmware:
         self._streaming = False
         self._here = Goal()  # where a path would begin: on the present path, or where the vehicle is
         self.yaw = 0.0
-        self.setpoints_received = 0
 
     # -- commands from the radio ------------------------------------------------------------------------------------
     def stream(self, data: bytes, t: float) -> None:
@@ -126,7 +125,6 @@ class Firmware:
 
         :param t: s, the fleet's clock.
         """
-        self.setpoints_received += 1
         kind = data[0] if data else -1
         if kind == 0:
             self._accept(Setpoint(t, motors=False))

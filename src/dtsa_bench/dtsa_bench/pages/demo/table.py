@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dtsa_bench.experiments.batch.table import aligned, markdown
+from dtsa_bench.experiments.batch.table import aligned
 
 from .flown import Flights, of_step
 from .story import Step
@@ -36,8 +36,3 @@ def rows(steps: Sequence[Step], flights: Flights) -> list[list[str]]:
 def for_terminal(steps: Sequence[Step], flights: Flights) -> str:
     """The table for a terminal."""
     return aligned([HEAD, *rows(steps, flights)], rule=True)
-
-
-def for_readme(steps: Sequence[Step], flights: Flights) -> str:
-    """The table in Markdown, as it stands in the README."""
-    return markdown(HEAD, rows(steps, flights))

@@ -82,20 +82,10 @@ class Merge:
         }
 
 
-def merge(bags: Sequence[AgentBag], air_ns: int = 0) -> dict[str, Any]:
-    """Lays bags of one flight on one time line and judges the flight; see :class:`Merge`.
-
-    :param bags: one a process, in any order.
-    :param air_ns: ns that a frame is on the air; see :meth:`Merge.judge`.
-    :returns: the results, plain values.
-    """
-    return Merge(bags).judge(air_ns)
-
-
 def verified(summary: Mapping[str, Any]) -> bool:
     """Whether nothing in a merged flight contradicts the protocol or another bag.
 
-    :param summary: of :func:`merge`.
+    :param summary: of :meth:`Merge.judge`.
     """
     again = summary["decisions_again"]
     # Of frames that nobody else heard nothing is known if their sender's bag was not finished.

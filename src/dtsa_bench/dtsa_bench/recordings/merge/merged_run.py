@@ -59,7 +59,7 @@ class MergedRun:
         return fly(self.lives, replays, self.senders(), self.common_slot)
 
     def judge(self) -> dict[str, Any]:
-        """Judges the flight again from what the bag holds, with the keys of :func:`.merge.merge`."""
+        """Judges the flight again from what the bag holds, with the keys of :meth:`.merge.Merge.judge`."""
         sent = sent_of(self.lives)
         replays = {life: Replay(bag) for life, bag in self.lives.items()}
         flown = ended(self.fly(replays))

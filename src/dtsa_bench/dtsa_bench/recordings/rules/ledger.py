@@ -36,8 +36,6 @@ class Ledger:
     anchor_collisions: int = 0  # ... in an anchor that its owner gave away before it restarted
     handed_collisions: int = 0  # ... in a turn that a lessee handed on before it restarted
     plain_collisions: int = 0  # any other slot with two senders
-    open_slots: int = 0
-    adopted_slots: int = 0
     leased_slots: int = 0
     broken: list[str] = field(default_factory=list)  # rules that were broken, in words
     _rules: Memory = field(init=False, compare=False, repr=False)
@@ -56,8 +54,6 @@ class Ledger:
         owner = slot % self.agents + 1
         is_open = any(lessee == OPEN for _, lessee in given)
         adopted = any(issuer != owner for issuer, _ in given)
-        self.open_slots += is_open
-        self.adopted_slots += adopted and not is_open
         self.leased_slots += bool(given) and not is_open and not adopted
         if len(frames) > 1:
             self.open_collisions += is_open
