@@ -56,10 +56,10 @@ def test_speeds_and_missed_targets_are_quoted() -> None:
     record = {
         "date": "2026-01-02T03:04Z",
         "machine": {"cores": 2, "load": 0.1, "python": "3.11.7"},
-        "kernels": [{"what": "priorities of all", "agents": n, "ours_us": n / 12, "ratio": 9.1} for n in sizes],
+        "kernels": [{"what": "priorities of all", "agents": n, "ours_us": n / 12} for n in sizes],
         "avoidance": [{"what": "avoidance of all", "agents": n, "pyrvo_ten_us": n / 2} for n in sizes],
         "slots": [
-            {"what": "whole slot", "agents": n, "policy": p, "core_us": n / 4, "numpy_us": 9 * n, "share_of_pyrvo": 0.5}
+            {"what": "whole slot", "agents": n, "policy": p, "core_us": n / 4, "share_of_pyrvo": 0.5}
             for n in sizes
             for p in policies
         ],

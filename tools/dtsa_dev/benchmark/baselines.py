@@ -15,7 +15,7 @@ class NotHere(DtsaError):
 def baseline(name: str) -> ModuleType:
     """One baseline.
 
-    :param name: ``numpy_swarm``, ``pyrvo_step`` or ``rotorpy_step``.
+    :param name: ``pyrvo_step`` or ``rotorpy_step``.
     :raises NotHere: if the package that it wraps is missing.
     """
     try:

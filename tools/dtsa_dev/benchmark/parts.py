@@ -65,14 +65,6 @@ def _priorities(agents: int) -> Row:
     p, v = random.normal(size=(2, 3, agents)) * np.array([[[5.0]], [[1.0]]])
     row: Row = {"what": "priorities of all", "agents": agents}
     row["ours_us"] = 1e6 * seconds(lambda: _kernel.priority(p.tobytes(), v.tobytes(), 0.01))
-    out = np.frombuffer(_kernel.priority(p.tobytes(), v.tobytes(), 0.01))
-    try:
-        plain = baseline("numpy_swarm").priorities
-    except NotHere as missing:
-        return {**row, "left_out": str(missing)}
-    row["numpy_us"] = 1e6 * seconds(lambda: plain(p, v, 0.01))
-    row["ratio"] = row["numpy_us"] / row["ours_us"]
-    row["largest_difference"] = float(np.abs(out / plain(p, v, 0.01) - 1.0).max())
     return row
 
 
@@ -95,14 +87,15 @@ def avoidance() -> Iterator[Row]:
 
 
 def slots(avoided: list[Row]) -> Iterator[Row]:
-    """A whole slot, averaged over a flight, against NumPy and against pyrvo's avoidance alone.
+    """A whole slot, averaged over a flight, against pyrvo's avoidance alone.
 
     :param avoided: rows of :func:`avoidance`.
     """
     pyrvo = {row["agents"]: row for row in avoided if "pyrvo_ten_us" in row}
     for agents in SIZES:
         for policy in POLICIES:
-            row: Row = {"what": "whole slot", "agents": agents, "policy": policy, **_slot(agents, policy)}
+            mean, count = slot_us(agents, policy)
+            row: Row = {"what": "whole slot", "agents": agents, "policy": policy, "core_us": mean, "slots": count}
             for setting in ("ten", "customary"):
                 if agents in pyrvo:
                     row[f"pyrvo_{setting}_us"] = pyrvo[agents][f"pyrvo_{setting}_us"]
@@ -110,16 +103,6 @@ def slots(avoided: list[Row]) -> Iterator[Row]:
                 row["pyrvo_ratio"] = row["pyrvo_ten_us"] / row["core_us"]
                 row["share_of_pyrvo"] = row["core_us"] / row["pyrvo_ten_us"]
             yield row
-
-
-def _slot(agents: int, policy: str) -> Row:
-    mean, count = slot_us(agents, policy)
-    row: Row = {"core_us": mean, "slots": count}
-    try:
-        row["numpy_us"] = baseline("numpy_swarm").measure(agents, policy)["numpy_us"]
-    except NotHere as missing:
-        return {**row, "left_out": str(missing)}
-    return {**row, "numpy_ratio": row["numpy_us"] / mean}
 
 
 def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0.2) -> tuple[float, int]:

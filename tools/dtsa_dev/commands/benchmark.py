@@ -10,8 +10,8 @@ from typing import Any
 
 DESCRIPTION = """\
 Measures kernels, whole slots, whole flights, nodes in lockstep and the Crazyflie bridge (with cflib), and beside
-them, in the same run, the same scenario in plain NumPy, pyrvo's ORCA step and RotorPy's multirotor. Times depend
-on the machine and on what else runs on it; the ratios much less."""
+them, in the same run, pyrvo's ORCA step and RotorPy's multirotor. Times depend on the machine and on what else runs
+on it; the ratios much less."""
 PARTS = ("kernels", "avoidance", "slots", "flights", "cost", "nodes", "crazyflie")
 
 

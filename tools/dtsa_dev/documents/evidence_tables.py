@@ -90,10 +90,8 @@ def speed(record: Row) -> str:
     flights = [_by_size(_plain(record["flights"]), "flight", policy) for policy in ("tdma", "dtsa")]
     lines = [
         ["all priorities g, one thread", *_cells(kernels, lambda row: _us(row["ours_us"]))],
-        ["... against plain NumPy", *_cells(kernels, lambda row: f"{row['ratio']:.0f} x faster")],
         ["whole slot, tdma (policy, estimates, avoider, physics)", *_cells(tdma, lambda row: _us(row["core_us"]))],
         ["whole slot, dtsa", *_cells(dtsa, lambda row: _us(row["core_us"]))],
-        ["whole slot in plain NumPy, dtsa", *_cells(dtsa, lambda row: _us(row["numpy_us"]))],
         ["pyrvo's avoidance step alone, ten neighbours", *_cells(avoided, lambda row: _us(row["pyrvo_ten_us"]))],
         ["whole slot over that step, tdma", *_cells(tdma, lambda row: f"{row['share_of_pyrvo']:.2f}")],
         ["whole slot over that step, dtsa", *_cells(dtsa, lambda row: f"{row['share_of_pyrvo']:.2f}")],
