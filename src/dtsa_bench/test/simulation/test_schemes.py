@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dtsa_dev.protocol.experiment import Experiment
+from dtsa_dev.protocol.optimum import optimum
 
 import dtsa
 from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
@@ -23,7 +24,6 @@ from dtsa_bench.experiments.sweep.spec import run_config
 from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.schemes.knowledge import whittle_index
-from dtsa_bench.simulation.schemes.optimum import optimum
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig

@@ -13,7 +13,7 @@ class GenieAge:
     """The agent with the largest sum of true ages at all receivers, over pairs that count as movers.
 
     Greedy. For one base station and equal links greedy is optimal (Kadota and others, arXiv 1801.01803); here, where
-    all send to all, it is a reference and no proven optimum: :mod:`.optimum` compares them for three agents.
+    all send to all, it is a reference and no proven optimum (compared for three agents in docs/evidence/league.md).
     """
 
     def __init__(self, config: SwarmConfig, agent: int) -> None:

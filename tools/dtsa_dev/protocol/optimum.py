@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .knowledge import whittle_index
+from dtsa_bench.simulation.schemes.knowledge import whittle_index
 
 #: Pairs (receiver, sender) whose ages are the state, by axis.
 PAIRS = tuple((j, k) for j in range(3) for k in range(3) if j != k)
