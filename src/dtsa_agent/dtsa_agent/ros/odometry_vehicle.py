@@ -43,14 +43,14 @@ class VehicleSettings(Settings):
     vehicle: str = setting(
         SIMULATED, "what the agent flies: the simulated vehicle, or one with odometry", choices=(SIMULATED, ODOMETRY)
     )
-    odometry_topic: str = setting("odom", "where the vehicle says where it is, nav_msgs/Odometry")
+    odometry_topic: str = setting("odom", "topic of the vehicle's odometry, nav_msgs/Odometry")
     odometry_origin: tuple[float, float, float] = setting(
-        (0.0, 0.0, 0.0), "where the origin of its odometry lies in the swarm's map", unit="m", kind="vector"
+        (0.0, 0.0, 0.0), "where the origin of the odometry lies in the swarm's map", unit="m", kind="vector"
     )
     twist_frame: str = setting(
-        BODY, "axes of the velocity in its odometry: the body's (REP-103), or the map's", choices=(BODY, MAP)
+        BODY, "axes of the velocity in the odometry: the body's (REP-103), or the map's", choices=(BODY, MAP)
     )
-    command_topic: str = setting("cmd_vel", "where it takes velocities")
+    command_topic: str = setting("cmd_vel", "topic on which the vehicle takes velocities")
     command_frame: str = setting(MAP, "axes of these velocities: the map's, or the body's", choices=(MAP, BODY))
     command_type: str = setting(
         TWIST,
@@ -60,7 +60,7 @@ class VehicleSettings(Settings):
     command_hz: float = setting(50.0, "rate of the commands, at most one a slot", unit="Hz", minimum=1, maximum=200)
     stale_s: float = setting(0.3, "odometry older than this holds the vehicle", unit="s", minimum=0.02, maximum=5)
     fastest_mps: float = setting(
-        5.0, "odometry that moves faster than this is not believed", unit="m/s", minimum=0.1, maximum=50
+        5.0, "odometry that moves faster than this is refused", unit="m/s", minimum=0.1, maximum=50
     )
 
 

@@ -39,22 +39,22 @@ class PositionSettings(Settings):
     )
     topic: str = setting("", "topic of the poses; {name} is the Crazyflie's; empty: /{name}/pose, or /poses if named")
     send: str = setting(
-        EXTPOSE, "what the Crazyflies are sent, places or places with attitudes", choices=(EXTPOS, EXTPOSE)
+        EXTPOSE, "what the bridge sends to the Crazyflies: places, or places with attitudes", choices=(EXTPOS, EXTPOSE)
     )
     max_rate_hz: float = setting(
         100.0, "sent at most this often, each to its own Crazyflie; counts in the radio budget",
         unit="Hz", minimum=1, maximum=200,
     )  # fmt: skip
     agree_m: float = setting(
-        0.1, "nobody is ready, armed or takes off whose estimate is farther than this from where it is seen",
+        0.1, "largest distance from the estimate to motion capture with which a vehicle is ready, armed, and takes off",
         unit="m", minimum=0.005, maximum=1,
     )  # fmt: skip
     jump_m: float = setting(
-        0.3, f"a pose farther than this, and {FASTEST_MPS:g} m/s, from the one before is not believed",
+        0.3, f"a pose farther than this, and {FASTEST_MPS:g} m/s, from the one before is refused",
         unit="m", minimum=0.01, maximum=10,
     )  # fmt: skip
     late_s: float = setting(
-        0.06, "a pose that takes so much longer than the fastest one is not believed: the vehicle has moved on",
+        0.06, "a pose that takes so much longer than the fastest one is refused: the vehicle has moved on",
         unit="s", minimum=0.005, maximum=10,
     )  # fmt: skip
 

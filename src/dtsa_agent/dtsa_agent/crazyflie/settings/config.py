@@ -76,7 +76,7 @@ class RobotSettings(Settings):
     id: int = setting(REQUIRED, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
     uri: str = setting(REQUIRED, "the Crazyflie's address, such as radio://0/80/2M/E7E7E7E701", custom=True)
     enabled: bool = setting(True, "false: it takes no part")
-    type: str = setting("", "one of robot_types, whose values it takes over")
+    type: str = setting("", "one of robot_types; the robot takes over its values")
     group_mask: int = setting(
         0, "groups that it belongs to, a bit each: services with a group_mask reach those that share a bit with it",
         minimum=0, maximum=255,
@@ -156,7 +156,7 @@ class StationSettings(Settings):
 
     min_connected: int = setting(
         1,
-        "fewer usable Crazyflies than this: the bridge ends (exit code 1), nobody takes off",
+        "fewer usable Crazyflies than this: the bridge ends (exit code 1), no vehicle takes off",
         minimum=1,
         maximum=1000,
     )

@@ -44,13 +44,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--truth", type=Path, metavar="FILE", help="record of what really happened (JSON lines)")
     parser.add_argument(
-        "--priority", metavar="N", default="30", help="real-time priority, 0 to 90: the world waits for nobody [30]"
+        "--priority",
+        metavar="N",
+        default="30",
+        help="real-time priority, 0 to 90: the simulated world does not wait [30]",
     )
     parser.add_argument("--quiet", action="store_true", help="no status line")
     parser.add_argument(
         "--ignore-interrupt",
         action="store_true",
-        help="Ctrl-C is for whoever flies them, who still has to land them; SIGTERM ends them",
+        help="Ctrl-C does not end them: the program that flies them has to land them first; SIGTERM ends them",
     )
     radio = parser.add_argument_group("simulated radios", "Crazyradios in place of UDP; simulation only")
     radio.add_argument(

@@ -44,15 +44,15 @@ class FleetConfig(Settings):
         choices=("auto", "required", "mixed"),
     )
     positions: str = setting(
-        "decks", "what tells them where they are: decks of their own, or positions that the host sends",
+        "decks", "source of their positions: decks of their own, or positions that the host sends",
         choices=("decks", "host"),
     )  # fmt: skip
     tracking_port: int = setting(
-        0, "UDP port on this machine that is told 100 times a second where everybody is; 0: nobody",
+        0, "UDP port on this machine that gets the positions of all 100 times a second; 0: none",
         minimum=0, maximum=65535,
     )  # fmt: skip
     noise: bool = setting(True, "sensors have noise")
-    model: str = setting("orca", "flight model whose vehicle they are", choices=AVOIDERS.names, open_choices=True)
+    model: str = setting("orca", "flight model that has their vehicle", choices=AVOIDERS.names, open_choices=True)
     collision_m: float = setting(
         0.2, "the record notes two flying vehicles closer than this", unit="m", minimum=0, maximum=10
     )
