@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import statistics
 
 import numpy as np
 import pytest
@@ -53,17 +52,6 @@ def test_clocks_depend_on_seed_and_agent_alone():
     assert np.abs([clock.offset_ns for clock in clocks]).max() <= 10**9
 
 
-def test_jitter_is_normal_and_repeatable():
-    clock = make_clocks(ClockConfig(jitter_ns=1000, seed=3), 2)[1]
-    jitter = [clock.jitter(event) for event in range(5000)]
-    assert clock.jitter(4321) == jitter[4321]
-    assert abs(statistics.mean(jitter)) < 4.5 * 1000 / math.sqrt(5000)
-    assert abs(statistics.stdev(jitter) - 1000) < 4.5 * 1000 / math.sqrt(10_000)
-    assert max(map(abs, jitter)) <= 4000
-    assert make_clocks(ClockConfig(jitter_ns=1000, seed=3), 2)[0].jitter(5) != jitter[5]
-    assert AgentClock().jitter(10**9) == 0
-
-
 @pytest.mark.parametrize(("name", "value"), [("offset_ns", -1), ("drift_ppm", 2000), ("jitter_ns", "x"), ("skew", 1)])
 def test_bad_clock_settings(name, value):
     with pytest.raises(ConfigError) as caught:
@@ -110,9 +98,10 @@ def ten_minutes(*, loss, align, jitter_ns=5000, agents=18, slots=60_000, burst_l
     """
     slot_ns = 10 * MS
     length = 30
-    clocks = make_clocks(ClockConfig(drift_ppm=50, offset_ns=10**12, jitter_ns=jitter_ns, seed=seed), agents)
+    clocks = make_clocks(ClockConfig(drift_ppm=50, offset_ns=10**12, seed=seed), agents)
     # Crystals over the whole range, whatever the seed drew; in no order, so that neighbours meet.
-    drifts = np.random.default_rng(seed).permutation(np.linspace(-50_000, 50_000, agents)).astype(int)
+    random = np.random.default_rng(seed)
+    drifts = random.permutation(np.linspace(-50_000, 50_000, agents)).astype(int)
     clocks = [dataclasses.replace(c, drift_ppb=d) for c, d in zip(clocks, drifts.tolist(), strict=True)]
     channel = Channel(ChannelConfig(agents=agents, loss=loss, burst_length=burst_length, seed=seed))
     line = Air(channel)
@@ -122,10 +111,11 @@ def ten_minutes(*, loss, align, jitter_ns=5000, agents=18, slots=60_000, burst_l
     zero = [clock.to_local(0) for clock in clocks]
     guard = slot_ns // 4
     aligners = [ClockAligner() for _ in clocks]
+    jitter = (jitter_ns * random.standard_normal(slots)).astype(int).tolist()  # of each transmission
     spread = collided = 0
     for slot in range(slots):
         owner = slot % agents
-        start = clocks[owner].to_channel(zero[owner] + slot * slot_ns + guard) + clocks[owner].jitter(slot)
+        start = clocks[owner].to_channel(zero[owner] + slot * slot_ns + guard) + jitter[slot]
         line.begin(slot, owner + 1, start, length)
         for verdict in line.settle((slot - 4) * slot_ns):
             collided += verdict.collided > 0

@@ -93,7 +93,6 @@ def simulate(
     shared_table: bool | None = None,
     trace: bool = False,
     observer: int = 1,
-    ages: bool = True,
     core: str = COMPILED,
 ) -> Flight:
     """Flies one run.
@@ -102,7 +101,6 @@ def simulate(
     :param shared_table: one table for all agents; None: where :func:`may_share` allows it.
     :param trace: keep what happened in every slot.
     :param observer: id whose table the trace follows.
-    :param ages: measure ages and estimate errors; without them a run is a little faster.
     :param core: ``compiled``, or ``reference``: the specification in plain Python, much slower.
     """
     begun = time.perf_counter()
@@ -113,18 +111,15 @@ def simulate(
         swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared, core=core))
         metrics = FlightMetrics(run, scenario, core)
         fly = _fly_unslotted if run.swarm.policy_row.unslotted else _fly
-        fly(swarm, Channel(run.air), metrics, kept, observer, ages)
+        fly(swarm, Channel(run.air), metrics, kept, observer)
     return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
 
 
-def _fly(
-    swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int, ages: bool
-) -> None:
+def _fly(swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int) -> None:
     """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
     advance, begin, fly, hear, end = swarm.scenario.advance, swarm.begin, swarm.fly, swarm.hear, swarm.end
     frame, arbitrate, update = swarm.frame, channel.arbitrate, metrics.update
     ids, track, position = swarm.ids, swarm.track, swarm.position
-    tables = swarm if ages else None
     table = 0 if swarm.shared else observer - 1
     compare = None if swarm.shared else metrics.compare_tables  # one table cannot differ from itself
     slot = 0
@@ -144,7 +139,7 @@ def _fly(
             for _, data in heard:
                 hear(slot, data)
         end(slot)
-        over = update(slot, track, tables, verdict.outcome, lengths)
+        over = update(slot, track, swarm, verdict.outcome, lengths)
         if kept is not None:
             _keep(kept, swarm, slot, verdict.senders, verdict.outcome, table)
         if over:
@@ -153,7 +148,7 @@ def _fly(
 
 
 def _fly_unslotted(
-    swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int, ages: bool
+    swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int
 ) -> None:
     """The same for agents that send at any instant: what arrives in a slot is heard in it."""
     traffic = UnslottedTraffic(swarm, channel)
@@ -166,7 +161,7 @@ def _fly_unslotted(
         for frame, mask in carried.heard:
             swarm.hear(slot, frame, mask)
         swarm.end(slot)
-        over = metrics.update(slot, swarm.track, swarm if ages else None, carried.outcome, carried.lengths)
+        over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
         if kept is not None:
             _keep(kept, swarm, slot, carried.senders, carried.outcome, observer - 1)
         slot += 1

@@ -1,11 +1,8 @@
-"""Clocks of the agents: an offset, a constant drift, jitter of single events; in integer nanoseconds."""
+"""Clocks of the agents: an offset and a constant drift; in integer nanoseconds."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-
-import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, setting
@@ -13,7 +10,6 @@ from dtsa_agent.core.settings.declaration import Settings, setting
 from .draws import CLOCK, generator
 
 _PPB = 1_000_000_000
-_BLOCK = 1024
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -35,16 +31,10 @@ class AgentClock:
 
     :param offset_ns: ns, what the clock shows at the channel's time 0.
     :param drift_ppb: ppb (parts per billion) by which it runs fast.
-    :param jitter_ns: ns, standard deviation of the time of a single event.
-    :param seed: seed of the jitter.
-    :param agent: id of the agent.
     """
 
     offset_ns: int = 0
     drift_ppb: int = 0
-    jitter_ns: float = 0.0
-    seed: int = 0
-    agent: int = 1
 
     def __post_init__(self) -> None:
         if not -_PPB < self.drift_ppb < _PPB:
@@ -68,17 +58,6 @@ class AgentClock:
         # to_local(c) >= l  <=>  c (1e9 + drift) >= (l - offset) 1e9, because floor(x) >= n <=> x >= n.
         return -(-(local_ns - self.offset_ns) * _PPB // (_PPB + self.drift_ppb))
 
-    def jitter(self, event: int) -> int:
-        """Return the deviation of one event's time, ns: normal, cut off at four standard deviations.
-
-        :param event: number of the event (a slot, a turn), 0 or more; the same event has the same jitter,
-            always.
-        """
-        if not self.jitter_ns:
-            return 0
-        block = _normal_block(self.seed, self.agent, event // _BLOCK)
-        return round(self.jitter_ns * block[event % _BLOCK])
-
 
 def make_clocks(config: ClockConfig, agents: int) -> tuple[AgentClock, ...]:
     """Return the clocks of the agents 1 to N: offset and drift uniform within limits, by seed and agent.
@@ -93,16 +72,6 @@ def make_clocks(config: ClockConfig, agents: int) -> tuple[AgentClock, ...]:
             AgentClock(
                 offset_ns=round(offset * config.offset_ns),
                 drift_ppb=round(drift * config.drift_ppm * 1000.0),
-                jitter_ns=config.jitter_ns,
-                seed=config.seed,
-                agent=agent,
             )
         )
     return tuple(clocks)
-
-
-@lru_cache(maxsize=1024)
-def _normal_block(seed: int, agent: int, block: int) -> tuple[float, ...]:
-    """Return standard normal numbers of the events of one block, cut off at 4."""
-    numbers = generator(seed, CLOCK, agent, block + 1).standard_normal(_BLOCK)
-    return tuple(np.clip(numbers, -4.0, 4.0).tolist())
