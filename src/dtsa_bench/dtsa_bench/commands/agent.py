@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     check_key(config)  # before anything is made
     check_joinable(config.policy)
     if args.seal and not config.auth_session:
-        print("dtsa: with --auth-session 0 frames of earlier flights with this key are believed", file=sys.stderr)
+        print("dtsa: with --auth-session 0 frames of earlier flights with this key are accepted", file=sys.stderr)
     order = Order(own, config, udp, prepare(config), args.out, args.json)
     if args.own_process:
         become(order, "dtsa_bench.commands.agent_process")

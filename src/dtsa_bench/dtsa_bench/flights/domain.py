@@ -50,7 +50,7 @@ def ros_domain(wanted: int | None = None, *, shared: bool = False) -> Iterator[i
         finally:
             os.close(lock)
     if wanted is not None:
-        raise ConfigError("domain", wanted, "a ROS domain that nobody on this machine uses (it is in use)")
+        raise ConfigError("domain", wanted, "a ROS domain that no process on this machine uses (it is in use)")
     raise DtsaError(f"all ROS domains from 1 to {LAST_FREE_DOMAIN} are in use on this machine")
 
 

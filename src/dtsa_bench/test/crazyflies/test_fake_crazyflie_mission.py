@@ -319,7 +319,7 @@ def test_a_dry_run_flies_from_where_they_stand_and_nobody_moves(tmp_path: Path) 
         config.write_text(yaml.safe_dump(data))
         command[command.index(str(out))] = str(tmp_path / "again")
         result = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
-        assert (result.returncode, "where cf2 stand is not known" in result.stderr) == (1, True)
+        assert (result.returncode, "the places of cf2 are not known" in result.stderr) == (1, True)
 
 
 @flown_again_when_overloaded

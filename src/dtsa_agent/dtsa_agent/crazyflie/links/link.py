@@ -275,7 +275,7 @@ class Link:
         cf.open_link(self.robot.uri)
         radio = RadioPort.of(cf)
         if radio is not None and not opening.heard.wait(FIRST_ANSWER_S) and not opening.failure:
-            raise LinkError(f"nobody answers on the air within {FIRST_ANSWER_S:g} s")
+            raise LinkError(f"no answer on the air within {FIRST_ANSWER_S:g} s")
         if not opening.settled.wait(max(0.0, deadline - time.monotonic())):
             raise LinkError(f"no answer within {limit:g} s")
         if opening.failure:

@@ -42,7 +42,7 @@ class CapturedPoses:
         if problem:
             if now - self._complained > COMPLAIN_S:
                 self._complained = now
-                self._log("warn", f"{self._name}: a pose of motion capture is not believed: {problem}")
+                self._log("warn", f"{self._name}: a pose of motion capture is refused: {problem}")
             return None
         assert tracker.last is not None
         return Position(self._packet(tracker.last)) if tracker.due(now) else None

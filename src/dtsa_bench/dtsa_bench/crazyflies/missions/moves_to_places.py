@@ -68,7 +68,7 @@ def _check(names: Sequence[str], here: Array, goal: Array, layer: float, fence: 
         )
     problems += close_pairs(names, here, "hover") + close_pairs(names, goal, "would begin")
     if problems:
-        raise MissionError(f"nobody can be brought to its place (at least {APART_M} m apart): {'; '.join(problems)}")
+        raise MissionError(f"no vehicle can be led to its place (at least {APART_M} m apart): {'; '.join(problems)}")
 
 
 def _clearance(here: Array, k: int, place: Array) -> float:

@@ -74,14 +74,14 @@ def measured_places(settings: SwarmSettings, swarm_yaml: Path) -> list[list[floa
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=WHERE_S, check=False)
     except subprocess.TimeoutExpired:
-        raise MissionError(f"where everybody stands is not known after {WHERE_S:g} s") from None
+        raise MissionError(f"the places of the vehicles are not known after {WHERE_S:g} s") from None
     lines = [line for line in result.stdout.splitlines() if line.startswith("{")]
     if result.returncode == 2:
         raise ConfigError("config", str(swarm_yaml), result.stderr.strip().splitlines()[-1])
     found: dict[str, Any] = json.loads(lines[-1]) if lines else {}
     missing = [robot.name for robot in settings.robots if robot.name not in found]
     if missing:
-        raise MissionError(f"no rehearsal: where {', '.join(missing)} stand is not known")
+        raise MissionError(f"no rehearsal: the places of {', '.join(missing)} are not known")
     return [found[robot.name] for robot in settings.robots]
 
 

@@ -34,7 +34,7 @@ def latest(sock: socket.socket) -> bytes:
 def main(argv: list[str] | None = None) -> int:
     """Publish until SIGTERM."""
     parser = argparse.ArgumentParser(prog="motion_capture", description=__doc__, allow_abbrev=False)
-    parser.add_argument("--port", type=int, required=True, help="UDP port on which the fleet tells where everybody is")
+    parser.add_argument("--port", type=int, required=True, help="UDP port on which the fleet tells its positions")
     parser.add_argument("--topic", default="/cf{id}/pose", help="of each, {id} is its id [%(default)s]")
     parser.add_argument("--priority", type=int, default=30, help="real-time priority, where allowed [%(default)s]")
     args = parser.parse_args(argv)

@@ -81,7 +81,7 @@ class MergedMessages:
         self._heard = heard
         self._last = max(self._here)
         if self._last - self._first >= 2 * len(self._here) + 1000 or self._last > _BITS:
-            raise BagError(f"nobody tells of most of the slots {self._first} to {self._last}: no flight to record")
+            raise BagError(f"no agent tells of most of the slots {self._first} to {self._last}: no flight to record")
         self._senders: dict[int, dict[int, tuple[int, bytes]]] = {}  # by slot and agent: when, and what
         for (slot, agent), stray in run.strays.items():
             self._senders.setdefault(slot, {})[agent] = stray.sent_ns, stray.data
