@@ -20,193 +20,162 @@ _FOUND_S = 10.0  # by then an agent that does not find the channel again has end
 _IN_THE_WAY = (*REALTIME, "--no-stop-on-crash")
 
 
-def _flight(directory: Path, words: tuple[str, ...], act: Callable[[Running], None], begun: bool = True) -> None:
-    with flying(directory, *words, *ENDLESS, begun=begun) as flight:
-        act(flight)
+def _during(*words: str, begun: bool = True) -> Callable[[Callable[[Running], None]], Callable[[Path], None]]:
+    """Makes the `run` of a fault from what is done to a flight with these options, which does not end by itself."""
+
+    def fault(act: Callable[[Running], None]) -> Callable[[Path], None]:
+        def run(directory: Path) -> None:
+            with flying(directory, *words, *ENDLESS, begun=begun) as flight:
+                act(flight)
+
+        return run
+
+    return fault
 
 
-def _agent_killed(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        victim = flight.pid_of(2)
-        os.kill(victim, signal.SIGKILL)
-        clean_end(flight, 1, f"cf2 (process {victim}) was killed by SIGKILL")
-        verified(flight)
-
-    _flight(directory, LOCKSTEP, act)
+@_during(*LOCKSTEP)
+def _agent_killed(flight: Running) -> None:
+    victim = flight.pid_of(2)
+    os.kill(victim, signal.SIGKILL)
+    clean_end(flight, 1, f"cf2 (process {victim}) was killed by SIGKILL")
+    verified(flight)
 
 
-def _agent_asked_to_end(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        victim = flight.pid_of(2)
-        os.kill(victim, signal.SIGTERM)
-        clean_end(flight, 1, f"cf2 (process {victim}) ended")
-        verified(flight)
-
-    _flight(directory, LOCKSTEP, act)
+@_during(*LOCKSTEP)
+def _agent_asked_to_end(flight: Running) -> None:
+    victim = flight.pid_of(2)
+    os.kill(victim, signal.SIGTERM)
+    clean_end(flight, 1, f"cf2 (process {victim}) ended")
+    verified(flight)
 
 
-def _all_agents_killed(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        for pid in flight.known:
-            os.kill(pid, signal.SIGKILL)
-        clean_end(flight, 1, "was killed by SIGKILL")
-        verified(flight)
-
-    _flight(directory, LOCKSTEP, act)
+@_during(*LOCKSTEP)
+def _all_agents_killed(flight: Running) -> None:
+    for pid in flight.known:
+        os.kill(pid, signal.SIGKILL)
+    clean_end(flight, 1, "was killed by SIGKILL")
+    verified(flight)
 
 
-def _host_killed(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        os.kill(flight.known[-1], signal.SIGKILL)
-        clean_end(flight, 1, "swarm_host_", "was killed by SIGKILL")
-        verified(flight)
-
-    _flight(directory, (*LOCKSTEP, "--processes", "2"), act)
+@_during(*LOCKSTEP, "--processes", "2")
+def _host_killed(flight: Running) -> None:
+    os.kill(flight.known[-1], signal.SIGKILL)
+    clean_end(flight, 1, "swarm_host_", "was killed by SIGKILL")
+    verified(flight)
 
 
-def _agent_hangs(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        os.kill(flight.pid_of(3), signal.SIGSTOP)
-        clean_end(flight, 1, "cf3 did not answer slot", "within 1 s: dead or hung?")
-        verified(flight)
-
-    _flight(directory, (*LOCKSTEP, "--answer-s", "1"), act)
+@_during(*LOCKSTEP, "--answer-s", "1")
+def _agent_hangs(flight: Running) -> None:
+    os.kill(flight.pid_of(3), signal.SIGSTOP)
+    clean_end(flight, 1, "cf3 did not answer slot", "within 1 s: dead or hung?")
+    verified(flight)
 
 
-def _agent_paused(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        pid = flight.pid_of(3)
+@_during(*LOCKSTEP)
+def _agent_paused(flight: Running) -> None:
+    pid = flight.pid_of(3)
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(_STOPPED_S)
+    os.kill(pid, signal.SIGCONT)
+    flies_on(flight)
+    interrupted_well(flight)
+
+
+@_during(*LOCKSTEP)
+def _channel_paused(flight: Running) -> None:
+    flight.process.send_signal(signal.SIGSTOP)
+    time.sleep(_STOPPED_S)
+    flight.process.send_signal(signal.SIGCONT)
+    flies_on(flight)
+    interrupted_well(flight)
+
+
+@_during(*LOCKSTEP)
+def _suspended(flight: Running) -> None:
+    everybody = (flight.process.pid, *flight.known)
+    for pid in everybody:
         os.kill(pid, signal.SIGSTOP)
-        time.sleep(_STOPPED_S)
+    time.sleep(_SUSPENDED_S)
+    for pid in everybody:
         os.kill(pid, signal.SIGCONT)
-        flies_on(flight)
-        interrupted_well(flight)
-
-    _flight(directory, LOCKSTEP, act)
-
-
-def _channel_paused(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        flight.process.send_signal(signal.SIGSTOP)
-        time.sleep(_STOPPED_S)
-        flight.process.send_signal(signal.SIGCONT)
-        flies_on(flight)
-        interrupted_well(flight)
-
-    _flight(directory, LOCKSTEP, act)
+    flies_on(flight)
+    time.sleep(_FOUND_S)
+    flies_on(flight)
+    interrupted_well(flight)
 
 
-def _suspended(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        everybody = (flight.process.pid, *flight.known)
-        for pid in everybody:
-            os.kill(pid, signal.SIGSTOP)
-        time.sleep(_SUSPENDED_S)
-        for pid in everybody:
-            os.kill(pid, signal.SIGCONT)
-        flies_on(flight)
-        time.sleep(_FOUND_S)
-        flies_on(flight)
-        interrupted_well(flight)
-
-    _flight(directory, LOCKSTEP, act)
+@_during(*REALTIME)
+def _channel_paused_in_real_time(flight: Running) -> None:
+    flight.process.send_signal(signal.SIGSTOP)
+    time.sleep(_STOPPED_S)
+    flight.process.send_signal(signal.SIGCONT)
+    flies_on(flight)
+    found = interrupted_well(flight)
+    met("not been heard of" not in flight.said(), "agents are taken for lost because the channel stood still")
+    met(found["returned_agents"] == [], "agents have come back that were never away")
 
 
-def _channel_paused_in_real_time(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        flight.process.send_signal(signal.SIGSTOP)
-        time.sleep(_STOPPED_S)
-        flight.process.send_signal(signal.SIGCONT)
-        flies_on(flight)
-        found = interrupted_well(flight)
-        met("not been heard of" not in flight.said(), "agents are taken for lost because the channel stood still")
-        met(found["returned_agents"] == [], "agents have come back that were never away")
-
-    _flight(directory, REALTIME, act)
+def _recorder_killed(flight: Running) -> None:
+    flight.process.kill()
+    flight.process.wait()
+    flight.nobody_left()
+    recovered(flight)
 
 
-def _recorder_killed(words: tuple[str, ...]) -> Callable[[Path], None]:
-    def run(directory: Path) -> None:
-        def act(flight: Running) -> None:
-            flight.process.kill()
-            flight.process.wait()
-            flight.nobody_left()
-            recovered(flight)
-
-        _flight(directory, words, act)
-
-    return run
+@_during(*_IN_THE_WAY)
+def _agent_killed_in_real_time(flight: Running) -> None:
+    os.kill(flight.pid_of(2), signal.SIGKILL)
+    until(lambda: "was killed by SIGKILL; the others fly on" in flight.said(), "it says that cf2 is gone")
+    flies_on(flight)
+    interrupted_well(flight)
 
 
-def _agent_killed_in_real_time(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        os.kill(flight.pid_of(2), signal.SIGKILL)
-        until(lambda: "was killed by SIGKILL; the others fly on" in flight.said(), "it says that cf2 is gone")
-        flies_on(flight)
-        interrupted_well(flight)
-
-    _flight(directory, _IN_THE_WAY, act)
-
-
-def _agent_killed_and_started_again(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        first = flight.pid_of(2)
-        os.kill(first, signal.SIGKILL)
-        until(lambda: "cf2 takes part again" in flight.said(), "cf2 takes part again")
-        met(flight.pid_of(2) != first, "the same process")
-        met(interrupted_well(flight)["returned_agents"] == [2], "the summary does not name cf2 as returned")
-
-    _flight(directory, (*_IN_THE_WAY, "--respawn", "0.5"), act)
+@_during(*_IN_THE_WAY, "--respawn", "0.5")
+def _agent_killed_and_started_again(flight: Running) -> None:
+    first = flight.pid_of(2)
+    os.kill(first, signal.SIGKILL)
+    until(lambda: "cf2 takes part again" in flight.said(), "cf2 takes part again")
+    met(flight.pid_of(2) != first, "the same process")
+    met(interrupted_well(flight)["returned_agents"] == [2], "the summary does not name cf2 as returned")
 
 
-def _all_agents_killed_in_real_time(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        for pid in flight.known:
-            os.kill(pid, signal.SIGKILL)
-        clean_end(flight, 1, "nobody is left")
-        verified(flight)
-
-    _flight(directory, REALTIME, act)
+@_during(*REALTIME)
+def _all_agents_killed_in_real_time(flight: Running) -> None:
+    for pid in flight.known:
+        os.kill(pid, signal.SIGKILL)
+    clean_end(flight, 1, "nobody is left")
+    verified(flight)
 
 
-def _agent_stopped_in_real_time(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        pid = flight.pid_of(3)
-        os.kill(pid, signal.SIGSTOP)
-        until(lambda: "cf3 has not been heard of" in flight.said(), "it says that cf3 is silent")
-        flies_on(flight)
-        os.kill(pid, signal.SIGCONT)
-        until(lambda: "cf3 takes part again" in flight.said(), "cf3 takes part again")
-        interrupted_well(flight)
-
-    _flight(directory, _IN_THE_WAY, act)
+@_during(*_IN_THE_WAY)
+def _agent_stopped_in_real_time(flight: Running) -> None:
+    pid = flight.pid_of(3)
+    os.kill(pid, signal.SIGSTOP)
+    until(lambda: "cf3 has not been heard of" in flight.said(), "it says that cf3 is silent")
+    flies_on(flight)
+    os.kill(pid, signal.SIGCONT)
+    until(lambda: "cf3 takes part again" in flight.said(), "cf3 takes part again")
+    interrupted_well(flight)
 
 
 def _signalled(number: int, words: tuple[str, ...]) -> Callable[[Path], None]:
-    def run(directory: Path) -> None:
-        _flight(directory, words, lambda flight: met(interrupted_well(flight, number)["end"] == "stopped", "no end"))
-
-    return run
+    return _during(*words)(lambda flight: met(interrupted_well(flight, number)["end"] == "stopped", "no end"))
 
 
-def _signal_during_the_start(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        until(lambda: children(flight.process.pid), "processes are started", PATIENCE_S)
+@_during(*LOCKSTEP, begun=False)
+def _signal_during_the_start(flight: Running) -> None:
+    until(lambda: children(flight.process.pid), "processes are started", PATIENCE_S)
+    flight.process.send_signal(signal.SIGINT)
+    clean_end(flight, 130)
+
+
+@_during(*LOCKSTEP)
+def _three_signals(flight: Running) -> None:
+    for _ in range(3):
         flight.process.send_signal(signal.SIGINT)
-        clean_end(flight, 130)
-
-    _flight(directory, LOCKSTEP, act, begun=False)
-
-
-def _three_signals(directory: Path) -> None:
-    def act(flight: Running) -> None:
-        for _ in range(3):
-            flight.process.send_signal(signal.SIGINT)
-            time.sleep(0.05)
-        clean_end(flight, 130)
-        verified(flight)
-
-    _flight(directory, LOCKSTEP, act)
+        time.sleep(0.05)
+    clean_end(flight, 130)
+    verified(flight)
 
 
 _ENDS = "the flight ends with code 1 and a line that names it; no process stays; the bag is complete and verifies"
@@ -229,9 +198,9 @@ FAULTS = (
     Fault("channel paused, real time", "SIGSTOP and, 1 s later, SIGCONT to the channel, real time",
           "the flight goes on; nobody is taken for lost; the bag verifies", _channel_paused_in_real_time),
     Fault("recorder killed, lockstep", "SIGKILL to channel and recorder, lockstep", _RECOVERS,
-          _recorder_killed(LOCKSTEP)),
+          _during(*LOCKSTEP)(_recorder_killed)),
     Fault("recorder killed, real time", "SIGKILL to channel and recorder, real time", _RECOVERS,
-          _recorder_killed(REALTIME), True),
+          _during(*REALTIME)(_recorder_killed), True),
     Fault("agent killed, real time", "SIGKILL to an agent's process, real time",
           "the flight says so and goes on; the bag verifies", _agent_killed_in_real_time),
     Fault("agent killed and started again, real time", "the same with `--respawn`",
