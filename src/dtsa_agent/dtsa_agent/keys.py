@@ -30,6 +30,17 @@ def check_key(config: SwarmConfig) -> None:
     authenticator(config)
 
 
+def check_session(config: SwarmConfig) -> None:
+    """Whether sealed frames say which flight they are of, where no channel's node draws that.
+
+    :param config: the swarm's settings.
+    :raises ConfigError: if they do not: frames of earlier flights, played again, would count as genuine.
+    """
+    if config.auth and not config.auth_session:
+        allowed = "1 to 2^63 - 1, another one for each flight and the same on all computers; or frames without a seal"
+        raise ConfigError("auth_session", config.auth_session, allowed)
+
+
 def authenticator(config: SwarmConfig) -> Authenticator | None:
     """What seals and opens the frames of a swarm; None if its settings do not ask for that.
 

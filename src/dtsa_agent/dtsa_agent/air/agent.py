@@ -20,7 +20,7 @@ from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
-from dtsa_agent.keys import authenticator
+from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.stop import Stop
 
 from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, flight_ns
@@ -54,7 +54,7 @@ class AirAgent:
     :param watcher: is told what happens; None: nobody is.
     :param vehicle: what it flies; None: a simulated one.
     :param prepared: what follows from ``config``, if it is known already.
-    :raises ConfigError: for an id or a policy that cannot fly here, or a missing key.
+    :raises ConfigError: for an id or a policy that cannot fly here, or a missing key or session.
     """
 
     def __init__(
@@ -69,6 +69,7 @@ class AirAgent:
         if own.id > config.agents:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
         check_joinable(config.policy)
+        check_session(config)
         self.own, self.config, self._port = own, config, port
         scenario, header = (None, b"") if prepared is None else (prepared.scenario, prepared.header)
         wrapping = Wrapping(config, authenticator(config), header)

@@ -56,8 +56,9 @@ def test_networks_that_cannot_be_used_are_refused_by_name(field: str, values: di
     [
         ("id", 4, CONFIG, ""),
         ("policy", 1, dataclasses.replace(CONFIG, policy="dtsa"), ""),
-        ("DTSA_AUTH_KEY", 1, dataclasses.replace(CONFIG, auth=True), ""),
-        ("auth_key", 1, dataclasses.replace(CONFIG, auth=True), "00" * 16),
+        ("DTSA_AUTH_KEY", 1, dataclasses.replace(CONFIG, auth=True, auth_session=1), ""),
+        ("auth_key", 1, dataclasses.replace(CONFIG, auth=True, auth_session=1), "00" * 16),
+        ("auth_session", 1, dataclasses.replace(CONFIG, auth=True), KEY.hex()),
     ],
 )
 def test_agents_that_cannot_fly_are_refused_by_name(

@@ -112,6 +112,7 @@ def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_
     [
         ({"air": "smoke"}, "air: got 'smoke'"),
         ({"air": "udp", "auth": "false"}, "interface: got ''"),
+        ({"air": "udp", "interface": "lo"}, "auth_session: got 0"),
         ({"air": "udp", "auth": "false", "interface": "lo", "id": 13}, "id: got 13"),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -67,12 +66,16 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
     """The swarm that the options describe.
 
     :param args: parsed options.
-    :raises ConfigError: for one that cannot be.
+    :raises ConfigError: for one that cannot be, or a missing key or session.
     """
     from dtsa_agent.core import SwarmConfig
+    from dtsa_agent.keys import check_key, check_session
     from dtsa_bench.runs.options import given
 
-    return SwarmConfig.from_dict({**given(args, SwarmConfig, "swarm"), "policy": args.policy, "auth": args.seal})
+    config = SwarmConfig.from_dict({**given(args, SwarmConfig, "swarm"), "policy": args.policy, "auth": args.seal})
+    check_key(config)  # before anything is made
+    check_session(config)
+    return config
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,17 +84,13 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.air.settings import AgentSettings
     from dtsa_agent.air.udp import UdpSettings
     from dtsa_agent.core.agents.joining import check_joinable
-    from dtsa_agent.keys import check_key
     from dtsa_bench.network.flying import Order, become, fly
     from dtsa_bench.runs.options import given
 
     own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
     udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
     config = swarm_of(args)
-    check_key(config)  # before anything is made
-    check_joinable(config.policy)
-    if args.seal and not config.auth_session:
-        print("dtsa: with --auth-session 0 frames of earlier flights with this key are accepted", file=sys.stderr)
+    check_joinable(config.policy)  # before anything is made
     order = Order(own, config, udp, prepare(config), args.out, args.json)
     if args.own_process:
         become(order, "dtsa_bench.commands.agent_process")

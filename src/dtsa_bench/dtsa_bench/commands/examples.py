@@ -15,7 +15,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
     ),
     "agent": (
-        ("--id 3 --interface eth0", "the third of twelve; the key is in DTSA_AUTH_KEY"),
+        ("--id 3 --interface eth0 --auth-session 41", "the third of twelve; the key is in DTSA_AUTH_KEY"),
         ("--id 1 --agents 4 --interface lo --no-seal --duration-s 10 --out runs/cf1", "ten seconds, with a bag"),
     ),
     "simulate": (
@@ -36,7 +36,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),
     ),
     "verify": (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON")),
-    "sniff": (("--interface eth0 --out runs/sniffed", "twelve agents; until Ctrl-C"),),
+    "sniff": (("--interface eth0 --auth-session 41 --out runs/sniffed", "twelve agents; until Ctrl-C"),),
     "merge": (
         ("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"),
         ("runs/cf* --json", "all of them, as JSON"),
@@ -47,7 +47,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("runs/a", "a recorded run, played; one that is being recorded is followed"),
         ("runs/a runs/b", "two side by side"),
         ("--domain 7", "the swarm on a ROS domain"),
-        ("--air udp --interface eth0", "agents on a network, as one who listens; the key is in DTSA_AUTH_KEY"),
+        ("--air udp --interface eth0 --auth-session 41", "agents on a network; the key is in DTSA_AUTH_KEY"),
     ),
     "report": (("runs/a", "one run"), ("runs/a runs/b --out compared.html", "two side by side")),
     "export": (

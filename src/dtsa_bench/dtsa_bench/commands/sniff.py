@@ -27,7 +27,6 @@ def run(args: argparse.Namespace) -> int:
     """Listen until Ctrl-C, and print what came of it."""
     from dtsa_agent.air.udp import UdpSettings
     from dtsa_agent.core.settings.declaration import Setting
-    from dtsa_agent.keys import check_key
     from dtsa_agent.stop import Stop
     from dtsa_bench.network.sniffer import Sniffer
     from dtsa_bench.recordings.bag.errors import BagError
@@ -38,7 +37,6 @@ def run(args: argparse.Namespace) -> int:
 
     duration = Setting("duration_s", "float", 0.0, "how long", unit="s", minimum=0, maximum=1e6).read(args.duration_s)
     udp, config = UdpSettings.from_dict(given(args, UdpSettings, "udp")), swarm_of(args)
-    check_key(config)
     directory = None if args.out is None else new_directory(args.out)
     path = None if directory is None else directory / "sniffed.mcap"
     with Stop() as stop, Sniffer(config, udp, path) as sniffer:

@@ -125,7 +125,6 @@ def _check_source(args: argparse.Namespace) -> None:
 
 def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
     from dtsa_agent.air.udp.settings import UdpSettings
-    from dtsa_agent.keys import check_key
     from dtsa_bench.pages.view.network_listener import NetworkListener
     from dtsa_bench.pages.view.track import Track
     from dtsa_bench.runs.options import given
@@ -135,7 +134,6 @@ def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
     udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
     args.policy, args.seal = args.policy or DEFAULT_POLICY, args.seal is not False
     config = swarm_of(args)
-    check_key(config)
     track = Track(f"{udp.group} on {udp.interface}")
     return [track], [NetworkListener(track, config, udp)], None
 

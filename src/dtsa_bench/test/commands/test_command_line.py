@@ -151,6 +151,16 @@ def test_auth_without_a_key_leaves_nothing_behind(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("words", [["agent", "--id", "1"], ["sniff"], ["view", "--air", "udp"]])
+@pytest.mark.parametrize("session", [[], ["--auth-session", "0"]])
+def test_sealed_frames_on_a_network_need_a_session(
+    words: list[str], session: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else an old flight with the same key could be played again, and be believed."""
+    monkeypatch.setenv("DTSA_AUTH_KEY", "7c1f0a93e4d25b6880b13f96c2de470a")
+    assert "auth_session: got 0; allowed: 1 to" in said([*words, "--interface", "lo", *session], capsys)
+
+
 def test_an_argument_that_is_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert "argument surplus: unknown" in said(["simulate", "surplus"], capsys)
 

@@ -121,7 +121,7 @@ class SwarmConfig(Settings):
     auth_session: int = setting(
         0,
         "number of the flight for that code, so that frames of other flights are none of this; 0: nodes take a random "
-        "one for each flight",
+        "one for each flight; agents on a network, which have no node to draw it, refuse 0",
         minimum=0,
         maximum=2**63 - 1,
     )
