@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import platform
 import random
+import shutil
+import subprocess
 import time
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +18,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from waiting import wait_for
 
+import dtsa_agent
 from dtsa_agent.air.clock import OwnClock
 from dtsa_agent.air.datagram import HEADER, NOT_OURS, Wrapping, flight_ns
 from dtsa_agent.air.hearing import REASONS, STATES, Hearing, make_hearing
@@ -281,13 +286,51 @@ def test_it_sleeps_until_a_slot_and_a_while_at_most() -> None:
         assert hearing.sleep_until(100, 0)
 
 
-@pytest.mark.parametrize("wrong", [{"agents": 0}, {"id": 6}, {"header": b"DT"}, {"key": bytes(33)}, {"slot_ns": 0}])
-def test_values_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
-    values = {
+def given_values() -> dict[str, Any]:
+    """What a hearing is made of."""
+    return {
         "agents": 5, "id": 2, "anchor_every": 3, "slot_ns": SLOT_NS, "seed": 1, "header": bytes(8), "key": b"",
         "session": 0, "flight_ns": 0, "position_step": 0.002, "length": 45, "own_bytes": 0, "limit_ns": 1,
         "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0, "port": NoPort().compiled,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("drift", [1, -1, 40_000, -1_000_000, 500_000_000, -500_000_000])
+def test_the_own_clock_is_exact_however_long_it_runs(drift: int) -> None:
+    hearing = Hearing(*(given_values() | {"clock_drift_ppb": drift}).values())  # type: ignore[arg-type]
+    draw = random.Random(drift)
+    for bits in range(1, 62):
+        for elapsed in (draw.randrange(1 << bits), -draw.randrange(1 << bits), 1 << bits, -(1 << bits)):
+            assert hearing.local_ns(elapsed) == elapsed + elapsed * drift // 10**9
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64" or not shutil.which("gcc"), reason="needs gcc for x86_64")
+def test_the_hearing_compiles_for_32_bits(tmp_path: Path) -> None:
+    """No 128-bit integers there, and `long` is short. The headers of 64 bits do for a look at the syntax."""
+    (tmp_path / "gnu").mkdir()
+    (tmp_path / "gnu" / "stubs-32.h").touch()
+    package = Path(dtsa_agent.__file__).parent
+    rooms = [package / "air" / "_hearing", package / "libdtsa", package / "libdtsa" / "include", tmp_path]
+    words = ["gcc", "-m32", "-std=c11", "-Wall", "-Wextra", "-Werror", "-D_GNU_SOURCE", "-fsyntax-only"]
+    words += [f"-I{room}" for room in rooms]
+    words += ["-idirafter", "/usr/include/x86_64-linux-gnu"]
+    subprocess.run([*words, package / "air" / "_hearing" / "hearing.c"], check=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"agents": 0},
+        {"id": 6},
+        {"header": b"DT"},
+        {"key": bytes(33)},
+        {"slot_ns": 0},
+        {"clock_drift_ppb": 500_000_001},
+        {"clock_drift_ppb": -500_000_001},
+    ],
+)
+def test_values_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    values = given_values()
     Hearing(*values.values())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="out of range"):
         Hearing(*(values | wrong).values())  # type: ignore[arg-type]

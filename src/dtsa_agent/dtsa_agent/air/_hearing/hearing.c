@@ -17,10 +17,14 @@ static int64_t limited(int64_t value, int64_t limit)
 
 /* ---- the own clock ---- */
 
+/* floor(elapsed * by / of), without a product of 128 bits, which 32-bit processors lack:
+ * elapsed = whole * of + rest, 0 <= rest < of. |by| <= DRIFT_MOST = 0.5e9 <= of <= 1.5e9, so that
+ * |whole * by| <= |elapsed| + |by| and |rest * by| < 0.75e18: nothing overflows while |elapsed| is
+ * less than 2^62 ns, 146 years. */
 static int64_t share_of(int64_t elapsed, int64_t by, int64_t of)
 {
-    const __int128 product = (__int128)elapsed * by;
-    return (int64_t)(product / of - (product % of < 0));
+    const int64_t whole = floor_div(elapsed, of);
+    return whole * by + floor_div((elapsed - whole * of) * by, of);
 }
 
 int64_t clock_local(const own_clock *c, int64_t monotonic)

@@ -45,6 +45,7 @@ typedef struct said {
 } said;
 
 /* clock.py */
+enum { DRIFT_MOST = 500000000 }; /* parts per billion, either way */
 typedef struct own_clock {
     int64_t began, offset, drift; /* ns CLOCK_MONOTONIC, ns, parts per billion */
 } own_clock;
