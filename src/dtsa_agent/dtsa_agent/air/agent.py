@@ -30,7 +30,7 @@ from .precision import give_back_memory, going_first, wake_precisely
 from .prepared import Prepared
 from .record import Heard, SlotRecord, Watcher
 from .settings import AgentSettings
-from .tally import Tally
+from .tally import TOO_LATE, Tally
 from .vehicle import SimulatedVehicle, Vehicle
 
 _SECOND = 1_000_000_000
@@ -301,11 +301,13 @@ class AirAgent:
         late = max(0, self._late_ns(self.slot))
         frame, self._waiting = self._waiting, b""
         if late > self._latest_send_ns:  # it would disturb whoever has the next turn
-            self.swarm.drop(0)
-            self.tally.unsent += 1
+            self._drop(TOO_LATE)
             return
         datagram = self.hearing.wrap(frame, self.slot, late)
-        self._port.send(datagram)
+        refusal = self._port.send(datagram)
+        if refusal:
+            self._drop(refusal)
+            return
         self._said.append(datagram)
         self.tally.sent(late)
         if self._record is not None:
@@ -313,6 +315,11 @@ class AirAgent:
             self._record.datagram = datagram
         if self._leaves_by is not None and self.config.policy_row.says_leaving:
             self._gone = decode_extended(self.config.protocol_part(frame), self.config.extent_m).leaving
+
+    def _drop(self, reason: str) -> None:
+        """The frame of this slot does not leave: the agent has been silent."""
+        self.swarm.drop(0)
+        self.tally.unsent[reason] += 1
 
     def _close_slot(self) -> SlotRecord | None:
         """The present slot is over; its record."""

@@ -58,8 +58,8 @@ class DatagramPort(Protocol):
     byte_time_ns: int  # what each byte adds to that
     compiled: Any  # a capsule: what the compiled hearing reads (_hearing/port.h)
 
-    def send(self, data: bytes) -> bool:
-        """Sends a datagram at once; whether the port has taken it.
+    def send(self, data: bytes) -> str:
+        """Sends a datagram at once; why the port has not taken it, or an empty text.
 
         :param data: the datagram.
         """

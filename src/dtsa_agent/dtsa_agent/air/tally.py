@@ -10,6 +10,7 @@ from typing import Any
 from dtsa_agent.core.agents.delays import Delays
 
 _ON_TIME_NS = 1_000_000
+TOO_LATE = "too late"  # an own frame that would have disturbed the next turn
 
 
 class Tally:
@@ -19,7 +20,7 @@ class Tally:
         self.refused: Counter[str] = Counter()  # datagrams not taken in, by reason
         self.slots = 0  # slots that are over
         self.heard = 0  # frames of others taken in
-        self.unsent = 0  # own frames that would have left so late that they disturb the next turn
+        self.unsent: Counter[str] = Counter()  # own frames that did not leave, by reason
         self.began_ns = self.ended_ns = 0  # CLOCK_MONOTONIC
         self.first_slot = -1  # with which it began for the first time
         self.joined_ns = -1  # CLOCK_MONOTONIC, when
@@ -55,7 +56,8 @@ class Tally:
             "joined_after_s": (self.joined_ns - self.began_ns) / 1e9 if self.joined_ns >= 0 else None,
             "slots": self.slots,
             "sent": sent,
-            "unsent": self.unsent,
+            "unsent": self.unsent.total(),
+            "unsent_because": dict(sorted(self.unsent.items())),
             "sends_on_time_share": self._on_time / sent if sent else None,
             "send_late_ms": {
                 "p50": self._late.quantile_ms(0.5),

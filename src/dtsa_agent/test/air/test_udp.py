@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import random
+import socket
 import subprocess
 import sys
 import time
@@ -17,6 +19,7 @@ from dtsa_agent.air.clock import OwnClock
 from dtsa_agent.air.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
 from dtsa_agent.air.delay import Delay
 from dtsa_agent.air.precision import going_first
+from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.slots import SlotTime
 from dtsa_agent.air.tally import Tally
@@ -265,8 +268,62 @@ def test_who_wakes_late_sends_as_long_as_the_next_turn_is_not_disturbed(
         for slot, late in ((own, latest), (own + 2, latest + 1), (own + 4, 1_000)):
             now[0] = agent.hearing.slot_start_ns(slot) + late
             agent._open(slot)
-            counts.append((agent.tally.summary()["sent"], agent.tally.unsent))
+            counts.append((agent.tally.summary()["sent"], agent.tally.unsent["too late"]))
         assert counts == [(1, 0), (1, 1), (2, 1)]
+
+
+@pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EPERM, errno.ENETUNREACH])
+def test_what_the_network_refuses_does_not_count_as_sent(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    udp = UdpSettings(interface="lo", group=f"239.255.79.79:{20_000 + os.getpid() % 10_000}")
+    config = SwarmConfig(agents=2, policy="tdma")
+    with UdpPort(udp) as port:
+        agent = AirAgent(AgentSettings(id=1), config, port, watcher := Records())
+        agent.hearing.hear_slot(101, time.monotonic_ns())
+        agent._begin_anew()
+        own = agent.slot + 2 - agent.slot % 2  # a turn of agent 1
+        monkeypatch.setattr(agent, "_late_ns", lambda slot: 1_000)
+        with monkeypatch.context() as patch:
+            patch.setattr(port, "_out", Refusing(number))
+            agent._open(own)
+        agent._open(own + 2)
+        agent._tell(agent._close_slot())
+        found = agent.summary()
+    assert (found["sent"], found["unsent"]) == (1, 1)
+    assert found["unsent_because"] == {os.strerror(number): 1}
+    refused, sent = (record for record in watcher.slots if record.frame)
+    assert (refused.sent_ns, refused.datagram) == (-1, b"")
+    assert sent.sent_ns > 0
+
+
+def test_a_queue_that_is_full_is_told() -> None:
+    """Linux drops a datagram at a full queue, and says so only to those that have asked for it."""
+    with MulticastSocket(UdpSettings(interface="lo")) as end:
+        assert end._out.getsockopt(socket.IPPROTO_IP, 11) == 1  # IP_RECVERR
+
+
+class Refusing:
+    """A socket that takes nothing."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def sendto(self, data: bytes, address: object) -> int:
+        """See socket."""
+        raise OSError(self._number, os.strerror(self._number))
+
+
+class Records:
+    """A watcher that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.slots: list[SlotRecord] = []
+
+    def slot(self, record: SlotRecord) -> None:
+        """See Watcher."""
+        self.slots.append(record)
+
+    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
+        """See Watcher."""
 
 
 def test_an_agent_goes_first_and_what_it_starts_does_not() -> None:

@@ -23,6 +23,6 @@ class UdpPort(MulticastSocket):
         self.compiled = _socket.open_port(self.fileno(), socket.inet_aton(host), number)
 
     def counts(self) -> dict[str, int]:
-        """Datagrams that the network has not taken, failed reads, and how often the clock has been set."""
+        """Failed reads, and how often the clock has been set."""
         unreadable, clock_steps = _socket.counts(self.compiled)
-        return {"unsendable": self.unsendable, "unreadable": unreadable, "clock_steps": clock_steps}
+        return {"unreadable": unreadable, "clock_steps": clock_steps}

@@ -15,6 +15,7 @@ from dtsa_agent.core.errors import ConfigError
 from .settings import UdpSettings
 
 _SIOCGIFADDR = 0x8915
+_IP_RECVERR = 11
 _IP_MULTICAST_ALL = 49  # Linux: 0: only groups that this socket has joined
 _SO_TIMESTAMPNS = 35
 _STAMP = struct.Struct("@ll")
@@ -93,13 +94,13 @@ class MulticastSocket:
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stamps = StampClock()
-        self.unsendable = 0  # datagrams that the network has not taken
         self.unreadable = 0  # how often it could not be read
         try:
             self._out.bind((local, 0))
             self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
             self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, settings.ttl)
             self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+            self._out.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)  # else Linux drops, at a full queue, in silence
             self._in.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._in.bind(self._group)
             self._in.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
@@ -119,17 +120,16 @@ class MulticastSocket:
         """For ``select``: readable when something has arrived."""
         return self._in.fileno()
 
-    def send(self, data: bytes) -> bool:
-        """Sends to the group at once; whether the network has taken it.
+    def send(self, data: bytes) -> str:
+        """Sends to the group at once; why the network has not taken it, or an empty text.
 
         :param data: the datagram.
         """
         try:
             self._out.sendto(data, self._group)
-        except OSError:  # the interface is down for a while, or its queue is full: as good as lost on the air
-            self.unsendable += 1
-            return False
-        return True
+        except OSError as error:  # the interface is down for a while, or its queue is full
+            return error.strerror or type(error).__name__
+        return ""
 
     def receive(self, most: int) -> list[Datagram]:
         """What has arrived, in this order; empty if nothing has.
