@@ -78,7 +78,7 @@ def _draw(picture: Path, flight: Flight, summary: dict[str, Any]) -> None:
 
     assert flight.trace is not None
     try:
-        draw_flight(picture, flight.run, flight.scenario, flight.trace.positions(), summary)
+        draw_flight(picture, flight.scenario, flight.trace.positions(), summary)
     except OSError as error:
         raise ConfigError("picture", str(picture), f"a file that can be written ({error.strerror})") from error
     print(f"picture: {picture}", file=sys.stderr)

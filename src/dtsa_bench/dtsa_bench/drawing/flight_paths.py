@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
 from dtsa_agent.core.registry import POLICIES
-from dtsa_bench.runs.config import RunConfig
 
 from . import palette
 
@@ -151,62 +150,35 @@ def heading(summary: dict[str, Any]) -> str:
     return f"{built_in.label if built_in else summary['policy']}, {summary['estimator']}"
 
 
-def view_extent(scenario: Scenario, positions: Sequence[Array]) -> float:
+def view_extent(scenario: Scenario, positions: Array) -> float:
     """Half width, m, of a square that shows all starts, ends and paths.
 
-    :param positions: (T, 3, N) m of each flight, frame map.
+    :param positions: (T, 3, N) m, frame map.
     """
-    reach = max(
-        [float(np.abs(scenario.start[:2]).max()), *(float(np.abs(p[:, :2]).max()) for p in positions if p.size)]
-    )
-    return 1.16 * max(reach, 0.5)
+    reach = [float(np.abs(places).max()) for places in (scenario.start[:2], positions[:, :2]) if places.size]
+    return 1.16 * max(*reach, 0.5)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Writes a picture."""
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=_DPI, facecolor="white")
-
-
-def draw_flight(path: Path, run: RunConfig, scenario: Scenario, positions: Array, summary: dict[str, Any]) -> None:
+def draw_flight(path: Path, scenario: Scenario, positions: Array, summary: dict[str, Any]) -> None:
     """Draws one flight into a PNG.
 
     :param path: file to write.
-    :param run: the run.
-    :param scenario: its scenario.
+    :param scenario: starts, targets and movers.
     :param positions: (T, 3, N) m, frame map.
     :param summary: its results.
     """
-    draw_flights(path, [(scenario, positions, summary)], "")
-
-
-def draw_flights(path: Path, flights: Sequence[tuple[Scenario, Array, dict[str, Any]]], title: str) -> None:
-    """Draws flights side by side, in one scale.
-
-    :param path: file to write.
-    :param flights: scenario, positions (T, 3, N) and summary of each.
-    :param title: above all of them; may be empty.
-    """
     import matplotlib
 
-    count = len(flights)
     with matplotlib.rc_context(_FONT):
-        figure = Figure(figsize=(4.9 * count + 0.6, 6.3 if title else 6.0))
-        extent = max(view_extent(scenario, [positions]) for scenario, positions, _ in flights)
-        bottom, top = 0.135, (0.80 if title else 0.87)
-        for index, (scenario, positions, summary) in enumerate(flights):
-            axes = figure.add_axes((0.13 / count + index / count, bottom, 0.84 / count, top - bottom))
-            paint(axes, scenario, positions, summary["collided_pair"] if summary["end"] == "crashed" else None)
-            style(axes, heading(summary), subtitle(summary), extent)
-            if index:
-                axes.set_ylabel("")
-        if title:
-            figure.text(0.13 / count, 0.945, title, fontsize=14, fontweight="bold", color=INK)
-        first = flights[0][2]
+        figure = Figure(figsize=(5.5, 6.0))
+        axes = figure.add_axes((0.13, 0.135, 0.84, 0.735))
+        paint(axes, scenario, positions, summary["collided_pair"] if summary["end"] == "crashed" else None)
+        style(axes, heading(summary), subtitle(summary), view_extent(scenario, positions))
         note = (
-            f"{first['agents']} agents, {first['moving']} moving, {first['slot_ms']:g} ms slots, "
-            f"loss {first['loss']:g}, avoider {first['avoider']}, seed {first['seed']}.\n"
+            f"{summary['agents']} agents, {summary['moving']} moving, {summary['slot_ms']:g} ms slots, "
+            f"loss {summary['loss']:g}, avoider {summary['avoider']}, seed {summary['seed']}.\n"
             "Seen from above: rings are starts, dots are ends."
         )
-        figure.text(0.13 / count, 0.018, note, fontsize=8, color=MUTED, linespacing=1.5)
-        save(figure, path)
+        figure.text(0.13, 0.018, note, fontsize=8, color=MUTED, linespacing=1.5)
+        FigureCanvasAgg(figure)
+        figure.savefig(path, dpi=_DPI, facecolor="white")

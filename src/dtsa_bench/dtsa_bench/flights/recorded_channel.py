@@ -129,7 +129,7 @@ class RecordedFlight:
             from dtsa_bench.drawing.flight_paths import draw_flight
 
             picture = self.directory / "trajectories.png"
-            draw_flight(picture, self.run_config, self.scenario, positions.array(), summary)
+            draw_flight(picture, self.scenario, positions.array(), summary)
         return summary
 
 

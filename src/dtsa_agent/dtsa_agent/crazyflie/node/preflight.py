@@ -52,7 +52,7 @@ def preflight(
         *_links(snapshots),
         *_firmware(firmware),
         *_batteries(there, robots),
-        *_positions(settings, there, robots),
+        *_positions(there, robots),
         *_clocks(settings, there),
         *_geofence(settings, there),
         *_budget(settings),
@@ -110,9 +110,7 @@ def _batteries(there: Sequence[Snapshot], robots: Mapping[str, RobotSettings]) -
     return _all_well("batteries", found, f"{min(volts):.2f} to {max(volts):.2f} V")
 
 
-def _positions(
-    settings: SwarmSettings, there: Sequence[Snapshot], robots: Mapping[str, RobotSettings]
-) -> list[Finding]:
+def _positions(there: Sequence[Snapshot], robots: Mapping[str, RobotSettings]) -> list[Finding]:
     found, away = [], []
     for s in there:
         assert s.vehicle is not None

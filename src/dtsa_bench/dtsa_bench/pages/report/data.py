@@ -16,7 +16,7 @@ from dtsa_bench.recordings.tables.ages import follow_run
 from dtsa_bench.recordings.tables.followed import Ages
 from dtsa_bench.runs.hearing import recorded_problem, sentence
 
-from .distances import Distances, collision_m, crashes_of, distance_charts, pair_distances
+from .distances import collision_m, crashes_of, distance_charts, pair_distances
 from .json_values import BINS, flatten, pack, reduce_bins, thin
 from .mission import mission_data
 
@@ -69,7 +69,7 @@ def run_data(path: str | Path) -> dict[str, Any]:
         "sent_for": _sent_for(run),
         "distances": distance_charts(distances, run),
         "ages": _ages(ages, run),
-        "table": _table(run, ages, distances, scenario),
+        "table": _table(run, ages, scenario),
     }
 
 
@@ -232,9 +232,7 @@ def _ages(ages: Ages | None, run: RecordedRun) -> dict[str, Any] | None:
     }
 
 
-def _table(
-    run: RecordedRun, ages: Ages | None, distances: Distances | None, scenario: Scenario | None
-) -> list[dict[str, Any]]:
+def _table(run: RecordedRun, ages: Ages | None, scenario: Scenario | None) -> list[dict[str, Any]]:
     """One row an agent."""
     frames, motion = run.frames, run.motion
     rows = []
