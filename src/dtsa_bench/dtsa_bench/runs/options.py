@@ -22,19 +22,17 @@ _SECTIONS: tuple[tuple[str, type[Settings], tuple[str, ...]], ...] = (
 _TITLES = {"swarm": "the swarm", "channel": "the radio channel", "limits": "the end of a run"}
 
 
-def add_run_options(parser: argparse.ArgumentParser, skip: Iterable[str] = ()) -> None:
+def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Adds an option for every setting of a run, and `--channel FILE` for what does not fit into one option.
 
     :param parser: the command's parser.
-    :param skip: settings that the command does not offer.
     """
-    left_out = tuple(skip)
     for section, cls, derived in _SECTIONS:
         groups: dict[str, Any] = {}
         for setting in settings_of(cls):
             title = setting.group.lower() or _TITLES[section]
             group = groups.get(title) or groups.setdefault(title, parser.add_argument_group(title))
-            _offer(group, setting, section, "", (*derived, *left_out))
+            _offer(group, setting, section, "", derived)
         if section == "channel":
             group.add_argument(
                 "--channel",
@@ -140,7 +138,7 @@ def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:
     return int(Setting(name, "int", None, name, minimum=minimum, maximum=maximum).read(text))
 
 
-def new_directory(path: str | Path, name: str = "out") -> Path:
+def new_directory(path: str | Path) -> Path:
     """The directory for results: it does not exist yet, or is empty.
 
     :raises ConfigError: if it is in use or cannot be made.
@@ -148,8 +146,8 @@ def new_directory(path: str | Path, name: str = "out") -> Path:
     directory = Path(path)
     try:
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            raise ConfigError(name, str(path), "a directory that is empty or does not exist yet")
+            raise ConfigError("out", str(path), "a directory that is empty or does not exist yet")
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(name, str(path), f"a directory that can be written to ({error.strerror})") from None
+        raise ConfigError("out", str(path), f"a directory that can be written to ({error.strerror})") from None
     return directory

@@ -90,7 +90,6 @@ export class LiveRun {
     this.number = 0; // of the first moment that has come
     this.distance = new Series(["closest of all"]); this.ages = new Series(["mean of agents", "worst agent"]);
     this.shares = new Series(["success", "collision", "idle", "agents agree"]);
-    this.counted = {slot: 0, sent: 0};
   }
 
   /* Takes in moments; number: of the first. */
