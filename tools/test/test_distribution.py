@@ -1,4 +1,4 @@
-"""The distribution `dtsa`: built, installed into an environment without a workspace, and used from there."""
+"""Integration: the distribution `dtsa`: built, installed without a workspace, and used from there."""
 
 from __future__ import annotations
 
