@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from .precision import give_back_memory, going_first, wake_precisely
 from .prepared import Prepared
 from .record import Heard, SlotRecord, Watcher
 from .settings import AgentSettings
+from .strangers import Strangers
 from .tally import TOO_LATE, Tally
 from .vehicle import SimulatedVehicle, Vehicle
 
@@ -54,6 +56,7 @@ class AirAgent:
     :param watcher: is told what happens; None: nobody is.
     :param vehicle: what it flies; None: a simulated one.
     :param prepared: what follows from ``config``, if it is known already.
+    :param say: is told in flight, a line at a time, what its user should know; None: nobody is.
     :raises ConfigError: for an id or a policy that cannot fly here, or a missing key or session.
     """
 
@@ -65,6 +68,7 @@ class AirAgent:
         watcher: Watcher | None = None,
         vehicle: Vehicle | None = None,
         prepared: Prepared | None = None,
+        say: Callable[[str], None] | None = None,
     ) -> None:
         if own.id > config.agents:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
@@ -79,6 +83,7 @@ class AirAgent:
         self.watcher = watcher
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally()
+        self._strangers = Strangers(say)
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
         flight = flight_ns(config, port.flight_time_ns, port.byte_time_ns)
@@ -176,6 +181,8 @@ class AirAgent:
         :param found: see ``_hearing.pyi``.
         """
         heard, refused, restarted, more = found
+        if self._strangers.due_ns:
+            self._strangers.say(time.monotonic_ns())
         if refused is not None:
             for number, slot, data, arrival in refused:
                 self._refuse(self._own_name(slot, data) if number == OF_OWN_NAME else REASONS[number], data, arrival)
@@ -195,6 +202,7 @@ class AirAgent:
 
     def _refuse(self, reason: str, data: bytes, arrival_ns: int) -> None:
         self.tally.refused[reason] += 1
+        self._strangers.note(reason, time.monotonic_ns())
         if self.watcher is not None:
             self.watcher.other(reason, data, arrival_ns)
 

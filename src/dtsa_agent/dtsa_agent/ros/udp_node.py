@@ -38,7 +38,7 @@ def fly_over_udp(node: Node, agent: int, stop: Stop) -> int:
     logger = node.get_logger()
     try:
         with UdpPort(udp) as port:
-            flying = AirAgent(own, config, port, vehicle=vehicle)
+            flying = AirAgent(own, config, port, vehicle=vehicle, say=logger.warning)
             flying.run(stop)
             logger.info(f"ends: {json.dumps(flying.summary())}")
     finally:

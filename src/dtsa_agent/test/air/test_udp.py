@@ -6,6 +6,7 @@ import dataclasses
 import errno
 import os
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -299,6 +300,43 @@ def test_a_queue_that_is_full_is_told() -> None:
     """Linux drops a datagram at a full queue, and says so only to those that have asked for it."""
     with MulticastSocket(UdpSettings(interface="lo")) as end:
         assert end._out.getsockopt(socket.IPPROTO_IP, 11) == 1  # IP_RECVERR
+
+
+def test_other_settings_and_another_key_are_said_in_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second after the first such datagram, with counts; then not again for a while."""
+    monkeypatch.setenv("DTSA_AUTH_KEY", KEY.hex())
+    config = SwarmConfig(agents=3, policy="tdma", auth=True, auth_session=1)
+    others = dataclasses.replace(config, slot_ms=20.0)
+    udp = UdpSettings(interface="lo", group=f"239.255.81.81:{20_000 + os.getpid() % 10_000}")
+    said: list[str] = []
+    second, now = 1_000_000_000, [time.monotonic_ns()]
+    with UdpPort(udp) as port:
+        agent = AirAgent(AgentSettings(id=1), config, port, say=said.append)
+        frame = framed(2, 7)
+        slow = Wrapping(others, Authenticator(KEY, 1)).wrap(frame, 7)
+        strange = Wrapping(config, Authenticator(KEY[::-1], 1)).wrap(frame, 7)
+        monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
+
+        def arrives(*data: bytes) -> int:
+            verdicts = [agent.hearing.take_one(one, now[0])[0] for one in data]
+            agent._take_in((None, [(v, 0, d, now[0]) for v, d in zip(verdicts, data, strict=True)], False, False))
+            return len(said)
+
+        assert arrives(slow, strange, slow, b"noise" * 20) == 0
+        now[0] += second - 1
+        assert arrives() == 0
+        now[0] += 1
+        assert arrives() == 1
+        assert re.fullmatch(
+            "datagrams not taken in so far: 2 of other settings: slot length.*; 1 of another key.*", said[0]
+        )
+        now[0] += 20 * second
+        assert arrives(strange) == 1
+        now[0] += 10 * second
+        assert arrives() == 2
+        assert "; 2 of another key" in said[1]
+        now[0] += 1000 * second
+        assert arrives() == 2
 
 
 class Refusing:

@@ -69,9 +69,12 @@ def fly(order: Order) -> int:
     from dtsa_agent.air.udp import UdpPort
     from dtsa_agent.stop import Stop
 
+    def say(line: str) -> None:
+        print(f"dtsa: cf{order.own.id}: {line}", file=sys.stderr, flush=True)
+
     failure, directory = "", None
     with Stop() as stop, UdpPort(order.udp) as port:
-        agent = AirAgent(order.own, order.config, port, prepared=order.prepared)
+        agent = AirAgent(order.own, order.config, port, prepared=order.prepared, say=say)
         if order.out is None:
             agent.run(stop)
         else:
