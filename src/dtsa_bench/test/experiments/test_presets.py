@@ -80,6 +80,8 @@ def test_slots_of_slow_radios_hold_their_frames() -> None:
         "LoRa 250 kHz": [lora_ms(length, 250.0) for length in (19, 56)],
         "LoRa 500 kHz": [lora_ms(length, 500.0) for length in (19, 56)],
         "SiK 64 kbit/s": [8 * (length + 12) / 64.0 for length in (19, 56)],
+        "SiK 250 kbit/s": [8 * (length + 12) / 250.0 for length in (19, 56)],
+        "ESP-NOW long range": [8 * (length + 43) / 250.0 for length in (19, 56)],
     }
     for short, long in times.values():
         assert f"| {short:.1f} | {long:.1f} |" in text

@@ -81,8 +81,8 @@ Of `tools/dtsa export` and of the data frames of `import dtsa`. Ids begin at 1. 
 from the start of slot 0. Frame `map` has its origin in the room's centre (ENU: x and y level, z up).
 
 Of a bag that `tools/dtsa merge` has made, slot 0 is the first slot that all agents counted alike; the number that the
-agents gave it is in the bag. What no agent's bag says is empty there, or has no row: decisions, states and observers
-of an agent without a bag, what it sent in slots in which nobody heard it, and whether it received.
+agents gave it is in the bag. Values that no agent's bag holds are empty there, or have no row: decisions, states and
+observers of an agent without a bag, what it sent in slots in which nobody heard it, and whether it received.
 """
 
 
