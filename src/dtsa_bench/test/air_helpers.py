@@ -7,7 +7,7 @@ import random
 import socket
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -128,3 +128,36 @@ class Stranger:
         """Leaves."""
         with suppress(socket.error):
             self.socket.close()
+
+
+class OneWay:
+    """Carries datagrams from one group of the loopback interface to another one, late, and none back.
+
+    :param source: the group that is heard.
+    :param target: the group that hears it.
+    :param delay_s: s, how long each is under way.
+    """
+
+    def __init__(self, source: str, target: str, delay_s: float) -> None:
+        self._ends = [MulticastSocket(UdpSettings(interface="lo", group=group)) for group in (source, target)]
+        self._delay_s = delay_s
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        waiting: deque[tuple[float, bytes]] = deque()
+        source, target = self._ends
+        while not self._stopped:
+            now = time.monotonic()
+            waiting.extend((now + self._delay_s, datagram.data) for datagram in source.receive(100))
+            while waiting and waiting[0][0] <= now:
+                target.send(waiting.popleft()[1])
+            time.sleep(0.0005)
+
+    def end(self) -> None:
+        """Carries nothing any more."""
+        self._stopped = True
+        self._thread.join(_PATIENCE_S)
+        for end in self._ends:
+            end.close()

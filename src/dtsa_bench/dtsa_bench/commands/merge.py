@@ -10,8 +10,9 @@ from pathlib import Path
 DESCRIPTION = """\
 Lays the bags that agents on a network have made of their own flights on one time line, by the frames that they share,
 and says what came of the flight: clocks, ages, errors, agreement, the closest pair; whether two spoke in one turn;
-whether all decisions follow from what each agent heard, made again by the core. Exit code 1 if they do not, or if the
-agents did not hear each other. --out keeps the whole flight as one bag, which report, export, verify, replay and ros2
+whether all decisions follow from what each agent heard, made again by the core. Exit code 1 if they do not, if the
+agents did not hear each other, or if frames do not go both ways between groups of them: offsets of clocks are not
+determined then. --out keeps the whole flight as one bag, which report, export, verify, replay and ros2
 bag take like any other."""
 
 
@@ -29,8 +30,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Merge, and print what came of it."""
     from dtsa_agent.core.settings.declaration import Setting
-    from dtsa_bench.recordings.merge.agent_bag import read
-    from dtsa_bench.recordings.merge.merge import Merge, verified
+    from dtsa_bench.recordings.merge.agent_bag import read_all
+    from dtsa_bench.recordings.merge.merge import Merge, clocks_apart, verified
 
     out = Path(args.out) if args.out else None
     if out is not None:
@@ -40,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
         check_free(out)
     air_us = Setting("air_us", "float", 0.0, "time of a frame on the air", unit="us", minimum=0, maximum=1e6)
     air_ns = round(air_us.read(args.air_us) * 1e3)
-    merged = Merge([read(path) for path in args.bags])
+    merged = Merge(*read_all(args.bags))
     summary = merged.judge(air_ns)
     if out is not None:
         write(out, lay(merged, summary), summary)
@@ -48,6 +49,10 @@ def run(args: argparse.Namespace) -> int:
     print(text if args.json else "\n".join(lines(summary)) + "\n", end="")
     if summary["unheard"]:
         print(f"dtsa: {summary['unheard']}", file=sys.stderr)
+    if merged.apart:
+        print(f"dtsa: {clocks_apart(merged.apart)}", file=sys.stderr)
+    for path in merged.nothing_written:
+        print(f"dtsa: {path}: nothing was written there; left out", file=sys.stderr)
     return 0 if verified(summary) and not summary["unheard"] else 1
 
 

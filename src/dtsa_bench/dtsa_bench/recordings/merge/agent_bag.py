@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,11 +49,16 @@ class AgentBag:
         return flight_ns(self.swarm, int(self.udp["flight_time_ns"]), int(self.udp["byte_time_ns"]))
 
 
+class NothingWritten(UnusableBag):
+    """A process was started, and ended before it wrote anything."""
+
+
 def find(path: str | Path) -> Path:
     """The file of what was given as an agent's bag.
 
     :param path: the file, or a directory with one in it.
     :raises UnusableBag: if there is none, or several.
+    :raises NothingWritten: for a directory without one.
     """
     given = Path(path)
     if not given.is_dir():
@@ -60,6 +66,8 @@ def find(path: str | Path) -> Path:
             raise UnusableBag(given, "there is no such file or directory")
         return given
     found = sorted(given.glob("*.mcap"))
+    if not found:
+        raise NothingWritten(given, "holds no .mcap file")
     if len(found) != 1:
         raise UnusableBag(given, f"holds {len(found)} .mcap files; name one")
     return found[0]
@@ -70,12 +78,15 @@ def read(path: str | Path) -> AgentBag:
 
     :param path: see :func:`find`.
     :raises UnusableBag: if it is no bag of an agent on a network.
+    :raises NothingWritten: if its process ended before it wrote anything.
     """
     file = find(path)
     bag: AgentBag | None = None
     topics: dict[int, str] = {}
     finished = False
     try:
+        if not file.stat().st_size:
+            raise NothingWritten(file, "is empty")
         with file.open("rb") as stream:
             try:
                 for record in StreamReader(stream, validate_crcs=True, record_size_limit=_LONGEST_RECORD).records:
@@ -97,6 +108,25 @@ def read(path: str | Path) -> AgentBag:
         raise UnusableBag(file, f"no bag of an agent on a network, as `{program()} agent --out` makes them")
     bag.broken_off = not finished
     return bag
+
+
+def read_all(paths: Sequence[str | Path]) -> tuple[list[AgentBag], list[str]]:
+    """The bags of a flight's agents, and, by path, the processes that wrote nothing.
+
+    :param paths: see :func:`find`.
+    :raises UnusableBag: if one is no bag of an agent on a network, or the only one given is not written.
+    """
+    if len(paths) == 1:
+        return [read(paths[0])], []
+    found = [(str(path), _read_if_written(path)) for path in paths]
+    return [bag for _, bag in found if bag], [path for path, bag in found if not bag]
+
+
+def _read_if_written(path: str | Path) -> AgentBag | None:
+    try:
+        return read(path)
+    except NothingWritten:
+        return None
 
 
 def _metadata(file: Path, record: Metadata, bag: AgentBag | None) -> AgentBag | None:

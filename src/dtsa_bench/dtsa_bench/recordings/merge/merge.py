@@ -34,15 +34,18 @@ class Merge:
     """Bags of one flight on one time line.
 
     :param bags: one a process, in any order; an agent that came back has several.
+    :param nothing_written: directories and files of processes that ended before they wrote anything.
     :raises ConfigError: for bags of different swarms, two of one agent at one time, or none with a slot in it.
     """
 
-    def __init__(self, bags: Sequence[AgentBag]) -> None:
+    def __init__(self, bags: Sequence[AgentBag], nothing_written: Sequence[str] = ()) -> None:
         self.lives = _lives(bags)
+        self.nothing_written = list(nothing_written)
         self.config = bags[0].swarm
         self.sent = sent_of(self.lives)
-        self.strange, self._crossings = _crossings(self.lives, self.sent)
+        self.strange, self._crossings = _crossings(self.lives, self.sent, not self.nothing_written)
         self.line = fit(self._crossings, bags[0].flight_ns)
+        self.apart = _apart(self.lives, self.line)
         self.turns = _Turns(self.lives, self.line, self.config.slot_ns)
 
     def judge(self, air_ns: int = 0) -> dict[str, Any]:
@@ -67,7 +70,9 @@ class Merge:
             "bags": len(lives),
             "missing": [agent for agent in range(1, self.config.agents + 1) if agent not in here],
             "broken_off": [named(life) for life, bag in lives.items() if bag.broken_off],
+            "nothing_written": self.nothing_written,
             "not_on_the_time_line": [named(life) for life in lives if life not in line.clocks],
+            "not_determined": self.apart,
             "time_line": line.summary(),
             **self.turns.summary(),
             **_air(self.sent, line, air_ns, common_slot),
@@ -89,8 +94,21 @@ def verified(summary: Mapping[str, Any]) -> bool:
     """
     again = summary["decisions_again"]
     # Of frames that nobody else heard nothing is known if their sender's bag was not finished.
-    kept = summary["broken_off"] or summary["missing"] or not summary["turns"]["rules_broken"]
-    return bool(again["equal"] == again["of"] and not summary["frames_heard_not_as_sent"] and kept)
+    parts = summary["broken_off"] or summary["missing"] or summary["nothing_written"]
+    kept = parts or not summary["turns"]["rules_broken"]
+    told = again["equal"] == again["of"] and not summary["frames_heard_not_as_sent"]
+    return bool(told and kept and not summary["not_determined"])
+
+
+def clocks_apart(groups: Sequence[Sequence[str]]) -> str:
+    """Says that clocks of groups cannot be compared; empty where there are none.
+
+    :param groups: the names in each, `not_determined` of :meth:`Merge.judge`.
+    """
+    if not groups:
+        return ""
+    named_groups = " | ".join(", ".join(group) for group in groups)
+    return f"offsets of clocks not determined: frames do not go both ways between {named_groups}"
 
 
 def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
@@ -111,6 +129,17 @@ def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
             raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
         found[(bag.agent, number)] = bag
     return found
+
+
+def _apart(lives: Mapping[Life, AgentBag], line: TimeLine) -> list[list[str]]:
+    """The groups between which frames do not go both ways, by names; empty: it is one group.
+
+    A process that sent nothing could not be heard: it makes no group, and is not on the time line either.
+    """
+    sharing = {life for group in line.groups for life in group}
+    alone = [(life,) for life in lives if life not in sharing]
+    groups = [group for group in (*line.groups, *alone) if any(r.datagram for one in group for r in lives[one].slots)]
+    return [[named(life) for life in group] for group in groups] if len(groups) > 1 else []
 
 
 def sent_of(lives: Mapping[Life, AgentBag]) -> dict[tuple[int, int], Sent]:
@@ -149,19 +178,24 @@ def again(lives: Mapping[Life, AgentBag], replays: Mapping[Life, Replay]) -> dic
     }
 
 
-def strange_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> int:
+def strange_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], complete: bool) -> int:
     """How many frames were heard that their sender's bag does not have, or has otherwise.
 
     :param lives: the bags.
     :param sent: all frames of their bags.
+    :param complete: whether each process of the agents that have bags has one here.
     """
-    return _crossings(lives, sent)[0]
+    return _crossings(lives, sent, complete)[0]
 
 
-def _crossings(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> tuple[int, list[Crossing]]:
+def _crossings(
+    lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], complete: bool
+) -> tuple[int, list[Crossing]]:
     """How many frames were heard that their sender's bag does not have, and all others."""
     strange, found = 0, []
-    whole = {agent for agent, _ in lives} - {agent for (agent, _), bag in lives.items() if bag.broken_off}
+    whole: set[int] = set()
+    if complete:
+        whole = {agent for agent, _ in lives} - {agent for (agent, _), bag in lives.items() if bag.broken_off}
     for receiver, bag in lives.items():
         for record in bag.slots:
             for heard in (*record.before, *record.heard):
@@ -223,7 +257,8 @@ class _Turns:
 
     def summary(self) -> dict[str, Any]:
         """When all counted alike, and how far apart slots started then."""
-        after = None if self._common_ns is None else (self._common_ns - max(self._started)) / 1e9
+        known = self._common_ns is not None and self._started
+        after = (self._common_ns - max(self._started)) / 1e9 if known else None
         return {
             "common_slot": self.common_slot,
             "common_after_last_start_s": after,

@@ -18,6 +18,7 @@ from dtsa_channel_sim import ChannelConfig
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 from .agent_bag import AgentBag
+from .known_pairs import KnownPairs, all_known_after
 from .replay import Replay
 from .timeline import Life
 
@@ -67,7 +68,7 @@ def fly(
     if not lives:
         return None
     config = next(iter(lives.values())).swarm
-    begins = None if common_slot is None else common_slot + (config.anchor_every + 2) * config.agents
+    begins = None if common_slot is None else common_slot + all_known_after(config)
     by_slot: dict[int, dict[Life, SlotRecord]] = {}
     records: dict[int, dict[int, SlotRecord]] = {agent: {} for agent, _ in lives}
     for life, bag in lives.items():
@@ -82,27 +83,31 @@ def fly(
     for agent in range(1, config.agents + 1):
         if agent not in records:
             metrics.lose(agent, hovers=False)
-    first = None
+    first, known = None, KnownPairs(config, observers)
     for slot in sorted(by_slot):
         for life, record in by_slot[slot].items():
             replays[life].fly(record)
             replays[life].lay(tables, observers.index(life[0]))
+            known.hear(life[0], record)
         counts = begins is not None and begins <= slot < last
         if counts and first is None:
             counts = not any(_new(replays[life]) for life in by_slot[slot])
         if counts:
-            first = slot if first is None else first
+            if first is None:
+                first = slot
+                known.begin(slot)
             here = _follow(metrics, records, slot, track)
             if len(here) > 1:
                 metrics.compare_tables(slot, *_believed(records, here, slot, config.agents))
             count = senders.get(slot, 0)
             outcome = COLLISION if count > 1 else SUCCESS if count else IDLE
             metrics.update(slot, track, tables, outcome, [config.frame_length] * count)
+            known.follow(slot, here, tables)
         if common_slot is not None and slot >= common_slot:
             tables.estimate(slot + 1)
             yield Moment(slot, tables, _places(records, slot, config.agents), metrics.counted, counts)
         _forget(tables, observers, lives, slot)
-    return None if first is None else _results(metrics, first)
+    return None if first is None else _results(metrics, first) | known.summary()
 
 
 class Flown:

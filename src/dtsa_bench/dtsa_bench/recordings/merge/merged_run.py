@@ -23,7 +23,7 @@ from dtsa_bench.recordings.bag.errors import UnusableBag
 from dtsa_bench.recordings.bag.merged import MergedFrom
 
 from .agent_bag import AgentBag
-from .merge import Merge, again, judged, sent_of, strange_of
+from .merge import Merge, again, clocks_apart, judged, sent_of, strange_of
 from .merged_flight import Moment, ended, fly
 from .replay import Replay
 from .timeline import Clock, Life, named
@@ -63,10 +63,15 @@ class MergedRun:
         sent = sent_of(self.lives)
         replays = {life: Replay(bag) for life, bag in self.lives.items()}
         flown = ended(self.fly(replays))
+        # Bags of earlier versions have neither.
+        nothing_written, not_determined = (self.about.get(key, []) for key in ("nothing_written", "not_determined"))
+        complete = not nothing_written and not self.about["not_on_the_time_line"]
         return {
             "missing": self.about["missing"],
             "broken_off": self.about["broken_off"],
-            "frames_heard_not_as_sent": self.about["frames_heard_not_as_sent"] + strange_of(self.lives, sent),
+            "nothing_written": nothing_written,
+            "not_determined": not_determined,
+            "frames_heard_not_as_sent": self.about["frames_heard_not_as_sent"] + strange_of(self.lives, sent, complete),
             "decisions_again": again(self.lives, replays),
             "turns": judged(self.lives, sent, self.common_slot),
             "flight": flown,
@@ -88,6 +93,8 @@ def lay(merge: Merge, summary: Mapping[str, Any]) -> MergedRun:
     :raises ConfigError: if there is no slot that all counted alike.
     """
     first = merge.turns.common_slot
+    if first is None and merge.apart:
+        raise ConfigError("bags", len(merge.lives), f"bags of one flight on one time line; {clocks_apart(merge.apart)}")
     if first is None:
         raise ConfigError("bags", len(merge.lives), "bags of agents that hear each other and come to count slots alike")
     on_line = {life: bag for life, bag in merge.lives.items() if life in merge.line.clocks and bag.slots}
@@ -98,18 +105,21 @@ def lay(merge: Merge, summary: Mapping[str, Any]) -> MergedRun:
         return lambda own_ns: round((clock.common_ns(own_ns) - zero) * slot_ns / length)
 
     lives = {life: _moved(bag, shown(merge.line.clocks[life])) for life, bag in on_line.items()}
+    sent = sent_of(lives)
     strays: dict[tuple[int, int], OnAir] = {}
     for bag in lives.values():
         for record in bag.slots:
             for heard in (*record.before, *record.heard):
                 key = heard.slot, heard.sender
-                if key not in merge.sent and key not in strays:
+                if key not in sent and key not in strays:
                     strays[key] = OnAir(heard.arrival_ns - round(merge.line.flight_ns), heard.datagram[HEADER:])
     about = {
         "common_slot": first,
         "missing": summary["missing"],
         "broken_off": summary["broken_off"],
+        "nothing_written": summary["nothing_written"],
         "not_on_the_time_line": summary["not_on_the_time_line"],
+        "not_determined": summary["not_determined"],
         "frames_heard_not_as_sent": summary["frames_heard_not_as_sent"],
         "residual_us": summary["time_line"]["residual_us"],
         "clocks": summary["time_line"]["clocks"],

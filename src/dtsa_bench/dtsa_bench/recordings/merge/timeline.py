@@ -3,11 +3,13 @@
 Agent i sends a frame when its clock shows s, and agent j has it when its own shows a. Clocks are taken to run evenly:
 common time is t = c - o - d (c - c0), with an offset o and a drift d for each but the first, whose clock is the common
 one. The time that a frame is under way is one more number, the same for all; frames go both ways, so it does not pass
-for an offset. Least squares, without the frames that a busy computer has held up.
+for an offset. Least squares, without the frames that a busy computer has held up. Between groups whose frames go one
+way only an offset cannot be told from time under way: the line then has the clocks of the largest group alone.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -53,12 +55,13 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class TimeLine:
-    """The clocks of agents that have heard each other."""
+    """The clocks of agents that have heard each other, directly or by way of others."""
 
     clocks: Mapping[Life, Clock]
     residual_ns: NDArray[np.float64]  # of the frames in the fit
     left_out: int  # frames that were held up
-    flight_ns: float  # time under way, as fitted
+    flight_ns: float  # time under way, as fitted; as supposed, if there are no clocks
+    groups: Sequence[tuple[Life, ...]]  # of all that share frames, connected both ways; the first has the clocks
 
     def summary(self) -> dict[str, Any]:
         """Offsets, drifts and residuals as plain values."""
@@ -74,7 +77,7 @@ class TimeLine:
             },
             "frames": len(size),
             "frames_left_out": self.left_out,
-            "flight_time_us": self.flight_ns / 1e3,
+            "flight_time_us": self.flight_ns / 1e3 if self.clocks else None,
             "residual_us": {
                 name: float(np.quantile(size, share)) / 1e3 if len(size) else None
                 for name, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
@@ -91,18 +94,18 @@ def named(life: Life) -> str:
 
 
 def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
-    """The time line of the processes that are connected by frames with the first one of the lowest id.
+    """The time line of the largest group of processes whose frames go both ways, directly or by way of others.
 
     :param crossings: frames heard.
     :param flight_ns: ns, how long a frame is under way, about.
     """
-    used = crossings[:: max(1, len(crossings) // _MOST_FRAMES)]
-    coarse = _coarse(used, flight_ns)
+    groups = both_ways(crossings)
+    rows = _used(crossings, set(groups[0])) if groups else []
+    coarse = _coarse(rows, flight_ns)
     if not coarse:
-        return TimeLine({}, np.zeros(0), 0, float(flight_ns))
+        return TimeLine({}, np.zeros(0), 0, float(flight_ns), groups)
     ids = sorted(coarse)
     column = {life: k for k, life in enumerate(ids)}
-    rows = [c for c in used if c.sender in column and c.receiver in column]
     sender = np.array([column[c.sender] for c in rows])
     receiver = np.array([column[c.receiver] for c in rows])
     sent = np.array([c.sent_ns - coarse[c.sender] for c in rows], dtype=np.float64)
@@ -123,7 +126,37 @@ def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
         for life, k in column.items()
     }
     rest = (late - matrix @ solution[2:])[good]
-    return TimeLine(clocks, rest, int((~good).sum()), flight_ns + float(solution[-1]))
+    return TimeLine(clocks, rest, int((~good).sum()), flight_ns + float(solution[-1]), groups)
+
+
+def both_ways(crossings: Sequence[Crossing]) -> list[tuple[Life, ...]]:
+    """Groups of processes between any two of which frames go both ways, directly or by way of others.
+
+    :param crossings: frames heard.
+    :returns: the largest group first; of equal ones that of the lowest id. Each process is in one of them.
+    """
+    pairs = {(c.sender, c.receiver) for c in crossings}
+    lives = sorted({life for pair in pairs for life in pair})
+    column = {life: k for k, life in enumerate(lives)}
+    reaches = np.eye(len(lives), dtype=np.float32)
+    for sender, receiver in pairs:
+        reaches[column[sender], column[receiver]] = 1.0
+    for _ in range(len(lives).bit_length()):  # each round doubles the frames that a way may have
+        reaches = (reaches @ reaches > 0).astype(np.float32)
+    mutual = (reaches > 0) & (reaches.T > 0)
+    groups = {tuple(lives[k] for k in np.flatnonzero(row)) for row in mutual}
+    return sorted(groups, key=lambda group: (-len(group), group))
+
+
+def _used(crossings: Sequence[Crossing], group: set[Life]) -> list[Crossing]:
+    """The frames of the fit: those within a group, and of many every k-th of each pair, so that both ways stay."""
+    within = [c for c in crossings if c.sender in group and c.receiver in group]
+    every, seen, used = max(1, len(within) // _MOST_FRAMES), Counter[tuple[Life, Life]](), []
+    for c in within:
+        if seen[c.sender, c.receiver] % every == 0:
+            used.append(c)
+        seen[c.sender, c.receiver] += 1
+    return used
 
 
 def _equations(

@@ -8,7 +8,7 @@ from typing import Any
 from dtsa_bench.recordings.bag.errors import UnusableBag
 from dtsa_bench.recordings.bag.merged import merged_from
 from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.merge.merge import verified
+from dtsa_bench.recordings.merge.merge import clocks_apart, verified
 from dtsa_bench.recordings.merge.merged_messages import MergedMessages, Out
 from dtsa_bench.recordings.merge.merged_run import read
 from dtsa_bench.runs.config import RunConfig
@@ -76,10 +76,12 @@ class MergedCheck:
         if others := found["frames_heard_not_as_sent"]:
             why = "nobody hears what was not sent"
             raise Mismatch(Difference("frames heard", "as they were sent", f"{others} others", why))
+        if apart := found["not_determined"]:
+            raise Mismatch(Difference("time line", "one of all agents", f"{len(apart)} groups", clocks_apart(apart)))
         if not verified(found):
             why = "all bags are there and whole"
             raise Mismatch(Difference("frames in turn", "no rule broken", "; ".join(turns["which"]), why))
-        if found["missing"] or found["broken_off"]:
+        if found["missing"] or found["broken_off"] or found["nothing_written"]:
             result.skipped["turns"] = "bags are missing or break off: who was given a turn is not known of all"
         else:
             result.count("frames in turn", turns["frames_judged"])

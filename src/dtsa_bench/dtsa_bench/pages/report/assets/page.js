@@ -32,9 +32,11 @@ const FIGURES = [
   ["Idle slots", run => whole(run.summary.slots.idle), run => percent(run.summary.slots.total ? run.summary.slots.idle / run.summary.slots.total : null)],
   ["Lost to noise", run => percent(run.summary.lost_fraction, 2), () => "of all receptions"],
   ["Age", run => num(run.summary.age_mean_slots, 1, "slots"), run => `at most ${whole(run.summary.age_max_slots)}`],
+  ["Pairs known", run => percent(run.summary.pairs_known_share), run => `oldest frame heard ${whole(run.summary.heard_age_max_slots)} slots ago`, null, run => run.summary.pairs_known_share != null],
   ["Age from waking on", run => num(run.summary.waking_age_mean_slots, 1, "slots"), run => `first heard after ${whole(run.summary.first_heard_95_slots)} (95 %)`],
   ["Estimate error", run => length(run.summary.estimate_error_mean_m), run => `at most ${length(run.summary.estimate_error_max_m)}`],
 ];
+const shownFigures = FIGURES.filter(([, , , , has]) => !has || RUNS.some(has));
 function lede(run) {
   const s = run.summary, config = Object.fromEntries(run.config.map(([, name, value]) => [name, value]));
   const who = `${run.agents} agents${s.moving !== undefined && s.moving !== run.agents ? `, ${s.moving} moving` : ""}`;
@@ -51,7 +53,7 @@ root.append(el("header", {},
   el("span", {class: "options"}, scaleButton, " ", themeButton, " ", el("button", {type: "button", onclick: () => print()}, "Print"))));
 for (const run of RUNS) for (const note of run.notes) root.append(el("p", {class: "note"}, single ? note : `${run.name}: ${note}`));
 if (single) {
-  root.append(el("div", {class: "figures"}, ...FIGURES.map(([label, value, extra, kind]) => {
+  root.append(el("div", {class: "figures"}, ...shownFigures.map(([label, value, extra, kind]) => {
     const [, number, unit] = value(RUNS[0]).match(/^(.*?)(?:\u202f(.*))?$/);
     return el("div", {class: "figure"}, el("div", {class: "label"}, label),
       el("div", {class: `value ${kind ? kind(RUNS[0]) : ""}`}, number, unit ? el("small", {}, " " + unit) : null), el("div", {class: "extra"}, extra(RUNS[0])));
@@ -60,7 +62,7 @@ if (single) {
   main.append(el("section", {}, el("h2", {}, "Results"), el("p", {class: "what"}, "Definitions are those of summary.json."), el("div", {class: "scroll"}, el("table", {},
     el("thead", {}, el("tr", {}, el("th"), ...RUNS.map((run, index) => el("th", {}, runTitle(run, index))))),
     el("tbody", {}, el("tr", {}, el("td", {}, "Settings"), ...RUNS.map(run => el("td", {style: "white-space:normal;max-width:260px"}, lede(run)))),
-      ...FIGURES.map(([label, value, extra, kind]) => el("tr", {}, el("td", {}, label), ...RUNS.map(run => el("td", {class: kind ? kind(run) : ""}, value(run))))))))));
+      ...shownFigures.map(([label, value, extra, kind]) => el("tr", {}, el("td", {}, label), ...RUNS.map(run => el("td", {class: kind ? kind(run) : ""}, value(run))))))))));
 }
 root.append(main);
 

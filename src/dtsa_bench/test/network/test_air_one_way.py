@@ -1,0 +1,188 @@
+"""Integration: bags of agents over UDP between which frames go one way only, or nothing was written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import air_helpers as helpers
+import numpy as np
+import pytest
+from waiting import wait_for
+
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp import UdpSettings
+from dtsa_agent.core import SwarmConfig
+from dtsa_bench.commands.cli import main
+from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.recordings.merge.agent_bag import NothingWritten, read
+from dtsa_bench.recordings.merge.known_pairs import all_known_after
+from dtsa_bench.recordings.merge.merge import Merge
+from dtsa_bench.recordings.merge.timeline import Crossing, Life, both_ways, fit
+from dtsa_bench.recordings.verify import verify_bag
+
+CONFIG = SwarmConfig(agents=3, policy="lease", slot_ms=20.0, open_every=0, adoption=False)
+DELAY_S = 0.1
+MS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """cf1 and cf2 hear each other; cf3 hears them after 100 ms, and nobody hears cf3."""
+    helpers.need_multicast()
+    directory = tmp_path_factory.mktemp("one_way")
+    near, far = helpers.own_group(), helpers.own_group()
+    paths = [directory / f"cf{agent}" / f"cf{agent}.mcap" for agent in (1, 2, 3)]
+    flying: list[helpers.Flying] = []
+    carrier = helpers.OneWay(near, far, DELAY_S)
+    try:
+        for agent, path in enumerate(paths, 1):
+            path.parent.mkdir()
+            udp = UdpSettings(interface="lo", group=far if agent == 3 else near)
+            flying.append(helpers.Flying(AgentSettings(id=agent), CONFIG, udp, path))
+        first, second, third = flying
+        wait_for(lambda: first.heard[2] > 20 and second.heard[1] > 20 and third.heard[1] > 20 and third.heard[2] > 20)
+        seen = len(third.slots)
+        wait_for(lambda: len(third.slots) > seen + 100)
+    finally:
+        for one in flying:
+            one.end()
+        carrier.end()
+    return paths
+
+
+def _merged(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, dict[str, Any], str]:
+    code = main(["merge", *map(str, words), "--json"])
+    said = capsys.readouterr()
+    return code, json.loads(said.out) if said.out else {}, said.err
+
+
+def test_between_groups_that_hear_one_way_no_offset_is_made_up(
+    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, found, said = _merged(capsys, *bags, "--out", tmp_path / "whole")
+    assert code == 1
+    assert found["not_determined"] == [["cf1", "cf2"], ["cf3"]]
+    assert found["not_on_the_time_line"] == ["cf3"]
+    assert said.count("\n") == 1
+    assert "not determined: frames do not go both ways between cf1, cf2 | cf3" in said
+    assert found["time_line"]["clocks"].keys() == {"cf1", "cf2"}  # all clocks are one here
+    assert abs(found["time_line"]["clocks"]["cf2"]["offset_ms"]) < 2.0
+    verified = verify_bag(tmp_path / "whole")
+    assert not verified.ok
+    assert "cf1, cf2 | cf3" in str(verified.difference)
+    assert any("cf3 are left out" in note for note in run_data(tmp_path / "whole")["notes"])
+
+
+def test_two_agents_of_which_one_is_deaf_have_no_time_line(
+    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, found, said = _merged(capsys, bags[0], bags[2])
+    assert code == 1
+    assert found["not_determined"] == [["cf1"], ["cf3"]]
+    assert "cf1 | cf3" in said
+    assert (found["time_line"]["clocks"], found["time_line"]["flight_time_us"]) == ({}, None)
+    assert (found["common_slot"], found["flight"]) == (None, None)
+    assert found["clock_spread_ms"] == {"mean": None, "max": None, "end": None}
+    code, _, said = _merged(capsys, bags[0], bags[2], "--out", tmp_path / "whole")
+    assert code == 2
+    assert (said.count("\n"), "cf1 | cf3" in said) == (1, True)
+    assert not (tmp_path / "whole").exists()
+
+
+def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(
+    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty, killed = tmp_path / "cf3", tmp_path / "killed"
+    empty.mkdir()
+    killed.mkdir()
+    (killed / "cf3.mcap").touch()
+    whole = tmp_path / "whole"
+    code, found, said = _merged(capsys, bags[0].parent, empty, bags[1].parent, killed, "--out", whole)
+    assert code == 0, said
+    assert found["nothing_written"] == [str(empty), str(killed)]
+    assert (found["bags"], found["missing"], found["not_determined"]) == (2, [3], [])
+    assert [str(empty) in line or str(killed) in line for line in said.splitlines()] == [True, True]
+    assert found["flight"]["pairs_known_share"] is not None
+    assert verify_bag(whole).ok
+    assert any(str(empty) in note for note in run_data(whole)["notes"])
+    with pytest.raises(NothingWritten, match=r"holds no \.mcap file"):
+        read(empty)
+    for words in ([empty], [empty, killed], [bags[0], tmp_path / "never"]):
+        code, _, said = _merged(capsys, *words)
+        assert (code, said.count("\n")) == (2, 1)
+
+
+def test_frames_of_a_process_that_wrote_nothing_are_no_lies(
+    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """cf2 was killed before it wrote, and its frames were heard; then it came back, and was heard, too."""
+    later = read(bags[1])
+    middle = later.slots[len(later.slots) // 2].slot
+    later.slots = [record for record in later.slots if record.slot >= middle]
+    assert Merge([read(bags[0]), later]).judge()["frames_heard_not_as_sent"] > 0
+    assert Merge([read(bags[0]), later], ["runs/cf2"]).judge()["frames_heard_not_as_sent"] == 0
+
+
+def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
+    ones = [read(path) for path in bags[:2]]
+    before = Merge(ones).judge()["flight"]
+    first, last = ones[1].slots[0].slot, ones[1].slots[-1].slot
+    since = first + (last - first) // 2
+    assert last - since > 2 * all_known_after(CONFIG)
+    for record in ones[1].slots:  # cf2 heard nothing in the second half
+        if record.slot >= since:
+            record.heard = []
+    after = Merge(ones).judge()["flight"]
+    assert before["heard_age_max_slots"] < after["heard_age_max_slots"] <= last - since + before["heard_age_max_slots"]
+    assert after["heard_age_max_slots"] > (last - since) * 0.8
+    assert after["heard_age_max_pair"] == [2, 1]
+    assert after["heard_age_max_ms"] == after["heard_age_max_slots"] * CONFIG.slot_ms
+    assert before["pairs_known_share"] == 1.0
+    assert 0.5 < after["pairs_known_share"] < 1.0
+
+
+def _crossings(delays_ns: dict[tuple[int, int], int], frames: int = 400) -> list[Crossing]:
+    """Frames among agents whose clocks are one and the same."""
+    draw = np.random.default_rng(5)
+    return [
+        Crossing((sender, 0), (receiver, 0), at * 10 * MS, at * 10 * MS + under_way + int(draw.normal(0, 5_000)))
+        for at in range(frames)
+        for (sender, receiver), under_way in delays_ns.items()
+    ]
+
+
+def _names(groups: list[tuple[Life, ...]]) -> list[tuple[int, ...]]:
+    return [tuple(agent for agent, _ in group) for group in groups]
+
+
+def test_time_under_way_does_not_pass_for_an_offset() -> None:
+    """Frames from cf1 and cf2 to cf3 and cf4 take 100 ms; back there are none."""
+    slow = {(sender, receiver): 100 * MS for sender in (1, 2) for receiver in (3, 4)}
+    near = dict.fromkeys([(1, 2), (2, 1), (3, 4), (4, 3)], 184_000)
+    line = fit(_crossings(near | slow), 30_000)
+    assert _names(list(line.groups)) == [(1, 2), (3, 4)]
+    assert line.clocks.keys() == {(1, 0), (2, 0)}
+    assert line.flight_ns == pytest.approx(184_000, abs=2_000)
+    lone = fit(_crossings({(1, 2): 100 * MS}), 30_000)
+    assert (dict(lone.clocks), lone.summary()["flight_time_us"]) == ({}, None)
+
+
+def test_groups_are_those_connected_both_ways_by_way_of_others() -> None:
+    ring = {(1, 2): MS, (2, 3): MS, (3, 1): MS}
+    assert _names(both_ways(_crossings(ring, 3))) == [(1, 2, 3)]
+    line = fit(_crossings(ring), 30_000)
+    assert line.flight_ns == pytest.approx(MS, abs=5_000)
+    assert all(abs(clock.offset_ns + clock.coarse_ns - line.clocks[(1, 0)].coarse_ns) < 5_000
+               for clock in line.clocks.values())  # fmt: skip
+    assert _names(both_ways(_crossings(ring | {(4, 1): MS, (4, 5): MS, (5, 4): MS}, 3))) == [(1, 2, 3), (4, 5)]
+    assert both_ways([]) == []
+
+
+def test_of_many_frames_the_rare_ones_of_one_way_stay_in_the_fit() -> None:
+    many = _crossings({(1, 2): MS}, 90_001)
+    back = Crossing((2, 0), (1, 0), 5 * MS, 6 * MS)
+    line = fit([*many[:7], back, *many[7:]], 30_000)
+    assert line.clocks.keys() == {(1, 0), (2, 0)}
+    assert line.flight_ns == pytest.approx(MS, abs=50_000)
