@@ -72,7 +72,7 @@ def test_between_groups_that_hear_one_way_no_offset_is_made_up(
     verified = verify_bag(tmp_path / "whole")
     assert not verified.ok
     assert "cf1, cf2 | cf3" in str(verified.difference)
-    assert any("cf3 are left out" in note for note in run_data(tmp_path / "whole")["notes"])
+    assert any("the others: cf3." in note for note in run_data(tmp_path / "whole")["notes"])
 
 
 def test_two_agents_of_which_one_is_deaf_have_no_time_line(

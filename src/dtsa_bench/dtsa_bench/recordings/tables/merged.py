@@ -96,7 +96,7 @@ def merged_notes(about: Mapping[str, Any], results: NDArray[np.int64]) -> list[s
     for key, text in (
         ("missing", "There is no bag of {}: what they did, and where they were, is not known."),
         ("broken_off", "The bags of {} break off: what they did afterwards is not known."),
-        ("not_on_the_time_line", "{} are left out: frames do not go both ways between them and the others."),
+        ("not_on_the_time_line", "Left out because frames do not go both ways between them and the others: {}."),
         ("nothing_written", "Nothing was written in {}."),
     ):
         if about.get(key):
