@@ -105,12 +105,16 @@ def test_a_frame_reaches_all_others_as_it_was_sent(cables: Cables) -> None:
     assert seen.end_ns - seen.start_ns == 130_000 + (73 + 8 * 47) * 500
 
 
-def test_frames_that_overlap_destroy_each_other(cables: Cables) -> None:
-    cables.send(1, frame(1, 3))
-    cables.send(2, frame(2, 3))
-    cables.carry(2)
-    assert [cables.heard(host) for host in (1, 2, 3)] == [[], [], []]
-    assert [seen.collided > 0 for seen in cables.switch.log] == [True, True]
+def test_frames_that_overlap_destroy_each_other() -> None:
+    cables = Cables(bitrate=2000)  # 0.2 s on the air: a busy machine reads both cables within it
+    try:
+        cables.send(1, frame(1, 3))
+        cables.send(2, frame(2, 3))
+        cables.carry(2)
+        assert [cables.heard(host) for host in (1, 2, 3)] == [[], [], []]
+        assert [seen.collided > 0 for seen in cables.switch.log] == [True, True]
+    finally:
+        cables.close()
 
 
 def test_a_cut_medium_carries_to_one_side(cables: Cables) -> None:
