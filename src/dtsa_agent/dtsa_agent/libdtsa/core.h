@@ -114,8 +114,8 @@ void gossip_learn(dtsa_table *table, int64_t sampled, const gossip_entry *entry)
 /* The same, of the table's own agent: somebody has heard it. */
 void gossip_confirm(dtsa_table *table, int64_t sampled, const gossip_entry *entry);
 
-/* avoider/avoider.c: command of one agent from others' states as estimated, docs/reference/avoiders.md.
- * `ages` may be NULL. */
+/* avoider/avoider.c: command of one agent from others' states as estimated,
+ * docs/reference/avoiders.md. `ages` may be NULL. */
 int avoid_scratch_doubles(int n);
 
 #endif

@@ -54,8 +54,8 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     if (!port) goto failed;
     if (h->agents < 1 || h->agents > DTSA_AGENTS_MAX || id < 1 || id > h->agents ||
         header_length != AGREED || key_length > (Py_ssize_t)sizeof h->key || h->length > LONGEST ||
-        h->length <= HEADER + DTSA_TAG_BYTES || h->own_bytes < 0 || drift < -DRIFT_MOST || drift > DRIFT_MOST ||
-        !(h->position_step > 0.0) ||
+        h->length <= HEADER + DTSA_TAG_BYTES || h->own_bytes < 0 ||
+        drift < -DRIFT_MOST || drift > DRIFT_MOST || !(h->position_step > 0.0) ||
         !dtsa_timebase_init(&h->base, h->agents, anchor_every, slot_ns, id, seed)) {
         PyErr_SetString(PyExc_ValueError, "what is heard: a value is out of range");
         goto failed;

@@ -11,9 +11,9 @@ int avoid_scratch_doubles(int n);
 /* Commanded velocity of agent `self` (0-based).
  * position, velocity, goal: own true state and goal, 3 each (m, m/s, frame map).
  * others_p, others_v: (3, n) planes, where this agent takes everybody to be now; entry `self` is
- * ignored, and so is whoever's estimated position is not finite. age_s: (n) seconds since each one's
- * state was sampled, or NULL (no margins). scratch: avoid_scratch_doubles(n) doubles, contents
- * undefined. command: 3, output. */
+ * ignored, and so are positions that are not finite. age_s: (n) seconds since each one's state was
+ * sampled, or NULL (no margins). scratch: avoid_scratch_doubles(n) doubles, contents undefined.
+ * command: 3, output. */
 void avoid_command(int kind, const dtsa_avoid_params *params, int n, int self,
                    const double position[3], const double velocity[3], const double goal[3],
                    const double *others_p, const double *others_v, const double *age_s,

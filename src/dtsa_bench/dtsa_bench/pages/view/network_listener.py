@@ -30,6 +30,7 @@ from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import authenticator
 from dtsa_bench.pages.report.json_values import pack
+from dtsa_bench.recordings.merge.known_pairs import all_known_after
 from dtsa_bench.recordings.rules.judge import Judge
 from dtsa_bench.runs.config import REALTIME, RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, SUCCESS
@@ -65,7 +66,7 @@ class HeardRun:
         self._frames: dict[int, dict[int, tuple[bytes, bytes]]] = {}  # by slot, sender: with and without its tag
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
         self._absent = set(range(1, config.agents + 1))
-        self._quiet = (config.anchor_every + 2) * config.agents  # slots, in which everybody has had a turn
+        self._quiet = all_known_after(config)  # slots, in which every agent has had a turn
         self._late_ns: deque[int] = deque(maxlen=_LATENESS)
         self._nobody = np.zeros(config.agents, np.uint16)  # whom they take for the sender, only the agents know
         self._reason = np.full(config.agents, _NO_REASON, np.uint8)

@@ -1,6 +1,6 @@
 """Records what one agent did and heard: MCAP with JSON messages, which needs no ROS.
 
-What is in it: docs/how-to/several-computers.md.
+What is in it: docs/reference/network.md.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 /* Policy lease: an agent's decisions. Who may send in a slot, and what silence means.
  *
  * Only the owner of a turn gives it away, in a frame of its own, for good, and at most up to its
- * next main anchor; who was given it may hand it on in the same way. So whoever sends in a turn is
- * its owner or the last one that was named for it. docs/reference/protocol.md has states and events,
- * docs/explanation/lease.md the proof.
+ * next main anchor; an agent that was given it may hand it on in the same way. So the sender in a
+ * turn is its owner or the last one that was named for it. docs/reference/protocol.md has states
+ * and events, docs/explanation/lease.md the proof.
  */
 #include <string.h>
 
