@@ -73,6 +73,38 @@ class Host:
 
         return subprocess.Popen(command, preexec_fn=enter, text=True, **more)
 
+    def unplug(self) -> None:
+        """Its interface goes, as a USB adapter that is pulled."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as loose:  # nothing comes from there or goes there
+            loose.setblocking(False)
+            os.dup2(loose.fileno(), self.cable, inheritable=False)
+
+    def plug(self, address: str) -> None:
+        """An interface of the same name is made anew.
+
+        :param address: its address.
+        """
+        with inside(self):
+            made = _new_cable(address)
+            os.dup2(made, self.cable, inheritable=False)
+            os.close(made)
+
+    def readdress(self, address: str) -> None:
+        """Its interface gets another address in place of the one that it has.
+
+        :param address: the new one.
+        """
+        with inside(self):
+            _set_address(address)
+
+    def switch(self, up: bool) -> None:
+        """Its interface is switched on or off; it keeps its address.
+
+        :param up: on.
+        """
+        with inside(self):
+            _set_up(CABLE, up)
+
 
 @contextmanager
 def hosts(count: int) -> Iterator[list[Host]]:
@@ -89,6 +121,25 @@ def hosts(count: int) -> Iterator[list[Host]]:
             if _libc().setns(home, _CLONE_NEWNET):
                 os._exit(1)  # whatever this process did from here on would be in the wrong place
         yield found
+
+
+@contextmanager
+def inside(host: Host) -> Iterator[None]:
+    """Until the end of the context this thread is on a host: sockets that it makes stay there.
+
+    :param host: the host.
+    """
+    home = os.open(_OWN, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        if _libc().setns(host.namespace, _CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        try:
+            yield
+        finally:
+            if _libc().setns(home, _CLONE_NEWNET):
+                os._exit(1)  # as in `hosts`
+    finally:
+        os.close(home)
 
 
 def arrived(cable: int) -> Iterator[bytes]:
@@ -118,19 +169,40 @@ def _made(stack: ExitStack, number: int) -> Host:
     try:
         if _libc().unshare(_CLONE_NEWNET):
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-        cable = _opened(stack, "/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
-        fcntl.ioctl(cable, _TUNSETIFF, struct.pack("16sH", CABLE.encode(), _IFF_TAP | _IFF_NO_PI))
         address = f"{_NET}.{number >> 8}.{number & 255}"
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-            _set(asked, _SIOCSIFADDR, CABLE, address)
-            _set(asked, _SIOCSIFNETMASK, CABLE, "255.255.0.0")
-            for name in (CABLE, "lo"):
-                flags = fcntl.ioctl(asked, _SIOCGIFFLAGS, struct.pack("16sH14x", name.encode(), 0))
-                up = struct.unpack_from("H", flags, 16)[0] | _IFF_UP
-                fcntl.ioctl(asked, _SIOCSIFFLAGS, struct.pack("16sH14x", name.encode(), up))
+        cable = _new_cable(address)
+        stack.callback(os.close, cable)
+        _set_up("lo", True)
         return Host(number, address, cable, _opened(stack, _OWN, os.O_RDONLY))
     except OSError as error:
         raise Unavailable(f"no network namespaces with TAP devices here: {error.strerror or error}") from None
+
+
+def _new_cable(address: str) -> int:
+    """A TAP device of the namespace in which this thread is; the switch's end."""
+    cable = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        fcntl.ioctl(cable, _TUNSETIFF, struct.pack("16sH", CABLE.encode(), _IFF_TAP | _IFF_NO_PI))
+        _set_address(address)
+        _set_up(CABLE, True)
+    except OSError:
+        os.close(cable)
+        raise
+    return cable
+
+
+def _set_address(address: str) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        _set(asked, _SIOCSIFADDR, CABLE, address)
+        _set(asked, _SIOCSIFNETMASK, CABLE, "255.255.0.0")
+
+
+def _set_up(name: str, up: bool) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        flags = fcntl.ioctl(asked, _SIOCGIFFLAGS, struct.pack("16sH14x", name.encode(), 0))
+        before = struct.unpack_from("H", flags, 16)[0]
+        after = before | _IFF_UP if up else before & ~_IFF_UP
+        fcntl.ioctl(asked, _SIOCSIFFLAGS, struct.pack("16sH14x", name.encode(), after))
 
 
 def _set(asked: socket.socket, request: int, name: str, address: str) -> None:

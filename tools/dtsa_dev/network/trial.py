@@ -74,7 +74,7 @@ class Flight:
 
     def __init__(self, trial: Trial, joined: Sequence[Host], directory: Path) -> None:
         self.trial, self.directory = trial, directory
-        self._joined = {host.number: host for host in joined}
+        self.joined = {host.number: host for host in joined}
         swarm = trial.swarm
         shared = {"agents": swarm.agents, "slot_ns": swarm.slot_ns, "seed": trial.seed, "link_delay_ns": 0}
         self.config = ChannelConfig(**{**shared, **trial.channel})
@@ -101,7 +101,7 @@ class Flight:
         command = [sys.executable, "-m", "dtsa_bench", "agent"]
         command += [f"--{name}={value}" for name, value in words.items()] + swarm_words(self.trial.swarm)
         with (self.directory / f"cf{agent}-{life}.err").open("w") as errors:
-            self._processes[agent] = self._joined[agent].start(
+            self._processes[agent] = self.joined[agent].start(
                 command, self._random.randrange(1, _CLOCKS_S), stdout=subprocess.DEVNULL, stderr=errors,
                 env={**os.environ, VARIABLE: self.key},
             )  # fmt: skip
@@ -132,7 +132,7 @@ class Flight:
 
         :raises NotFlown: if one does not.
         """
-        order = list(self._joined)
+        order = list(self.joined)
         self._random.shuffle(order)
         for agent in order:
             self.start(agent)

@@ -26,6 +26,7 @@ from dtsa_agent.stop import Stop
 
 from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, flight_ns
 from .hearing import OF_OWN_NAME, REASONS, STATES, make_hearing
+from .outage import Outage
 from .port import DatagramPort
 from .precision import give_back_memory, going_first, wake_precisely
 from .prepared import Prepared
@@ -83,7 +84,8 @@ class AirAgent:
         self.watcher = watcher
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally()
-        self._strangers = Strangers(say)
+        self._strangers, self._outage = Strangers(say), Outage(say)
+        port.say = say
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
         flight = flight_ns(config, port.flight_time_ns, port.byte_time_ns)
@@ -314,8 +316,11 @@ class AirAgent:
         datagram = self.hearing.wrap(frame, self.slot, late)
         refusal = self._port.send(datagram)
         if refusal:
+            self._outage.refused(refusal, time.monotonic_ns())
             self._drop(refusal)
             return
+        if self._outage.since_ns:
+            self._outage.left(time.monotonic_ns())
         self._said.append(datagram)
         self.tally.sent(late)
         if self._record is not None:

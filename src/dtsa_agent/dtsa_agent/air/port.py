@@ -6,6 +6,7 @@ derives the outcome of a slot from what its own receiver has heard.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -57,6 +58,7 @@ class DatagramPort(Protocol):
     flight_time_ns: int  # from the order to send a datagram until its arrival, without the time of its bytes
     byte_time_ns: int  # what each byte adds to that
     compiled: Any  # a capsule: what the compiled hearing reads (_hearing/port.h)
+    say: Callable[[str], None] | None  # set by the agent: is told a line in flight when the port fails or is back
 
     def send(self, data: bytes) -> str:
         """Sends a datagram at once; why the port has not taken it, or an empty text.

@@ -38,7 +38,7 @@ SLOT_NS, OWN, UDP = OPEN.slot_ns, 2, UdpSettings(interface="lo", group="239.255.
 class NoPort:
     """A port through which nothing comes."""
 
-    flight_time_ns, byte_time_ns = UDP.flight_time_ns, UDP.byte_time_ns
+    flight_time_ns, byte_time_ns, say = UDP.flight_time_ns, UDP.byte_time_ns, None
 
     def __init__(self) -> None:
         self.compiled = _socket.open_port(-1, bytes(4), 9)

@@ -6,7 +6,7 @@ import fcntl
 import socket
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ _SECOND = 1_000_000_000
 _STEP_NS = 1_000_000  # the clock of the stamps has been set if it moved by this between two looks
 _EXACT_NS = 2_000  # between two looks at one clock: good enough for the other one in between
 _OLDEST_NS = 60 * _SECOND  # a stamp cannot be older than the longest sleep of a process
+_LOOK_NS = _SECOND  # a listener looks this often whether its interface is still the same
 
 
 class Datagram(NamedTuple):
@@ -76,45 +77,95 @@ def _look() -> tuple[int, int]:
     return best[1], best[2]
 
 
+class Place(NamedTuple):
+    """Where an interface is now: both change when it is made anew or gets another address."""
+
+    number: int  # that the kernel gives the interface
+    address: str  # IPv4
+
+
 class MulticastSocket:
     """Sends to a group and hears what others send to it. A context manager.
 
     Datagrams of other groups and interfaces do not get in. What it sends comes back to it, marked as its own: other
-    agents on this computer hear it in the same way.
+    agents on this computer hear it in the same way. When the interface is made anew, or gets another address, the group
+    is joined again: at a send that the network refuses, and for those that only listen within a second.
 
     :param settings: interface and group.
     :raises ConfigError: if the interface cannot be used.
     """
 
     def __init__(self, settings: UdpSettings) -> None:
-        self._group = settings.address
+        self._settings, self._group = settings, settings.address
         group, port = self._group
-        local = interface_address(settings.interface)
-        membership = struct.pack("=4s4si", socket.inet_aton(group), b"\0\0\0\0", settings.interface_index())
-        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        place = _place(settings)
         self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stamps = StampClock()
         self.unreadable = 0  # how often it could not be read
+        self.interface_changes = 0  # how often the group was joined again
+        self.say: Callable[[str], None] | None = None  # is told a line when the interface goes, and when it is back
+        self._place: Place | None = None  # by which the group is joined; None: the interface has gone
+        self._membership = b""
+        self._look_ns = time.monotonic_ns() + _LOOK_NS
         try:
-            self._out.bind((local, 0))
-            self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
-            self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, settings.ttl)
-            self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
-            self._out.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)  # else Linux drops, at a full queue, in silence
             self._in.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._in.bind(self._group)
             self._in.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
-            self._in.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
             with suppress(OSError):  # arrivals are then as exact as this process is quick
                 self._in.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            for end in (self._in, self._out):
-                end.setblocking(False)
+            self._in.setblocking(False)
+            self._join(place)
         except OSError as error:
             self.close()
             where = f"{settings.interface}, group {group}:{port}"
             raise ConfigError("interface", where, f"one that takes part in the group ({error.strerror})") from None
-        self.address: tuple[str, int] = self._out.getsockname()  # from which it sends
         self._read = self._in.recvmsg
+
+    def _join(self, place: Place) -> None:
+        """Joins the group, and sends to it, by an interface as it is now."""
+        membership = struct.pack("=4s4si", socket.inet_aton(self._group[0]), b"\0\0\0\0", place.number)
+        out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # a bound socket cannot get another address
+        try:
+            out.bind((place.address, 0))
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, self._settings.ttl)
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+            out.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)  # else Linux drops, at a full queue, in silence
+            out.setblocking(False)
+            if self._membership:  # of an interface that has gone, maybe: the socket still has it
+                with suppress(OSError):
+                    self._in.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, self._membership)
+            self._in.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        except OSError:
+            out.close()
+            raise
+        self._out.close()
+        self._out, self._membership, self._place = out, membership, place
+        self.address: tuple[str, int] = out.getsockname()  # from which it sends
+
+    def look(self) -> bool:
+        """Joins the group again if the interface is another one than before; whether that was so."""
+        try:
+            place = _place(self._settings)
+        except ConfigError:
+            if self._place is not None:
+                self._tell("has gone, or has no address: no frame leaves or arrives until it is back")
+            self._place = None
+            return False
+        if place == self._place:
+            return False
+        try:
+            self._join(place)
+        except OSError:  # it is not ready yet
+            return False
+        self.interface_changes += 1
+        self._tell(f"is another one now (number {place.number}, address {place.address}): joined the group again")
+        return True
+
+    def _tell(self, what: str) -> None:
+        if self.say is not None:
+            self.say(f"interface {self._settings.interface} {what}")
 
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
@@ -125,6 +176,10 @@ class MulticastSocket:
 
         :param data: the datagram.
         """
+        refusal = self._send(data)
+        return self._send(data) if refusal and self.look() else refusal
+
+    def _send(self, data: bytes) -> str:
         try:
             self._out.sendto(data, self._group)
         except OSError as error:  # the interface is down for a while, or its queue is full
@@ -136,6 +191,10 @@ class MulticastSocket:
 
         :param most: number of datagrams at a time.
         """
+        now = time.monotonic_ns()
+        if now >= self._look_ns:
+            self._look_ns = now + _LOOK_NS
+            self.look()
         arrived: list[tuple[bytes, list[tuple[int, int, bytes]], int, Any]] = []  # as the system gives them
         try:
             while len(arrived) < most:
@@ -174,6 +233,10 @@ def _stamp(notes: Sequence[tuple[int, int, bytes]]) -> int | None:
             seconds, nanoseconds = _STAMP.unpack_from(value)
             return int(seconds) * _SECOND + int(nanoseconds)
     return None
+
+
+def _place(settings: UdpSettings) -> Place:
+    return Place(settings.interface_index(), interface_address(settings.interface))
 
 
 def interface_address(name: str) -> str:

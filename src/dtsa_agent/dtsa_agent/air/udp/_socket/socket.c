@@ -85,6 +85,14 @@ static int receive(air_port *port, arrived batch[BURST])
 
 static void close_port(PyObject *capsule) { PyMem_Free(PyCapsule_GetPointer(capsule, DTSA_PORT)); }
 
+static int read_address(socket_port *s, const char *address, Py_ssize_t length, int number)
+{
+    if (length != 4) return PyErr_Format(PyExc_ValueError, "an address of %zd bytes", length), 0;
+    memcpy(&s->address.sin_addr.s_addr, address, 4);
+    s->address.sin_port = htons((uint16_t)number);
+    return 1;
+}
+
 static PyObject *open_port(PyObject *module, PyObject *args)
 {
     const char *address;
@@ -93,18 +101,32 @@ static PyObject *open_port(PyObject *module, PyObject *args)
     PyObject *capsule;
     (void)module;
     if (!PyArg_ParseTuple(args, "iy#i", &descriptor, &address, &length, &number)) return NULL;
-    if (length != 4) return PyErr_Format(PyExc_ValueError, "an address of %zd bytes", length);
     socket_port *s = PyMem_Calloc(1, sizeof *s);
     if (!s) return PyErr_NoMemory();
+    if (!read_address(s, address, length, number)) {
+        PyMem_Free(s);
+        return NULL;
+    }
     s->port = (air_port){descriptor, receive};
-    memcpy(&s->address.sin_addr.s_addr, address, 4);
-    s->address.sin_port = htons((uint16_t)number);
     stamps_look(&s->stamps);
     s->stamps.usable = 1;
     s->stamps.steps = 0;
     capsule = PyCapsule_New(s, DTSA_PORT, close_port);
     if (!capsule) PyMem_Free(s);
     return capsule;
+}
+
+static PyObject *set_address(PyObject *module, PyObject *args)
+{
+    const char *address;
+    Py_ssize_t length;
+    int number;
+    PyObject *capsule;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "Oy#i", &capsule, &address, &length, &number)) return NULL;
+    socket_port *s = PyCapsule_GetPointer(capsule, DTSA_PORT);
+    if (!s || !read_address(s, address, length, number)) return NULL;
+    Py_RETURN_NONE;
 }
 
 static PyObject *counts(PyObject *module, PyObject *capsule)
@@ -128,6 +150,7 @@ static PyObject *stamped(PyObject *module, PyObject *args)
 
 static PyMethodDef FUNCTIONS[] = {
     {"open_port", open_port, METH_VARARGS, NULL},
+    {"set_address", set_address, METH_VARARGS, NULL},
     {"counts", counts, METH_O, NULL},
     {"stamped", stamped, METH_VARARGS, NULL},
     {0},
