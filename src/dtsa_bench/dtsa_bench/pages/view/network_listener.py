@@ -66,6 +66,7 @@ class HeardRun:
         self._frames: dict[int, dict[int, tuple[bytes, bytes]]] = {}  # by slot, sender: with and without its tag
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
         self._absent = set(range(1, config.agents + 1))
+        self._lost: dict[int, int] = {}  # slot since when, of those that were heard before
         self._quiet = all_known_after(config)  # slots, in which every agent has had a turn
         self._late_ns: deque[int] = deque(maxlen=_LATENESS)
         self._nobody = np.zeros(config.agents, np.uint16)  # whom they take for the sender, only the agents know
@@ -111,11 +112,19 @@ class HeardRun:
 
     def _tell_moment(self, refused: Counter[str]) -> None:
         self._tables.estimate(self.slot)
-        self._moments.place(self.slot, self._tables.estimate_position[0])
+        self._moments.place(self.slot, self._places())
         late = statistics.median(self._late_ns) / 1e6 if self._late_ns else 0.0
         more = {"lag_ms": round(late, 2), "refused": refused.total(), "age": pack(self._ages())}
         gathered = self._moments.gather(self.slot, self._tables, self._nobody, None, self._absent, **more)
         self._track.add(self._moments.moment(gathered))
+
+    def _places(self) -> NDArray[np.float64]:
+        """(3, N) m, frame map, where the agents are: those that are lost where the last frame left them."""
+        place = self._tables.estimate_position[0].copy()
+        for agent, since in self._lost.items():
+            if self._tables.sent_slot[0, agent - 1] <= since:  # else others hear it, and tell of it
+                place[:, agent - 1] = self._tables.sent_position[0, :, agent - 1]
+        return place
 
     def _ages(self) -> NDArray[np.uint16]:
         """(N,) tenths of slots since each was heard, also those that rest."""
@@ -143,6 +152,7 @@ class HeardRun:
 
     def _note(self, slot: int, sender: int, frame: bytes) -> None:
         """Who has come, and who leaves."""
+        self._lost.pop(sender, None)
         if sender in self._absent:
             self._absent.discard(sender)
             self._moments.event(slot, "back", f"cf{sender} is heard")
@@ -155,6 +165,7 @@ class HeardRun:
     def _lose(self, slot: int, agent: int, text: str) -> None:
         del self._last[agent]
         self._absent.add(agent)
+        self._lost[agent] = slot
         self._moments.event(slot, "lost", text)
 
 

@@ -1,0 +1,70 @@
+"""What a listener on a network makes of frames, without a network."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.air.datagram import Wrapping
+from dtsa_agent.core import Frame, SwarmConfig, encode_frame
+from dtsa_bench.pages.view.network_listener import HeardRun
+from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
+
+CONFIG = SwarmConfig(agents=3, policy="tdma", slot_ms=50.0)
+FIRST = 300
+
+
+class Heard:
+    """A listener, to which frames come."""
+
+    def __init__(self) -> None:
+        self._track = Track("listener")
+        self._run = HeardRun(self._track, CONFIG, FIRST, 0)
+        self._wrapping = Wrapping(CONFIG, None)
+
+    def slots(self, first: int, end: int, senders: tuple[int, ...]) -> None:
+        """Slots go by; in its turn each sender says that it flies along x at 1 m/s.
+
+        :param first: the first slot.
+        :param end: the slot after the last one.
+        :param senders: those that are heard.
+        """
+        for slot in range(first, end):
+            sender = slot % CONFIG.agents + 1
+            now = slot * CONFIG.slot_ns
+            if sender in senders:
+                place = ((slot - FIRST) * CONFIG.slot_s, float(sender), 1.0)
+                frame = encode_frame(Frame(sender, slot, 1, place, (1.0, 0.0, 0.0)))
+                said = self._wrapping.read(self._wrapping.wrap(frame, slot))
+                assert (said.fault, self._run.hear(said, said.frame, 0, now)) == ("", "")
+            self._run.tell(Counter(), now)
+
+    def moments(self) -> list[dict[str, Any]]:
+        """What a page is told."""
+        return [json.loads(moment.text) for moment in self._track.since(0, MOST_MOMENTS)[1]]
+
+
+def places(moment: dict[str, Any]) -> NDArray[np.float32]:
+    """(3, N) m, where the page has the agents."""
+    return np.frombuffer(base64.b64decode(moment["place"]), "<f4").reshape(-1, 3, CONFIG.agents)[-1]
+
+
+def test_who_falls_silent_is_shown_where_it_was_heard_last_and_comes_back() -> None:
+    heard, lost, back = Heard(), FIRST + 30, FIRST + 330
+    heard.slots(FIRST, lost, (1, 2, 3))
+    heard.slots(lost, back, (1, 3))
+    at_end = heard.moments()[-1]
+    assert at_end["absent"] == [2]
+    last = max(slot for slot in range(FIRST, lost) if slot % 3 + 1 == 2)
+    np.testing.assert_allclose(places(at_end)[:, 1], ((last - FIRST) * CONFIG.slot_s, 2.0, 1.0), atol=0.01)
+    others = (at_end["slot"] - FIRST) * CONFIG.slot_s
+    np.testing.assert_allclose(places(at_end)[0, [0, 2]], others, atol=0.2)
+    heard.slots(back, back + 30, (1, 2, 3))
+    again = heard.moments()[-1]
+    assert again["absent"] == []
+    np.testing.assert_allclose(places(again)[0], (again["slot"] - FIRST) * CONFIG.slot_s, atol=0.2)
