@@ -22,6 +22,7 @@ COMPILE_FLAGS = [
 
 LIBRARY, SIMULATOR, BINDING = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/core/_kernel"
 HEARING, SOCKET = "dtsa_agent/air/_hearing", "dtsa_agent/air/udp/_socket"
+QUEUE = "dtsa_agent/air/_queue"
 OF_THE_LIBRARY = ("draw", "frame", "tag", "timebase")  # what an agent on a network uses without Python between
 
 
@@ -59,6 +60,14 @@ setup(
             depends=[*files(".h", (HEARING, SOCKET)), "setup.py"],
             include_dirs=[HEARING, SOCKET],  # of the hearing: port.h alone
             define_macros=[("_GNU_SOURCE", None)],  # recvmmsg
+            extra_compile_args=COMPILE_FLAGS,
+            py_limited_api=True,
+        ),
+        Extension(
+            "dtsa_agent.air._queue",
+            sources=files(".c", (QUEUE,)),
+            depends=[*files(".h", (HEARING,)), "setup.py"],
+            include_dirs=[HEARING],  # port.h alone
             extra_compile_args=COMPILE_FLAGS,
             py_limited_api=True,
         ),

@@ -177,6 +177,7 @@ def compiled() -> list[Path]:
     return [
         kernel(),
         package / "air" / "_hearing.abi3.so",
+        package / "air" / "_queue.abi3.so",
         package / "air" / "udp" / "_socket.abi3.so",
         package / "ros" / "common" / "workarounds" / "_endless.abi3.so",
     ]

@@ -34,10 +34,14 @@ static hearing *opened(input *in)
     if (!h) abort();
     h->agents = 1 + (int)(next(in, 1) % 12);
     h->self = (int)(next(in, 1) % h->agents);
-    memcpy(h->header, "DT\1\0abcd", AGREED);
+    h->agreed = kind >> 4 & 1 ? 2 : WITH_MAGIC; /* a port where bytes are dear, or a network */
+    h->late_bytes = 2;
+    h->peers = kind >> 4 & 1 ? 1 : PEERS;
+    h->head = h->agreed + h->late_bytes + 4 * h->peers;
+    memcpy(h->header, "DT\1\0abcd", (size_t)h->agreed);
     h->key_length = kind & 1 ? 32 : 0;
     h->position_step = 0.002;
-    h->length = HEADER + LENGTHS[(kind >> 1 & 3) % 3] + (kind & 1 ? DTSA_TAG_BYTES : 0);
+    h->length = h->head + LENGTHS[(kind >> 1 & 3) % 3] + (kind & 1 ? DTSA_TAG_BYTES : 0);
     h->own_bytes = kind >> 3 & 1 ? 5 : 0;
     h->clock = (own_clock){next(in, 5), next(in, 5), next(in, 2) - 32768};
     dtsa_timebase_init(&h->base, h->agents, 1 + (int)(next(in, 1) & 7),
@@ -64,11 +68,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         if (!datagram) abort();
         memcpy(datagram, in.at, (size_t)length);
         in.at += length;
-        if (kind & 2 && length >= AGREED) memcpy(datagram, h->header, AGREED);
+        if (kind & 2 && length >= h->agreed) memcpy(datagram, h->header, (size_t)h->agreed);
         if (kind & 4 && length == h->length) {
-            hearing_wrap(h, datagram + HEADER,
-                         (int64_t)datagram[HEADER + 4] | datagram[HEADER + 5] << 8, next(&in, 4),
-                         made);
+            const uint8_t *frame = datagram + h->head;
+            hearing_wrap(h, frame, (int64_t)frame[4] | frame[5] << 8, next(&in, 4), made);
             memcpy(datagram, made, (size_t)length);
         }
         now += next(&in, 3);

@@ -15,9 +15,9 @@ class Hearing:
     listening: bool  # it knows no time yet
 
     def __new__(
-        cls, agents: int, id: int, anchor_every: int, slot_ns: int, seed: int, header: bytes, key: bytes, session: int,
-        flight_ns: int, position_step: float, length: int, own_bytes: int, limit_ns: int, clock_began_ns: int,
-        clock_offset_ns: int, clock_drift_ppb: int, port: _Port, /,
+        cls, agents: int, id: int, anchor_every: int, slot_ns: int, seed: int, header: bytes, late_bytes: int,
+        peers: int, key: bytes, session: int, flight_ns: int, position_step: float, length: int, own_bytes: int,
+        limit_ns: int, clock_began_ns: int, clock_offset_ns: int, clock_drift_ppb: int, port: _Port, /,
     ) -> Hearing: ...  # fmt: skip
 
     # Sleeps until so long before a slot, a while at most. None: it is not that time yet; else as `take`.

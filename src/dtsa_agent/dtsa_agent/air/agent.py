@@ -24,7 +24,7 @@ from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
 from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.stop import Stop
 
-from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, flight_ns
+from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, check_fits, flight_ns
 from .hearing import OF_OWN_NAME, REASONS, STATES, make_hearing
 from .outage import Outage
 from .port import DatagramPort
@@ -77,7 +77,8 @@ class AirAgent:
         check_session(config)
         self.own, self.config, self._port = own, config, port
         scenario, header = (None, b"") if prepared is None else (prepared.scenario, prepared.header)
-        wrapping = Wrapping(config, authenticator(config), header)
+        check_fits(config, port.properties)
+        wrapping = Wrapping(config, authenticator(config), header, port.properties)
         self.swarm: AbstractSwarm = make_swarm(config, scenario, local=[own.id])
         self._group = AgentGroup(self.swarm)
         self._present, self._chosen = self.swarm.present.data, self.swarm.chosen.data
@@ -88,7 +89,7 @@ class AirAgent:
         port.say = say
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
-        flight = flight_ns(config, port.flight_time_ns, port.byte_time_ns)
+        flight = flight_ns(config, port.properties)
         self._latest_send_ns = latest_send_ns(self._slot_ns, flight)
         self._too_long_ns = too_long_ns(config)
         self._ordinary = ""  # why it has no real-time priority

@@ -10,6 +10,10 @@
 | 10-25 | four of those that its sender hears (:mod:`.delay`): id, 0: nobody; how much later than expected, in 10 us |
 | 26-.. | the frame, sealed or not |
 
+Where bytes are dear a port has a shorter header (:class:`.port.PortProperties`): two to four bytes of the hash in place
+of the first eight bytes, and fewer than four of those that its sender hears. Where there is no room at all, a sealed
+frame is the datagram.
+
 A computer that is busy sends late. Its clock is not late, and says by how much the frame is.
 """
 
@@ -20,40 +24,64 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from dtsa_agent.core.agents.authentication import Authenticator
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.core.settings.agreement import agreed_settings, settings_hash
 from dtsa_agent.core.settings.config import SwarmConfig
 
-from .delay import PEERS, Peer
+from .delay import Peer
+from .port import PortProperties
 
-HEADER = 26  # bytes before the frame
-MODE = "udp"
+NETWORK = PortProperties("udp")  # with the longest header
+HEADER = NETWORK.header(sealed=True).size  # bytes before the frame
 NOT_OURS, LENGTH, OTHER_SETTINGS = "not ours", "length", "other settings"
 NO_FRAME, UNKNOWN, REJECTED = "no frame", "unknown agent", "rejected"
 OTHER_TIME, REPEATED, OWN_ID, EARLY = "other time", "repeated", "own id", "too early"
-_TIMES = struct.Struct("<H" + PEERS * "Hh")
 _MAGIC = b"DT\x01\x00"
-_AGREED = 8  # bytes of the header that are the same in all datagrams of a swarm
+_WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
 _UNIT_NS = 10_000  # of times in the header
 
 
-def flight_ns(config: SwarmConfig, flight_time_ns: int, byte_time_ns: int) -> int:
+def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
     """From the order to send a frame to its arrival, as agents take it to be, ns.
 
     :param config: what all agents share.
-    :param flight_time_ns: of :class:`.port.DatagramPort`.
-    :param byte_time_ns: ns for each byte, of the same.
+    :param port: what carries the frames.
     """
-    return flight_time_ns + byte_time_ns * (HEADER + config.frame_length)
+    return port.flight_time_ns + port.byte_time_ns * (port.header(config.auth).size + config.frame_length)
 
 
-def header_of(config: SwarmConfig) -> bytes:
+def frame_in(datagram: bytes, config: SwarmConfig) -> bytes:
+    """The frame in a datagram of a swarm as the air carried it: sealed, if frames are; empty for no datagram.
+
+    :param datagram: the datagram.
+    :param config: what all agents share.
+    """
+    return datagram[-config.frame_length :]
+
+
+def check_fits(config: SwarmConfig, port: PortProperties) -> None:
+    """Refuses frames that are too long for a port.
+
+    :param config: what all agents share.
+    :param port: what is to carry them.
+    :raises ConfigError: if they are.
+    """
+    room = port.longest - port.header(config.auth).size
+    if config.frame_length > room:
+        by = f"policy {config.policy}, frame {config.frame}{', sealed' if config.auth else ''}"
+        raise ConfigError("frame", f"{config.frame_length} bytes ({by})", f"at most {room} bytes over {port.name}")
+
+
+def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
     """With which all datagrams of a swarm begin.
 
     :param config: what all agents share.
+    :param port: what carries them.
     """
-    agreed = settings_hash(agreed_settings(config, MODE)) & 0xFFFFFFFF
-    return _MAGIC + agreed.to_bytes(4, "little")
+    agreed = settings_hash(agreed_settings(config, port.name)).to_bytes(8, "little")
+    count = port.header(config.auth).agreed
+    return _MAGIC + agreed[:4] if count == _WITH_MAGIC else agreed[:count]
 
 
 class Said(NamedTuple):
@@ -73,11 +101,22 @@ class Wrapping:
     :param config: what all agents share.
     :param authenticator: seals and opens frames; None: they are not sealed.
     :param header: with which all datagrams of the swarm begin, if it is known already.
+    :param port: what carries them.
     """
 
-    def __init__(self, config: SwarmConfig, authenticator: Authenticator | None, header: bytes = b"") -> None:
-        self.header = header or header_of(config)
-        self.length = HEADER + config.frame_length  # bytes of a datagram
+    def __init__(
+        self,
+        config: SwarmConfig,
+        authenticator: Authenticator | None,
+        header: bytes = b"",
+        port: PortProperties = NETWORK,
+    ) -> None:
+        self.header = header or header_of(config, port)
+        self.layout = port.header(config.auth)
+        self.peers = self.layout.peers // 4  # of those that it hears a datagram names so many
+        self._before = self.layout.size
+        self._times = struct.Struct("<" + self.peers * "Hh")
+        self.length = self._before + config.frame_length  # bytes of a datagram
         self._agents, self._authenticator = config.agents, authenticator
 
     @property
@@ -91,11 +130,12 @@ class Wrapping:
         :param frame: the frame, not sealed yet.
         :param slot: number of the slot in which it is sent.
         :param late_ns: ns, how much later than its slot it leaves.
-        :param peers: whom its sender hears how late, :data:`PEERS` at most.
+        :param peers: whom its sender hears how late, as many at most as the port has room for.
         """
         told = [number for peer, late in peers for number in (peer, min(max(late // _UNIT_NS, -0x8000), 0x7FFF))]
-        told += [0] * (2 * PEERS - len(told))
-        times = _TIMES.pack(min(max(late_ns, 0) // _UNIT_NS, 0xFFFF), *told)
+        told += [0] * (2 * self.peers - len(told))
+        late = min(max(late_ns, 0) // _UNIT_NS, 0xFFFF).to_bytes(2, "little")[: self.layout.late]
+        times = late + self._times.pack(*told)
         sealed = frame if self._authenticator is None else self._authenticator.seal(frame, slot, times)
         return self.header + times + sealed
 
@@ -104,13 +144,14 @@ class Wrapping:
 
         :param data: the datagram.
         """
-        if data[:3] != _MAGIC[:3]:
+        agreed = len(self.header)
+        if agreed == _WITH_MAGIC and data[:3] != _MAGIC[:3]:
             return Said(NOT_OURS)
-        if data[:_AGREED] != self.header:
-            return Said(OTHER_SETTINGS if len(data) >= _AGREED else LENGTH)
+        if data[:agreed] != self.header:
+            return Said(OTHER_SETTINGS if len(data) >= agreed else LENGTH)
         if len(data) != self.length:
             return Said(LENGTH)
-        times, frame = data[_AGREED:HEADER], data[HEADER:]
+        times, frame = data[agreed : self._before], data[self._before :]
         named = named_in(frame)
         if named is None:
             return Said(NO_FRAME)
@@ -122,6 +163,7 @@ class Wrapping:
             if opened is None:
                 return Said(REJECTED)
             frame = opened
-        late, *told = _TIMES.unpack(times)
+        late = int.from_bytes(times[: self.layout.late], "little")
+        told = self._times.unpack(times[self.layout.late :])
         peers = tuple((peer, by * _UNIT_NS) for peer, by in zip(told[::2], told[1::2], strict=True) if peer)
         return Said("", sender, slot, late * _UNIT_NS, peers, frame)

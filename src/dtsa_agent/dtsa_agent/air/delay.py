@@ -14,7 +14,6 @@ from collections.abc import Sequence
 
 _SHARE = 64  # of which the estimate moves by a part with a frame: slowly, so that it does not follow the slots
 _STEP_NS = 1_000_000
-PEERS = 4  # of which a datagram tells
 
 Peer = tuple[int, int]  # id, and how much later than expected it is heard, ns
 
@@ -24,12 +23,13 @@ class Delay:
 
     :param agent: own id.
     :param limit_ns: ns; what is off by more, either way, counts as this.
+    :param peers: of those that it hears a datagram names so many.
     """
 
-    __slots__ = ("_agent", "_hears", "_limit_ns", "_said", "_sum_of", "_sums", "_turn", "error_ns")
+    __slots__ = ("_agent", "_hears", "_limit_ns", "_peers", "_said", "_sum_of", "_sums", "_turn", "error_ns")
 
-    def __init__(self, agent: int, limit_ns: int) -> None:
-        self._agent, self._limit_ns = agent, limit_ns
+    def __init__(self, agent: int, limit_ns: int, peers: int = 4) -> None:
+        self._agent, self._limit_ns, self._peers = agent, limit_ns, peers
         self._hears: dict[int, int] = {}  # how much later than expected each other one is heard, ns
         self._said: dict[int, int] = {}  # how much later than expected each other one says to hear this one, ns
         self._sum_of: dict[int, int] = {}  # of both, where both are known: own slots that move change none
@@ -69,7 +69,7 @@ class Delay:
     def tell(self) -> tuple[Peer, ...]:
         """What the next datagram says: the others in turn."""
         heard = sorted(self._hears)
-        count = min(PEERS, len(heard))
+        count = min(self._peers, len(heard))
         told = [heard[(self._turn + k) % len(heard)] for k in range(count)]
         self._turn += count
         return tuple((peer, self._hears[peer]) for peer in told)

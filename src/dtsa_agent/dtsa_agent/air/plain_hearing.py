@@ -39,7 +39,7 @@ class PlainHearing:
         self._config, self._agent, self._wrapping, self._flight_ns = config, agent, wrapping, flight_ns
         self._clock = OwnClock() if clock is None else clock
         self.time = SlotTime(config, agent)
-        self.delay = Delay(agent, config.slot_ns // 4)
+        self.delay = Delay(agent, config.slot_ns // 4, wrapping.peers)
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
 
     def take(self, data: bytes, arrival_ns: int) -> Taken:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from dtsa_agent.core.swarms.outcome import SlotOutcome
 
@@ -52,11 +52,53 @@ class AirListener(Protocol):
         """
 
 
+class Header(NamedTuple):
+    """What stands before a frame in a datagram, bytes, in this order; see :mod:`.datagram`."""
+
+    agreed: int
+    late: int  # 2, or 0: it does not say how late it left
+    peers: int  # four for each of them
+
+    @property
+    def size(self) -> int:
+        """Bytes before the frame."""
+        return sum(self)
+
+
+@dataclass(frozen=True, slots=True)
+class PortProperties:
+    """What agents, listeners and bags must know of a port: all ports of a swarm have the same."""
+
+    name: str  # of the kind of port: agents that use different kinds do not hear each other
+    flight_time_ns: int = 0  # from the order to send a datagram until its arrival, without the time of its bytes
+    byte_time_ns: int = 0  # what each byte adds to that
+    agreed_bytes: int = 8  # of a datagram's header, by which a swarm knows its own: 8, or 2 to 4 of them
+    peers: int = 4  # of those that an agent hears a datagram names so many
+    longest: int = 512  # bytes of the longest datagram
+    bare_sealed: bool = False  # a sealed frame is the whole datagram: its tag tells the swarm from others
+
+    def header(self, sealed: bool) -> Header:
+        """What stands before a frame.
+
+        :param sealed: whether frames carry a tag.
+        """
+        if self.bare_sealed and sealed:
+            return Header(0, 0, 0)
+        return Header(self.agreed_bytes, 2, 4 * self.peers)
+
+
+class Datagram(NamedTuple):
+    """What has arrived."""
+
+    data: bytes
+    arrival_ns: int  # CLOCK_MONOTONIC
+    own: bool  # this very port has sent it
+
+
 class DatagramPort(Protocol):
     """What an agent with a clock of its own asks of the port that carries its datagrams."""
 
-    flight_time_ns: int  # from the order to send a datagram until its arrival, without the time of its bytes
-    byte_time_ns: int  # what each byte adds to that
+    properties: PortProperties
     compiled: Any  # a capsule: what the compiled hearing reads (_hearing/port.h)
     say: Callable[[str], None] | None  # set by the agent: is told a line in flight when the port fails or is back
 
@@ -68,6 +110,42 @@ class DatagramPort(Protocol):
 
     def counts(self) -> dict[str, int]:
         """What it counts, by name, for the agent's summary."""
+
+    def __enter__(self) -> DatagramPort: ...
+
+    def __exit__(self, *unused: object) -> None: ...
+
+
+class Listener(Protocol):
+    """What hears the datagrams of a swarm and sends none."""
+
+    def fileno(self) -> int:
+        """For ``select``: readable when something has arrived."""
+
+    def receive(self, most: int) -> list[Datagram]:
+        """What has arrived, in this order; empty if nothing has.
+
+        :param most: number of datagrams at a time.
+        """
+
+    def __enter__(self) -> Listener: ...
+
+    def __exit__(self, *unused: object) -> None: ...
+
+
+class PortSettings(Protocol):
+    """The settings of a kind of port."""
+
+    @property
+    def properties(self) -> PortProperties:
+        """What agents, listeners and bags must know of it."""
+
+    @property
+    def where(self) -> str:
+        """Where the frames go, for people."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as plain values."""
 
 
 @dataclass(slots=True)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import Scenario, make_scenario, policy_key
 
-from .datagram import header_of
+from .datagram import NETWORK, header_of
+from .port import PortProperties
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,11 +20,12 @@ class Prepared:
     header: bytes  # with which all datagrams begin
 
 
-def prepare(config: SwarmConfig) -> Prepared:
+def prepare(config: SwarmConfig, port: PortProperties = NETWORK) -> Prepared:
     """What follows from the settings that all agents share.
 
     :param config: these settings.
+    :param port: what carries the datagrams.
     :raises ConfigError: for a scenario that cannot be.
     """
     scenario = dataclasses.replace(make_scenario(config), policy_key=policy_key(config.seed))
-    return Prepared(scenario, header_of(config))
+    return Prepared(scenario, header_of(config, port))

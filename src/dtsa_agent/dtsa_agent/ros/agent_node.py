@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
+from dtsa_agent.air.ports import AIRS
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import MAX_AGENTS
 from dtsa_agent.core.settings.declaration import Setting
@@ -21,10 +22,8 @@ from .hosting import declare_swarm, host_agents
 
 _UNNAMED = names.agent_namespace(0)  # replaced below unless the command line gives a namespace
 
-CHANNEL, UDP = "channel", "udp"
-_AIR = Setting(
-    "air", "text", CHANNEL, "what carries the frames: the channel's node, or a network", words=(CHANNEL, UDP)
-)
+CHANNEL = "channel"
+_AIR = Setting("air", "text", CHANNEL, "what carries the frames: the channel's node, or a port", words=(CHANNEL, *AIRS))
 
 
 def _make_node(supervised: bool) -> tuple[Node, int, str]:
@@ -51,10 +50,11 @@ def _own_id(node: Node, default: int) -> int:
 def _body(stop: Stop, supervised: bool) -> int | None:
     node, agent, space = _make_node(supervised)
     with ending(node):
-        if _AIR.check(declare_setting(node, _AIR)) == UDP:
-            from .udp_node import fly_over_udp  # other agents need no sockets
+        air = _AIR.check(declare_setting(node, _AIR))
+        if air != CHANNEL:
+            from .port_node import fly_over_port  # other agents need no port
 
-            return fly_over_udp(node, agent, stop)
+            return fly_over_port(node, air, agent, stop)
         config = declare_swarm(node)
         if agent > config.agents:
             raise ConfigError("id", agent, f"1 to {config.agents}, the number of agents")

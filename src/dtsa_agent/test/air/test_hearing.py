@@ -23,6 +23,7 @@ from dtsa_agent.air.clock import OwnClock
 from dtsa_agent.air.datagram import HEADER, NOT_OURS, Wrapping, flight_ns
 from dtsa_agent.air.hearing import REASONS, STATES, Hearing, make_hearing
 from dtsa_agent.air.plain_hearing import PlainHearing
+from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings, _socket, sockets
 from dtsa_agent.air.udp.sockets import StampClock
@@ -34,13 +35,21 @@ OPEN = SwarmConfig(agents=5, policy="tdma", slot_ms=10.0)
 SEALED = dataclasses.replace(OPEN, auth=True, auth_session=3, seed=2**63 - 1)
 SLOT_NS, OWN, UDP = OPEN.slot_ns, 2, UdpSettings(interface="lo", group="239.255.80.80:20080")
 
+PORTS = (
+    UDP.properties,
+    PortProperties("serial", 900_000, 17_361, agreed_bytes=2, peers=1),
+    PortProperties("radio", 500_000, 14_000, agreed_bytes=2, peers=0, bare_sealed=True),
+    PortProperties("radio", 500_000, 14_000, agreed_bytes=4, peers=3),
+)
+
 
 class NoPort:
     """A port through which nothing comes."""
 
-    flight_time_ns, byte_time_ns, say = UDP.flight_time_ns, UDP.byte_time_ns, None
+    say = None
 
-    def __init__(self) -> None:
+    def __init__(self, properties: PortProperties = UDP.properties) -> None:
+        self.properties = properties
         self.compiled = _socket.open_port(-1, bytes(4), 9)
 
     def send(self, data: bytes) -> bool:
@@ -55,15 +64,23 @@ class NoPort:
 class Both:
     """The same agent twice."""
 
-    def __init__(self, config: SwarmConfig, offset_ns: int, drift_ppb: int, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.wrapping = Wrapping(config, Authenticator(KEY, config.auth_session) if config.auth else None)
+    def __init__(
+        self,
+        config: SwarmConfig,
+        offset_ns: int,
+        drift_ppb: int,
+        monkeypatch: pytest.MonkeyPatch,
+        port: PortProperties = UDP.properties,
+    ) -> None:
+        key = Authenticator(KEY, config.auth_session) if config.auth else None
+        self.wrapping = Wrapping(config, key, port=port)
         self.now = 5_000_000_000_000
         with monkeypatch.context() as patched:
             patched.setattr(time, "monotonic_ns", lambda: self.now)
             own = AgentSettings(id=OWN, clock_offset_ns=offset_ns, clock_drift_ppb=drift_ppb)
-            self.compiled = make_hearing(config, own, self.wrapping, NoPort())
+            self.compiled = make_hearing(config, own, self.wrapping, NoPort(port))
             clock = OwnClock(offset_ns, drift_ppb)
-        flight = flight_ns(config, UDP.flight_time_ns, UDP.byte_time_ns)
+        flight = flight_ns(config, port)
         self.plain = PlainHearing(config, OWN, self.wrapping, flight, clock)
         self.clock = clock
 
@@ -104,18 +121,19 @@ _SAID = st.tuples(
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     config=st.sampled_from((OPEN, SEALED)),
+    port=st.sampled_from(PORTS),
     offset=st.integers(-(10**15), 10**15),
     drift=st.sampled_from((0, 50_000, -1_000_000)),
     said=st.lists(_SAID, min_size=20, max_size=60),
 )
 def test_frames_right_and_wrong_are_heard_as_the_plain_statement_says(
-    monkeypatch: pytest.MonkeyPatch, config: SwarmConfig, offset: int, drift: int, said: list[Any]
+    monkeypatch: pytest.MonkeyPatch, config: SwarmConfig, port: PortProperties, offset: int, drift: int, said: list[Any]
 ) -> None:
-    both, slot = Both(config, offset, drift, monkeypatch), 100
+    both, slot = Both(config, offset, drift, monkeypatch, port), 100
     for sender, on, late, left_late, peers, change in said:
         slot = max(0, slot + on)
         both.now += SLOT_NS
-        data = both.wrapping.wrap(framed(sender, slot), slot, left_late, peers)
+        data = both.wrapping.wrap(framed(sender, slot), slot, left_late, peers[: port.peers])
         if change is not None:
             at, by = change[0] % len(data), change[1]
             data = data[:at] + bytes([data[at] ^ by]) + data[at + 1 :]
@@ -161,15 +179,17 @@ def test_slots_and_delays_of_a_long_flight_are_those_of_the_plain_statement(
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     config=st.sampled_from((OPEN, SEALED)),
+    port=st.sampled_from(PORTS),
     begins=st.integers(0, HEADER + 8),
     noise=st.binary(max_size=80) | st.binary(min_size=500, max_size=512),
 )
-@example(config=OPEN, begins=0, noise=b"")
-@example(config=OPEN, begins=2, noise=b"\x01")
+@example(config=OPEN, port=PORTS[0], begins=0, noise=b"")
+@example(config=OPEN, port=PORTS[0], begins=2, noise=b"\x01")
+@example(config=OPEN, port=PORTS[2], begins=1, noise=b"")
 def test_noise_is_refused_for_the_same_reason(
-    monkeypatch: pytest.MonkeyPatch, config: SwarmConfig, begins: int, noise: bytes
+    monkeypatch: pytest.MonkeyPatch, config: SwarmConfig, port: PortProperties, begins: int, noise: bytes
 ) -> None:
-    both = Both(config, 0, 0, monkeypatch)
+    both = Both(config, 0, 0, monkeypatch, port)
     both.take(both.wrapping.wrap(framed(1, 7), 7)[:begins] + noise)
 
 
@@ -289,9 +309,10 @@ def test_it_sleeps_until_a_slot_and_a_while_at_most() -> None:
 def given_values() -> dict[str, Any]:
     """What a hearing is made of."""
     return {
-        "agents": 5, "id": 2, "anchor_every": 3, "slot_ns": SLOT_NS, "seed": 1, "header": bytes(8), "key": b"",
-        "session": 0, "flight_ns": 0, "position_step": 0.002, "length": 45, "own_bytes": 0, "limit_ns": 1,
-        "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0, "port": NoPort().compiled,
+        "agents": 5, "id": 2, "anchor_every": 3, "slot_ns": SLOT_NS, "seed": 1, "header": bytes(8), "late_bytes": 2,
+        "peers": 4, "key": b"", "session": 0, "flight_ns": 0, "position_step": 0.002, "length": 45,
+        "own_bytes": 0, "limit_ns": 1, "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0,
+        "port": NoPort().compiled,
     }  # fmt: skip
 
 
@@ -322,7 +343,11 @@ def test_the_hearing_compiles_for_32_bits(tmp_path: Path) -> None:
     [
         {"agents": 0},
         {"id": 6},
-        {"header": b"DT"},
+        {"header": bytes(9)},
+        {"late_bytes": 1},
+        {"peers": -1},
+        {"peers": 5},
+        {"length": 18},
         {"key": bytes(33)},
         {"slot_ns": 0},
         {"clock_drift_ppb": 500_000_001},

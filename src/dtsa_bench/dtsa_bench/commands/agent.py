@@ -1,4 +1,4 @@
-"""`dtsa agent`: one agent whose frames go over a network."""
+"""`dtsa agent`: one agent whose frames go over a network or a radio."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from dtsa_agent.air.port import PortSettings
     from dtsa_agent.core import SwarmConfig
 
 DESCRIPTION = """\
-Flies one agent, with a simulated vehicle, whose frames go to a multicast group: one process a computer, no channel
+Flies one agent, with a simulated vehicle, whose frames go over a port (--air): one process a computer, no channel
 node, no start signal, no ROS. The first agent begins; groups that meet become one. Frames are sealed: the key is in the
 environment, DTSA_AUTH_KEY. See docs/how-to/several-computers.md."""
 DEFAULT_POLICY = "lease"
@@ -20,29 +21,36 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     from dtsa_agent.air.settings import AgentSettings
     from dtsa_bench.runs.options import add_options
 
-    parser = subparsers.add_parser("agent", help="one agent on a real network", description=DESCRIPTION)
+    parser = subparsers.add_parser("agent", help="one agent on a real network or radio", description=DESCRIPTION)
     parser.usage = "%(prog)s --id N --interface NAME [OPTIONS]"
     add_air(parser)
     add_options(parser.add_argument_group("this agent"), AgentSettings, "own")
-    add_network(parser)
+    add_ports(parser)
     add_swarm(parser)
 
 
 def add_air(parser: argparse.ArgumentParser) -> None:
     """Adds what carries the frames, and where the results go."""
-    parser.add_argument("--air", choices=("udp",), default="udp", help="what carries the frames [udp]")
+    from dtsa_agent.air.ports import AIRS
+
+    parser.add_argument("--air", choices=AIRS, default=AIRS[0], help=f"what carries the frames [{AIRS[0]}]")
     parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
 
 
-def add_network(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of the network, and whether frames are sealed."""
-    from dtsa_agent.air.udp.settings import UdpSettings
+def add_ports(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of the ports, and whether frames are sealed. A setting that several ports have is one option."""
+    from dtsa_agent.air.ports import AIRS, settings_class
+    from dtsa_agent.core.settings.declaration import settings_of
     from dtsa_bench.runs.options import add_options
 
-    network = parser.add_argument_group("the network")
-    add_options(network, UdpSettings, "udp")
-    network.add_argument(
+    known: set[str] = set()
+    for air in AIRS:
+        group = parser.add_argument_group(f"what carries the frames: --air {air}")
+        add_options(group, settings_class(air), "port", skip=known)
+        known |= {setting.name for setting in settings_of(settings_class(air))}
+    group = parser.add_argument_group("authentication")
+    group.add_argument(
         "--seal",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -60,6 +68,24 @@ def add_swarm(parser: argparse.ArgumentParser) -> None:
     swarm.add_argument("--policy", metavar="NAME", default=DEFAULT_POLICY, help=f"who sends next [{DEFAULT_POLICY}]")
     skip = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
     add_options(swarm, SwarmConfig, "swarm", skip=skip)
+
+
+def port_of(args: argparse.Namespace) -> PortSettings:
+    """What carries the frames, as the options describe it.
+
+    :param args: parsed options.
+    :raises ConfigError: for one that cannot be, or for an option of another port.
+    """
+    from dtsa_agent.air.ports import AIRS, make_settings, settings_class
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_bench.runs.options import given
+
+    values = given(args, settings_class(args.air), "port")
+    for air in AIRS:
+        for name, value in given(args, settings_class(air), "port").items():
+            if name not in values:
+                raise ConfigError(name, value, f"only with --air {air}")
+    return make_settings(args.air, values)
 
 
 def swarm_of(args: argparse.Namespace) -> SwarmConfig:
@@ -80,18 +106,18 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
 
 def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C, and print what came of it."""
+    from dtsa_agent.air.datagram import check_fits
     from dtsa_agent.air.prepared import prepare
     from dtsa_agent.air.settings import AgentSettings
-    from dtsa_agent.air.udp import UdpSettings
     from dtsa_agent.core.agents.joining import check_joinable
     from dtsa_bench.network.flying import Order, become, fly
     from dtsa_bench.runs.options import given
 
     own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
-    udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
-    config = swarm_of(args)
+    port, config = port_of(args), swarm_of(args)
     check_joinable(config.policy)  # before anything is made
-    order = Order(own, config, udp, prepare(config), args.out, args.json)
+    check_fits(config, port.properties)
+    order = Order(own, config, port, prepare(config, port.properties), args.out, args.json)
     if args.own_process:
         become(order, "dtsa_bench.commands.agent_process")
     return fly(order)

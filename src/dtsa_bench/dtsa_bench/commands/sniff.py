@@ -1,4 +1,4 @@
-"""`dtsa sniff`: listens to agents on a network without taking part."""
+"""`dtsa sniff`: listens to agents on a network or a radio without taking part."""
 
 from __future__ import annotations
 
@@ -6,40 +6,39 @@ import argparse
 import json
 
 DESCRIPTION = """\
-Listens to a swarm on a network without taking part, records what it hears, and judges it: two senders in a slot, frames
-out of turn, turns given away twice or by others. Exit code 1 if a rule was broken. Who listens may miss frames: then a
-lease that it does not know looks like a broken rule."""
+Listens to a swarm on a network or a radio without taking part, records what it hears, and judges it: two senders in a
+slot, frames out of turn, turns given away twice or by others. Exit code 1 if a rule was broken. A listener may miss
+frames: then a lease that it does not know looks like a broken rule."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
-    from .agent import add_air, add_network, add_swarm
+    from .agent import add_air, add_ports, add_swarm
 
-    parser = subparsers.add_parser("sniff", help="listen to agents on a real network", description=DESCRIPTION)
+    parser = subparsers.add_parser("sniff", help="listen to agents on a real network or radio", description=DESCRIPTION)
     parser.usage = "%(prog)s --interface NAME [OPTIONS]"
     add_air(parser)
     parser.add_argument("--duration-s", metavar="X", default="0", help="for so long; 0: until Ctrl-C [0]")
-    add_network(parser)
+    add_ports(parser)
     add_swarm(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Listen until Ctrl-C, and print what came of it."""
-    from dtsa_agent.air.udp import UdpSettings
     from dtsa_agent.core.settings.declaration import Setting
     from dtsa_agent.stop import Stop
     from dtsa_bench.network.sniffer import Sniffer
     from dtsa_bench.recordings.bag.errors import BagError
-    from dtsa_bench.runs.options import given, new_directory
+    from dtsa_bench.runs.options import new_directory
 
-    from .agent import swarm_of
+    from .agent import port_of, swarm_of
     from .merge import lines
 
     duration = Setting("duration_s", "float", 0.0, "how long", unit="s", minimum=0, maximum=1e6).read(args.duration_s)
-    udp, config = UdpSettings.from_dict(given(args, UdpSettings, "udp")), swarm_of(args)
+    port, config = port_of(args), swarm_of(args)
     directory = None if args.out is None else new_directory(args.out)
     path = None if directory is None else directory / "sniffed.mcap"
-    with Stop() as stop, Sniffer(config, udp, path) as sniffer:
+    with Stop() as stop, Sniffer(config, port, path) as sniffer:
         sniffer.run(stop, duration)
     summary = sniffer.summary()
     text = json.dumps(summary, indent=2) + "\n"

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Shows a swarm on a page that this machine alone can open: a recorded run to be played, one that is being
-recorded and followed while it grows, or without a bag the swarm on the ROS graph, or (--air udp) agents on a network,
-with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not know it gets
-nothing."""
+recorded and followed while it grows, or without a bag the swarm on the ROS graph, or (--air) agents on a network or a
+radio, with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not know
+it gets nothing."""
 _MOST = 2  # runs side by side
-_ROS, _UDP = "ros", "udp"
+_ROS = "ros"
 
 
 class Source(Protocol):
@@ -43,8 +43,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.usage = "%(prog)s [BAG ...] [OPTIONS]"
     parser.add_argument("bags", nargs="*", metavar="BAG", help=f"{RECORDED_RUN}; two are shown side by side")
+    from dtsa_agent.air.ports import AIRS
+
     parser.add_argument(
-        "--air", choices=(_ROS, _UDP), default=_ROS, help="without a bag: what carries the swarm's frames [ros]"
+        "--air", choices=(_ROS, *AIRS), default=_ROS, help="without a bag: what carries the swarm's frames [ros]"
     )
     parser.add_argument("--domain", metavar="N", default=None, help="without a bag: ROS_DOMAIN_ID of the swarm")
     parser.add_argument(
@@ -59,9 +61,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--listen", metavar="ADDRESS", default=None, help="an address of this machine that others reach [127.0.0.1]"
     )
-    from .agent import add_network, add_swarm
+    from .agent import add_ports, add_swarm
 
-    add_network(parser)
+    add_ports(parser)
     add_swarm(parser)
     parser.set_defaults(policy=None, seal=None)  # so that it is known whether they were given
 
@@ -85,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     order = None
     if not args.bags:
         give_way()
-        tracks, sources, order = _air(args) if args.air == _UDP else _graph(args)
+        tracks, sources, order = _graph(args) if args.air == _ROS else _air(args)
     for bag in args.bags:
         from dtsa_bench.pages.view.recording import BagSource
 
@@ -105,37 +107,37 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_source(args: argparse.Namespace) -> None:
     """Refuses options of another source than the one that is shown."""
-    from dtsa_agent.air.udp.settings import UdpSettings
+    from dtsa_agent.air.ports import AIRS, settings_class
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.runs.options import given
 
     for name in ("domain", "namespace", "control"):
-        if getattr(args, name) and (args.bags or args.air == _UDP):
+        if getattr(args, name) and (args.bags or args.air != _ROS):
             raise ConfigError(name, getattr(args, name), "only without a bag" if args.bags else "only with --air ros")
-    if args.air == _UDP:
+    if args.air != _ROS:
         if args.bags:
             raise ConfigError("air", args.air, "only without a bag")
         return
     own = {"policy": args.policy, "seal": args.seal}
-    for name, value in {**given(args, UdpSettings, "udp"), **given(args, SwarmConfig, "swarm"), **own}.items():
+    for air in AIRS:
+        own |= given(args, settings_class(air), "port")
+    for name, value in {**own, **given(args, SwarmConfig, "swarm")}.items():
         if value is not None:
-            raise ConfigError(name, value, "only with --air udp")
+            raise ConfigError(name, value, f"only with --air {' or '.join(AIRS)}")
 
 
 def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
-    from dtsa_agent.air.udp.settings import UdpSettings
     from dtsa_bench.pages.view.network_listener import NetworkListener
     from dtsa_bench.pages.view.track import Track
-    from dtsa_bench.runs.options import given
 
-    from .agent import DEFAULT_POLICY, swarm_of
+    from .agent import DEFAULT_POLICY, port_of, swarm_of
 
-    udp = UdpSettings.from_dict(given(args, UdpSettings, "udp"))
+    port = port_of(args)
     args.policy, args.seal = args.policy or DEFAULT_POLICY, args.seal is not False
     config = swarm_of(args)
-    track = Track(f"{udp.group} on {udp.interface}")
-    return [track], [NetworkListener(track, config, udp)], None
+    track = Track(port.where)
+    return [track], [NetworkListener(track, config, port)], None
 
 
 def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callable[[Order], str] | None]:

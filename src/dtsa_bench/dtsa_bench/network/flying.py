@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from dtsa_agent.air.agent import AirAgent
+    from dtsa_agent.air.port import PortSettings
     from dtsa_agent.air.prepared import Prepared
     from dtsa_agent.air.settings import AgentSettings
-    from dtsa_agent.air.udp import UdpSettings
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.stop import Stop
 
@@ -32,7 +32,7 @@ class Order:
 
     own: AgentSettings
     config: SwarmConfig
-    udp: UdpSettings
+    port: PortSettings
     prepared: Prepared
     out: str | None  # directory for its bag and summary; None: there are none
     as_json: bool  # print the summary as JSON
@@ -62,18 +62,18 @@ def fly(order: Order) -> int:
 
     :param order: what to fly.
     :returns: exit code.
-    :raises ConfigError: for a network, a directory or an id that cannot be used.
+    :raises ConfigError: for a port, a directory or an id that cannot be used.
     :raises BagError: if the record is not whole.
     """
     from dtsa_agent.air.agent import AirAgent
-    from dtsa_agent.air.udp import UdpPort
+    from dtsa_agent.air.ports import open_port
     from dtsa_agent.stop import Stop
 
     def say(line: str) -> None:
         print(f"dtsa: cf{order.own.id}: {line}", file=sys.stderr, flush=True)
 
     failure, directory = "", None
-    with Stop() as stop, UdpPort(order.udp) as port:
+    with Stop() as stop, open_port(order.port) as port:
         agent = AirAgent(order.own, order.config, port, prepared=order.prepared, say=say)
         if order.out is None:
             agent.run(stop)
@@ -81,7 +81,7 @@ def fly(order: Order) -> int:
             from dtsa_bench.runs.options import new_directory
 
             directory = new_directory(order.out)
-            failure = _run_recorded(agent, order.udp, stop, directory)
+            failure = _run_recorded(agent, order.port, stop, directory)
     summary = agent.summary()
     text = json.dumps(summary, indent=2) + "\n"
     if directory is not None:
@@ -104,11 +104,11 @@ def fly(order: Order) -> int:
     return int(bool(problem))
 
 
-def _run_recorded(agent: AirAgent, udp: UdpSettings, stop: Stop, directory: Path) -> str:
+def _run_recorded(agent: AirAgent, port: PortSettings, stop: Stop, directory: Path) -> str:
     """Flies, and records it; why the record is not whole, or an empty text."""
     from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 
-    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, udp) as recorder:
+    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, port) as recorder:
         agent.watcher = recorder
         agent.run(stop)
         recorder.finish(agent.summary())

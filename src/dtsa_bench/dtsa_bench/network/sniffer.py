@@ -9,11 +9,13 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.datagram import HEADER, Wrapping
-from dtsa_agent.air.udp import MulticastSocket, UdpSettings
+from dtsa_agent.air.datagram import Wrapping, frame_in
+from dtsa_agent.air.port import PortSettings
+from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
+from dtsa_bench.recordings.merge.agent_recorder import about_port
 from dtsa_bench.recordings.merge.json_bag import JsonBag, described
 from dtsa_bench.recordings.rules.judge import Judge
 
@@ -36,20 +38,21 @@ class Sniffer:
     """One who listens.
 
     :param config: the settings that all agents share.
-    :param udp: the network.
+    :param port: what carries the frames.
     :param path: file for what was heard; None: it is only judged.
-    :raises ConfigError: for a network that cannot be used, or without the key of sealed frames.
+    :raises ConfigError: for a port that cannot be used, or without the key of sealed frames.
     """
 
-    def __init__(self, config: SwarmConfig, udp: UdpSettings, path: Path | None = None) -> None:
-        self._wrapping, self._judge = Wrapping(config, authenticator(config)), Judge(config)
+    def __init__(self, config: SwarmConfig, port: PortSettings, path: Path | None = None) -> None:
+        self._config, self._judge = config, Judge(config)
+        self._wrapping = Wrapping(config, authenticator(config), port=port.properties)
         self._slots: dict[int, dict[int, bytes]] = {}  # not judged yet
         self._judged = -1  # last slot
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._kept = 0  # refused datagrams since the last flush
-        self._socket = MulticastSocket(udp)
-        about = {"swarm": json.dumps(config.to_dict(), sort_keys=True), "udp": json.dumps(udp.to_dict())}
+        self._listener = open_listener(port)
+        about = {"swarm": json.dumps(config.to_dict(), sort_keys=True), **about_port(port)}
         self.bag = None if path is None else JsonBag(path, {FRAME: FRAME_SCHEMA}, METADATA, about)
 
     def run(self, stop: Stop, seconds: float = 0.0) -> None:
@@ -60,8 +63,8 @@ class Sniffer:
         """
         end = time.monotonic() + seconds
         while not stop and not (seconds and time.monotonic() >= end):
-            select.select([self._socket], [], [], _PATIENCE_S)
-            for datagram in self._socket.receive(_BURST):
+            select.select([self._listener], [], [], _PATIENCE_S)
+            for datagram in self._listener.receive(_BURST):
                 self._take(datagram.data, datagram.arrival_ns)
             if self.bag is not None and self.bag.flush_if_due():
                 self._kept = 0
@@ -79,7 +82,7 @@ class Sniffer:
             self.refused[reason] += 1
             return
         self.heard[sender] += 1
-        self._slots.setdefault(slot, {})[sender] = data[HEADER:]
+        self._slots.setdefault(slot, {})[sender] = frame_in(data, self._config)
         for over in sorted(s for s in self._slots if s <= max(self._slots) - _WAITS):
             self._judge.slot(over, self._slots.pop(over))
             self._judged = over
@@ -102,8 +105,8 @@ class Sniffer:
         }
 
     def close(self) -> None:
-        """Ends the record, and leaves the network."""
-        self._socket.close()
+        """Ends the record, and leaves the air."""
+        self._listener.__exit__()
         if self.bag is not None:
             self.bag.__exit__()
 

@@ -13,7 +13,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_dev.soak import mutants
 
 from dtsa_agent import plugin_watch
-from dtsa_agent.air import datagram, delay, slots
+from dtsa_agent.air import datagram, slots
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.agents import authentication, pacing
 from dtsa_agent.core.plugins import unslotted
@@ -155,7 +155,7 @@ FIGURES: dict[str, list[str]] = {
     ],
     "docs/reference/network.md": [
         f"| {datagram.HEADER}-.. | the frame",
-        f"{word(delay.PEERS)} of those that its sender hears",
+        f"{word(datagram.NETWORK.peers)} of those that its sender hears",
         f"in {datagram._UNIT_NS / 1000:g} us, little-endian",
         f"median offset of {word(ALIGN['receptions'])} frames. When {word(slots._DOUBTS)} in a row "
         f"are off by more than {ms(ALIGN['limit_ns'])}",

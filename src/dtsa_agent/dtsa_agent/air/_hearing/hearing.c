@@ -47,9 +47,10 @@ static void make_tag(const hearing *h, const uint8_t *data, long frame_length, i
                      uint8_t tag[DTSA_TAG_BYTES])
 {
     uint8_t covered[LONGEST];
-    memcpy(covered, data + HEADER, (size_t)frame_length);
-    memcpy(covered + frame_length, data + AGREED, TIMES);
-    dtsa_tag(h->key, h->key_length, h->session, (uint64_t)slot, covered, frame_length + TIMES, tag);
+    const long times = h->head - h->agreed;
+    memcpy(covered, data + h->head, (size_t)frame_length);
+    memcpy(covered + frame_length, data + h->agreed, (size_t)times);
+    dtsa_tag(h->key, h->key_length, h->session, (uint64_t)slot, covered, frame_length + times, tag);
 }
 
 static int is_authentic(const hearing *h, const uint8_t *data, const said *s)
@@ -63,26 +64,26 @@ static int is_authentic(const hearing *h, const uint8_t *data, const said *s)
 
 verdict hearing_read(const hearing *h, const uint8_t *data, long length, said *out)
 {
-    const uint8_t *frame = data + HEADER;
-    if (length < 3 || memcmp(data, h->header, 3)) return NOT_OURS;
-    if (length < AGREED) return WRONG_LENGTH;
-    if (memcmp(data, h->header, AGREED)) return OTHER_SETTINGS;
+    const uint8_t *frame = data + h->head;
+    if (h->agreed == WITH_MAGIC && (length < 3 || memcmp(data, h->header, 3))) return NOT_OURS;
+    if (length < h->agreed) return WRONG_LENGTH;
+    if (memcmp(data, h->header, (size_t)h->agreed)) return OTHER_SETTINGS;
     if (length != h->length) return WRONG_LENGTH;
     const int profile = frame[0] & 0xf;
-    if (length - HEADER < NAMED || frame[0] >> 4 != FRAME_VERSION || profile >= DTSA_PROFILE_COUNT)
+    if (length - h->head < NAMED || frame[0] >> 4 != FRAME_VERSION || profile >= DTSA_PROFILE_COUNT)
         return NO_FRAME;
     *out = (said){.sender = profile == DTSA_PROFILE_EXTENDED ? frame[1] : word(frame + 1),
                   .slot = (int64_t)((uint32_t)word(frame + 4) | (uint32_t)word(frame + 6) << 16),
-                  .late = (int64_t)word(data + AGREED) * UNIT,
+                  .late = h->late_bytes ? (int64_t)word(data + h->agreed) * UNIT : 0,
                   .frame = frame,
-                  .frame_length = length - HEADER};
+                  .frame_length = length - h->head};
     if (out->sender < 1 || out->sender > h->agents) return UNKNOWN_AGENT;
     if (h->key_length) {
         out->frame_length -= DTSA_TAG_BYTES;
         if (out->frame_length < 1 || !is_authentic(h, data, out)) return REJECTED;
     }
-    for (int i = 0; i < PEERS; i++) {
-        const uint8_t *at = data + AGREED + 2 + 4 * i;
+    for (int i = 0; i < h->peers; i++) {
+        const uint8_t *at = data + h->agreed + h->late_bytes + 4 * i;
         out->peers[i] = (peer){word(at), (int64_t)(int16_t)word(at + 2) * UNIT};
     }
     return TAKEN;
@@ -149,7 +150,7 @@ static void delay_tell(hearing *h, peer told[PEERS])
     const delays *d = &h->delay;
     int heard = 0, count, index = 0;
     for (int k = 0; k < h->agents; k++) heard += d->known[k] & HEARS;
-    count = heard < PEERS ? heard : PEERS;
+    count = heard < h->peers ? heard : h->peers;
     for (int k = 0; k < h->agents && count; k++) {
         if (!(d->known[k] & HEARS)) continue;
         const int place = (int)((index++ - d->turn % heard + heard) % heard);
@@ -168,19 +169,19 @@ static void put(uint8_t *at, int64_t time, int64_t least, int64_t most)
 
 void hearing_wrap(hearing *h, const uint8_t *frame, int64_t slot, int64_t late, uint8_t *out)
 {
-    const long length = h->length - HEADER - (h->key_length ? DTSA_TAG_BYTES : 0);
+    const long length = h->length - h->head - (h->key_length ? DTSA_TAG_BYTES : 0);
     peer told[PEERS] = {{0, 0}};
     delay_tell(h, told);
-    memcpy(out, h->header, AGREED);
-    put(out + AGREED, late, 0, 0xffff);
-    for (int i = 0; i < PEERS; i++) {
-        uint8_t *at = out + AGREED + 2 + 4 * i;
+    memcpy(out, h->header, (size_t)h->agreed);
+    if (h->late_bytes) put(out + h->agreed, late, 0, 0xffff);
+    for (int i = 0; i < h->peers; i++) {
+        uint8_t *at = out + h->agreed + h->late_bytes + 4 * i;
         at[0] = (uint8_t)told[i].id;
         at[1] = (uint8_t)(told[i].id >> 8);
         put(at + 2, told[i].late, -0x8000, 0x7fff);
     }
-    memcpy(out + HEADER, frame, (size_t)length);
-    if (h->key_length) make_tag(h, out, length, slot, out + HEADER + length);
+    memcpy(out + h->head, frame, (size_t)length);
+    if (h->key_length) make_tag(h, out, length, slot, out + h->head + length);
 }
 
 /* ---- slots ---- */

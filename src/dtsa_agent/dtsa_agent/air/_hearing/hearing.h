@@ -9,12 +9,9 @@
 #include "dtsa.h"
 #include "port.h"
 
-enum {
-    AGREED = 8,
-    TIMES = 18,
-    HEADER = AGREED + TIMES,
-    PEERS = 4
-}; /* bytes of a datagram; see datagram.py */
+/* Bytes of a datagram, see datagram.py: those that a swarm agrees on, 8 with the magic of a
+ * network; and of how many others a datagram tells, at most. */
+enum { WITH_MAGIC = 8, PEERS = 4 };
 
 /* What has come of a datagram. */
 typedef enum verdict {
@@ -65,7 +62,9 @@ enum { HEARS = 1, SAYS = 2, SUM = 4 };
 typedef struct hearing {
     /* Given. */
     int agents, self; /* number of agents, own index */
-    uint8_t header[AGREED], key[32];
+    uint8_t header[WITH_MAGIC], key[32];
+    int agreed, late_bytes, peers, head; /* of the header: bytes agreed on; 2, or 0: it does not
+                                            say how late it left; others told of; all bytes */
     int key_length; /* 0: not sealed */
     uint64_t session;
     int64_t flight;

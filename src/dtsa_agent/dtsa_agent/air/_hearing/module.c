@@ -45,22 +45,28 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     air_port *port;
     (void)unused;
     if (!h) return PyErr_NoMemory();
-    if (!PyArg_ParseTuple(args, "iiiLKy#y#KLdiiLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
-                          &seed, &header, &header_length, &key, &key_length, &session, &flight,
-                          &h->position_step, &h->length, &h->own_bytes, &limit, &began, &offset,
+    if (!PyArg_ParseTuple(args, "iiiLKy#iiy#KLdiiLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
+                          &seed, &header, &header_length, &h->late_bytes, &h->peers, &key,
+                          &key_length, &session, &flight, &h->position_step, &h->length,
+                          &h->own_bytes, &limit, &began, &offset,
                           &drift, &capsule))
         goto failed;
     port = PyCapsule_GetPointer(capsule, DTSA_PORT);
     if (!port) goto failed;
     if (h->agents < 1 || h->agents > DTSA_AGENTS_MAX || id < 1 || id > h->agents ||
-        header_length != AGREED || key_length > (Py_ssize_t)sizeof h->key || h->length > LONGEST ||
-        h->length <= HEADER + DTSA_TAG_BYTES || h->own_bytes < 0 ||
+        header_length > WITH_MAGIC || (h->late_bytes && h->late_bytes != 2) || h->peers < 0 ||
+        h->peers > PEERS ||
+        key_length > (Py_ssize_t)sizeof h->key || h->length > LONGEST ||
+        h->length <= header_length + h->late_bytes + 4 * h->peers + DTSA_TAG_BYTES ||
+        h->own_bytes < 0 ||
         drift < -DRIFT_MOST || drift > DRIFT_MOST || !(h->position_step > 0.0) ||
         !dtsa_timebase_init(&h->base, h->agents, anchor_every, slot_ns, id, seed)) {
         PyErr_SetString(PyExc_ValueError, "what is heard: a value is out of range");
         goto failed;
     }
-    memcpy(h->header, header, AGREED);
+    memcpy(h->header, header, (size_t)header_length);
+    h->agreed = (int)header_length;
+    h->head = h->agreed + h->late_bytes + 4 * h->peers;
     memcpy(h->key, key, (size_t)key_length);
     h->self = id - 1;
     h->key_length = (int)key_length;
@@ -301,7 +307,7 @@ static PyObject *wrap(PyObject *self, PyObject *args)
     long long slot, late;
     uint8_t out[LONGEST];
     if (!PyArg_ParseTuple(args, "y#LL", &frame, &length, &slot, &late)) return NULL;
-    if (length != h->length - HEADER - (h->key_length ? DTSA_TAG_BYTES : 0))
+    if (length != h->length - h->head - (h->key_length ? DTSA_TAG_BYTES : 0))
         return PyErr_Format(PyExc_ValueError, "a frame of %zd bytes", length);
     hearing_wrap(h, (const uint8_t *)frame, slot, late, out);
     return bytes(out, h->length);

@@ -18,7 +18,7 @@ class UdpPort(MulticastSocket):
 
     def __init__(self, settings: UdpSettings) -> None:
         super().__init__(settings)
-        self.flight_time_ns, self.byte_time_ns = settings.flight_time_ns, settings.byte_time_ns
+        self.properties = settings.properties
         host, number = self.address
         self.compiled = _socket.open_port(self.fileno(), socket.inet_aton(host), number)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from dataclasses import dataclass
 
+from dtsa_agent.air.port import PortProperties
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import REQUIRED, Settings, check, setting
 
@@ -36,6 +37,16 @@ class UdpSettings(Settings):
         check(self)
         _address(self.group)
         self.interface_index()
+
+    @property
+    def properties(self) -> PortProperties:
+        """What agents, listeners and bags must know of it."""
+        return PortProperties("udp", self.flight_time_ns, self.byte_time_ns)
+
+    @property
+    def where(self) -> str:
+        """Where the frames go, for people."""
+        return f"{self.group} on {self.interface}"
 
     @property
     def address(self) -> tuple[str, int]:

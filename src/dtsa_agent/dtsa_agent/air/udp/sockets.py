@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
+from dtsa_agent.air.port import Datagram
 from dtsa_agent.core.errors import ConfigError
 
 from .settings import UdpSettings
@@ -26,14 +27,6 @@ _STEP_NS = 1_000_000  # the clock of the stamps has been set if it moved by this
 _EXACT_NS = 2_000  # between two looks at one clock: good enough for the other one in between
 _OLDEST_NS = 60 * _SECOND  # a stamp cannot be older than the longest sleep of a process
 _LOOK_NS = _SECOND  # a listener looks this often whether its interface is still the same
-
-
-class Datagram(NamedTuple):
-    """What has arrived."""
-
-    data: bytes
-    arrival_ns: int  # CLOCK_MONOTONIC
-    own: bool  # this very socket has sent it
 
 
 class StampClock:

@@ -1,4 +1,4 @@
-"""Agents on a network as a source of moments: a listener to their group, which knows only what frames say."""
+"""Agents on a network or a radio as a source of moments: a listener, which knows only what frames say."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from dtsa_agent.air.datagram import (
     EARLY,
-    HEADER,
     NO_FRAME,
     OTHER_TIME,
     REPEATED,
     Said,
     Wrapping,
     flight_ns,
+    frame_in,
 )
-from dtsa_agent.air.udp import MulticastSocket, UdpSettings
+from dtsa_agent.air.port import PortSettings
+from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.agents.pacing import MOST_EARLY, too_long_ns
@@ -52,11 +53,12 @@ class HeardRun:
 
     :param track: where the moments go.
     :param config: the settings that all agents share.
+    :param air: name of the kind of port.
     :param first: the first slot that is told.
     :param zero_ns: ns, CLOCK_MONOTONIC, when slot 0 began or would have begun.
     """
 
-    def __init__(self, track: Track, config: SwarmConfig, first: int, zero_ns: int) -> None:
+    def __init__(self, track: Track, config: SwarmConfig, air: str, first: int, zero_ns: int) -> None:
         self._track, self._config = track, config
         self.slot, self.zero_ns, self.heard_ns = first, zero_ns, 0
         self._scenario = make_scenario(config)
@@ -71,7 +73,7 @@ class HeardRun:
         self._late_ns: deque[int] = deque(maxlen=_LATENESS)
         self._nobody = np.zeros(config.agents, np.uint16)  # whom they take for the sender, only the agents know
         self._reason = np.full(config.agents, _NO_REASON, np.uint8)
-        seen = {"live": True, "control": False, "mode": "udp", "listener": True}
+        seen = {"live": True, "control": False, "mode": air, "listener": True}
         track.begin(run_info(track.name, RunConfig(config, mode=REALTIME), self._scenario) | seen)
 
     def hear(self, said: Said, sealed: bytes, zero_ns: int, now_ns: int) -> str:
@@ -170,36 +172,36 @@ class HeardRun:
 
 
 class NetworkListener:
-    """Listens to the agents on a network without taking part.
+    """Listens to agents without taking part.
 
     :param track: where the moments go.
     :param config: the settings that all agents share.
-    :param udp: the network.
-    :raises ConfigError: for a swarm that cannot fly on a network, a network that cannot be used, or without the key of
+    :param port: what carries the frames.
+    :raises ConfigError: for a swarm that cannot fly by itself, a port that cannot be used, or without the key of
         sealed frames.
     """
 
-    def __init__(self, track: Track, config: SwarmConfig, udp: UdpSettings) -> None:
+    def __init__(self, track: Track, config: SwarmConfig, port: PortSettings) -> None:
         check_joinable(config.policy)
         if config.estimator_row.needs_everybody:
             raise ConfigError("estimator", config.estimator, "one that needs only what is heard")
         self._track, self._config = track, config
-        self._wrapping = Wrapping(config, authenticator(config))
-        self._flight_ns = flight_ns(config, udp.flight_time_ns, udp.byte_time_ns)
+        self._wrapping = Wrapping(config, authenticator(config), port=port.properties)
+        self._air, self._flight_ns = port.properties.name, flight_ns(config, port.properties)
         self._too_long_ns = too_long_ns(config)
-        self._where = f"{udp.group} on {udp.interface}"
-        self._socket = MulticastSocket(udp)
+        self._where = port.where
+        self._listener = open_listener(port)
         self._run: HeardRun | None = None
         self.refused: Counter[str] = Counter()  # datagrams that were not taken in, by reason
         self.stopped = False
 
     def run(self) -> None:
         """Listens until ``stopped`` is set."""
-        self._track.end(f"waiting for frames to {self._where}")
-        with self._socket:
+        self._track.end(f"waiting for frames: {self._where}")
+        with self._listener:
             while not self.stopped:
-                select.select([self._socket], [], [], _PATIENCE_S)
-                for datagram in self._socket.receive(_BURST):
+                select.select([self._listener], [], [], _PATIENCE_S)
+                for datagram in self._listener.receive(_BURST):
                     if reason := self.take(datagram.data, datagram.arrival_ns, time.monotonic_ns()):
                         self.refused[reason] += 1
                 self.pass_time(time.monotonic_ns())
@@ -221,8 +223,8 @@ class NetworkListener:
         if run is not None and said.slot < run.slot and now_ns - run.heard_ns < _SILENCE_NS:
             return OTHER_TIME
         if run is None or said.slot < run.slot or run.zero_ns - zero_ns > self._too_long_ns:
-            run = self._run = HeardRun(self._track, self._config, said.slot, zero_ns)
-        return run.hear(said, data[HEADER:], zero_ns, now_ns)
+            run = self._run = HeardRun(self._track, self._config, self._air, said.slot, zero_ns)
+        return run.hear(said, frame_in(data, self._config), zero_ns, now_ns)
 
     def pass_time(self, now_ns: int) -> None:
         """Tells what is over. Who stood still for too long begins anew.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
 from dtsa_agent.air.datagram import flight_ns
+from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.recordings.bag.errors import UnusableBag
@@ -35,7 +36,7 @@ class AgentBag:
     path: Path
     agent: int  # id
     swarm: SwarmConfig
-    udp: dict[str, Any]
+    port: PortProperties
     started_ns: int  # own clock, when its process began
     slots: list[SlotRecord] = field(default_factory=list)  # ascending
     refused: Counter[str] = field(default_factory=Counter)  # datagrams not taken in, by reason
@@ -46,7 +47,7 @@ class AgentBag:
     @property
     def flight_ns(self) -> int:
         """From the order to send a frame to its arrival as the agents take it to be, ns."""
-        return flight_ns(self.swarm, int(self.udp["flight_time_ns"]), int(self.udp["byte_time_ns"]))
+        return flight_ns(self.swarm, self.port)
 
 
 class NothingWritten(UnusableBag):
@@ -134,12 +135,21 @@ def _metadata(file: Path, record: Metadata, bag: AgentBag | None) -> AgentBag | 
     if record.name == METADATA:
         try:
             swarm = SwarmConfig.from_dict(json.loads(values["swarm"]))
-            return AgentBag(file, int(values["id"]), swarm, json.loads(values["udp"]), int(values["started_ns"]))
-        except (KeyError, ValueError) as error:
+            return AgentBag(file, int(values["id"]), swarm, _port(values), int(values["started_ns"]))
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise UnusableBag(file, f"its settings cannot be read ({error})") from None
     if record.name == SUMMARY and bag is not None:
         bag.summary = json.loads(values.get("summary", "{}"))
     return bag
+
+
+def _port(values: Mapping[str, str]) -> PortProperties:
+    """Bags of earlier versions are of networks, and have their settings alone."""
+    if "port" in values:
+        said = json.loads(values["port"])
+        return PortProperties(str(said.pop("name")), **{name: int(value) for name, value in said.items()})
+    udp = json.loads(values["udp"])
+    return PortProperties("udp", int(udp["flight_time_ns"]), int(udp["byte_time_ns"]))
 
 
 def _message(bag: AgentBag, topic: str, said: dict[str, Any]) -> None:

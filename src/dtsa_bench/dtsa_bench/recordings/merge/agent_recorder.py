@@ -5,14 +5,15 @@ What is in it: docs/reference/network.md.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
+from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
 
 from .json_bag import JsonBag, described
@@ -52,7 +53,7 @@ SLOT_SCHEMA = described(
     goal=("array", "m, where it flies to"),
     frame=("string", "what it was to send, without a tag, hexadecimal; empty: silent"),
     datagram=("string", "as on the air, hexadecimal; empty: nothing was sent"),
-    sent_ns=("integer", "when that was handed to the network, ns, own clock; -1: not at all"),
+    sent_ns=("integer", "when that was handed to the port, ns, own clock; -1: not at all"),
 )
 SLOT_SCHEMA["properties"] |= {"before": _HEARD, "heard": _HEARD}
 REFUSED_SCHEMA = described(
@@ -63,21 +64,33 @@ REFUSED_SCHEMA = described(
 )
 
 
+def about_port(port: PortSettings) -> dict[str, str]:
+    """What a bag says of the port: its settings under its name, and what they come to.
+
+    :param port: its settings.
+    """
+    properties = dataclasses.asdict(port.properties)
+    return {
+        properties["name"]: json.dumps(port.to_dict(), sort_keys=True),
+        "port": json.dumps(properties, sort_keys=True),
+    }
+
+
 class AgentRecorder(JsonBag):
     """The bag of one agent, written while it flies: a watcher of the agent.
 
     :param path: the file; must not exist.
     :param own: the agent.
     :param config: the settings that all agents share.
-    :param udp: the network.
+    :param port: what carries the frames.
     :raises BagError: if the file cannot be made.
     """
 
-    def __init__(self, path: Path, own: AgentSettings, config: SwarmConfig, udp: UdpSettings) -> None:
+    def __init__(self, path: Path, own: AgentSettings, config: SwarmConfig, port: PortSettings) -> None:
         started = monotonic_ns() + own.clock_offset_ns  # own clock
-        sections = {"own": own, "swarm": config, "udp": udp}
+        sections = {"own": own, "swarm": config}
         about = {name: json.dumps(section.to_dict(), sort_keys=True) for name, section in sections.items()}
-        about |= {"id": str(own.id), "started_ns": str(started)}
+        about |= {"id": str(own.id), "started_ns": str(started), **about_port(port)}
         super().__init__(path, {SLOT: SLOT_SCHEMA, REFUSED: REFUSED_SCHEMA}, METADATA, about)
         self._refused = 0  # since the last flush
         self._slots: list[SlotRecord] = []  # not written yet

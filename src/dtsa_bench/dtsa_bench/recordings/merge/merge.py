@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.datagram import frame_in
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.recordings.rules.judge import Judge
@@ -216,6 +216,7 @@ def judged(
     :param sent: all frames of their bags.
     :param common_slot: from which all counted alike; None: never.
     """
+    config = next(iter(lives.values())).swarm
     frames: dict[int, dict[int, bytes]] = {}
     unsent: dict[int, dict[int, bytes]] = {}
     for (agent, _), bag in lives.items():
@@ -223,10 +224,10 @@ def judged(
             if record.frame and not record.datagram:
                 unsent.setdefault(record.slot, {})[agent] = record.frame
             for heard in (*record.before, *record.heard):
-                frames.setdefault(heard.slot, {})[heard.sender] = heard.datagram[HEADER:]
+                frames.setdefault(heard.slot, {})[heard.sender] = frame_in(heard.datagram, config)
     for (slot, agent), origin in sent.items():
-        frames.setdefault(slot, {})[agent] = origin.record.datagram[HEADER:]
-    judge = Judge(next(iter(lives.values())).swarm)
+        frames.setdefault(slot, {})[agent] = frame_in(origin.record.datagram, config)
+    judge = Judge(config)
     for slot in sorted({*frames, *unsent}):
         if common_slot is not None and slot >= common_slot:
             judge.slot(slot, frames.get(slot, {}), unsent.get(slot))

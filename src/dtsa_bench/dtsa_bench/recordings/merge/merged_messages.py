@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.datagram import frame_in
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.core import REASONS
 from dtsa_agent.ros.common.graph import names
@@ -88,7 +88,7 @@ class MergedMessages:
         for (agent, _), bag in run.lives.items():
             for record in bag.slots:
                 if record.datagram:
-                    said = record.sent_ns, record.datagram[HEADER:]
+                    said = record.sent_ns, frame_in(record.datagram, bag.swarm)
                     self._senders.setdefault(record.slot, {})[agent] = said
 
     @cached_property
@@ -179,7 +179,7 @@ class MergedMessages:
         at = self._at(records[-1].slot)
         heard = [((r.slot - 1) & _BITS, one) for r in records for one in r.before]
         heard += [(r.slot, one) for r in records for one in r.heard]
-        frames = [_frame(record) for record in records]
+        frames = [frame_in(record.datagram, self._run.config) for record in records]
         return self._out(
             names.REPORT, at, at, agent=_array([agent], "u2"), slot=_array([r.slot for r in records], "u4"),
             offset_ns=_array([self._offset(record) for record in records], "i8"),
@@ -204,7 +204,7 @@ class MergedMessages:
             if not here:
                 continue
             at, records = self._at(slot), list(here.values())
-            frames = [_frame(record) for record in records]
+            frames = [frame_in(record.datagram, self._run.config) for record in records]
             planes = {name: values.reshape(-1, 3).T for name, values in _vectors(records).items()}
             yield self._out(
                 names.TRANSMISSION, at, at, slot=slot, agent=_array(list(here), "u2"),
@@ -258,10 +258,6 @@ class MergedMessages:
                 place, goal = (np.stack(list(v), axis=1) for v in zip(*((r.track[-1], r.goal) for r in here.values()),
                                                                       strict=True))  # fmt: skip
                 yield Out(at, topic, packer.pack(at, place, state, goal))
-
-
-def _frame(record: SlotRecord) -> bytes:
-    return record.datagram[HEADER:]
 
 
 def _array(values: Sequence[Any], kind: str) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.datagram import HEADER, NETWORK, frame_in
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
@@ -112,7 +112,9 @@ def lay(merge: Merge, summary: Mapping[str, Any]) -> MergedRun:
             for heard in (*record.before, *record.heard):
                 key = heard.slot, heard.sender
                 if key not in sent and key not in strays:
-                    strays[key] = OnAir(heard.arrival_ns - round(merge.line.flight_ns), heard.datagram[HEADER:])
+                    strays[key] = OnAir(
+                        heard.arrival_ns - round(merge.line.flight_ns), frame_in(heard.datagram, merge.config)
+                    )
     about = {
         "common_slot": first,
         "missing": summary["missing"],
@@ -214,7 +216,14 @@ class _Reader:
             before.append((life, said))
             summary = {"ended": True} if said["ended_in_order"] else {}
             self._lives[life] = AgentBag(
-                path, life[0], config, {}, 0, summary=summary, broken_off=bool(said["broken_off"]), unsent_kept=False
+                path,
+                life[0],
+                config,
+                NETWORK,
+                0,
+                summary=summary,
+                broken_off=bool(said["broken_off"]),
+                unsent_kept=False,
             )
 
     def run(self) -> MergedRun:

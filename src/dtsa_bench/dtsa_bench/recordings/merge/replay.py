@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from dtsa_agent.air.datagram import HEADER
+from dtsa_agent.air.datagram import frame_in
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import AgentGroup, make_scenario
 from dtsa_agent.core.frame import TAG_LENGTH
@@ -25,7 +25,7 @@ class Replay:
     def __init__(self, bag: AgentBag) -> None:
         # Tags are left out: whether they are right was for the agent to judge, and the key is not in the bag.
         config = dataclasses.replace(bag.swarm, auth=False)
-        self._tag = TAG_LENGTH if bag.swarm.auth else 0
+        self._of = bag.swarm
         self.agent = bag.agent
         self._unsent_kept = bag.unsent_kept
         self.swarm = make_swarm(config, make_scenario(config), local=[bag.agent])
@@ -65,7 +65,11 @@ class Replay:
 
     def _hear(self, frames: list[Heard]) -> None:
         for heard in frames:
-            self.swarm.hear(heard.slot, heard.datagram[HEADER : len(heard.datagram) - self._tag])
+            self.swarm.hear(heard.slot, self._frame_in(heard.datagram))
+
+    def _frame_in(self, datagram: bytes) -> bytes:
+        sealed = frame_in(datagram, self._of)
+        return sealed[:-TAG_LENGTH] if self._of.auth else sealed
 
     def _compare(self, record: SlotRecord) -> None:
         swarm = self.swarm
