@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from dtsa_dev.proofs.embedded import fly_here, fly_on_cortex
+from dtsa_dev.proofs.embedded import FUSING, fly_here, fly_on_cortex, fused
 from dtsa_dev.proofs.fuzz import Found, build, fuzz
 from dtsa_dev.proofs.library import LIBRARY, NotHere
 from dtsa_dev.proofs.prove import MUTANTS, World, explore
@@ -53,6 +53,20 @@ def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
     assert [flight.digest for flight in cortex] == [flight.digest for flight in here]
     assert len({flight.digest for flight in here}) == 6
     assert all(flight.memory < 8192 for flight in cortex)
+
+
+def test_a_firmware_that_fuses_operations_flies_the_same_bits(tmp_path: Path) -> None:
+    """Its flags allow it, libdtsa's sources forbid it; without that rule the same sources have fused operations."""
+    copy = tmp_path / "libdtsa"
+    shutil.copytree(LIBRARY, copy)
+    (copy / "rounding.h").write_text("")
+    try:
+        assert fused(tmp_path) == {}
+        assert set(fused(tmp_path, copy)) == {"orca_scalar.c", "urgent.c"}
+        cortex = fly_on_cortex(tmp_path, slots=30, metered=False, more=FUSING)
+    except NotHere as error:
+        pytest.skip(str(error))
+    assert [flight.digest for flight in cortex] == [flight.digest for flight in fly_here(tmp_path, slots=30)]
 
 
 def test_code_for_software_doubles_gives_the_same_bits(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +14,8 @@ from .library import HERE, LIBRARY, compile_program, sources, tool
 
 CALLS = ("slot", "command", "hear", "end")  # in the order of meter.h
 _CORTEX = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-O2")
+#: Flags of a firmware that fuses multiplications and additions where it may.
+FUSING = ("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno")
 _IN_PARTS = ("-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections")
 _LIMIT_S = 120.0
 
@@ -49,30 +53,32 @@ def fly_here(directory: Path, slots: int = 200, compiler: str = "gcc", soft: boo
     return _read(_run([str(program)]))
 
 
-def fly_on_cortex(directory: Path, slots: int = 200, metered: bool = True) -> list[Flight]:
+def fly_on_cortex(directory: Path, slots: int = 200, metered: bool = True, more: Sequence[str] = ()) -> list[Flight]:
     """The flights on a Cortex-M4F in QEMU.
 
     :param directory: for the program, ``flight.elf``.
     :param slots: of each flight.
     :param metered: count stack and instructions of each call, which takes a while.
+    :param more: flags of the compiler.
     :raises NotHere: where compiler or QEMU are missing.
     """
     qemu = [*_qemu(), *(["-icount", "shift=5"] if metered else [])]  # 32 ns an instruction, see mps2.c
-    return _read(_run([*qemu, "-kernel", str(build_for_cortex(directory, slots, metered))]))
+    return _read(_run([*qemu, "-kernel", str(build_for_cortex(directory, slots, metered, more))]))
 
 
-def build_for_cortex(directory: Path, slots: int = 200, metered: bool = True) -> Path:
+def build_for_cortex(directory: Path, slots: int = 200, metered: bool = True, more: Sequence[str] = ()) -> Path:
     """The program for the board.
 
     :param directory: where it is put.
     :param slots: of each flight.
     :param metered: with counters of stack and instructions.
+    :param more: flags of the compiler.
     """
     compiler = tool("arm-none-eabi-gcc", "gcc-arm-none-eabi libnewlib-arm-none-eabi")
     board = ["-nostartfiles", "--specs=rdimon.specs", f"-T{HERE / 'mps2.ld'}", f"-I{HERE}", f"-DSLOTS={slots}"]
     board += ["-DMETERED"] if metered else []
     files = [*_files(), HERE / "mps2.c"]
-    return compile_program(compiler, directory / "flight.elf", files, [*_CORTEX, *_IN_PARTS, *board])
+    return compile_program(compiler, directory / "flight.elf", files, [*_CORTEX, *_IN_PARTS, *board, *more])
 
 
 def code_size(directory: Path) -> dict[str, int]:
@@ -92,6 +98,23 @@ def code_size(directory: Path) -> dict[str, int]:
         )
         sums[part] = sums.get(part, 0) + int(text)
     return sums
+
+
+def fused(directory: Path, library: Path = LIBRARY) -> dict[str, int]:
+    """Fused multiplications and additions by file where a firmware's flags allow them; files without any are left out.
+
+    :param directory: for assembly.
+    :param library: folder of libdtsa.
+    """
+    compiler = tool("arm-none-eabi-gcc", "gcc-arm-none-eabi libnewlib-arm-none-eabi")
+    counts = {}
+    for path in sources(library):
+        out = directory / f"{path.parent.name}-{path.stem}.s"
+        compile_program(compiler, out, [path], [*_CORTEX, *FUSING, "-S"], library, links=())
+        count = len(re.findall(r"^\s+vfn?m[as]", out.read_text(), re.MULTILINE))
+        if count:
+            counts[path.name] = count
+    return counts
 
 
 def _files() -> list[Path]:

@@ -3,6 +3,8 @@
 #ifndef DTSA_CORE_H
 #define DTSA_CORE_H
 
+#include "rounding.h"
+
 #include "dtsa.h"
 #include "frame.h"
 

@@ -2,6 +2,8 @@
 #ifndef DTSA_FRAME_H
 #define DTSA_FRAME_H
 
+#include "rounding.h"
+
 #include "dtsa.h"
 
 enum { FRAME_VERSION = 1 };

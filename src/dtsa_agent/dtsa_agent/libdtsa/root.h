@@ -4,6 +4,8 @@
 #ifndef DTSA_ROOT_H
 #define DTSA_ROOT_H
 
+#include "rounding.h"
+
 #include <math.h>
 
 #if !defined(DTSA_SOFT_DOUBLES) && defined(__ARM_FP) && !(__ARM_FP & 8)

@@ -3,6 +3,8 @@
 #ifndef DTSA_AVOIDER_H
 #define DTSA_AVOIDER_H
 
+#include "rounding.h"
+
 #include "dtsa.h"
 
 /* Scratch memory one caller needs for n agents, in doubles. */

@@ -4,6 +4,8 @@
 #ifndef DTSA_AVOIDER_SIMD_H
 #define DTSA_AVOIDER_SIMD_H
 
+#include "rounding.h"
+
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
