@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from dtsa_bench.simulation.schemes.knowledge import whittle_index
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.model.airtime import Airtime
+from dtsa_channel_sim.model.airtime import Airtime, Line
 from dtsa_channel_sim.model.verdict import COLLISION
 
 LEAGUE = Path(__file__).resolve().parents[4] / "docs" / "evidence" / "league.md"
@@ -416,6 +417,9 @@ def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
         assert length == SwarmConfig(policy=policy.split(",")[0]).frame_length
         assert float(turn.split()[0]) == airtime.ramp_up_ns / 1e6
         assert float(frame.split()[0]) == pytest.approx(airtime.on_air_ns(length) / 1e6, abs=5e-4)
-        parts = {"guard_ns": guard, "link_delay_ns": links, "decide_ns": decision}
-        given = {name: round(float(text.split("x ")[-1].split()[0]) * 1e6) for name, text in parts.items() if text}
-        assert float(shortest.split()[0]) == pytest.approx(airtime.shortest_slot_ns(length, **given) / 1e6, abs=6e-3)
+        guard_ns, link_ns, decide_ns = (
+            round(float(text.split("x ")[-1].split()[0]) * 1e6) if text else 0 for text in (guard, links, decision)
+        )
+        airtime = replace(airtime, line=Line(link_ns, 0, link_ns, 0))
+        slot_ns = airtime.shortest_slot_ns(length, guard_ns=guard_ns, decide_ns=decide_ns, needs_frame=bool(link_ns))
+        assert float(shortest.split()[0]) == pytest.approx(slot_ns / 1e6, abs=6e-3)

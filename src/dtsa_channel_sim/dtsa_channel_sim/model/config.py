@@ -13,6 +13,7 @@ from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, bu
 
 from .airtime import Airtime
 from .gilbert import GilbertElliott
+from .radio_table import airtime_of
 from .schedule import Change, listed
 from .timeline import check_schedule
 from .topology import LinkLoss, format_partition, parse_matrix, parse_partition
@@ -118,7 +119,7 @@ class ChannelConfig(Settings):
     @property
     def airtime(self) -> Airtime:
         """The radio's times."""
-        return Airtime(self.bitrate, self.ramp_up_ns)
+        return airtime_of("plain", self.bitrate, self.ramp_up_ns, self.link_delay_ns)
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> ChannelConfig:
