@@ -12,9 +12,9 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -50,6 +50,7 @@ class Links:
     delay_ns: int = 0
     jitter_ns: int = 0  # more, evenly distributed
     double: float = 0.0  # share of frames that arrive twice
+    later_to: Mapping[int, int] = field(default_factory=dict)  # ns more on the way to a host, by its number
 
 
 class Switch:
@@ -150,6 +151,7 @@ class Switch:
                 times = 1 + bool(self._links.double and self._random.random() < self._links.double)
                 for _ in range(times):
                     delay = self._links.delay_ns + round(self._links.jitter_ns * self._random.random())
+                    delay += self._links.later_to.get(number, 0)
                     self._count += 1
                     entry = (verdict.arrival_ns + delay, self._count, self._cables[number], frame)
                     heapq.heappush(self._due, entry)
