@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from .swarm_file import add_swarm_file, take_swarm_file
+
 if TYPE_CHECKING:
     from dtsa_agent.air.port import PortSettings
     from dtsa_agent.core import SwarmConfig
@@ -33,7 +35,8 @@ def add_air(parser: argparse.ArgumentParser) -> None:
     """Adds what carries the frames, and where the results go."""
     from dtsa_agent.air.ports import AIRS
 
-    parser.add_argument("--air", choices=AIRS, default=AIRS[0], help=f"what carries the frames [{AIRS[0]}]")
+    parser.add_argument("--air", choices=AIRS, help=f"what carries the frames [{AIRS[0]}]")
+    add_swarm_file(parser)
     parser.add_argument("--out", metavar="DIR", help="directory for its bag and summary.json; default: only printed")
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
 
@@ -53,8 +56,9 @@ def add_ports(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--seal",
         action=argparse.BooleanOptionalAction,
-        default=True,
-        help="frames carry a code that only holders of the key can make; the key is in the environment: DTSA_AUTH_KEY",
+        default=None,
+        help="frames carry a code that only holders of the key can make; the key is in the environment: DTSA_AUTH_KEY "
+        "[--seal]",
     )
 
 
@@ -65,7 +69,7 @@ def add_swarm(parser: argparse.ArgumentParser) -> None:
     from dtsa_bench.runs.options import add_options
 
     swarm = parser.add_argument_group("the swarm: what all agents share")
-    swarm.add_argument("--policy", metavar="NAME", default=DEFAULT_POLICY, help=f"who sends next [{DEFAULT_POLICY}]")
+    swarm.add_argument("--policy", metavar="NAME", help=f"who sends next [{DEFAULT_POLICY}]")
     skip = ("policy", "auth", *(s.name for s in settings_of(SwarmConfig) if s.group == "Priority and selection"))
     add_options(swarm, SwarmConfig, "swarm", skip=skip)
 
@@ -98,7 +102,8 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
     from dtsa_agent.keys import check_key, check_session
     from dtsa_bench.runs.options import given
 
-    config = SwarmConfig.from_dict({**given(args, SwarmConfig, "swarm"), "policy": args.policy, "auth": args.seal})
+    named = {"policy": args.policy or DEFAULT_POLICY, "auth": args.seal is not False}
+    config = SwarmConfig.from_dict({**given(args, SwarmConfig, "swarm"), **named})
     check_key(config)  # before anything is made
     check_session(config)
     return config
@@ -107,12 +112,14 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
 def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C, and print what came of it."""
     from dtsa_agent.air.datagram import check_fits
+    from dtsa_agent.air.ports import AIRS
     from dtsa_agent.air.prepared import prepare
     from dtsa_agent.air.settings import AgentSettings
     from dtsa_agent.core.agents.joining import check_joinable
     from dtsa_bench.network.flying import Order, become, fly
     from dtsa_bench.runs.options import given
 
+    take_swarm_file(args, AIRS[0])
     own = AgentSettings.from_dict(given(args, AgentSettings, "own"))
     port, config = port_of(args), swarm_of(args)
     check_joinable(config.policy)  # before anything is made

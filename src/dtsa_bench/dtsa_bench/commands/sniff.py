@@ -25,6 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Listen until Ctrl-C, and print what came of it."""
+    from dtsa_agent.air.ports import AIRS
     from dtsa_agent.core.settings.declaration import Setting
     from dtsa_agent.stop import Stop
     from dtsa_bench.network.sniffer import Sniffer
@@ -33,7 +34,9 @@ def run(args: argparse.Namespace) -> int:
 
     from .agent import port_of, swarm_of
     from .merge import lines
+    from .swarm_file import take_swarm_file
 
+    take_swarm_file(args, AIRS[0])
     duration = Setting("duration_s", "float", 0.0, "how long", unit="s", minimum=0, maximum=1e6).read(args.duration_s)
     port, config = port_of(args), swarm_of(args)
     directory = None if args.out is None else new_directory(args.out)

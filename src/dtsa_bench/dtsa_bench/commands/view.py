@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from .registry import RECORDED_RUN
+from .swarm_file import add_swarm_file, take_swarm_file
 
 if TYPE_CHECKING:
     from dtsa_bench.pages.view.orders import Order
@@ -45,9 +46,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("bags", nargs="*", metavar="BAG", help=f"{RECORDED_RUN}; two are shown side by side")
     from dtsa_agent.air.ports import AIRS
 
-    parser.add_argument(
-        "--air", choices=(_ROS, *AIRS), default=_ROS, help="without a bag: what carries the swarm's frames [ros]"
-    )
+    parser.add_argument("--air", choices=(_ROS, *AIRS), help="without a bag: what carries the swarm's frames [ros]")
     parser.add_argument("--domain", metavar="N", default=None, help="without a bag: ROS_DOMAIN_ID of the swarm")
     parser.add_argument(
         "--namespace", metavar="NAME", default=None, help="without a bag: namespace of the swarm [/swarm]"
@@ -63,13 +62,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     from .agent import add_ports, add_swarm
 
+    add_swarm_file(parser)
     add_ports(parser)
     add_swarm(parser)
-    parser.set_defaults(policy=None, seal=None)  # so that it is known whether they were given
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until a signal comes."""
+    from dtsa_agent.air.ports import AIRS
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.pages.view.link import give_way
     from dtsa_bench.pages.view.server import ViewServer, new_token
@@ -79,6 +79,9 @@ def run(args: argparse.Namespace) -> int:
     port = whole_number(args.port, "port", 0, 65535)
     if len(args.bags) > _MOST:
         raise ConfigError("bags", len(args.bags), f"at most {_MOST} side by side")
+    if args.swarm_file is not None and args.bags:
+        raise ConfigError("swarm", args.swarm_file, "only without a bag")
+    take_swarm_file(args, _ROS if args.swarm_file is None else AIRS[0])
     _check_source(args)
     if args.listen is not None and not _plain_address(args.listen):
         raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
@@ -131,10 +134,9 @@ def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
     from dtsa_bench.pages.view.network_listener import NetworkListener
     from dtsa_bench.pages.view.track import Track
 
-    from .agent import DEFAULT_POLICY, port_of, swarm_of
+    from .agent import port_of, swarm_of
 
     port = port_of(args)
-    args.policy, args.seal = args.policy or DEFAULT_POLICY, args.seal is not False
     config = swarm_of(args)
     track = Track(port.where)
     return [track], [NetworkListener(track, config, port)], None
