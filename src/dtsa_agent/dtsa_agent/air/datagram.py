@@ -61,12 +61,14 @@ def frame_in(datagram: bytes, config: SwarmConfig) -> bytes:
 
 
 def check_fits(config: SwarmConfig, port: PortProperties) -> None:
-    """Refuses frames that are too long for a port.
+    """Refuses frames that are too long for a port, and slots that are too short.
 
     :param config: what all agents share.
     :param port: what is to carry them.
     :raises ConfigError: if they are.
     """
+    if config.slot_ns < port.shortest_slot_ns:
+        raise ConfigError("slot_ms", config.slot_ms, f"at least {port.shortest_slot_ns / 1e6:g} over {port.name}")
     room = port.longest - port.header(config.auth).size
     if config.frame_length > room:
         by = f"policy {config.policy}, frame {config.frame}{', sealed' if config.auth else ''}"

@@ -76,6 +76,7 @@ class PortProperties:
     peers: int = 4  # of those that an agent hears a datagram names so many
     longest: int = 512  # bytes of the longest datagram
     bare_sealed: bool = False  # a sealed frame is the whole datagram: its tag tells the swarm from others
+    shortest_slot_ns: int = 0  # shorter slots are refused
 
     def header(self, sealed: bool) -> Header:
         """What stands before a frame.

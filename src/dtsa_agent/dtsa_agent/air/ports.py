@@ -20,6 +20,9 @@ class _Kind(NamedTuple):
 
 _KINDS = {
     "udp": _Kind("udp.settings.UdpSettings", "udp.port.UdpPort", "udp.sockets.MulticastSocket"),
+    "crazyradio": _Kind(
+        "crazyradio.settings.CrazyradioSettings", "crazyradio.port.CrazyradioPort", "crazyradio.port.CrazyradioPort"
+    ),
 }
 AIRS = tuple(_KINDS)
 

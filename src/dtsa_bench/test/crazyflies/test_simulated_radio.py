@@ -8,6 +8,7 @@ import pytest
 
 from dtsa_agent.crazyflie.settings import radio_budget as budget
 from dtsa_bench.crazyflies.simulated.radio import esb
+from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
 from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import (
     ACK_ENABLE,
@@ -15,11 +16,11 @@ from dtsa_bench.crazyflies.simulated.radio.dongle import (
     SET_ADDRESS,
     SET_CHANNEL,
     SET_RATE,
-    Agenda,
     Dongle,
 )
 from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, Receiver
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+from dtsa_bench.crazyflies.simulated.radio.sniffer import Sniffer
 
 NULL, SAFELINK = b"\xff", b"\xff\x05\x01"
 PACKET = b"\x3c" + bytes(14)
@@ -48,8 +49,17 @@ class Room:
         ]
         by_id = {first + k: receiver for k, receiver in enumerate(self.receivers)}
         air = RadioAir(first - 1 + len(by_id), self.settings.loss, self.settings.seed)
+        sniffers: dict[int, Sniffer] = {}
         self.dongles = [
-            Dongle(k, self.settings, air, self.agenda, by_id, lambda radio, up: (radio - first, up) not in self.deaf)
+            Dongle(
+                k,
+                self.settings,
+                air,
+                self.agenda,
+                by_id,
+                lambda radio, up: (radio - first, up) not in self.deaf,
+                sniffers,
+            )
             for k in range(1, first)
         ]
 

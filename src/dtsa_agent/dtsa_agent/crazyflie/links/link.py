@@ -58,9 +58,12 @@ def require_cflib() -> None:
         import cflib.crtp
 
     if path := os.environ.get(SIMULATED_RADIO):
-        from . import simulated_radio
+        import libusb_package
 
-        simulated_radio.install(Path(path))
+        from dtsa_agent.air.crazyradio.simulated import SimulatedBackend
+
+        backend = SimulatedBackend(Path(path))
+        libusb_package.get_libusb1_backend = lambda: backend  # cflib finds these dongles, and no others
     if not cflib.crtp.CLASSES:
         cflib.crtp.init_drivers()
     keep_links_open()

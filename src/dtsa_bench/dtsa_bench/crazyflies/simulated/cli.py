@@ -14,6 +14,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.process.priority import take_priority
+from dtsa_bench.crazyflies.simulated.radio.dongles import Dongles
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
 from dtsa_bench.runs.options import add_options, given, whole_number
 
@@ -60,7 +61,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--simulated-radio",
         type=Path,
         metavar="SOCKET",
-        help="new Unix socket, for `bridge --simulated-radio SOCKET`",
+        help="new Unix socket, for `bridge` and `agent --air crazyradio` with `--simulated-radio SOCKET`",
+    )
+    radio.add_argument(
+        "--dongles-only", action="store_true", help="with --simulated-radio: Crazyradios on an air without Crazyflies"
     )
     add_options(radio, RadioSettings, "radio", prefix="radio-")
     faults = parser.add_argument_group("faults", "sent to a fleet that is already running, instead of starting one")
@@ -85,7 +89,8 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
     if args.config is not None:
         return _from_swarm(args.config, options)
     if radio.path is not None:
-        raise ConfigError("config", None, "--config FILE with --simulated-radio: its URIs say where they listen")
+        allowed = "--config FILE with --simulated-radio: its URIs say where they listen; or --dongles-only"
+        raise ConfigError("config", None, allowed)
     config = FleetConfig(**options)
     start = layout.positions(args.layout, config.count, tuple(args.half_axes))
     return dataclasses.replace(config, start=start)
@@ -166,6 +171,8 @@ def run(args: argparse.Namespace) -> int:
 
         follow_supervisor()
     priority = whole_number(args.priority, "priority", 0, 90)
+    if args.dongles_only:
+        return _run_dongles(args, priority)
     fleet = Fleet(fleet_config(args))
     cameras = start_cameras(fleet.config) if args.motion_capture else None
     take_priority(priority)
@@ -190,6 +197,22 @@ def run(args: argparse.Namespace) -> int:
             cameras.wait()
     if not args.quiet:
         print(status_line(fleet))
+    return 0
+
+
+def _run_dongles(args: argparse.Namespace, priority: int) -> int:
+    """Simulated Crazyradios alone, until Ctrl-C; exit code."""
+    if args.simulated_radio is None or args.config is not None:
+        raise ConfigError("dongles_only", True, "with --simulated-radio SOCKET, and without --config")
+    settings = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
+    dongles = Dongles(settings)
+    take_priority(priority)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: dongles.stop())
+    if args.ignore_interrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    print(f"{settings.dongles} simulated Crazyradios at {settings.path}; Ctrl-C ends", flush=True)
+    dongles.run()
     return 0
 
 

@@ -238,7 +238,8 @@ class Fleet:
             timeout = timeout if due is None else min(timeout, due)
         for key, _ in self._selector.select(timeout):
             if isinstance(key.data, (RadioSide, Host)):
-                self._serve_radio(key.data)
+                assert self.radio is not None
+                self.radio.take(key.data if isinstance(key.data, Host) else None, self._selector)
                 continue
             if key.data < 0:
                 self._serve_control()
@@ -252,16 +253,6 @@ class Fleet:
                 self._receive(key.data, datagram, host)
         if self.radio is not None:
             self.radio.run()
-
-    def _serve_radio(self, what: RadioSide | Host) -> None:
-        assert self.radio is not None
-        if isinstance(what, RadioSide):
-            if (host := self.radio.accept()) is not None:
-                self._selector.register(host.socket, selectors.EVENT_READ, host)
-            return
-        sock = what.socket
-        if not self.radio.serve(what):
-            self._selector.unregister(sock)
 
     def _passes(self, index: int, up: bool) -> bool:
         """Whether a packet on the air passes the faults of a vehicle's link."""

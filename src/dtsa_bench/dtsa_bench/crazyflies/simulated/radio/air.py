@@ -25,15 +25,18 @@ class RadioAir:
         self._by_channel: dict[int, list[OnAir]] = {}
         self._judged = 0  # each transmission has random numbers of its own
 
-    def send(self, channel: int, rate: str, sender: int, start_ns: int, length: int) -> OnAir:
+    def send(
+        self, channel: int, rate: str, sender: int, start_ns: int, length: int, turn_ns: int = esb.TURN_NS
+    ) -> OnAir:
         """A transmission begins.
 
         :param channel: number of the radio channel, 0 to 125.
         :param sender: id of the radio.
         :param start_ns: ns, when it turns to sending.
         :param length: bytes of payload.
+        :param turn_ns: ns, how long it takes to turn; it hears nothing meanwhile.
         """
-        air = start_ns + esb.TURN_NS
+        air = start_ns + turn_ns
         frame = OnAir(sender, start_ns, air, air + esb.on_air_ns(length, rate))
         frames = self._by_channel.setdefault(channel, [])
         if frames and frames[0].end_ns < start_ns - _FORGET_NS:

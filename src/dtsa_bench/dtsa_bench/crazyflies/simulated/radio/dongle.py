@@ -7,52 +7,25 @@ Crazyradio 2.0 (compatible-usb-protocol.md, legacy_usb.c, esb.c, radio.c).
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from dtsa_channel_sim.model.medium import OnAir
 
 from . import esb
+from .agenda import Agenda
 from .air import RadioAir
 from .receiver import Receiver
-from .settings import RadioSettings
+from .settings import DEVICES, RadioSettings
+from .sniffer import FIRST_FIRMWARE, Sniffer, Tuned
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_POWER, SET_ARD, SET_ARC = range(1, 7)
 ACK_ENABLE, SET_CARRIER, SCAN_CHANNELS = 0x10, 0x20, 0x21
+SET_RADIO_MODE, SET_SNIFFER_ADDRESS = 0x24, 0x25
 ACKNOWLEDGED, POWER_DETECTED = 0x01, 0x02
 ACK_TIMEOUT_NS = 500_000  # of a Crazyradio 2.0, from the end of the packet to the address of the acknowledgement
 HIGHEST_CHANNEL = {"pa": 125, "2": 100}
 SCAN_RESULTS = 63
-
-
-class Agenda:
-    """What happens when, in the order of times."""
-
-    def __init__(self) -> None:
-        self._heap: list[tuple[int, int, Callable[[], None]]] = []
-        self._count = 0
-
-    def at(self, when_ns: int, action: Callable[[], None]) -> None:
-        """Do something at a time.
-
-        :param when_ns: ns, the time.
-        """
-        self._count += 1
-        heapq.heappush(self._heap, (when_ns, self._count, action))
-
-    @property
-    def next_ns(self) -> int | None:
-        """Time of the next thing; None: there is nothing."""
-        return self._heap[0][0] if self._heap else None
-
-    def run(self, until_ns: int) -> None:
-        """Do all that is due.
-
-        :param until_ns: ns, up to and with this time.
-        """
-        while self._heap and self._heap[0][0] <= until_ns:
-            heapq.heappop(self._heap)[2]()
 
 
 @dataclass(slots=True)
@@ -60,6 +33,7 @@ class _Transfer:
     packet: bytes
     answer: Callable[[bytes], None]
     acknowledged: bool  # wanted
+    rate: str = ""
     retries: int = 0
     reply: tuple[OnAir, bytes] | None = None  # the acknowledgement to this dongle
 
@@ -73,6 +47,7 @@ class Dongle:
     :param agenda: what happens when.
     :param receivers: the Crazyflies by their ids on the air.
     :param passes: says whether a packet to (True) or from a Crazyflie passes the faults of its link.
+    :param sniffers: of all dongles on the air; this one adds its own.
     """
 
     def __init__(
@@ -83,18 +58,25 @@ class Dongle:
         agenda: Agenda,
         receivers: dict[int, Receiver],
         passes: Callable[[int, bool], bool],
+        sniffers: dict[int, Sniffer],
     ) -> None:
         self._radio, self._settings, self._air, self._agenda = radio, settings, air, agenda
         self._receivers, self._passes = receivers, passes
         self.packets = 0  # transfers since the start
         self._busy_ns = 0
         self._scanned = b""
+        self.sniffer = Sniffer(radio, air, agenda, round(settings.usb_ms * 0.5e6), settings.seed)
+        self.sniffer.arrived = self._broadcast
+        sniffers[radio] = self.sniffer
+        self._sniffers = sniffers
         self.reset()
 
     def reset(self) -> None:
         """As after plugging in."""
         self._channel, self._rate, self._address = 2, "2M", b"\xe7" * 5
+        self._second = b"\xc2" * 5  # address of the second pipe in sniffer mode
         self._ard, self._arc, self._ack, self._carrier = 0xA0, 3, True, False
+        self.sniffer.stop()
 
     def request(self, number: int, value: int, index: int, data: bytes, now: int) -> None:
         """A vendor request from the host; what is not known is ignored.
@@ -118,6 +100,25 @@ class Dongle:
             self._carrier = bool(value)
         elif number == SCAN_CHANNELS:
             self._scan(value, index, bytes(data))
+        elif number == SET_SNIFFER_ADDRESS and len(data) == 5:
+            if value == 0:
+                self._address = bytes(data)
+            elif value == 1:
+                self._second = bytes(data)
+        elif number == SET_RADIO_MODE and DEVICES[self._settings.device] >= FIRST_FIRMWARE:
+            self._set_mode(value, now)
+        if self.sniffer.tuned is not None:
+            self.sniffer.tuned = self._tuned
+
+    @property
+    def _tuned(self) -> Tuned:
+        return Tuned(self._channel, self._rate, (self._address, self._second))
+
+    def _set_mode(self, mode: int, now: int) -> None:
+        if mode == 0:
+            self.sniffer.stop()
+        elif mode == 1 and self.sniffer.tuned is None:
+            self.sniffer.start(now, self._tuned)
 
     def _scan(self, first: int, last: int, packet: bytes) -> None:
         """Which channels answer: without the air, at once."""
@@ -147,9 +148,15 @@ class Dongle:
     def transfer(self, packet: bytes, now: int, answer: Callable[[bytes], None]) -> None:
         """Send a packet; `answer` gets what the host reads. Without acknowledgements there is nothing to read.
 
+        In sniffer mode a packet begins with the address to which it goes.
+
         :param now: ns, the time.
         """
         self.packets += 1
+        if self.sniffer.tuned is not None:
+            if self._can_send:
+                self.sniffer.order(packet, now)
+            return
         half = round(self._settings.usb_ms * 0.5e6)
         start = max(now, self._busy_ns) + half
         if self._ack:
@@ -169,21 +176,17 @@ class Dongle:
     def _attempt(self, transfer: _Transfer, start: int) -> int:
         frame = self._air.send(self._channel, self._rate, self._radio, start, len(transfer.packet))
         channel, rate, address = self._channel, self._rate, self._address
+        transfer.rate = rate
         self._agenda.at(frame.end_ns, lambda: self._arrived(transfer, frame, channel, rate, address))
         return frame.end_ns
 
     def _arrived(self, transfer: _Transfer, frame: OnAir, channel: int, rate: str, address: bytes) -> None:
         """The packet has left the air: who has it?"""
         heard = self._air.heard(channel, frame)
+        self._overheard(heard, address, transfer.packet, channel, rate, frame)
         seconds = frame.end_ns / 1e9
         replies = []
-        for radio in heard & self._receivers.keys():
-            receiver = self._receivers[radio]
-            station = receiver.station
-            if station.channel != channel or station.rate != rate or address not in (station.address, esb.BROADCAST):
-                continue
-            if not self._passes(radio, True):
-                continue
+        for radio, receiver in self._reached(heard, channel, rate, address):
             if address == esb.BROADCAST:
                 receiver.hear_all(transfer.packet, seconds)
             else:
@@ -200,12 +203,40 @@ class Dongle:
         else:
             self._agenda.at(over, lambda: self._missed(transfer, over))
 
+    def _reached(self, heard: set[int], channel: int, rate: str, address: bytes) -> list[tuple[int, Receiver]]:
+        """Crazyflies that have a packet, and their ids on the air."""
+        found = []
+        for radio in heard & self._receivers.keys():
+            receiver = self._receivers[radio]
+            station = receiver.station
+            tuned = station.channel == channel and station.rate == rate and address in (station.address, esb.BROADCAST)
+            if tuned and self._passes(radio, True):
+                found.append((radio, receiver))
+        return found
+
+    def _overheard(self, heard: set[int], address: bytes, packet: bytes, channel: int, rate: str, frame: OnAir) -> None:
+        """Dongles in sniffer mode have a packet."""
+        for radio in sorted(heard & self._sniffers.keys()):
+            tuned = self._sniffers[radio].tuned
+            if tuned is not None and (tuned.channel, tuned.rate) == (channel, rate):
+                self._sniffers[radio].hear(address, packet, frame)
+
+    def _broadcast(self, address: bytes, packet: bytes, tuned: Tuned, frame: OnAir) -> None:
+        """A packet that this dongle has sent in sniffer mode has left the air."""
+        heard = self._air.heard(tuned.channel, frame)
+        self._overheard(heard, address, packet, tuned.channel, tuned.rate, frame)
+        if not esb.between_crazyflies(packet):  # the vehicles have no app that takes these
+            for _, receiver in self._reached(heard, tuned.channel, tuned.rate, address):
+                receiver.hear_all(packet, frame.end_ns / 1e9)
+
     def _patience_ns(self, rate: str) -> int:
         return ACK_TIMEOUT_NS if self._settings.device == "2" else esb.retry_delay_ns(self._ard, rate)
 
     def _answered(self, transfer: _Transfer, reply: OnAir, radio: int, payload: bytes, channel: int, over: int) -> None:
         """The acknowledgement has left the air."""
-        if self._radio in self._air.heard(channel, reply) and self._passes(radio, False):
+        heard = self._air.heard(channel, reply)
+        self._overheard(heard, self._receivers[radio].station.address, payload, channel, transfer.rate, reply)
+        if self._radio in heard and self._passes(radio, False):
             status = transfer.retries << 4 | POWER_DETECTED | ACKNOWLEDGED
             self._finish(transfer, reply.end_ns, bytes((status,)) + payload)
         else:

@@ -9,11 +9,14 @@ A host connects with one socket a dongle. Messages are whole (SOCK_SEQPACKET); t
 | 2 request | number, value (2), index (2), data | |
 | 3 packet | the packet | status and payload; nothing without acknowledgements |
 | 4 scanned | | channels that answered |
+| 5 read | | in sniffer mode: 3 and the next packet that was heard, as soon as there is one |
+| 6 dropped | | 6 and the number of packets that were heard and lost, 4 bytes |
 """
 
 from __future__ import annotations
 
 import contextlib
+import selectors
 import socket
 import struct
 import time
@@ -23,12 +26,14 @@ from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
 
+from .agenda import Agenda
 from .air import RadioAir
-from .dongle import Agenda, Dongle
+from .dongle import Dongle
 from .receiver import Receiver
 from .settings import DEVICES, RadioSettings
+from .sniffer import Sniffer
 
-LIST, CLAIM, REQUEST, PACKET, SCANNED = range(5)
+LIST, CLAIM, REQUEST, PACKET, SCANNED, READ, DROPPED = range(7)
 _REQUEST = struct.Struct("<BBHH")
 _LONGEST = 128
 
@@ -66,8 +71,9 @@ class RadioSide:
         ]
         by_id = {first + index: receiver for index, receiver in enumerate(self.receivers)}
         air = RadioAir(settings.dongles + len(by_id), settings.loss, settings.seed)
+        sniffers: dict[int, Sniffer] = {}
         self.dongles = [
-            Dongle(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up))
+            Dongle(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
             for k in range(1, first)
         ]
         self._taken: set[int] = set()
@@ -77,15 +83,23 @@ class RadioSide:
         """The fleet's time."""
         return time.monotonic_ns() - self.origin_ns
 
-    def accept(self) -> Host | None:
-        """A host that has come."""
-        with contextlib.suppress(OSError):
-            connection = self.listener.accept()[0]
-            connection.setblocking(False)
-            return Host(connection)
-        return None
+    def take(self, host: Host | None, selector: selectors.BaseSelector) -> None:
+        """Take what has come.
 
-    def serve(self, host: Host) -> bool:
+        :param host: whose connection is readable; None: the listener is.
+        :param selector: learns of hosts that come and go.
+        """
+        if host is None:
+            with contextlib.suppress(OSError):
+                connection = self.listener.accept()[0]
+                connection.setblocking(False)
+                selector.register(connection, selectors.EVENT_READ, Host(connection))
+            return
+        sock = host.socket
+        if not self._serve(host):
+            selector.unregister(sock)
+
+    def _serve(self, host: Host) -> bool:
         """Take what a host has sent; False when it has gone."""
         try:
             message = host.socket.recv(_LONGEST)
@@ -121,6 +135,11 @@ class RadioSide:
             dongle.transfer(message[1:], self.now_ns(), lambda data: _send(host, data))
         elif kind == SCANNED:
             _send(host, dongle.scanned or b"\xff")
+        elif kind == READ:
+            dongle.sniffer.give = lambda data: _send(host, bytes((PACKET,)) + data)
+            dongle.sniffer.read()
+        elif kind == DROPPED:
+            _send(host, struct.pack("<BI", DROPPED, dongle.sniffer.dropped))
 
     def leave(self, host: Host) -> None:
         """A host goes; its dongle is free again."""

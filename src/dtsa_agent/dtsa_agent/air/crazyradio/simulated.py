@@ -2,7 +2,8 @@
 
 The backend takes the place of libusb in this process. The dongles are those of
 `fake-crazyflie --simulated-radio SOCKET`: one connection a dongle, one message a transfer
-(dtsa_bench.crazyflies.simulated.radio.side says which).
+(dtsa_bench.crazyflies.simulated.radio.side says which). In sniffer mode it cuts transfers into USB packets of 64 bytes
+as the host's controller and the dongle do: a transfer ends with a shorter packet, be it empty.
 """
 
 from __future__ import annotations
@@ -12,18 +13,28 @@ import errno
 import socket
 import struct
 import time
+from collections import deque
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import libusb_package
 import usb.backend
 import usb.core
 
 from dtsa_agent.core.errors import ConfigError
 
-LIST, CLAIM, REQUEST, PACKET, SCANNED = range(5)
-VENDOR_OUT, VENDOR_IN, STANDARD_IN = 0x40, 0xC0, 0x80
+from .packets import (
+    FIRST_FIRMWARE,
+    GET_SNIFFER_DROP_COUNT,
+    SET_RADIO_MODE,
+    SNIFFER,
+    USB_PACKET,
+    VENDOR_IN,
+    VENDOR_OUT,
+)
+
+LIST, CLAIM, REQUEST, PACKET, SCANNED, READ, DROPPED = range(7)
+STANDARD_IN = 0x80
 GET_DESCRIPTOR, STRING = 6, 3
 SCAN_CHANNELS = 0x21
 GONE_S = 0.01  # pause before the error of a dongle that has gone: cflib asks again at once, for ever
@@ -36,6 +47,9 @@ class _Handle:
     def __init__(self, number: int) -> None:
         self.number = number
         self.socket: socket.socket | None = None
+        self.sniffs = False
+        self.written = b""  # whole USB packets of a transfer that goes on
+        self.arrived: deque[bytes] = deque()  # USB packets
 
 
 class SimulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
@@ -111,6 +125,8 @@ class SimulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         if dev_handle.socket is not None:
             dev_handle.socket.close()
             dev_handle.socket = None
+            dev_handle.sniffs, dev_handle.written = False, b""
+            dev_handle.arrived.clear()
 
     def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
         pass
@@ -153,7 +169,7 @@ class SimulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         assert handle.socket is not None
         try:
             handle.socket.settimeout(timeout_ms / 1000 if timeout_ms else None)
-            data = handle.socket.recv(64)
+            data = handle.socket.recv(128)
         except TimeoutError as error:
             raise usb.core.USBTimeoutError("no answer", None, errno.ETIMEDOUT) from error
         except OSError as error:
@@ -169,21 +185,59 @@ class SimulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
 
     def bulk_write(self, dev_handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
         message = bytes(data)
+        if dev_handle.sniffs:
+            dev_handle.written += message
+            if message and not len(message) % USB_PACKET:
+                return len(message)
+            message, dev_handle.written = dev_handle.written, b""
         self._send(dev_handle, bytes((PACKET,)) + message)
-        return len(message)
+        return len(data)
 
     def bulk_read(self, dev_handle: _Handle, ep: int, intf: int, buff: Any, timeout: int) -> int:
+        if dev_handle.sniffs:
+            return self._read_transfer(dev_handle, buff, timeout)
         answer = self._receive(dev_handle, timeout)
         buff[: len(answer)] = array.array("B", answer)
         return len(answer)
+
+    def _read_transfer(self, handle: _Handle, buff: Any, timeout: int) -> int:
+        """USB packets until a short one, or until there is no room."""
+        count = 0
+        while count + USB_PACKET <= len(buff):
+            if not handle.arrived:
+                self._send(handle, bytes((READ,)))
+                self._await(handle, PACKET, timeout)
+            packet = handle.arrived.popleft()
+            buff[count : count + len(packet)] = array.array("B", packet)
+            count += len(packet)
+            if len(packet) < USB_PACKET:
+                break
+        return count
+
+    def _await(self, handle: _Handle, kind: int, timeout: int) -> bytes:
+        """The next message of a kind; packets that come before it wait."""
+        while True:
+            message = self._receive(handle, timeout)
+            if message[0] == PACKET:
+                data = message[1:]
+                handle.arrived.extend(data[at : at + USB_PACKET] for at in range(0, len(data) + 1, USB_PACKET))
+            if message[0] == kind:
+                return message[1:]
 
     def ctrl_transfer(
         self, dev_handle: _Handle, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data: Any, timeout: int
     ) -> int:
         if bmRequestType == VENDOR_OUT:
+            if bRequest == SET_RADIO_MODE:
+                if wValue > SNIFFER or self._versions[dev_handle.number] < FIRST_FIRMWARE:
+                    raise usb.core.USBError("Pipe error", None, errno.EPIPE)
+                dev_handle.sniffs = wValue == SNIFFER
             self._send(dev_handle, struct.pack("<BBHH", REQUEST, bRequest, wValue, wIndex) + bytes(data))
             return len(data)
-        if bmRequestType == VENDOR_IN and bRequest == SCAN_CHANNELS:
+        if bmRequestType == VENDOR_IN and bRequest == GET_SNIFFER_DROP_COUNT and dev_handle.sniffs:
+            self._send(dev_handle, bytes((DROPPED,)))
+            answer = self._await(dev_handle, DROPPED, timeout)
+        elif bmRequestType == VENDOR_IN and bRequest == SCAN_CHANNELS:
             self._send(dev_handle, bytes((SCANNED,)))
             answer = self._receive(dev_handle, timeout)
             answer = b"" if answer == b"\xff" else answer
@@ -207,13 +261,3 @@ class SimulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
 
     def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
         return False
-
-
-def install(path: Path) -> None:
-    """Let cflib find the simulated dongles, and no others, in this process.
-
-    :param path: the socket of the simulated Crazyflies.
-    :raises ConfigError: nobody listens there.
-    """
-    backend = SimulatedBackend(path)
-    libusb_package.get_libusb1_backend = lambda: backend

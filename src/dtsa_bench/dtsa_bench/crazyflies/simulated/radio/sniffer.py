@@ -1,0 +1,141 @@
+"""Sniffer mode of a simulated Crazyradio 2.0: it hears all packets to two addresses, and sends without acknowledgement.
+
+Source: crazyradio2-firmware 5.4 (docs/development/compatible-usb-protocol.md, legacy_usb.c, esb.c). One thread of the
+firmware does all: it waits for a packet that was heard, a tick longer than 1 ms at most, and only in between looks
+whether there is something to send. So nobody knows when a packet leaves. While it sends, its radio hears nothing.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from dtsa_channel_sim.model.medium import OnAir
+
+from . import esb
+from .agenda import Agenda
+from .air import RadioAir
+
+FIRST_FIRMWARE = 0x0504  # that has this mode
+ADDRESS = 5  # bytes before the payload of a packet that is to be sent
+QUEUE = 8  # packets that wait for USB; more are lost, and counted
+_ORDERS = 10  # packets that wait for the thread
+_POLL_NS = 1_040_000  # longest wait for a packet that was heard: 1 ms, and a tick of 1/32768 s
+_TICK_NS = 30_518
+_OFF_NS = 214_000  # the radio is switched off, and the thread sleeps for 200 us, in whole ticks
+_ON_NS = 170_000  # after sending, until the radio hears again
+_HEAD = struct.Struct("<BBBI")
+_RSSI = 45  # -dBm
+_MOST_DRIFT = 20e-6  # of its crystal
+
+
+class Tuned(NamedTuple):
+    """To what a dongle is tuned."""
+
+    channel: int
+    rate: str
+    addresses: tuple[bytes, bytes]  # of the pipes
+
+
+class Sniffer:
+    """A dongle in this mode.
+
+    :param radio: its id on the air.
+    :param air: where it sends.
+    :param agenda: what happens when.
+    :param half_ns: ns, a packet on USB, one way.
+    :param seed: of its clock and its waits.
+    """
+
+    def __init__(self, radio: int, air: RadioAir, agenda: Agenda, half_ns: int, seed: int) -> None:
+        self._radio, self._air, self._agenda, self._half_ns = radio, air, agenda, half_ns
+        self._random = random.Random(f"{seed} {radio}")
+        self._rate = 1.0 + self._random.uniform(-_MOST_DRIFT, _MOST_DRIFT)
+        self.arrived: Callable[[bytes, bytes, Tuned, OnAir], None] = lambda *_: None  # address, packet
+        self.give: Callable[[bytes], None] | None = None  # to the host
+        self.tuned: Tuned | None = None  # None: another mode
+        self._wake = 0  # number of the wake-up that counts
+        self.stop()
+
+    def stop(self) -> None:
+        """Another mode, or unplugged."""
+        self.tuned = self.give = None
+        self.dropped = 0
+        self._began_ns = self._deaf_ns = 0
+        self._orders: deque[bytes] = deque()
+        self._heard: deque[bytes] = deque()
+        self._wake += 1
+        self._wanted = False  # the host reads
+
+    def start(self, now: int, tuned: Tuned) -> None:
+        """Begins to listen.
+
+        :param now: ns, the time.
+        :param tuned: to what.
+        """
+        self.stop()
+        self._began_ns, self.tuned = now, tuned
+
+    # -- sending ----------------------------------------------------------------------------------------------------
+    def order(self, transfer: bytes, now: int) -> None:
+        """The host has written.
+
+        :param transfer: address and payload.
+        :param now: ns, the time.
+        """
+        if len(transfer) <= ADDRESS or len(self._orders) == _ORDERS:
+            return
+        self._orders.append(transfer)
+        if len(self._orders) == 1:
+            self._look_at(max(now + self._half_ns, self._deaf_ns) + round(self._random.uniform(0, _POLL_NS)))
+
+    def _look_at(self, when: int) -> None:
+        self._wake += 1
+        number = self._wake
+        self._agenda.at(when, lambda: self._look(when) if number == self._wake else None)
+
+    def _look(self, now: int) -> None:
+        """The thread looks whether there is something to send."""
+        if not self._orders or self.tuned is None:
+            return
+        transfer = self._orders.popleft()
+        address, packet = transfer[:ADDRESS], transfer[ADDRESS:][: esb.MAX_SNIFFED]
+        tuned = self.tuned
+        turn = _OFF_NS + round(self._random.uniform(0, _TICK_NS)) + esb.TURN_NS
+        frame = self._air.send(tuned.channel, tuned.rate, self._radio, now, len(packet), turn)
+        self._deaf_ns = frame.end_ns + _ON_NS
+        self._agenda.at(frame.end_ns, lambda: self.arrived(address, packet, tuned, frame))
+        if self._orders:
+            self._look_at(self._deaf_ns + round(self._random.uniform(0, _POLL_NS)))
+
+    # -- hearing ----------------------------------------------------------------------------------------------------
+    def hear(self, address: bytes, packet: bytes, frame: OnAir) -> None:
+        """A packet has left the air, and nothing has disturbed it here.
+
+        :param frame: its transmission.
+        """
+        if self.tuned is None or address not in self.tuned.addresses or frame.air_ns < self._deaf_ns:
+            return
+        now = frame.end_ns
+        if len(self._heard) == QUEUE:
+            self.dropped = (self.dropped + 1) & 0xFFFFFFFF
+        else:
+            stamp = round((now - self._began_ns) * self._rate) // 1000 & 0xFFFFFFFF
+            head = _HEAD.pack(_HEAD.size + len(packet), _RSSI, self.tuned.addresses.index(address), stamp)
+            self._heard.append(head + packet)
+            self._agenda.at(now + self._half_ns, self._tell)
+        if self._orders:
+            self._look_at(now)
+
+    def read(self) -> None:
+        """The host is ready for a transfer."""
+        self._wanted = True
+        self._tell()
+
+    def _tell(self) -> None:
+        if self._wanted and self._heard and self.give is not None:
+            self._wanted = False
+            self.give(self._heard.popleft())
