@@ -42,6 +42,7 @@ setup(
             "recorded_channel = dtsa_bench.entry:recorded_channel",
             "fake_crazyflie = dtsa_bench.entry:fake_crazyflie",
         ],
+        "dtsa.recorders": ["agent = dtsa_bench.recordings.merge.agent_recorder:recorded"],
         "dtsa.policies": [
             "genie-age = dtsa_bench.simulation.schemes:GenieAge",
             "genie-error = dtsa_bench.simulation.schemes:GenieError",

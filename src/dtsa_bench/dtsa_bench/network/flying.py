@@ -16,14 +16,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from dtsa_agent.air.agent import AirAgent
     from dtsa_agent.air.port import PortSettings
     from dtsa_agent.air.prepared import Prepared
     from dtsa_agent.air.settings import AgentSettings
     from dtsa_agent.core import SwarmConfig
-    from dtsa_agent.stop import Stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,24 +68,22 @@ def fly(order: Order) -> int:
     def say(line: str) -> None:
         print(f"dtsa: cf{order.own.id}: {line}", file=sys.stderr, flush=True)
 
-    failure, directory = "", None
+    failure = ""
     with Stop() as stop, open_port(order.port) as port:
         agent = AirAgent(order.own, order.config, port, prepared=order.prepared, say=say)
         if order.out is None:
             agent.run(stop)
+            summary = agent.summary()
         else:
-            from dtsa_bench.runs.options import new_directory
+            from dtsa_bench.recordings.merge.agent_recorder import recorded
 
-            directory = new_directory(order.out)
-            failure = _run_recorded(agent, order.port, stop, directory)
-    summary = agent.summary()
-    text = json.dumps(summary, indent=2) + "\n"
-    if directory is not None:
-        (directory / "summary.json").write_text(text, encoding="utf-8")
+            with recorded(order.out, agent, order.port) as recorder:
+                agent.run(stop)
+            summary, failure = recorder.summary, recorder.failure
     from dtsa_bench.runs.hearing import of_datagrams
     from dtsa_bench.runs.summary_text import describe  # what is needed afterwards only takes no memory in flight
 
-    print(text if order.as_json else describe(summary), end="")
+    print(json.dumps(summary, indent=2) + "\n" if order.as_json else describe(summary), end="")
     not_taken_in = summary["not_taken_in"]
     hearing = of_datagrams(
         2, *(summary[key] for key in ("slots", "sent", "heard")), not_taken_in
@@ -102,14 +96,3 @@ def fly(order: Order) -> int:
 
         raise BagError(failure)
     return int(bool(problem))
-
-
-def _run_recorded(agent: AirAgent, port: PortSettings, stop: Stop, directory: Path) -> str:
-    """Flies, and records it; why the record is not whole, or an empty text."""
-    from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
-
-    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, port) as recorder:
-        agent.watcher = recorder
-        agent.run(stop)
-        recorder.finish(agent.summary())
-    return recorder.failure

@@ -7,16 +7,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic_ns
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
+from dtsa_bench.runs.options import new_directory
 
 from .json_bag import JsonBag, described
+
+if TYPE_CHECKING:
+    from dtsa_agent.air.agent import AirAgent
 
 SLOT, REFUSED = "slot", "refused"  # topics
 METADATA, SUMMARY = "dtsa_agent", "dtsa_summary"  # metadata records
@@ -95,6 +101,7 @@ class AgentRecorder(JsonBag):
         self._refused = 0  # since the last flush
         self._slots: list[SlotRecord] = []  # not written yet
         self.left_out = 0  # refused datagrams of which no record is kept
+        self.summary: dict[str, Any] = {}  # of the agent; known at the end
 
     def slot(self, record: SlotRecord) -> None:
         """A slot of the agent is over.
@@ -140,12 +147,33 @@ class AgentRecorder(JsonBag):
 
         :param summary: the agent's own.
         """
+        self.summary = summary
         self._write_slots()
         self.add_metadata(SUMMARY, {"summary": json.dumps(summary), "refused_left_out": str(self.left_out)})
 
     def __exit__(self, *unused: object) -> None:
         self._write_slots()
         super().__exit__(*unused)
+
+
+@contextmanager
+def recorded(out: str, agent: AirAgent, port: PortSettings) -> Iterator[AgentRecorder]:
+    """The directory of an agent that flies within the context: its bag, and at the end ``summary.json``.
+
+    It is an entry point, so that the agent's node finds it (``dtsa.recorders``).
+
+    :param out: the directory; it is empty or does not exist yet.
+    :param agent: before its flight.
+    :param port: the settings of what carries its frames.
+    :raises ConfigError: for a directory that cannot be used.
+    :raises BagError: if the bag cannot be made.
+    """
+    directory = new_directory(out)
+    with AgentRecorder(directory / f"cf{agent.own.id}.mcap", agent.own, agent.config, port) as recorder:
+        agent.watcher = recorder
+        yield recorder
+        recorder.finish(agent.summary())
+    (directory / "summary.json").write_text(json.dumps(recorder.summary, indent=2) + "\n", encoding="utf-8")
 
 
 def _heard(frames: list[Heard]) -> list[dict[str, Any]]:
