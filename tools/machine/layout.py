@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import shutil
 import sys
 from pathlib import Path
@@ -37,20 +38,26 @@ def has_ros_installation() -> bool:
     return os.environ.get("ROS_DISTRO") == DISTRIBUTION
 
 
+def has_ros_wheels() -> bool:
+    """Whether there are wheels of ROS for this machine; `DTSA_ROS=none`: they are not wanted."""
+    here = platform.system(), platform.machine(), platform.libc_ver()[0]
+    return here == ("Linux", "x86_64", "glibc") and os.environ.get("DTSA_ROS") != "none"
+
+
 def kind() -> str:
-    """Where ROS comes from: `system` (apt, conda) or `wheels`."""
-    return "system" if has_ros_installation() else "wheels"
+    """Where ROS comes from: `system` (apt, conda), `wheels`, or `none`: commands that need it say so."""
+    return "system" if has_ros_installation() else "wheels" if has_ros_wheels() else "none"
 
 
 def suffix(root: Path) -> str:
     """Ending of the names of everything that is made for this kind of machine and this Python.
 
-    The first kind in a checkout has plain names (`.venv`, `build`); an installed ROS has `-jazzy`; another Python than
-    the one that is there has its version added. No kind takes away what another one uses.
+    The first kind in a checkout has plain names (`.venv`, `build`); an installed ROS has `-jazzy`, a machine without it
+    `-no-ros`; another Python than the one that is there has its version added. No kind takes away what another uses.
 
     :param root: the checkout.
     """
-    plain = f"-{DISTRIBUTION}" if has_ros_installation() else ""
+    plain = {"system": f"-{DISTRIBUTION}", "wheels": "", "none": "-no-ros"}[kind()]
     made_for = owner(root / f".venv{plain}")
     return plain if made_for in ((), (python_version(),), (python_version(), kind())) else f"{plain}-{python_version()}"
 

@@ -181,12 +181,13 @@ def run_shell(arguments: list[str]) -> int:
     if arguments:
         return start("bash", arguments)
     start_file = layout.STATE / f"bashrc{layout.SUFFIX}"
+    source = "" if layout.kind() == "none" else f". '{layout.INSTALL}/local_setup.bash'\n"
     unless = "command -v ros2 >/dev/null || " if layout.has_ros_installation() else ""
     layout.write(
         start_file,
         "[ -f ~/.bashrc ] && . ~/.bashrc\n"
         f"export PATH='{workspace.environment()['PATH']}'\n"
-        f". '{layout.INSTALL}/local_setup.bash'\n"
+        f"{source}"
         f"dtsa() {{ '{layout.ROOT}/tools/dtsa' \"$@\"; }}\n"
         f"{unless}ros2() {{ '{layout.ROOT}/tools/dtsa' ros2 \"$@\"; }}\n"
         'PS1="(dtsa) ${PS1-}"\n',
@@ -204,6 +205,8 @@ def has_ros2(environment: Mapping[str, str]) -> bool:
 
 def run_ros2(arguments: list[str]) -> int:
     """`tools/dtsa ros2 ...`: the real command where it exists."""
+    if layout.kind() == "none":
+        raise SetupError("missing: ROS 2 Jazzy (apt or conda), sourced: source /opt/ros/jazzy/setup.bash", code=2)
     prepare.prepare(set())
     environment = workspace.environment()
     if has_ros2(environment):

@@ -40,7 +40,8 @@ def prepare(extras: set[str]) -> None:
         # All that can be missing is looked for before the first directory is touched.
         checks.check()
         wheels.check_system_packages(extras)
-        workspace.colcon()
+        if layout.kind() != "none":
+            workspace.colcon()
         if not wheels.has_venv():
             wheels.make_venv()
         wheels.note_interruption(extras)

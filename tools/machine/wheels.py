@@ -53,7 +53,7 @@ def venv_key() -> str:
 
 def required_sets(extras: set[str]) -> list[str]:
     """Sets to install: those that every machine needs, those asked for, and those installed before."""
-    base = ["runtime"] if layout.has_ros_installation() else ["ros", "runtime"]
+    base = {"system": ["runtime"], "wheels": ["ros", "runtime"], "none": ["build", "runtime"]}[layout.kind()]
     before = {name for name in layout.EXTRAS if (layout.VENV_STAMPS / name).exists()}
     return base + sorted(extras | before)
 

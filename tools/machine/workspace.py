@@ -47,7 +47,7 @@ def stamp_file(package: str) -> Path:
 
 def build_key() -> str:
     """Changes when everything has to be built anew: other tools, other place, other kind of machine."""
-    tools = "system" if layout.has_ros_installation() else wheels.set_key("ros")
+    tools = {"system": "system", "wheels": wheels.set_key("ros"), "none": wheels.set_key("build")}[layout.kind()]
     return layout.digest(SETTINGS, wheels.venv_key(), tools)
 
 
@@ -76,6 +76,8 @@ def is_built(package: str) -> bool:
 def products(package: str) -> bool:
     """Whether what the build made is still there, and made by us and not by a plain `colcon build`."""
     installed = layout.INSTALL / package
+    if layout.kind() == "none":
+        return package != "dtsa_agent" or all(made.exists() for made in compiled())
     if not (layout.BUILD / package).is_dir() or not (installed / "share" / package / "package.sh").exists():
         return False
     if package == "dtsa_msgs":
@@ -101,8 +103,9 @@ def disown(packages: Iterable[str]) -> None:
 
 
 def changed_packages() -> list[str]:
-    """Packages that have to be built, in order."""
-    return [package for package in PACKAGES if not is_built(package)]
+    """Packages that have to be built, in order; messages have no use without ROS."""
+    wanted = PACKAGES[1:] if layout.kind() == "none" else PACKAGES
+    return [package for package in wanted if not is_built(package)]
 
 
 def build_environment() -> dict[str, str]:
@@ -155,6 +158,13 @@ def build(packages: list[str]) -> None:
         disown(packages)  # after an interruption they are built from the beginning: half a library looks like a new one
         remove_kernel("cpython-*.so")  # made for one Python: Python looks for these first
         (layout.INSTALL / ".dtsa-environment.json").unlink(missing_ok=True)
+        if layout.kind() == "none":
+            for package in packages:
+                develop = "import os, runpy, sys; os.chdir(sys.argv.pop(1)); runpy.run_path('setup.py')"
+                words = [str(layout.PYTHON), "-c", develop, str(layout.SOURCES / package), "develop", "--no-deps"]
+                current.run(words, build_environment())
+                stamp(package)
+            return
         arguments = ["--base-paths", str(layout.SOURCES), "--symlink-install", "--packages-select", *packages]
         arguments += ["--build-base", str(layout.BUILD), "--install-base", str(layout.INSTALL)]
         arguments += ["--event-handlers", "console_cohesion+"]
@@ -221,6 +231,8 @@ def environment() -> dict[str, str]:
 
 def capture() -> dict[str, str]:
     """Source the workspace once and keep the search paths that it adds."""
+    if layout.kind() == "none":
+        return {"PATH": str(layout.VENV / "bin")}
     script = '. "$1" && python3 -I -S -c "import json, os; print(json.dumps(dict(os.environ)))"'
     bare = {"PATH": f"{layout.VENV / 'bin'}:/usr/bin:/bin", "HOME": os.environ.get("HOME", "/")}
     setup = layout.INSTALL / "local_setup.bash"

@@ -201,11 +201,28 @@ def test_missing_headers_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         checks.check()
 
 
-def test_other_machines_are_told_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_systems_are_told_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DISTRO", raising=False)
-    monkeypatch.setattr(checks.platform, "machine", lambda: "aarch64")
-    with pytest.raises(layout.SetupError, match=r"got Linux aarch64 .*source /opt/ros/jazzy/setup.bash"):
+    monkeypatch.setattr(checks.platform, "system", lambda: "Darwin")
+    with pytest.raises(layout.SetupError, match=r"got Darwin .*source /opt/ros/jazzy/setup.bash"):
         checks.check()
+
+
+@pytest.mark.parametrize("how", ["another machine", "not wanted"])
+def test_without_wheels_of_ros_all_is_set_up_but_ros(how: str, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+    monkeypatch.delenv("DTSA_ROS", raising=False)
+    assert layout.kind() == "wheels"
+    if how == "another machine":
+        monkeypatch.setattr(layout.platform, "machine", lambda: "aarch64")
+    else:
+        monkeypatch.setenv("DTSA_ROS", "none")
+    assert layout.kind() == "none"
+    checks.check()
+    assert layout.suffix(checkout) == "-no-ros"
+    assert wheels.required_sets(set()) == ["build", "runtime"]
+    assert workspace.changed_packages() == ["dtsa_agent", "dtsa_channel_sim", "dtsa_bench"]
+    assert main.main(["ros2", "run", "dtsa_agent", "agent"]) == 2
 
 
 def test_a_python_that_is_too_old_is_refused(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import importlib.util
 import sys
 
 _WORKSPACE = "build the workspace and source it: colcon build && . install/setup.bash"
-_ROS = "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout"
+_ROS = "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout on x86_64"
 _HOW = {
     **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
     **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard"), "pip install {}"),
