@@ -13,7 +13,8 @@ from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins.guard import Guarded
 from dtsa_agent.core.registry import POLICIES
 from dtsa_channel_sim import Air, Channel, ChannelConfig
-from dtsa_channel_sim.model.radios import NEVER, Radios, radio_rules
+from dtsa_channel_sim.model.air import NEVER
+from dtsa_channel_sim.model.radios import Radios, radio_rules
 from dtsa_channel_sim.ros.live_air import LiveAir
 
 MS = 1_000_000

@@ -76,6 +76,11 @@ class PolicyRow:
         """Whether an agent's radio listens before it sends, and so decides itself when it begins."""
         return self.unslotted and "busy" in self.port
 
+    @property
+    def needs_frame(self) -> bool:
+        """Whether an agent must have a slot's frame before it knows who sends in the next one: all tables are equal."""
+        return not (self.may_join or self.needs_everybody or self.unslotted)
+
 
 @dataclass(frozen=True, slots=True)
 class EstimatorRow:

@@ -24,14 +24,14 @@ def clock_parameters(run: RunConfig, ids: Sequence[int], priority: int) -> dict[
         return {}
     all_clocks = make_clocks(run.clocks, run.swarm.agents)
     clocks = [all_clocks[agent - 1] for agent in ids]
-    airtime, link = run.air.airtime, run.air.link_delay_ns
-    fixed = airtime.total_ns(0)
+    airtime = run.air.airtime
+    under_way = [airtime.total_ns(length) + airtime.from_radio_ns(length) for length in (0, 1)]
     return {
         "clock_offset_ns": [clock.offset_ns for clock in clocks],
         "clock_drift_ppb": [clock.drift_ppb for clock in clocks],
         "clock_jitter_ns": float(run.clocks.jitter_ns),
         "align": run.align,
-        "flight_time_ns": [fixed + link, airtime.total_ns(1) - fixed],
+        "flight_time_ns": [under_way[0], under_way[1] - under_way[0]],
         "nice": AGENTS_NICE,
         "priority": priority,
     }

@@ -56,6 +56,23 @@ class RunConfig(Settings):
         ):
             if there != here:
                 raise ConfigError(f"channel.{name}", there, f"{here}, as in the swarm")
+        self._check_radio()
+
+    def _check_radio(self) -> None:
+        """Whether the radio takes the frames, and slots hold what a frame costs on its line.
+
+        Clocks and decisions are left out. A slot that is shorter cannot work with any of them.
+        """
+        airtime, length, row = self.air.airtime, self.swarm.frame_length, self.swarm.policy_row
+        if length > airtime.longest:
+            allowed = f"a radio that takes frames of {length} bytes, not {airtime.longest} at most"
+            raise ConfigError("channel.radio", self.air.radio, allowed)
+        if not airtime.line.serial or row.unslotted:
+            return
+        shortest = airtime.shortest_slot_ns(length, guard_ns=0, needs_frame=row.needs_frame)
+        if self.swarm.slot_ns < shortest:
+            allowed = f"at least {shortest / 1e6:g} with radio {self.air.radio}, policy {row.name} and {length} bytes"
+            raise ConfigError("slot_ms", self.swarm.slot_ms, allowed)
 
     @property
     def air(self) -> ChannelConfig:

@@ -18,9 +18,8 @@ from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins.entry_points import plug_ins_of
 from dtsa_agent.core.plugins.unslotted import next_wake
 from dtsa_channel_sim import Channel
-from dtsa_channel_sim.model.air import Air
-from dtsa_channel_sim.model.airtime import LONGEST_FRAME
-from dtsa_channel_sim.model.radios import NEVER, Radios
+from dtsa_channel_sim.model.air import NEVER, Air
+from dtsa_channel_sim.model.radios import Radios
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
 
@@ -69,7 +68,6 @@ class UnslottedTraffic:
         self._free_ns = [0] * len(swarm.ids)  # when each radio has done with its last packet
         self._count = 0
         self._on_air: dict[int, _Packet] = {}
-        self._ends: list[int] = []  # ns, when packets that have no verdict yet leave the air, if agents react: a heap
         self._arriving: list[tuple[int, int, _Packet, NDArray[np.bool_]]] = []  # heap by arrival
         self._frames: list[bytes] = []
         self._carried = Carried()
@@ -100,8 +98,8 @@ class UnslottedTraffic:
             wake = self._wakes[0] if self._wakes else (NEVER, 0)
             heard = self._radios.next if self._radios is not None else (NEVER, 0)
             next_ns = min(wake, heard)[0]
-            if self._ends and self._ends[0] <= min(next_ns, end_ns):
-                self._settle(heappop(self._ends))
+            if self._reacts and self._air.due_ns <= min(next_ns, end_ns):
+                self._settle(self._air.due_ns)
             elif self._reacts and self._arriving and self._arriving[0][0] <= min(next_ns, end_ns - 1):
                 self._take_in(self._arriving[0][0])
             elif next_ns >= end_ns:
@@ -135,7 +133,7 @@ class UnslottedTraffic:
             self._radios.drop(agent)
             self._call_at(index, end_ns)
         elif self._radios.listen(self._swarm.position) is not None:
-            self._begin(_Packet(agent, self._frames[index]), now_ns)
+            self._begin(_Packet(agent, self._frames[index]), now_ns, now_ns)
             policy, table = self._parts.policies[index], self._parts.tables[index]
             answer = policy.sent(table, now_ns, True)
             self._call_at(index, next_wake(policy, answer, now_ns, "sent"))
@@ -151,7 +149,7 @@ class UnslottedTraffic:
         if not self._frames[index]:
             return False
         if self._radios is not None:
-            self._radios.hand_over(self._swarm.ids[index], now_ns)
+            self._radios.hand_over(self._swarm.ids[index], now_ns + self._to_radio_ns(len(self._frames[index])))
             return True
         return self.transmit(_Packet(self._swarm.ids[index], self._frames[index], note, to), now_ns)
 
@@ -166,20 +164,28 @@ class UnslottedTraffic:
             raise PluginError(f"{policy}, wake", f"sent {given!r}; allowed: bytes, to 0 (all) to {len(self._frames)}")
         if now_ns < self._free_ns[packet.sender - 1]:
             return False
-        self._begin(packet, now_ns)
+        self._begin(packet, now_ns + self._to_radio_ns(len(packet.note) + len(packet.frame)), now_ns)
         return True
 
-    def _begin(self, packet: _Packet, now_ns: int) -> None:
+    def _to_radio_ns(self, length: int) -> int:
+        """How long after the order a radio has a packet, ns; a constant delay moves arrivals alone."""
+        return self._airtime.to_radio_ns(length) if self._airtime.line.serial else 0
+
+    def _begin(self, packet: _Packet, at_ns: int, now_ns: int) -> None:
+        """A radio has a packet, and begins to send it as soon as it can.
+
+        :param packet: the packet.
+        :param at_ns: ns, when it has it.
+        :param now_ns: ns, now.
+        """
         index, length = packet.sender - 1, len(packet.note) + len(packet.frame)
-        if not 1 <= length <= LONGEST_FRAME:
+        if not 1 <= length <= self._airtime.longest:
             policy = self._parts.policies[index].name
-            raise PluginError(f"{policy}, wake", f"sent {length} bytes; allowed: 1 to {LONGEST_FRAME}")
+            raise PluginError(f"{policy}, wake", f"sent {length} bytes; allowed: 1 to {self._airtime.longest}")
         self._settle(now_ns)
         self._count += 1
-        self._air.begin(self._count, packet.sender, now_ns, length)
-        self._free_ns[index] = now_ns + self._airtime.total_ns(length)
-        if self._reacts:
-            heappush(self._ends, self._free_ns[index])
+        self._air.begin(self._count, packet.sender, at_ns, length)
+        self._free_ns[index] = at_ns + self._airtime.total_ns(length)
         self._on_air[self._count] = packet
         if packet.frame:
             self._began.add(index)

@@ -97,7 +97,8 @@ def runs(draw: st.DrawFn) -> RunConfig:
     swarm = draw(swarms(agents=4))
     channel = draw(st.none() | channels(slot_ns=swarm.slot_ns))
     limits, clocks = RunLimits(**draw(some_of(RunLimits))), ClockConfig(**draw(some_of(ClockConfig)))
-    return RunConfig(swarm, channel, limits, draw(st.sampled_from(MODES)), clocks, draw(st.booleans()))
+    values = {"swarm": swarm, "channel": channel, "limits": limits, "clocks": clocks}
+    return allowed(RunConfig, values | {"mode": draw(st.sampled_from(MODES)), "align": draw(st.booleans())})
 
 
 def objects(cls: type[Settings]) -> st.SearchStrategy[Any]:

@@ -49,6 +49,30 @@ def test_the_channels_own_verdicts_always_pass(frames: list[tuple[int, int, int]
     assert sent.check_verdicts([]) == len(frames)
 
 
+@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
+@settings(max_examples=60, deadline=None)
+def test_when_frames_began_and_arrived_behind_a_line_follows_from_who_received_them(
+    frames: list[tuple[int, int, int]], loss: float, seed: int
+) -> None:
+    """Starts that waited and arrivals that queued are found again from the recording, without the channel's seed."""
+    config = ChannelConfig(agents=5, loss=loss, seed=seed, radio="crazyflie")
+    line, sent = Air(Channel(config)), SentFrames(config, own_clocks=True)
+    for number, (sender, start, length) in enumerate(sorted(frames, key=lambda f: f[1])):
+        line.begin((number, sender), sender, start, length)
+        sent.send(number, sender, start, bytes(length))
+    verdicts = {v.frame_id: v for v in line.settle(100 * MS)}
+    sent.lay({key: v.received for key, v in verdicts.items()})
+    for key, verdict in verdicts.items():
+        found = sent.get(*key)
+        assert found is not None
+        assert (found.on_air.start_ns, found.arrival_ns) == (verdict.start_ns, verdict.arrival_ns)
+        if verdict.received.any():
+            sent.deliver(*key, found.data, verdict.received)
+        sent.judged(key[0], key[1], verdict.received, verdict.lost, verdict.collided)
+    sent.check_overlaps()
+    assert sent.check_verdicts([]) == len(frames)
+
+
 def test_a_frame_that_began_although_its_radio_heard_another_one_is_noticed() -> None:
     config = ChannelConfig(agents=5)
     turn = config.airtime.ramp_up_ns

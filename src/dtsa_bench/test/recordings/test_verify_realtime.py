@@ -36,6 +36,15 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def waiting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight whose radios are behind lines, with frames at random instants: many wait for a reception."""
+    out = tmp_path_factory.mktemp("waiting") / "flight"
+    words = ("--agents", "6", "--policy", "pure-aloha", "--options", "pure-aloha.load=0.3", "--radio", "crazyflie")
+    fly(out, *words, "--processes", "2", "--seed", "9", "--mode", "realtime", "--timeout-s", "1.5", "--no-picture")
+    return out
+
+
 Edit = Callable[..., "bytes | None"]
 
 
@@ -193,6 +202,17 @@ def test_untouched_bags_pass_and_what_is_not_checked_is_said(flown: Path, tmp_pa
     with Bag(flown / "bag") as bag:
         sent = sum(message.topic == "/swarm/frame" for message in bag.messages())
     assert result.checked["frames that nobody heard together with another"] == sent
+
+
+def test_radios_behind_lines_are_checked_by_their_times(waiting: Path, tmp_path: Path) -> None:
+    """Frames that waited began later than they were handed over, and receptions that queued arrived later."""
+    result = rewritten(waiting, tmp_path / "same", lambda message, value, pack: message.data)
+    assert result.ok, result.difference
+    assert result.checked["frames taken in as they were delivered"] > 100
+    with Bag(waiting / "bag") as bag:
+        channel = bag.config["channel"]
+    plain = rewritten(waiting, tmp_path / "plain", lambda m, v, pack: m.data, channel={**channel, "radio": "plain"})
+    assert "slot.stamp" in str(plain.difference)
 
 
 def test_a_mission_whose_slots_follow_the_station_is_checked_too(tmp_path: Path) -> None:

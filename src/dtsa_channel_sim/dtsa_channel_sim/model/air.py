@@ -11,13 +11,17 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Generic, Protocol, TypeVar
 
+import numpy as np
+
 from dtsa_agent.core.errors import LocalProtocolError
 
-from .airtime import LONGEST_FRAME
 from .config import ChannelConfig
+from .lines import Lines
 from .medium import Mask, Medium, OnAir, Positions, Reception
 
 Key = TypeVar("Key", bound=Hashable)
+
+NEVER = 2**63  # ns
 
 
 class Media(Protocol):
@@ -43,15 +47,15 @@ class FrameVerdict(Generic[Key]):
     slot: int
     """Slot of the channel's clock in which the transmission started."""
     start_ns: int
-    """Start of the transmission, ns from the start of slot 0 by the channel's clock."""
+    """Start of the transmission, ns from the start of slot 0 by the channel's clock: when the radio began."""
     end_ns: int
     """End of the last bit, same clock."""
     arrival_ns: int
-    """When the receivers' flight processors have it, same clock."""
+    """When the last of the receivers' flight processors has it, same clock."""
     received: Mask
     """(N,): agent with id index + 1 received it."""
     lost: int
-    """Receivers in reach that lost it to noise or jamming."""
+    """Receivers in reach that lost it to noise or jamming, or whose radios had no room for it."""
     collided: int
     """Receivers in reach where it collided, or that were sending themselves."""
 
@@ -59,18 +63,28 @@ class FrameVerdict(Generic[Key]):
 class Air(Generic[Key]):
     """One time line of transmissions.
 
-    What is on air at one time is a handful of frames; only these are looked at, whatever waits beside them.
+    What is on air at one time is a handful of frames; only these are looked at, whatever waits beside them. With radios
+    behind serial lines (:class:`~.lines.Lines`) starts depend on what was received before, so all goes by the order of
+    times: ends of transmissions before starts at the same instant.
 
     :param channel: the medium by slot.
     """
 
-    __slots__ = ("_by_end", "_by_start", "_channel", "_count", "_ids", "_longest_ns", "_near", "_settled_ns", "late")
+    __slots__ = (
+        "_airtime", "_asked", "_begun", "_by_end", "_by_start", "_channel", "_count", "_ids", "_lines", "_longest_ns",
+        "_near", "_settled", "_settled_ns", "late",
+    )  # fmt: skip
 
     def __init__(self, channel: Media) -> None:
         self._channel = channel
-        self._longest_ns = channel.config.airtime.total_ns(LONGEST_FRAME)
+        self._airtime = airtime = channel.config.airtime
+        self._longest_ns = airtime.total_ns(airtime.longest)
+        self._lines = Lines(airtime, channel.config.agents) if airtime.line.serial else None
+        self._asked: list[tuple[int, int, int, int, Key]] = []  # with lines, what no radio has begun to send: a heap
+        self._begun: dict[Key, int] = {}  # with lines, when those that have no verdict yet began
+        self._settled: list[FrameVerdict[Key]] = []  # verdicts that have not been asked for yet
         self._count = 0  # makes entries of the heaps differ: keys need no order
-        self._by_end: list[tuple[int, int, int, int, OnAir, Key]] = []  # not settled yet: a heap
+        self._by_end: list[tuple[int, int, int, int, OnAir, int, Key]] = []  # not settled yet: a heap
         self._by_start: list[tuple[int, int, OnAir]] = []  # not near the time that is settled yet: a heap
         self._near: list[OnAir] = []  # settled or not, what may overlap the next frame that is settled
         self._ids: set[Key] = set()
@@ -81,7 +95,13 @@ class Air(Generic[Key]):
     @property
     def pending(self) -> int:
         """Number of frames that have no verdict yet."""
-        return len(self._by_end)
+        return len(self._by_end) + len(self._asked) + len(self._settled)
+
+    @property
+    def due_ns(self) -> int:
+        """Until when to settle next, ns: before that nothing begins or ends that has been handed in."""
+        end_ns = self._by_end[0][0] if self._by_end else NEVER
+        return min(end_ns, self._asked[0][0] + 1 if self._asked else NEVER)
 
     @property
     def near(self) -> list[OnAir]:
@@ -91,29 +111,44 @@ class Air(Generic[Key]):
     def begin(self, frame_id: Key, sender: int, start_ns: int, length: int) -> bool:
         """Hand in one transmission; False when it is too late for it: it is dropped then, and counted.
 
+        A radio that is at work when it has the frame begins later.
+
         :param frame_id: anything that tells frames apart until they are settled.
         :param sender: id of the sender, 1 to N.
         :param start_ns: start of the transmission, ns from the start of slot 0 by the channel's clock.
-        :param length: bytes, 1 to 255.
+        :param length: bytes, 1 to as many as the radio takes.
         :raises LocalProtocolError: for an id that is not the swarm's, a frame handed in twice, or an
             impossible length.
         """
-        config = self._channel.config
+        config, longest = self._channel.config, self._airtime.longest
         if not 1 <= sender <= config.agents:
             raise LocalProtocolError(f"sender {sender}: ids run from 1 to {config.agents}")
-        if not 1 <= length <= LONGEST_FRAME:
-            raise LocalProtocolError(f"length {length}: a frame has 1 to {LONGEST_FRAME} bytes")
+        if not 1 <= length <= longest:
+            raise LocalProtocolError(f"length {length}: a frame has 1 to {longest} bytes")
         if frame_id in self._ids:
             raise LocalProtocolError(f"frame {frame_id!r} is pending already")
         if start_ns < self._settled_ns:
             self.late += 1
             return False
-        frame = OnAir.of(config.airtime, sender, start_ns, length)
         self._ids.add(frame_id)
         self._count += 1
-        heappush(self._by_end, (frame.end_ns, start_ns, sender, self._count, frame, frame_id))
-        heappush(self._by_start, (start_ns, self._count, frame))
+        if self._lines is None:
+            self._lay(sender, start_ns, self._count, length, frame_id)
+        else:
+            heappush(self._asked, (start_ns, sender, self._count, length, frame_id))
         return True
+
+    def begun_ns(self, frame_id: Key, asked_ns: int, positions: Positions | None = None) -> int:
+        """Return when a radio begins to send a frame, ns, as soon as it has it.
+
+        :param frame_id: the frame, which is pending.
+        :param asked_ns: ns, for when it was handed in; all that begins before has been handed in.
+        :param positions: (3, N), m, frame map; needed with a limited range or capture.
+        """
+        if self._lines is None:
+            return asked_ns
+        self._run(asked_ns, asked_ns + 1, positions)
+        return self._begun[frame_id]
 
     def busy(self, receiver: int, when_ns: int, positions: Positions | None = None) -> bool:
         """Return whether an agent's radio finds the air busy, or cannot listen because it sends itself.
@@ -127,6 +162,8 @@ class Air(Generic[Key]):
         """
         if when_ns < self._settled_ns:
             raise LocalProtocolError(f"the air at {when_ns} ns: settled until {self._settled_ns} ns already")
+        if self._lines is not None:
+            self._run(when_ns, when_ns + 1, positions)
         self._approach(when_ns + 1)
         medium = self._channel.medium(self._slot(when_ns))
         return any(medium.senses(receiver, when_ns, frame, positions) for frame in self._near)
@@ -140,14 +177,8 @@ class Air(Generic[Key]):
         :param positions: (3, N), m, frame map; needed with a limited range or capture.
         """
         self._settled_ns = max(self._settled_ns, until_ns)
-        verdicts = []
-        while self._by_end and self._by_end[0][0] <= until_ns:
-            *_, frame, frame_id = heappop(self._by_end)
-            self._ids.discard(frame_id)
-            self._approach(frame.end_ns)
-            verdicts.append(self._verdict(frame, frame_id, positions))
-            # What is settled later ends later, so it starts at most one longest frame before this end.
-            self._forget(frame.end_ns - self._longest_ns)
+        self._run(until_ns, until_ns, positions)
+        verdicts, self._settled = self._settled, []
         if verdicts:
             self._channel.advance(until_ns // self._channel.config.slot_ns)
         return verdicts
@@ -171,6 +202,34 @@ class Air(Generic[Key]):
             medium.judge(slot, frame, on_air[:k] + on_air[k + 1 :], positions) for k, frame in enumerate(frames, first)
         ]
 
+    def _run(self, until_ns: int, before_ns: int, positions: Positions | None) -> None:
+        """Let frames end up to and with a time, and radios begin what they have before another one."""
+        asked, by_end = self._asked, self._by_end
+        while True:
+            end_ns = by_end[0][0] if by_end else NEVER
+            if asked and asked[0][0] < end_ns:
+                if asked[0][0] >= before_ns:
+                    return
+                at_ns, sender, count, length, frame_id = heappop(asked)
+                assert self._lines is not None
+                start_ns = self._begun[frame_id] = self._lines.start_ns(sender, at_ns, length)
+                self._lay(sender, start_ns, count, length, frame_id)
+            elif end_ns <= until_ns:
+                *_, frame, length, frame_id = heappop(by_end)
+                self._ids.discard(frame_id)
+                self._approach(frame.end_ns)
+                self._settled.append(self._verdict(frame, length, frame_id, positions))
+                # What is settled later ends later, so it starts at most one longest frame before this end.
+                self._forget(frame.end_ns - self._longest_ns)
+            else:
+                return
+
+    def _lay(self, sender: int, start_ns: int, count: int, length: int, frame_id: Key) -> None:
+        """Put a transmission on the time line."""
+        frame = OnAir.of(self._airtime, sender, start_ns, length)
+        heappush(self._by_end, (frame.end_ns, start_ns, sender, count, frame, length, frame_id))
+        heappush(self._by_start, (start_ns, count, frame))
+
     def _slot(self, time_ns: int) -> int:
         return max(0, time_ns // self._channel.config.slot_ns)
 
@@ -183,12 +242,17 @@ class Air(Generic[Key]):
         if any(frame.end_ns <= oldest_ns for frame in self._near):
             self._near[:] = [frame for frame in self._near if frame.end_ns > oldest_ns]
 
-    def _verdict(self, frame: OnAir, frame_id: Key, positions: Positions | None) -> FrameVerdict[Key]:
+    def _verdict(self, frame: OnAir, length: int, frame_id: Key, positions: Positions | None) -> FrameVerdict[Key]:
         """Return the verdict on a transmission that all are known to that may overlap it."""
         slot = self._slot(frame.start_ns)
         others = [o for o in self._near if o is not frame and o.start_ns < frame.end_ns and o.end_ns > frame.start_ns]
         received, lost, collided = self._channel.medium(slot).judge(slot, frame, others, positions)
-        arrival_ns = frame.end_ns + self._channel.config.link_delay_ns
+        arrival_ns = frame.end_ns + self._airtime.from_radio_ns(length)
+        if self._lines is not None:
+            del self._begun[frame_id]
+            reached = int(np.count_nonzero(received))
+            received, arrival_ns = self._lines.receive(frame.end_ns, length, received)
+            lost += reached - int(np.count_nonzero(received))
         return FrameVerdict(
             frame_id, frame.sender, slot, frame.start_ns, frame.end_ns, arrival_ns, received, lost, collided
         )

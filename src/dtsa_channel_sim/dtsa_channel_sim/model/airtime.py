@@ -37,6 +37,11 @@ class Line:
     waits: bool = False
     queue: int = 0
 
+    @property
+    def serial(self) -> bool:
+        """Whether bytes go over it one after the other. Else it is a constant delay, which moves arrivals alone."""
+        return bool(self.to_byte_ns or self.from_byte_ns)
+
     def to_radio_ns(self, length: int) -> int:
         """Return the time that a frame takes from the flight processor to the radio, ns.
 
@@ -103,6 +108,15 @@ class Airtime:
         :param length: bytes of the frame.
         """
         return self.line.from_radio_ns(length)
+
+    def latest_ns(self, length: int) -> int:
+        """Return the longest time from the order to send until a receiver's flight processor has a frame, ns.
+
+        :param length: bytes of the longest frame on the air.
+        """
+        line = self.line
+        waiting = self.from_radio_ns(length) * line.waits + self.from_radio_ns(length) * max(0, line.queue - 1)
+        return waiting + self.total_ns(length) + self.from_radio_ns(length)
 
     def shortest_slot_ns(self, length: int, *, guard_ns: int, decide_ns: int = 0, needs_frame: bool = False) -> int:
         """Return the shortest slot in which no frame overlaps another one or waits for one, ns.

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 
 from .air import Air
-from .airtime import LONGEST_FRAME
 from .config import ChannelConfig
 from .losses import NoiseSource
 from .medium import Medium, OnAir
@@ -50,7 +49,7 @@ class Channel:
         self._near = self._air.near
         self._last = -1
         # A frame sent at the slot's start may be longer than the slot.
-        self._spills = self._airtime.total_ns(LONGEST_FRAME) > config.slot_ns
+        self._spills = self._airtime.total_ns(self._airtime.longest) > config.slot_ns
         self._idle = Verdict(IDLE, (), None, None, None)
         self._alone = {i: Verdict(SUCCESS, (i,), None, None, None) for i in range(1, config.agents + 1)}
         self._use(0)

@@ -13,7 +13,7 @@ from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, bu
 
 from .airtime import Airtime
 from .gilbert import GilbertElliott
-from .radio_table import airtime_of
+from .radio_table import RADIOS, airtime_of
 from .schedule import Change, listed
 from .timeline import check_schedule
 from .topology import LinkLoss, format_partition, parse_matrix, parse_partition
@@ -78,11 +78,16 @@ class ChannelConfig(Settings):
     path_loss_exponent: float = setting(
         2.0, "power falls with this power of the distance (capture)", minimum=1.0, maximum=6.0
     )
+    radio: str = setting(
+        "plain",
+        "what carries frames: plain, or a radio whose line to the flight processor takes its time",
+        choices=tuple(RADIOS),
+    )
     bitrate: int = setting(2_000_000, "bits on air per second", unit="bit/s", minimum=1000, maximum=10**9)
     ramp_up_ns: int = setting(130_000, "from the order to send to the first bit", unit="ns", minimum=0, maximum=10**9)
     link_delay_ns: int = setting(
         300_000,
-        "between radio and flight processor, on each side (arrival times in real time)",
+        "between radio and flight processor, each way, with radio plain (arrival times in real time)",
         unit="ns",
         minimum=0,
         maximum=10**9,
@@ -119,7 +124,7 @@ class ChannelConfig(Settings):
     @property
     def airtime(self) -> Airtime:
         """The radio's times."""
-        return airtime_of("plain", self.bitrate, self.ramp_up_ns, self.link_delay_ns)
+        return airtime_of(self.radio, self.bitrate, self.ramp_up_ns, self.link_delay_ns)
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> ChannelConfig:

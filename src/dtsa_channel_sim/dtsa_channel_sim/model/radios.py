@@ -19,12 +19,11 @@ from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import STREAM_RADIOS, generator
 
-from .air import Air
+from .air import NEVER, Air
 from .medium import Positions
 
 Key = TypeVar("Key", bound=Hashable)
 
-NEVER = 2**63  # ns
 _MOST_LISTENS = 10_000  # for one frame
 
 

@@ -94,12 +94,16 @@ class SimulatedAir:
             listener.sent(frame, None)
             return
         self._count += 1
-        end_ns = self.now_ns + self._channel.config.airtime.total_ns(len(frame))
         self._air.begin(self._count, agent, self.now_ns, len(frame))
         self._on_air[self._count] = frame
+        start_ns = self._air.begun_ns(self._count, self.now_ns, self.positions)
+        end_ns = start_ns + self._channel.config.airtime.total_ns(len(frame))
         self._ends_ns[agent] = end_ns
         self._push(end_ns, _END, self._settle)
-        listener.sent(frame, self.now_ns)
+        if start_ns > self.now_ns:  # its radio hands a reception over first
+            self._push(start_ns, _START, partial(listener.sent, frame, start_ns))
+        else:
+            listener.sent(frame, start_ns)
 
     def _settle(self) -> None:
         for verdict in self._air.settle(self.now_ns, self.positions):

@@ -13,10 +13,10 @@ from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.plugin_watch import watched
-from dtsa_channel_sim.model.air import Air, FrameVerdict
+from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
-from dtsa_channel_sim.model.radios import NEVER, Radios, radio_rules
+from dtsa_channel_sim.model.radios import Radios, radio_rules
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
@@ -49,13 +49,15 @@ class LiveAir:
     def __init__(self, channel: Channel) -> None:
         config = channel.config
         self.air: Air[Sent] = Air(channel)
-        self.hold_ns = max(round(_GRACE * config.slot_ns), config.link_delay_ns)
+        # A delivery may come no earlier than the frame arrives.
+        self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
         self.late = 0  # frames that came when the air had been settled past their start, and were dropped
         self.given_up = 0  # frames whose radios found no free air for a slot
         self._window_ns = round(_WINDOW * config.slot_ns)
-        self._slot_ns, self._airtime = config.slot_ns, config.airtime
+        self._slot_ns = config.slot_ns
         self._frames: dict[Sent, bytes] = {}
-        self._ends: list[int] = []  # ns, when frames that have no verdict yet leave the air: a heap
+        self._arriving: list[tuple[int, int, FrameVerdict[Sent]]] = []  # what lines still carry: a heap by arrival
+        self._count = 0
         self._settled_ns = _BEFORE
         self._radios: Radios[Sent] | None = None
         self._held: dict[int, tuple[Sent, bytes]] = {}  # by id of the radio's agent
@@ -69,7 +71,7 @@ class LiveAir:
     @property
     def waits(self) -> bool:
         """Whether a frame waits for its delivery."""
-        return bool(self._ends)
+        return bool(self.air.pending or self._arriving)
 
     @property
     def patience_ns(self) -> int:
@@ -121,7 +123,6 @@ class LiveAir:
             self.late += 1
             return None
         self._frames[key] = data
-        heappush(self._ends, start_ns + self._airtime.total_ns(len(data)))
         return Begun(key, data, start_ns)
 
     def listen(self, now: int, positions: Positions) -> Iterator[Begun]:
@@ -148,18 +149,27 @@ class LiveAir:
         self._listened_ns = max(self._listened_ns, ripe)
 
     def settle(self, now: int, positions: Positions) -> list[FrameVerdict[Sent]]:
-        """The verdicts on all frames whose time has come; after :meth:`listen`.
+        """The verdicts on all frames that have arrived; after :meth:`listen`.
 
         :param now: ns from the start of slot 0.
         :param positions: (3, N), m, frame map.
         """
-        ripe, until = now - self.hold_ns, now - max(self.hold_ns, self._window_ns)
-        while self._ends and self._ends[0] <= ripe:
-            until = max(until, heappop(self._ends))
-        if until <= self._settled_ns:
-            return []
-        self._settled_ns = until
-        return self.air.settle(until, positions)
+        ripe, late = now - self.hold_ns, now - max(self.hold_ns, self._window_ns)
+        while (due := self.air.due_ns) <= ripe:
+            self._settle(due, positions)
+        self._settle(late, positions)
+        arrived = []
+        while self._arriving and self._arriving[0][0] <= now:
+            arrived.append(heappop(self._arriving)[2])
+        return arrived
+
+    def _settle(self, until_ns: int, positions: Positions) -> None:
+        if until_ns <= self._settled_ns:
+            return
+        self._settled_ns = until_ns
+        for verdict in self.air.settle(until_ns, positions):
+            self._count += 1
+            heappush(self._arriving, (verdict.arrival_ns, self._count, verdict))
 
     def frame(self, key: Sent) -> bytes:
         """The bytes of a frame that is or was on the air.
@@ -178,10 +188,11 @@ class LiveAir:
         :param now: ns from the start of slot 0.
         :param most_ns: ns, at most.
         """
-        due = self._ends[0] if self._ends else NEVER
+        due = self.air.due_ns
         if self._radios is not None:
             due = min(due, self._radios.next[0])
-        return min(max(0, due + self.hold_ns - now), most_ns)
+        arrival = self._arriving[0][0] if self._arriving else NEVER
+        return min(max(0, min(due + self.hold_ns, arrival) - now), most_ns)
 
 
 def slot_verdict(settled: Sequence[FrameVerdict[Sent]]) -> Verdict:

@@ -25,7 +25,6 @@ from dtsa_agent.ros.common.wire.checks import OTHER_RUN, RANGE, SIZES, UNREADABL
 from dtsa_agent.ros.common.wire.report_fields import ReportFields, read_report
 from dtsa_agent.ros.common.wire.stamps import header_of, ns_of, time_of
 from dtsa_channel_sim.model.air import FrameVerdict
-from dtsa_channel_sim.model.airtime import LONGEST_FRAME
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.verdict import Verdict
 
@@ -101,7 +100,9 @@ class RealtimeChannel(RosChannel):
         self._recovered_ns = 0  # when all that was sent during the last stall should have come
         self._newest = -1  # slot: last one reported by anybody
         self._lag_ns = 0  # the swarm's common time runs with the mean of its clocks: its slots start so much later
-        self._close_ns = self.air.hold_ns + channel.config.airtime.total_ns(LONGEST_FRAME) + _TICK_NS
+        airtime = channel.config.airtime
+        self._longest = airtime.longest
+        self._close_ns = self.air.hold_ns + airtime.latest_ns(airtime.longest) + _TICK_NS
         self._patience_ns = max(_PATIENCE_SLOTS * self.slot_ns, _PATIENCE_NS)
 
     @property
@@ -307,7 +308,7 @@ class RealtimeChannel(RosChannel):
             self._meet_processes()  # a new process tells about itself before it sends anything else
         self.roster.check_frame(agent, self.loop.number, time.monotonic(), self.loop.sender)
         start_ns, now = ns_of(message.header.stamp) - names.TIME_ZERO_NS, self._now()
-        if not 1 <= length <= LONGEST_FRAME:
+        if not 1 <= length <= self._longest:
             raise Unusable(SIZES, f"a frame of {length} bytes")
         if named_in(bytes(message.data)) != (agent, slot & 0xFFFFFFFF):
             raise Unusable(RANGE, f"a frame for cf{agent} and slot {slot} that does not name them")
@@ -351,7 +352,7 @@ class RealtimeChannel(RosChannel):
         """Sends a frame that has left the air to those that received it."""
         slot, sender = verdict.frame_id
         self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
-        self.pace.lag.add(self._now() - verdict.end_ns - self.air.hold_ns)
+        self.pace.lag.add(self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns))
         heard = bool(verdict.received.any())
         if not heard and not self.air.listens:  # else its sender learns from the message when it began
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.ros.common.graph.names import named
-from dtsa_channel_sim import Air, Channel, ChannelConfig, OnAir
+from dtsa_channel_sim import Air, Channel, ChannelConfig, FrameVerdict, OnAir, Reception
 
 from .result import Difference, Mismatch
 
@@ -24,6 +25,8 @@ class Sent:
     slot: int  # as its sender counts
     on_air: OnAir
     data: bytes
+    asked_ns: int  # for when its sender handed it to its radio
+    arrival_ns: int  # when the last of its receivers had it
     received: Mask | None = None  # (N,) by whom, as delivered
     verdict: tuple[int, Mask, int, int] | None = None  # slot of its account, received, lost, collided
     alone: bool = True  # nobody else was sending meanwhile
@@ -37,6 +40,29 @@ class Sent:
     def dropped(self) -> bool:
         """Whether nobody was in reach of it, as of a frame that the channel got too late to put it on the air."""
         return self.verdict is not None and not self.verdict[1].any() and self.verdict[2:] == (0, 0)
+
+
+class _Recorded:
+    """A medium in which frames are received by whom a recording says.
+
+    :param config: the channel's settings.
+    :param frames: sender and receivers, (N,), of each frame, in the order in which they were handed to their radios.
+    """
+
+    def __init__(self, config: ChannelConfig, frames: list[tuple[int, Mask]]) -> None:
+        self.config = config
+        self._next: dict[int, deque[Mask]] = {}
+        for sender, received in frames:
+            self._next.setdefault(sender, deque()).append(received)
+
+    def medium(self, slot: int) -> _Recorded:
+        return self
+
+    def advance(self, slot: int) -> None:
+        pass
+
+    def judge(self, slot: int, frame: OnAir, others: Any, positions: Any = None) -> Reception:
+        return Reception(self._next[frame.sender].popleft(), 0, 0)
 
 
 class SentFrames:
@@ -59,9 +85,24 @@ class SentFrames:
         :param slot: as its sender counts.
         :param start_ns: ns from the start of slot 0 by the channel's clock.
         """
-        sent = Sent(slot, OnAir.of(self.config.airtime, sender, start_ns, len(data)), data)
+        airtime = self.config.airtime
+        on_air = OnAir.of(airtime, sender, start_ns, len(data))
+        sent = Sent(slot, on_air, data, start_ns, on_air.end_ns + airtime.from_radio_ns(len(data)))
         self._sent[(slot, sender)] = sent
         self._unjudged.setdefault(sender, deque()).append(sent)
+
+    def lay(self, received: dict[tuple[int, int], Mask]) -> None:
+        """Finds when frames began and arrived whose radios hand over one reception after the other.
+
+        :param received: by whom each frame was received as recorded, (N,), by its slot and sender.
+        """
+        nobody = np.zeros(self.config.agents, dtype=np.bool_)
+        in_order = sorted(self._sent, key=lambda key: self._sent[key].asked_ns)
+        recorded = _Recorded(self.config, [(key[1], received.get(key, nobody)) for key in in_order])
+        for verdict in self._settled(recorded, set()):
+            sent = self._sent[verdict.frame_id]
+            sent.on_air = OnAir.of(self.config.airtime, sent.sender, verdict.start_ns, len(sent.data))
+            sent.arrival_ns = verdict.arrival_ns
 
     def get(self, slot: int, sender: int) -> Sent | None:
         """A frame; None if it has not gone out.
@@ -198,18 +239,20 @@ class SentFrames:
     def _on_one_time_line(
         self, channel: Channel, left_out: set[tuple[int, int]]
     ) -> dict[tuple[int, int], tuple[Mask, int, int]]:
-        air: Air[tuple[int, int]] = Air(channel)
+        settled = self._settled(channel, left_out)
+        return {verdict.frame_id: (verdict.received, verdict.lost, verdict.collided) for verdict in settled}
+
+    def _settled(self, media: Any, left_out: set[tuple[int, int]]) -> Iterator[FrameVerdict[tuple[int, int]]]:
+        """The verdicts on all frames on one time line."""
+        air: Air[tuple[int, int]] = Air(media)
         frames = [item for item in self._sent.items() if item[0] not in left_out]
-        waiting = deque(sorted(frames, key=lambda item: item[1].on_air.start_ns))
+        waiting = deque(sorted(frames, key=lambda item: item[1].asked_ns))
         last = max((sent.on_air.end_ns for sent in self._sent.values()), default=0)
-        result = {}
         for at in range(0, last + 2 * self.config.slot_ns, self.config.slot_ns):
-            while waiting and waiting[0][1].on_air.start_ns < at:
+            while waiting and waiting[0][1].asked_ns < at:
                 key, sent = waiting.popleft()
-                air.begin(key, sent.sender, sent.on_air.start_ns, len(sent.data))
-            for verdict in air.settle(at):
-                result[verdict.frame_id] = verdict.received, verdict.lost, verdict.collided
-        return result
+                air.begin(key, sent.sender, sent.asked_ns, len(sent.data))
+            yield from air.settle(at)
 
     def _by_slots(self, channel: Channel) -> dict[tuple[int, int], tuple[Mask, int, int]]:
         slots: dict[int, list[Sent]] = {}

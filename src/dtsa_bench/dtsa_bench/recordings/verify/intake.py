@@ -17,12 +17,11 @@ class Intake:
     """Checks the reports of a run against the channel's deliveries.
 
     :param frames: all frames of the run, with who received them.
-    :param link_delay_ns: ns, from the end of a frame to the receivers' flight processors.
     :param slots: frames of this slot and later ones are not in the bag.
     """
 
-    def __init__(self, frames: SentFrames, link_delay_ns: int, slots: int) -> None:
-        self._frames, self._link_delay_ns, self._slots = frames, link_delay_ns, slots
+    def __init__(self, frames: SentFrames, slots: int) -> None:
+        self._frames, self._slots = frames, slots
         agents = frames.config.agents
         self._taken: dict[tuple[int, int], np.ndarray[Any, np.dtype[np.bool_]]] = {}
         self._delays = Delays(agents)
@@ -56,7 +55,7 @@ class Intake:
                 expected = "not yet taken in" if taken[index] else "not delivered"
                 raise Mismatch(Difference("report.heard_by", expected, f"taken in: cf{sender}", why, slot, index + 1))
         taken[receivers] = True
-        delay = at_ns - sent.on_air.end_ns - self._link_delay_ns
+        delay = at_ns - sent.arrival_ns
         if delay < 0:
             raise Mismatch(Difference("report.heard_ns", f"at least {at_ns - delay} ns", f"{at_ns} ns",
                                       "nobody hears a frame before it has arrived", slot, sender))  # fmt: skip

@@ -82,6 +82,8 @@ class RealtimeCheck:
         try:
             if self._apart:
                 self._load_frames()
+                if self.run.air.airtime.line.serial:
+                    self._lay()
             self._messages()
         finally:  # those that were looked at, wherever it ends
             self.result.slots = int(self._slots.max()) + 1
@@ -208,6 +210,16 @@ class RealtimeCheck:
                 self._fail("frame.agent", "one frame an agent and slot", f"cf{agent}", "the swarm's", slot)
             self.frames.send(slot, agent, stamp_ns(said.header.stamp) - names.TIME_ZERO_NS, said.data.tobytes())
 
+    def _lay(self) -> None:
+        """When frames began and arrived: that depends on what each radio had received before."""
+        received = {}
+        for _, said in self.bag.typed([SLOT]):
+            slot, count = int(said.heard_slot), len(said.sender)
+            if int(said.phase) == _RUN and len(said.received) == count * -(-self.agents // 8):
+                masks = unpack_received(said.received.tobytes(), count, self.agents).astype(bool)
+                received |= {(slot, sender): mask for sender, mask in zip(said.sender.tolist(), masks, strict=True)}
+        self.frames.lay(received)
+
     def _sent(self, slot: int, agent: int, start_ns: int, data: bytes) -> None:
         """A frame in a transmission: it goes out now, or is the one that has been handed over by itself."""
         if not self._apart:
@@ -217,7 +229,7 @@ class RealtimeCheck:
         if sent is None or sent.data != data:
             recorded = "none" if sent is None else sent.data.hex()
             self._fail("transmission.data", recorded, data.hex(), "the frame that was handed over", slot, agent)
-        self._equal_time("transmission.offset_ns", sent.on_air.start_ns, start_ns, slot, agent)
+        self._equal_time("transmission.offset_ns", sent.asked_ns, start_ns, slot, agent)
 
     def _note_unsent(self, said: Any) -> None:
         """Takes note of the agents that took themselves for the sender and did not send: what they made is unknown."""
@@ -227,7 +239,7 @@ class RealtimeCheck:
 
     def _reports(self, summary: dict[str, Any]) -> None:
         """What the agents took in had been delivered to them, and what they reported is in the transmissions."""
-        intake, untold = Intake(self.frames, self.run.air.link_delay_ns, self.result.slots), 0
+        intake, untold = Intake(self.frames, self.result.slots), 0
         replayable = self._own_states.has_key or not self.run.swarm.auth
         decisions = Decisions(self.run, self.frames) if replayable else None
         sense = CarrierSense(self.frames) if self.run.swarm.policy_row.listens else None
@@ -292,7 +304,7 @@ class RealtimeCheck:
                 self._catch_up(slot, sender)
             sent = self.frames.deliver(slot, sender, frame, mask)
             if self.own_clocks:
-                arrival = names.TIME_ZERO_NS + max(0, sent.on_air.end_ns + self.run.air.link_delay_ns)
+                arrival = names.TIME_ZERO_NS + max(0, sent.arrival_ns)
                 self._equal_time("slot.stamp", arrival, stamp, slot, sender)
             self.result.count("frames heard as they were sent")
         self.result.count("slot")

@@ -1,0 +1,167 @@
+"""Lines between radios and flight processors: what waits, what is cut, what has no room, and when frames arrive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_simulated_air import Receiver
+
+from dtsa_channel_sim import Air, Channel, ChannelConfig, SimulatedAir
+from dtsa_channel_sim.model.radio_table import RADIOS
+
+MS = 1_000_000
+AIRTIME = RADIOS["crazyflie"].airtime
+TOTAL, BACK = AIRTIME.total_ns(56), AIRTIME.from_radio_ns(56)
+FRAMES = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 8 * MS), st.integers(1, 60)), min_size=1, max_size=40)
+
+
+def line(agents=6, **config):
+    return Air(Channel(ChannelConfig(agents=agents, radio="crazyflie", **config)))
+
+
+def summary(verdicts):
+    return [(v.frame_id, v.start_ns, v.arrival_ns, v.received.tolist(), v.lost, v.collided) for v in verdicts]
+
+
+def test_a_frame_arrives_when_its_bytes_have_crossed_the_line():
+    air = line()
+    air.begin("one", 1, 0, 56)
+    (verdict,) = air.settle(10 * MS)
+    assert (verdict.end_ns, verdict.arrival_ns) == (TOTAL, TOTAL + 640_000)
+
+
+@pytest.mark.parametrize(("later_ns", "waits_ns"), [(-1, 0), (0, BACK), (1, BACK - 1), (BACK - 1, 1), (BACK, 0)])
+def test_an_own_frame_waits_while_its_radio_hands_a_reception_over(later_ns, waits_ns):
+    air = line()
+    air.begin("heard", 1, 0, 56)
+    air.begin("own", 2, TOTAL + later_ns, 56)
+    verdicts = {v.frame_id: v for v in air.settle(10 * MS)}
+    assert verdicts["own"].start_ns == TOTAL + later_ns + waits_ns
+    # Handed over a moment earlier it cuts the reception instead.
+    assert verdicts["heard"].received[1] == (later_ns >= 0)
+
+
+def test_an_own_frame_goes_before_the_next_reception_and_that_one_waits_for_nothing():
+    """Agent 3 has two receptions, and a frame of its own while it hands the first one over."""
+    air = line(agents=3)
+    second = TOTAL - AIRTIME.ramp_up_ns
+    air.begin("first", 1, 0, 56)
+    air.begin("second", 2, second, 20)
+    air.begin("own", 3, TOTAL + 1, 56)
+    verdicts = {v.frame_id: v for v in air.settle(10 * MS)}
+    assert verdicts["first"].received.tolist() == [False, False, True]  # agent 2 turned to sending
+    ends = second + AIRTIME.total_ns(20)
+    assert ends < TOTAL + BACK
+    assert verdicts["second"].received[2]
+    assert verdicts["own"].start_ns == TOTAL + BACK
+    assert verdicts["second"].arrival_ns == TOTAL + BACK + AIRTIME.from_radio_ns(20)
+
+
+def test_a_radio_holds_eight_receptions_and_loses_the_ninth():
+    """Back to back a frame of 56 bytes comes every 0.27 ms, and takes 0.64 ms to be handed over.
+
+    The senders do not hear each other, so none of them waits.
+    """
+    deaf = {"from": "1-20", "to": "1-20", "loss": 1}
+    air, bits = line(agents=21, link_loss=[deaf]), AIRTIME.on_air_ns(56)
+    for k in range(20):
+        air.begin(k, k + 1, k * bits, 56)
+    verdicts = air.settle(100 * MS)
+    at_last = [bool(v.received[20]) for v in verdicts]
+    through: list[int] = []
+    for k, verdict in enumerate(verdicts):  # a queue by hand
+        end = AIRTIME.ramp_up_ns + (k + 1) * bits
+        through = [at for at in through if at > end]
+        held = len(through)
+        assert at_last[k] == (held < 8)
+        if held < 8:
+            through.append((through[-1] if through else end) + BACK)
+        assert verdict.lost + verdict.collided == 19 + (held >= 8)
+    assert at_last.index(False) == 13  # 8 are held, and 5 handed over
+
+
+@given(FRAMES, st.randoms(use_true_random=False), st.integers(50_000, 5 * MS))
+@settings(max_examples=60, deadline=None)
+def test_order_and_rhythm_do_not_matter(frames, order, step):
+    frames = [(i, *frame) for i, frame in enumerate({frame[:2]: frame for frame in frames}.values())]
+    at_once = line(loss=0.2, seed=4)
+    for frame in frames:
+        at_once.begin(*frame)
+    expected = summary(at_once.settle(60 * MS))
+    assert len(expected) == len(frames)
+    assert at_once.pending == 0
+    stepwise = line(loss=0.2, seed=4)
+    order.shuffle(frames)
+    result, now = [], 0
+    while now < 60 * MS:
+        now += step
+        for frame in frames:
+            if now - step <= frame[2] < now:
+                stepwise.begin(*frame)
+        result += summary(stepwise.settle(now))
+    assert stepwise.late == 0
+    assert sorted(result) == sorted(expected)
+
+
+@given(st.lists(st.lists(st.integers(1, 6), unique=True, max_size=2), min_size=1, max_size=30), st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_slots_that_are_long_enough_know_nothing_of_the_line(slots, seed):
+    """The same verdicts as with radios without one, in the shortest slots that fit."""
+    slot_ns = AIRTIME.shortest_slot_ns(56, guard_ns=0)
+    plain, true = (
+        Air(Channel(ChannelConfig(agents=6, slot_ns=slot_ns, loss=0.2, seed=seed, radio=radio)))
+        for radio in ("plain", "crazyflie")
+    )
+    for air in (plain, true):
+        for slot, senders in enumerate(slots):
+            for sender in senders:
+                air.begin((slot, sender), sender, slot * slot_ns, 56)
+    one, other = (
+        [(v.frame_id, v.start_ns, v.received.tolist(), v.lost, v.collided) for v in air.settle(100 * MS)]
+        for air in (plain, true)
+    )
+    assert one == other
+
+
+def test_in_slots_that_are_too_short_frames_wait_and_then_meet():
+    slot_ns = AIRTIME.shortest_slot_ns(56, guard_ns=0) - 50_000
+    air = line()
+    for slot in range(600):
+        air.begin(slot, slot % 6 + 1, slot * slot_ns, 56)
+    verdicts = air.settle(10_000 * MS)
+    assert all(v.start_ns >= v.frame_id * slot_ns for v in verdicts)
+    assert max(v.start_ns - v.frame_id * slot_ns for v in verdicts) > 0
+    assert sum(v.collided + v.lost for v in verdicts) > 0
+
+
+def test_a_radio_that_waits_begins_and_is_sensed_later():
+    air = line()
+    air.begin("heard", 1, 0, 56)
+    air.begin("own", 2, TOTAL + 1, 56)
+    begins = TOTAL + BACK + AIRTIME.ramp_up_ns
+    assert not air.busy(3, begins - 1)
+    assert air.busy(3, begins)
+    assert [v.frame_id for v in air.settle(10 * MS)] == ["heard", "own"]
+
+
+def test_the_port_of_an_agent_tells_when_its_frame_really_began():
+    air = SimulatedAir(Channel(ChannelConfig(agents=3, radio="crazyflie")))
+    agents = [Receiver() for _ in range(3)]
+    ports = [air.join(k + 1, agent) for k, agent in enumerate(agents)]
+    ports[0].send(bytes(56), 0)
+    ports[1].send(bytes(20), TOTAL + 1000)
+    air.run(10 * MS)
+    assert agents[1].starts == [TOTAL + BACK]
+    assert [when for when, _ in agents[0].heard] == [TOTAL + BACK + AIRTIME.total_ns(20) + AIRTIME.from_radio_ns(20)]
+    assert [len(frame) for _, frame in agents[2].heard] == [56, 20]
+
+
+def test_what_a_crazyflie_cannot_send_is_refused():
+    from dtsa_agent.core.errors import LocalProtocolError
+
+    air = line()
+    with pytest.raises(LocalProtocolError, match="length 61: a frame has 1 to 60 bytes"):
+        air.begin(0, 1, 0, 61)
+    assert np.array_equal(air.settle(MS), [])
