@@ -16,7 +16,7 @@ from pathlib import Path
 
 from machine import layout, wheels
 from machine.layout import SetupError
-from machine.progress import step
+from machine.progress import Step, step
 
 PACKAGES = ("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim", "dtsa_bench")
 INSTALLED_FILES = {"package.xml", "setup.py", "setup.cfg", "CMakeLists.txt"}
@@ -160,10 +160,7 @@ def build(packages: list[str]) -> None:
         (layout.INSTALL / ".dtsa-environment.json").unlink(missing_ok=True)
         if layout.kind() == "none":
             for package in packages:
-                develop = "import os, runpy, sys; os.chdir(sys.argv.pop(1)); runpy.run_path('setup.py')"
-                words = [str(layout.PYTHON), "-c", develop, str(layout.SOURCES / package), "develop", "--no-deps"]
-                current.run(words, build_environment())
-                stamp(package)
+                build_in_place(current, package)
             return
         arguments = ["--base-paths", str(layout.SOURCES), "--symlink-install", "--packages-select", *packages]
         arguments += ["--build-base", str(layout.BUILD), "--install-base", str(layout.INSTALL)]
@@ -174,6 +171,20 @@ def build(packages: list[str]) -> None:
         current.run([colcon(), "--log-base", str(layout.COLCON_LOG), "build", *arguments, *cmake], build_environment())
         for package in packages:
             stamp(package)
+
+
+def build_in_place(current: Step, package: str) -> None:
+    """Builds a package as colcon does with `--symlink-install`, without what ROS would need of it.
+
+    :param current: the step.
+    :param package: its name.
+    """
+    where = layout.BUILD / package
+    layout.write(where / "setup.cfg", f"[build]\nbuild_base = {where}\n")  # else in the sources
+    develop = "import os, runpy, sys; os.chdir(sys.argv.pop(1)); runpy.run_path('setup.py')"
+    words = [str(layout.PYTHON), "-c", develop, str(layout.SOURCES / package), "develop", "--no-deps"]
+    current.run(words, build_environment() | {"DIST_EXTRA_CONFIG": str(where / "setup.cfg")})
+    stamp(package)
 
 
 def kernel() -> Path:
