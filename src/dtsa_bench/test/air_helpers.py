@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import random
 import socket
@@ -52,12 +53,14 @@ class Flying:
 
     def __init__(self, own: AgentSettings, config: SwarmConfig, udp: UdpSettings, path: Path) -> None:
         self.port = UdpPort(udp)
-        self.agent = AirAgent(own, config, self.port)
+        self.said: list[str] = []  # in flight
+        self.agent = AirAgent(own, config, self.port, say=self.said.append)
         self.recorder = AgentRecorder(path, own, config, udp)
         self.agent.watcher = self
         self.stop = Stop()
         self.heard: Counter[int] = Counter()  # frames by sender, since it began anew
         self.slots: list[int] = []
+        self.speed = 0.0  # m/s, at the start of the last slot
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -67,6 +70,7 @@ class Flying:
             self.heard.clear()
         self.heard.update(frame.sender for frame in record.heard)
         self.slots.append(record.slot)
+        self.speed = math.sqrt(float(record.velocity @ record.velocity))
         self.recorder.slot(record)
 
     def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
@@ -128,6 +132,37 @@ class Stranger:
         """Leaves."""
         with suppress(socket.error):
             self.socket.close()
+
+
+class TwoWays:
+    """Carries datagrams between two groups of the loopback interface, either way while that is not cut.
+
+    :param near: a group.
+    :param far: another one.
+    """
+
+    def __init__(self, near: str, far: str) -> None:
+        self._ends = [MulticastSocket(UdpSettings(interface="lo", group=group)) for group in (near, far)]
+        self.to_far = self.to_near = True
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        near, far = self._ends
+        while not self._stopped:
+            for source, target, carries in ((near, far, self.to_far), (far, near, self.to_near)):
+                for datagram in source.receive(100):
+                    if carries and not datagram.own:
+                        target.send(datagram.data)
+            time.sleep(0.0005)
+
+    def end(self) -> None:
+        """Carries nothing any more."""
+        self._stopped = True
+        self._thread.join(_PATIENCE_S)
+        for end in self._ends:
+            end.close()
 
 
 class OneWay:

@@ -17,7 +17,8 @@ class Hearing:
     def __new__(
         cls, agents: int, id: int, anchor_every: int, slot_ns: int, seed: int, header: bytes, late_bytes: int,
         peers: int, key: bytes, session: int, flight_ns: int, position_step: float, length: int, own_bytes: int,
-        limit_ns: int, clock_began_ns: int, clock_offset_ns: int, clock_drift_ppb: int, port: _Port, /,
+        limit_ns: int, clock_began_ns: int, clock_offset_ns: int, clock_drift_ppb: int, moving: int,
+        resting: int, named: int, port: _Port, /,
     ) -> Hearing: ...  # fmt: skip
 
     # Sleeps until so long before a slot, a while at most. None: it is not that time yet; else as `take`.
@@ -39,3 +40,7 @@ class Hearing:
     def wrap(self, frame: bytes, slot: int, late_ns: int, /) -> bytes: ...
     # -> state, restarts, corrected, corrections, error of the time under way
     def status(self) -> tuple[int, int, int, int, int]: ...
+    # How it stands with the others: -> there, hears, heard by, both; see `contacts.Contacts.count`.
+    def contact(self, slot: int, strict: bool, /) -> tuple[int, int, int, int]: ...
+    # -> frames of about the same time; of these, off by more than a quarter of a slot
+    def timing(self) -> tuple[int, int]: ...

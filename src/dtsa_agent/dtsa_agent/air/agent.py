@@ -24,14 +24,17 @@ from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
 from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.stop import Stop
 
+from .contacts import Contact
 from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, check_fits, flight_ns
 from .hearing import OF_OWN_NAME, REASONS, STATES, make_hearing
 from .outage import Outage
 from .port import DatagramPort
 from .precision import give_back_memory, going_first, wake_precisely
 from .prepared import Prepared
+from .quorum import Hold, Quorum
 from .record import Heard, SlotRecord, Watcher
 from .settings import AgentSettings
+from .short_slots import ShortSlots
 from .strangers import Strangers
 from .tally import TOO_LATE, Tally
 from .vehicle import SimulatedVehicle, Vehicle
@@ -40,6 +43,7 @@ _SECOND = 1_000_000_000
 _PATIENCE_S = 0.05  # a signal is noticed after this time at the latest
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
 _OWN_ID = 3  # frames in the own name after which an agent that is new gives way
+_JUDGED_S = 0.04  # from one look at the quorum to the next
 _SAID = 64  # own frames that are remembered
 
 _Frame = tuple[int, int, bytes, bytes, int]  # sender, slot, frame, datagram, arrival by the own clock
@@ -82,11 +86,18 @@ class AirAgent:
         self.swarm: AbstractSwarm = make_swarm(config, scenario, local=[own.id])
         self._group = AgentGroup(self.swarm)
         self._present, self._chosen = self.swarm.present.data, self.swarm.chosen.data
+        self._active = self.swarm.active.data
         self.watcher = watcher
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         self.tally = Tally()
         self._strangers, self._outage = Strangers(say), Outage(say)
         port.say = say
+        quorum = Quorum(own.quorum)
+        if quorum.least >= config.agents:
+            raise ConfigError("quorum", own.quorum, f"at most {config.agents - 1}, the number of the others")
+        self._hold, self._short_slots = Hold(quorum, say), ShortSlots(config.slot_ms, say)
+        self._judge_every = max(1, round(_JUDGED_S / config.slot_s))
+        self._new_slots = 2 * config.main_every * config.agents  # as long as an agent with policy lease is on probation
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
         flight = flight_ns(config, port.properties)
@@ -275,7 +286,7 @@ class AirAgent:
         self._waiting = frame
         if frame and self._late_ns(slot) > 0:
             self._send()
-        self._vehicle.fly(swarm, slot)
+        self._fly(slot)
         if self._early:
             early, self._early = self._early, []
             for one in early:
@@ -285,6 +296,26 @@ class AirAgent:
                     self._hear(one)
         if closed is not None:
             self._tell(closed)
+
+    def _fly(self, slot: int) -> None:
+        """Flies through a slot; without a quorum it hovers, and all else goes on."""
+        if slot % self._judge_every == 0:
+            self._judge(slot)
+        if not self._hold.held:
+            self._vehicle.fly(self.swarm, slot)
+            return
+        if not self._group.newcomers.some:
+            self._hold.hover()
+        active, self._active[0] = self._active[0], 0
+        self._vehicle.fly(self.swarm, slot)
+        self._active[0] = active
+
+    def _judge(self, slot: int) -> None:
+        """Looks whether it has a quorum, and whether slots are long enough."""
+        contact = Contact(*self.hearing.contact(slot, slot < self._first + self._new_slots))
+        self._hold.judge(contact, self._group.newcomers.some, time.monotonic_ns())
+        if not self._short_slots.found:
+            self._short_slots.judge(*self.hearing.timing())
 
     def _recorded(self, slot: int, frame: bytes, present: int) -> SlotRecord:
         swarm = self.swarm
@@ -369,6 +400,10 @@ class AirAgent:
             "times_corrected": corrected,
             "alignments": alignments,
             "flight_time_error_us": error_ns / 1e3,
+            "quorum": self.own.quorum,
+            "held_at_start_slots": self._hold.slots_at_start,
+            "held_slots": self._hold.slots,
+            "slots_too_short": self._short_slots.found,
             "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
             "not_taken_in": {name: count for name, count in sorted(refused.items()) if count},
             **self._port.counts(),

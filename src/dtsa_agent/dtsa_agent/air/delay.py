@@ -10,7 +10,7 @@ from the slots of those that hear little.
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 _SHARE = 64  # of which the estimate moves by a part with a frame: slowly, so that it does not follow the slots
 _STEP_NS = 1_000_000
@@ -66,12 +66,15 @@ class Delay:
         self._sum_of[peer] = total
         insort(self._sums, total)
 
-    def tell(self) -> tuple[Peer, ...]:
-        """What the next datagram says: the others in turn."""
-        heard = sorted(self._hears)
+    def tell(self, lately: Callable[[int], bool]) -> tuple[Peer, ...]:
+        """What the next datagram says: the others in turn, the last one again, so that no two neighbours stay apart.
+
+        :param lately: whether one was heard lately; the others are left out.
+        """
+        heard = sorted(filter(lately, self._hears))
         count = min(self._peers, len(heard))
         told = [heard[(self._turn + k) % len(heard)] for k in range(count)]
-        self._turn += count
+        self._turn += max(count - 1, min(count, 1))
         return tuple((peer, self._hears[peer]) for peer in told)
 
     def moved(self, by_ns: int) -> None:

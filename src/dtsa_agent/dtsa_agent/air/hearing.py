@@ -9,6 +9,7 @@ from dtsa_agent.core.reference.timebase import ALONE, JOINED, LISTENING
 from dtsa_agent.core.settings.config import SwarmConfig
 
 from ._hearing import Hearing
+from .contacts import limits_of
 from .datagram import (
     LENGTH,
     NO_FRAME,
@@ -44,6 +45,7 @@ def make_hearing(config: SwarmConfig, own: AgentSettings, wrapping: Wrapping, po
     :param port: what is read; the caller keeps it open.
     """
     key, session = wrapping.sealed_with
+    limits = limits_of(config, wrapping.peers)
     return Hearing(
         config.agents,
         own.id,
@@ -63,5 +65,8 @@ def make_hearing(config: SwarmConfig, own: AgentSettings, wrapping: Wrapping, po
         time.monotonic_ns(),
         own.clock_offset_ns,
         own.clock_drift_ppb,
+        limits.moving,
+        limits.resting,
+        limits.named,
         port.compiled,
     )

@@ -10,9 +10,12 @@ from dtsa_agent.core.reference.timebase import FOREIGN, LISTENING, RESTARTED
 from dtsa_agent.core.settings.config import SwarmConfig
 
 from .clock import OwnClock
+from .contacts import Contacts, limits_of
 from .datagram import NO_FRAME, OTHER_TIME, OWN_ID, REPEATED, Said, Wrapping
-from .delay import Delay
+from .delay import Delay, Peer
 from .slots import SlotTime
+
+NEAR_SLOTS = 8  # frames that are off by more are of another time
 
 
 class Taken(NamedTuple):
@@ -40,6 +43,9 @@ class PlainHearing:
         self._clock = OwnClock() if clock is None else clock
         self.time = SlotTime(config, agent)
         self.delay = Delay(agent, config.slot_ns // 4, wrapping.peers)
+        self.contacts = Contacts(config.agents, agent, limits_of(config, wrapping.peers), wrapping.peers)
+        #: Frames of about the same time, and of these those that were off by more than a quarter of a slot.
+        self.timed = self.off = 0
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
 
     def take(self, data: bytes, arrival_ns: int) -> Taken:
@@ -59,16 +65,29 @@ class PlainHearing:
             return Taken(REPEATED)
         began = self._clock.local_ns(arrival_ns) - self._flight_ns - said.late_ns
         before = self.time.slot_start_ns(said.slot)
+        off = abs(began - self.delay.error_ns - before)
+        if self.time.state != LISTENING and off <= NEAR_SLOTS * self._config.slot_ns:
+            self.timed += 1
+            self.off += off > self._config.slot_ns // 4
         outcome = self.time.hear(said.slot, began - self.delay.error_ns)
         if outcome == FOREIGN:
             return Taken(OTHER_TIME)
         self._last[said.sender] = said.slot
         if outcome == RESTARTED:
             self.delay.reset()
+            self.contacts.reset()
         else:
             self.delay.hear(said.sender, began - before, said.peers)
             self.delay.moved(self.time.slot_start_ns(said.slot) - before)
+        self.contacts.hear(said.sender, said.slot, said.frame, [peer for peer, _ in said.peers])
         return Taken("", outcome == RESTARTED, said)
+
+    def tell(self, slot: int) -> tuple[Peer, ...]:
+        """What the next datagram says of the others.
+
+        :param slot: the slot in which it is sent.
+        """
+        return self.delay.tell(lambda agent: self.contacts.hears(agent, slot))
 
     def _is_frame(self, frame: bytes) -> bool:
         """Whether bytes are a frame: nothing else may say what time it is. What holders of the key seal is one."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dtsa_agent.core.settings.config import MAX_AGENTS
-from dtsa_agent.core.settings.declaration import REQUIRED, Settings, setting
+from dtsa_agent.core.settings.declaration import REQUIRED, Settings, check, setting
+
+from .quorum import ALL_BUT_ONE, ALLOWED, Quorum
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +21,9 @@ class AgentSettings(Settings):
     duration_s: float = setting(
         0.0, "it ends by itself after this time; 0: with a signal only", unit="s", minimum=0, maximum=1e6
     )
+    quorum: str = setting(
+        ALL_BUT_ONE, f"it hovers unless it hears, and is heard by, so many of the others: {ALLOWED}", custom=True
+    )
     priority: int = setting(20, "real-time priority, where allowed; 0: none", minimum=0, maximum=90)
     clock_offset_ns: int = setting(
         0, "for trials: its clock shows this much more at the start", unit="ns", minimum=-(10**15), maximum=10**15
@@ -26,3 +31,7 @@ class AgentSettings(Settings):
     clock_drift_ppb: int = setting(
         0, "for trials: its clock runs fast by this many parts per billion", minimum=-(10**6), maximum=10**6
     )
+
+    def __post_init__(self) -> None:
+        check(self)
+        Quorum(self.quorum)

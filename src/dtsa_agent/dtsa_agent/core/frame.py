@@ -13,6 +13,7 @@ from .compiled import kernel as _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
 from .reference import frame as plain
 from .reference import tag
+from .reference.frame_extended import LEAVING
 from .registry import PROFILES
 
 PROFILE_PAPER = PROFILES.index("paper")  # id, c_r, slot, position, velocity: 19 bytes
@@ -28,7 +29,7 @@ EXTENT_M = 65.534  # m, default extent: 32767 steps, the largest coordinate that
 
 __all__ = [
     "EXTENT_M", "POSITION_STEP", "PROFILE_EXTENDED", "PROFILE_PAPER", "PROFILE_PAPER_INTENT", "TAG_LENGTH", "Frame",
-    "Vector", "decode_frame", "encode_frame", "named_in", "position_step",
+    "Vector", "condition_in", "decode_frame", "encode_frame", "named_in", "position_step",
 ]  # fmt: skip
 
 # The structure of libdtsa/frame.h: profile, sender, slot, c_r; position, velocity, intent.
@@ -110,6 +111,16 @@ def named_in(data: bytes) -> tuple[int, int] | None:
         return None
     sender = data[1] if data[0] & 15 == PROFILE_EXTENDED else int.from_bytes(data[1:3], "little")
     return sender, int.from_bytes(data[4:8], "little")
+
+
+def condition_in(data: bytes) -> tuple[bool, bool, bool]:
+    """Whether the sender of a frame leaves, rests, is on probation; frames of other profiles than the extended say no.
+
+    :param data: the bytes of a frame, at least those that :func:`named_in` reads.
+    """
+    if data[0] & 15 != PROFILE_EXTENDED:
+        return False, False, False
+    return data[2] == LEAVING, not data[3] & 1, bool(data[3] & 2)
 
 
 def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:

@@ -82,7 +82,7 @@ class OdometryVehicle:
         self._origin = np.array(settings.odometry_origin)
         self._last: tuple[float, Any, Any] | None = None  # s, monotonic; m, m/s, map: last believed
         self._attitude = (0.0, 0.0, 0.0, 1.0)  # of the same, x, y, z, w
-        self._hold: Any = None  # m, map: where it was first
+        self._hold: Any = None  # m, map: where it was when it began to hover
         kind = TwistStamped if settings.command_type == TWIST else VelocityWorld
         self._publisher = node.create_publisher(kind, settings.command_topic, 1)
         self._feed = Feed(node, Odometry, settings.odometry_topic, _LATEST, intake=self.intake)
@@ -161,8 +161,6 @@ class OdometryVehicle:
         # What was measured is as old as it is: a vehicle at 1 m/s has moved on by centimetres since.
         swarm.position[:, 0] = position + velocity * min(time.monotonic() - since, _LONGEST_PREDICTION_S)
         swarm.track[:, :, 0] = swarm.position[:, 0]
-        if self._hold is None:
-            self._hold = position
 
     def fly(self, swarm: AbstractSwarm, slot: int) -> None:
         """See Vehicle.
@@ -175,7 +173,11 @@ class OdometryVehicle:
         swarm.steer(slot, 0)
         if self._fresh() is None:
             swarm.command[:, 0] = 0.0
-        elif not swarm.active[0]:
+        elif swarm.active[0]:
+            self._hold = None
+        else:
+            if self._hold is None:
+                self._hold = swarm.position[:, 0].copy()
             swarm.command[:, 0] = np.clip(_HOLD_GAIN * (self._hold - swarm.position[:, 0]), -_HOLD_MPS, _HOLD_MPS)
         self._command(swarm.command[:, 0])
 

@@ -29,9 +29,11 @@ from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings, _socket, s
 from dtsa_agent.air.udp.sockets import StampClock
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.agents.authentication import Authenticator
+from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
 
 KEY = bytes.fromhex("8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4")
 OPEN = SwarmConfig(agents=5, policy="tdma", slot_ms=10.0)
+RESTS = dataclasses.replace(OPEN, policy="lease", anchor_every=2, anchor_rest=1)
 SEALED = dataclasses.replace(OPEN, auth=True, auth_session=3, seed=2**63 - 1)
 SLOT_NS, OWN, UDP = OPEN.slot_ns, 2, UdpSettings(interface="lo", group="239.255.80.80:20080")
 
@@ -96,14 +98,22 @@ class Both:
         slots = self.plain.time
         assert (STATES[state], restarts, corrected) == (slots.state, slots.restarts, slots.corrected)
         assert (corrections, error_ns) == (slots.corrections, self.plain.delay.error_ns)
+        assert self.compiled.timing() == (self.plain.timed, self.plain.off)
+        now = slots.slot(self.clock.local_ns(self.now)) or 0
+        for slot, strict in ((now, True), (now, False), (now + 60, False)):
+            assert self.compiled.contact(slot, strict) == self.plain.contacts.count(slot, strict)
         for slot in (0, 7, 2**32 - 1):
             assert self.compiled.slot_start_ns(slot) == slots.slot_start_ns(slot)
         return taken.fault
 
 
-def framed(sender: int, slot: int) -> bytes:
-    """A frame of an agent with policy tdma."""
-    return encode_frame(Frame(sender, slot, 1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0)))
+def framed(sender: int, slot: int, config: SwarmConfig = OPEN, condition: int = 1) -> bytes:
+    """A frame of an agent; with policy lease it may rest (0), leave (2) or be on probation (3)."""
+    own = Frame(sender, slot, int(condition != 0), (1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    if config.policy != "lease":
+        return encode_frame(own)
+    own = dataclasses.replace(own, sender=min(sender, 254), intent=(0.0, 0.0, 0.0))
+    return encode_extended(ExtendedFrame(own, leaving=condition == 2, probation=condition == 3))
 
 
 _PEERS = st.lists(st.tuples(st.integers(0, 7), st.integers(-(10**9), 10**9)), max_size=4)
@@ -113,6 +123,7 @@ _SAID = st.tuples(
     st.sampled_from((1, 1, 1, 1, 0, 2, 5, -30, 300)),  # slots on
     _LATE,  # arrival after its slot
     st.integers(0, 10**6) | st.sampled_from((400_000_000, 10**9)),  # how late it left
+    st.sampled_from((1, 1, 1, 0, 2, 3)),  # rests, leaves, is on probation
     _PEERS,
     st.none() | st.tuples(st.integers(0, 300), st.integers(1, 255)),  # a changed byte
 )
@@ -120,7 +131,7 @@ _SAID = st.tuples(
 
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    config=st.sampled_from((OPEN, SEALED)),
+    config=st.sampled_from((OPEN, SEALED, RESTS)),
     port=st.sampled_from(PORTS),
     offset=st.integers(-(10**15), 10**15),
     drift=st.sampled_from((0, 50_000, -1_000_000)),
@@ -130,10 +141,10 @@ def test_frames_right_and_wrong_are_heard_as_the_plain_statement_says(
     monkeypatch: pytest.MonkeyPatch, config: SwarmConfig, port: PortProperties, offset: int, drift: int, said: list[Any]
 ) -> None:
     both, slot = Both(config, offset, drift, monkeypatch, port), 100
-    for sender, on, late, left_late, peers, change in said:
+    for sender, on, late, left_late, condition, peers, change in said:
         slot = max(0, slot + on)
         both.now += SLOT_NS
-        data = both.wrapping.wrap(framed(sender, slot), slot, left_late, peers[: port.peers])
+        data = both.wrapping.wrap(framed(sender, slot, config, condition), slot, left_late, peers[: port.peers])
         if change is not None:
             at, by = change[0] % len(data), change[1]
             data = data[:at] + bytes([data[at] ^ by]) + data[at + 1 :]
@@ -141,14 +152,14 @@ def test_frames_right_and_wrong_are_heard_as_the_plain_statement_says(
         both.take(data)
         both.now -= late
         if slot % 3 == 0:
-            told = both.plain.delay.tell()
-            frame = framed(OWN, slot)
+            told = both.plain.tell(slot)
+            frame = framed(OWN, slot, config)
             assert both.compiled.wrap(frame, slot, left_late) == both.wrapping.wrap(frame, slot, left_late, told)
         instant = both.now + late * 1_000_000
         assert both.compiled.local_ns(instant) == both.clock.local_ns(instant)
 
 
-@pytest.mark.parametrize("config", [OPEN, SEALED])
+@pytest.mark.parametrize("config", [OPEN, SEALED, RESTS])
 def test_slots_and_delays_of_a_long_flight_are_those_of_the_plain_statement(
     monkeypatch: pytest.MonkeyPatch, config: SwarmConfig
 ) -> None:
@@ -164,16 +175,18 @@ def test_slots_and_delays_of_a_long_flight_are_those_of_the_plain_statement(
         peers = [(draw.choice((OWN, 1, 4)), draw.randrange(-(10**6), 10**6)) for _ in range(draw.randrange(4))]
         left_late, held_up = draw.randrange(200_000), 2_000_000 * (draw.random() < 0.05)
         both.now = begin + slot * SLOT_NS + ahead + left_late + held_up + draw.randrange(-100_000, 300_000)
-        refused[both.take(both.wrapping.wrap(framed(sender, slot), slot, left_late, peers))] += 1
-        told = both.plain.delay.tell()
-        assert both.compiled.wrap(framed(OWN, slot), slot, 0) == both.wrapping.wrap(framed(OWN, slot), slot, 0, told)
+        frame = framed(sender, slot, config, draw.choice((0, 1, 1, 1, 3)))
+        refused[both.take(both.wrapping.wrap(frame, slot, left_late, peers))] += 1
+        told = both.plain.tell(slot)
+        own = framed(OWN, slot, config)
+        assert both.compiled.wrap(own, slot, 0) == both.wrapping.wrap(own, slot, 0, told)
     _, restarts, corrected, corrections, error_ns, *_ = both.compiled.status()
     assert restarts == 1
     assert corrected >= 2
     assert refused[""] > 1900
     assert corrections > 100
     assert error_ns != 0
-    assert len(both.plain.delay.tell()) == 4
+    assert len(both.plain.tell(2100)) == 4
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -312,7 +325,7 @@ def given_values() -> dict[str, Any]:
         "agents": 5, "id": 2, "anchor_every": 3, "slot_ns": SLOT_NS, "seed": 1, "header": bytes(8), "late_bytes": 2,
         "peers": 4, "key": b"", "session": 0, "flight_ns": 0, "position_step": 0.002, "length": 45,
         "own_bytes": 0, "limit_ns": 1, "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0,
-        "port": NoPort().compiled,
+        "moving": 9, "resting": 9, "named": 9, "port": NoPort().compiled,
     }  # fmt: skip
 
 

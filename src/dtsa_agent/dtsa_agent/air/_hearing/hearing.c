@@ -5,7 +5,7 @@
 #include "frame.h"
 #include "hearing.h"
 
-enum { UNIT = 10000, DOUBTS = 9, SHARE = 64, STEP = 1000000, NAMED = 8 };
+enum { UNIT = 10000, DOUBTS = 9, SHARE = 64, STEP = 1000000, NAMED = 8, NEAR_SLOTS = 8 };
 static const int64_t PPB = 1000000000;
 
 static int64_t floor_div(int64_t a, int64_t b) /* b > 0 */ { return a / b - (a % b < 0); }
@@ -144,19 +144,24 @@ static void delay_reset(hearing *h)
     h->delay.count = 0;
 }
 
-/* What the next datagram says: the others in turn. */
-static void delay_tell(hearing *h, peer told[PEERS])
+static int is_told(const hearing *h, int k, int64_t slot)
+{
+    return h->delay.known[k] & HEARS && contacts_hears(&h->contact, k, slot);
+}
+
+/* What the next datagram says: the others in turn, the last one again. */
+static void delay_tell(hearing *h, int64_t slot, peer told[PEERS])
 {
     const delays *d = &h->delay;
     int heard = 0, count, index = 0;
-    for (int k = 0; k < h->agents; k++) heard += d->known[k] & HEARS;
+    for (int k = 0; k < h->agents; k++) heard += is_told(h, k, slot);
     count = heard < h->peers ? heard : h->peers;
     for (int k = 0; k < h->agents && count; k++) {
-        if (!(d->known[k] & HEARS)) continue;
+        if (!is_told(h, k, slot)) continue;
         const int place = (int)((index++ - d->turn % heard + heard) % heard);
         if (place < count) told[place] = (peer){k + 1, d->hears[k]};
     }
-    h->delay.turn += count;
+    h->delay.turn += count > 1 ? count - 1 : count;
 }
 
 static void put(uint8_t *at, int64_t time, int64_t least, int64_t most)
@@ -171,7 +176,7 @@ void hearing_wrap(hearing *h, const uint8_t *frame, int64_t slot, int64_t late, 
 {
     const long length = h->length - h->head - (h->key_length ? DTSA_TAG_BYTES : 0);
     peer told[PEERS] = {{0, 0}};
-    delay_tell(h, told);
+    delay_tell(h, slot, told);
     memcpy(out, h->header, (size_t)h->agreed);
     if (h->late_bytes) put(out + h->agreed, late, 0, 0xffff);
     for (int i = 0; i < h->peers; i++) {
@@ -182,6 +187,24 @@ void hearing_wrap(hearing *h, const uint8_t *frame, int64_t slot, int64_t late, 
     }
     memcpy(out + h->head, frame, (size_t)length);
     if (h->key_length) make_tag(h, out, length, slot, out + h->head + length);
+}
+
+/* ---- who hears whom, and when ---- */
+
+static void contacts_said(hearing *h, const said *s)
+{
+    int names[PEERS], count = 0;
+    for (int i = 0; i < PEERS; i++)
+        if (s->peers[i].id) names[count++] = s->peers[i].id;
+    contacts_hear(&h->contact, s->sender, s->slot, s->frame, names, count);
+}
+
+static void note_time(hearing *h, int64_t off)
+{
+    if (off < 0) off = -off;
+    if (h->base.state == DTSA_LISTENING || off > NEAR_SLOTS * h->slot_ns) return;
+    h->timed++;
+    h->off += off > h->slot_ns / 4;
 }
 
 /* ---- slots ---- */
@@ -211,16 +234,19 @@ verdict hearing_take(hearing *h, const uint8_t *data, long length, int64_t arriv
     if (h->last[k] == out->slot && h->base.state != DTSA_LISTENING) return REPEATED;
     const int64_t began = clock_local(&h->clock, arrival) - h->flight - out->late;
     const int64_t before = dtsa_timebase_slot_start(&h->base, out->slot);
+    note_time(h, began - h->delay.error - before);
     const int outcome = slots_hear(h, out->slot, began - h->delay.error);
     if (outcome == DTSA_FOREIGN) return OTHER_TIME;
     h->last[k] = out->slot;
     if (outcome == DTSA_RESTARTED) {
         *restarted = 1;
         delay_reset(h);
+        contacts_reset(&h->contact);
     } else {
         delay_hear(h, out, began - before);
         delay_moved(h, dtsa_timebase_slot_start(&h->base, out->slot) - before);
     }
+    contacts_said(h, out);
     return TAKEN;
 }
 
@@ -228,7 +254,12 @@ int hearing_open(hearing *h)
 {
     const size_t n = (size_t)h->agents;
     h->memory = calloc(6 * n, sizeof *h->memory);
-    if (!h->memory) return 0;
+    h->contact.agents = h->agents;
+    h->contact.self = h->self;
+    h->contact.peers = h->peers;
+    h->contact.of = calloc(n, sizeof *h->contact.of);
+    if (!h->memory || !h->contact.of) return hearing_close(h), 0;
+    contacts_reset(&h->contact);
     h->last = h->memory;
     h->delay.hears = h->memory + n;
     h->delay.says = h->memory + 2 * n;
@@ -239,4 +270,8 @@ int hearing_open(hearing *h)
     return 1;
 }
 
-void hearing_close(hearing *h) { free(h->memory); }
+void hearing_close(hearing *h)
+{
+    free(h->memory);
+    free(h->contact.of);
+}

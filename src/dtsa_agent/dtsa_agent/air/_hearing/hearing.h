@@ -6,6 +6,7 @@
 #ifndef DTSA_HEARING_H
 #define DTSA_HEARING_H
 
+#include "contacts.h"
 #include "dtsa.h"
 #include "port.h"
 
@@ -67,7 +68,7 @@ typedef struct hearing {
                                             say how late it left; others told of; all bytes */
     int key_length; /* 0: not sealed */
     uint64_t session;
-    int64_t flight;
+    int64_t flight, slot_ns;
     double position_step;
     int length, own_bytes; /* of a datagram; of these what plug-ins append to a frame */
     own_clock clock;
@@ -76,6 +77,8 @@ typedef struct hearing {
     dtsa_timebase base;
     unsigned corrected;
     delays delay;
+    contacts contact;
+    int64_t timed, off; /* frames of about this time; of these off by over a quarter of a slot */
     int64_t *last; /* (n) slot of the last frame, -1: none */
     int64_t *memory;
 } hearing;

@@ -38,6 +38,7 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     const char *header, *key;
     Py_ssize_t header_length, key_length;
     int id, anchor_every;
+    long long moving, resting, named;
     long long slot_ns, flight, limit, began, offset, drift;
     unsigned long long seed, session;
     hearing *h = PyMem_Calloc(1, sizeof *h);
@@ -45,11 +46,11 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     air_port *port;
     (void)unused;
     if (!h) return PyErr_NoMemory();
-    if (!PyArg_ParseTuple(args, "iiiLKy#iiy#KLdiiLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
+    if (!PyArg_ParseTuple(args, "iiiLKy#iiy#KLdiiLLLLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
                           &seed, &header, &header_length, &h->late_bytes, &h->peers, &key,
                           &key_length, &session, &flight, &h->position_step, &h->length,
                           &h->own_bytes, &limit, &began, &offset,
-                          &drift, &capsule))
+                          &drift, &moving, &resting, &named, &capsule))
         goto failed;
     port = PyCapsule_GetPointer(capsule, DTSA_PORT);
     if (!port) goto failed;
@@ -72,7 +73,11 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     h->key_length = (int)key_length;
     h->session = session;
     h->flight = flight;
+    h->slot_ns = slot_ns;
     h->delay.limit = limit;
+    h->contact.moving = moving;
+    h->contact.resting = resting;
+    h->contact.named = named;
     h->clock = (own_clock){began, offset, drift};
     if (!hearing_open(h)) {
         PyErr_NoMemory();
@@ -321,6 +326,20 @@ static PyObject *status(PyObject *self, PyObject *unused)
                          h->base.aligner.corrections, (long long)h->delay.error);
 }
 
+static PyObject *contacts_at(PyObject *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t v[2];
+    if (!whole(args, count, 2, v)) return NULL;
+    const contact_count n = contacts_count(&of(self)->contact, v[0], v[1] != 0);
+    return Py_BuildValue("(iiii)", n.there, n.hears, n.heard_by, n.both);
+}
+
+static PyObject *timing(PyObject *self, PyObject *unused)
+{
+    (void)unused;
+    return Py_BuildValue("(LL)", (long long)of(self)->timed, (long long)of(self)->off);
+}
+
 static PyObject *listening(PyObject *self, void *unused)
 {
     (void)unused;
@@ -346,6 +365,8 @@ static PyMethodDef METHODS[] = {
     {"local_ns", FAST(local_ns)},
     {"wrap", wrap, METH_VARARGS, NULL},
     {"status", status, METH_NOARGS, NULL},
+    {"contact", FAST(contacts_at)},
+    {"timing", timing, METH_NOARGS, NULL},
     {0},
 };
 

@@ -86,6 +86,11 @@ class Newcomers:
         self._since: NDArray[np.int64] = np.full(count, -1, dtype=np.int64)  # first slot, -1: not new
         self._some = False  # most processes never have any
 
+    @property
+    def some(self) -> bool:
+        """Whether any is new."""
+        return self._some
+
     def add(self, swarm: AbstractSwarm, index: Any, slot: int) -> None:
         """An agent begins anew, knowing nothing.
 

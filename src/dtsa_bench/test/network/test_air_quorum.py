@@ -1,0 +1,116 @@
+"""Integration: agents over UDP that do not hear enough of the others, or are not heard, hover and say so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import air_helpers as helpers
+import pytest
+from waiting import wait_for
+
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.air.udp import UdpSettings
+from dtsa_agent.core import SwarmConfig
+from dtsa_bench.recordings.merge.agent_bag import read
+from dtsa_bench.recordings.merge.merge import Merge, verified
+
+CONFIG = SwarmConfig(agents=4, policy="tdma", slot_ms=20.0)  # a frame counts for 40 slots
+FAST, SLOW = 0.05, 0.001  # m/s
+
+
+@pytest.fixture
+def groups() -> tuple[str, str]:
+    helpers.need_multicast()
+    return helpers.own_group(), helpers.own_group()
+
+
+@contextmanager
+def flying(
+    groups: tuple[str, str], directory: Path, config: SwarmConfig = CONFIG, quorum: str = "all-but-one"
+) -> Iterator[list[helpers.Flying]]:
+    """Agents of the first group, and the last agent in the second group."""
+    agents: list[helpers.Flying] = []
+    try:
+        for agent in range(1, config.agents + 1):
+            udp = UdpSettings(interface="lo", group=groups[agent == config.agents])
+            own = AgentSettings(id=agent, quorum=quorum)
+            agents.append(helpers.Flying(own, config, udp, directory / f"cf{agent}.mcap"))
+        yield agents
+    finally:
+        for one in agents:
+            one.end()
+
+
+def go_on(agent: helpers.Flying, slots: int) -> None:
+    """An agent goes on for so many slots."""
+    seen = len(agent.slots)
+    wait_for(lambda: len(agent.slots) > seen + slots)
+
+
+@pytest.mark.parametrize("deaf", [True, False])
+def test_an_agent_whose_frames_are_lost_one_way_hovers_in_flight_and_flies_on_when_they_come(
+    groups: tuple[str, str], tmp_path: Path, deaf: bool
+) -> None:
+    link = helpers.TwoWays(*groups)
+    try:
+        with flying(groups, tmp_path) as agents:
+            *others, cut = agents
+            wait_for(lambda: all(agent.speed > FAST for agent in agents))
+            if deaf:
+                link.to_far = False
+            else:
+                link.to_near = False
+            wait_for(lambda: any(line.startswith("hovers: ") for line in cut.said))
+            wait_for(lambda: cut.speed < SLOW)
+            line = next(line for line in cut.said if line.startswith("hovers: "))
+            assert ("hears 0 of 3" in line) == deaf
+            assert deaf or "hears 3 of 3" in line
+            assert "(quorum 2)" in line
+            assert not any("hovers" in line for agent in others for line in agent.said)  # one may be missing
+            link.to_far = link.to_near = True
+            wait_for(lambda: any(line.startswith("flies on: ") for line in cut.said))
+            wait_for(lambda: cut.speed > FAST)
+    finally:
+        link.end()
+    summary = cut.agent.summary()
+    assert summary["held_slots"] > 20
+    assert summary["quorum"] == "all-but-one"
+    assert [agent.agent.summary()["held_slots"] for agent in others] == [0, 0, 0]
+    found = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in range(1, 5)]).judge()
+    assert verified(found), found["decisions_again"]
+
+
+def test_an_agent_that_nobody_has_heard_does_not_begin_to_fly(groups: tuple[str, str], tmp_path: Path) -> None:
+    """It hears the others after 100 ms, and they do not hear it."""
+    link = helpers.OneWay(*groups, 0.1)
+    try:
+        with flying(groups, tmp_path) as agents:
+            *others, far = agents
+            wait_for(lambda: all(agent.speed > FAST for agent in others))
+            wait_for(lambda: any(line.startswith("hovers: ") for line in far.said))
+            go_on(far, 50)
+            assert far.speed < 1e-9
+    finally:
+        link.end()
+    summary = far.agent.summary()
+    assert summary["held_at_start_slots"] > 50
+    assert summary["held_slots"] == 0
+    assert not summary["arrived"]
+
+
+@pytest.mark.parametrize(("quorum", "flies"), [("0", True), ("all-but-one", True), ("1", False)])
+def test_an_agent_that_is_alone_flies_unless_others_have_to_be_there(
+    groups: tuple[str, str], tmp_path: Path, quorum: str, flies: bool
+) -> None:
+    udp = UdpSettings(interface="lo", group=groups[0])
+    alone = helpers.Flying(AgentSettings(id=1, quorum=quorum), CONFIG, udp, tmp_path / "cf1.mcap")
+    try:
+        if flies:
+            wait_for(lambda: alone.speed > FAST)
+        else:
+            wait_for(lambda: "hovers: hears 0 of 0, is heard by 0 (quorum 1)" in alone.said)
+            assert alone.speed < SLOW
+    finally:
+        alone.end()
