@@ -148,6 +148,9 @@ class Trial:
                 shutil.copytree(flown / f"cf{k}", self.directory / f"cf{k}")
         self.dtsa("merge", *(f"cf{k}" for k in range(1, AGENTS + 1)), "--out", "flight", makes="flight/bag")
         self.dtsa("verify", "flight")
+        self.dtsa("losses", "flight", "--out", "losses.json", makes="losses.json")
+        losses = ("--agents", str(AGENTS), "--slot-ms", str(self.installed.slot_ms), "--losses", "losses.json")
+        self.dtsa("simulate", *losses, "--timeout-s", "3", "--json", says='"policy"')
         self.dtsa("report", "flight", makes="flight/report.html")
         self.recovered()
         for words, extra in (

@@ -15,6 +15,7 @@ COMMANDS = {
     "verify": "check a bag: was every decision what the protocol says?",
     "sniff": "listen to agents on a real network, record and judge what they send",
     "merge": "the bags of agents on a real network as one flight: one time line, results, decisions made again",
+    "losses": "what each link lost in recorded flights: rates, bursts, distances, as a channel to fly in",
     "recover": "make a readable bag of what a killed recorder left behind",
     "view": "a swarm in the browser: a recorded run, one that is being recorded, one on the ROS graph or a network",
     "report": "one web page about one or several recorded runs",

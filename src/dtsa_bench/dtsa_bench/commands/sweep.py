@@ -36,6 +36,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--first-seed", metavar="N", help="first of them [1001]")
     parser.add_argument("--jobs", metavar="N", help="processes [all cores]")
     parser.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], help="change a setting of the base")
+    parser.add_argument("--losses", metavar="FILE", help="fly in losses that were measured, as simulate --losses does")
     parser.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
     parser.add_argument("--no-report", action="store_true", help="only results.csv and results.json")
     parser.add_argument(
@@ -83,7 +84,7 @@ def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     changes = {
         "seeds": None if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1_000_000),
         "first_seed": None if args.first_seed is None else whole_number(args.first_seed, "first-seed", 0, 2**62),
-        "base": _base(args.set),
+        "base": _base(args.set) | ({"losses": args.losses} if args.losses else {}),
     }
     if args.file:
         return [spec.load_file(args.file, **changes)]

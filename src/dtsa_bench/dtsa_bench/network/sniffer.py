@@ -15,11 +15,11 @@ from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
+from dtsa_bench.recordings.losses.sniffed import FRAME, METADATA
 from dtsa_bench.recordings.merge.agent_recorder import about_port
 from dtsa_bench.recordings.merge.json_bag import JsonBag, described
 from dtsa_bench.recordings.rules.judge import Judge
 
-FRAME, METADATA = "frame", "dtsa_sniffer"
 FRAME_SCHEMA = described(
     "dtsa.SniffedFrame",
     arrival_ns=("integer", "when it arrived, ns, CLOCK_MONOTONIC"),

@@ -34,7 +34,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
             group = groups.get(title) or groups.setdefault(title, parser.add_argument_group(title))
             _offer(group, setting, section, "", derived)
         if section == "channel":
-            group.add_argument(
+            groups[_TITLES[section]].add_argument(
                 "--channel",
                 metavar="FILE",
                 default=None,
@@ -100,7 +100,7 @@ def _add(group: Any, setting: Setting, section: str, prefix: str) -> None:
     if setting.kind == "bool":
         group.add_argument(option, dest=where, action=argparse.BooleanOptionalAction, default=None, help=text)
         return
-    metavar = {"int": "N", "float": "X", "values": "NAME=X,..."}.get(
+    metavar = {"int": "N", "float": "X", "values": "NAME=X,...", "file": "FILE"}.get(
         setting.kind, "NAME" if setting.choices else "TEXT"
     )
     action = group.add_argument(option, dest=where, metavar=metavar, default=None, help=text)

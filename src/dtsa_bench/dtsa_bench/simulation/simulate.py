@@ -82,6 +82,7 @@ def may_share(run: RunConfig) -> bool:
         or air.capture_db
         or air.loss_matrix
         or air.link_loss
+        or air.losses
         or air.schedule
     )
     return lossless and shareable(swarm)

@@ -13,6 +13,8 @@ from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, bu
 
 from .airtime import Airtime
 from .gilbert import GilbertElliott
+from .loss_file import losses_of
+from .measured import MeasuredLosses
 from .radio_table import RADIOS, airtime_of
 from .schedule import Change, listed
 from .timeline import check_schedule
@@ -53,6 +55,13 @@ class ChannelConfig(Settings):
     )
     p_good: float = setting(0.0, "loss within a good phase", minimum=0.0, maximum=1.0, changeable=True)
     p_bad: float = setting(1.0, "loss within a bad phase", minimum=0.0, maximum=1.0, changeable=True)
+    losses: MeasuredLosses | str = setting(
+        "",
+        "file of losses that were measured, on top of all others: what `losses` has written, or a table (.csv) that is "
+        "replayed slot by slot",
+        kind="file",
+        custom=True,
+    )
     jam: bool = setting(False, "all frames are lost", changeable=True)
     partition: str = setting(
         "", 'groups that do not hear each other, as "1-6 | 7-12"; empty: all together', changeable=True, custom=True
@@ -64,6 +73,7 @@ class ChannelConfig(Settings):
         minimum=0.0,
         maximum=1e6,
         changeable=True,
+        group="Reach and radio",
     )
     interference_factor: float = setting(
         1.0, "a frame disturbs others up to this many times range_m", minimum=1.0, maximum=100.0
@@ -109,6 +119,13 @@ class ChannelConfig(Settings):
             "link_loss",
             tuple(LinkLoss.from_dict(entry, self.agents, f"link_loss[{i}]") for i, entry in enumerate(links)),
         )
+        object.__setattr__(self, "losses", losses_of(self.losses, self.slot_ns))
+        if isinstance(self.losses, MeasuredLosses):
+            self.losses.check(self.agents, self.slot_ns)
+            if self.burst_length:
+                raise ConfigError(
+                    "burst_length", self.burst_length, "0 together with losses, which have their own bursts"
+                )
         if self.burst_length:
             GilbertElliott.from_means(self.loss, self.burst_length, self.p_good, self.p_bad)
         entries = listed(self.schedule, "schedule")

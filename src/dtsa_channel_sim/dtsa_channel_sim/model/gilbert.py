@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,10 +67,36 @@ class GilbertElliott:
         return cls(share, leave * share / (1.0 - share), leave)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkChains:
+    """The numbers of a chain of its own for each directed link, (N, N), row = sender, column = receiver.
+
+    :param bad_share: as in :class:`GilbertElliott`.
+    :param enter: p of each.
+    :param leave: r of each; p + r is at most 1.
+    """
+
+    bad_share: NDArray[np.float64]
+    enter: NDArray[np.float64]
+    leave: NDArray[np.float64]
+
+
+class _Limits(NamedTuple):
+    """Where words decide: scalars, or one for each receiver (N,)."""
+
+    enter: NDArray[np.uint64]
+    keep: NDArray[np.uint64]
+    share: NDArray[np.uint64]
+
+    def of(self, columns: NDArray[np.intp]) -> _Limits:
+        """Those of some receivers."""
+        return _Limits(*(limit[columns] for limit in self)) if self.enter.ndim else self
+
+
 class Chains:
     """States of the chains of all receivers, or of all links, begun at slot 0 in their long-run mixture.
 
-    :param model: the chain's numbers.
+    :param model: the chain's numbers, or those of each link.
     :param words: the words that drive it.
     :param factors: one constant per sender, indexed by id: makes the words of its links from those of the
         receivers.
@@ -78,24 +105,25 @@ class Chains:
     __slots__ = (
         "_block",
         "_end",
-        "_enter",
         "_factors",
         "_first",
-        "_keep",
         "_known",
-        "_share",
+        "_limits",
         "_step",
         "_words",
     )
 
-    def __init__(self, model: GilbertElliott, words: WordBlocks, factors: Sequence[np.uint64]) -> None:
+    def __init__(self, model: GilbertElliott | LinkChains, words: WordBlocks, factors: Sequence[np.uint64]) -> None:
         self._words = words
         self._factors = factors
-        self._enter = threshold(model.enter)
-        self._keep = threshold(1.0 - model.leave)
-        self._share = threshold(model.bad_share)
+        limits = _Limits(threshold(model.enter), threshold(1.0 - model.leave), threshold(model.bad_share))
+        if isinstance(model, LinkChains):
+            rows = [_Limits(*row) for row in zip(*limits, strict=True)]
+            self._limits = [rows[0], *rows]  # by the sender's id; index 0 is not used
+        else:
+            self._limits = [limits] * (words.agents + 1)
         # Enough slots to settle all links of a sender most of the time, in one look back.
-        kept = max(0.0, 1.0 - model.leave - model.enter)
+        kept = float(np.max(np.maximum(0.0, 1.0 - model.leave - model.enter)))
         decay = max(-math.log(kept), 1e-9) if kept > 0.0 else 40.0
         self._step = int(min(words.rows, max(8.0, (math.log(words.agents) + 2.0) / decay)))
         self._first = self._end = 0
@@ -124,12 +152,12 @@ class Chains:
             return before
         if floor > slot or before is None:
             floor, before = -1, None
-        bad = self._look_back(slot, self._factors[sender], floor, before)[None]
+        bad = self._look_back(slot, self._factors[sender], self._limits[sender], floor, before)[None]
         bad.setflags(write=False)
         self._known[sender] = (slot, bad)
         return bad
 
-    def _look_back(self, slot: int, factor: np.uint64, floor: int, before: Mask | None) -> Mask:
+    def _look_back(self, slot: int, factor: np.uint64, limits: _Limits, floor: int, before: Mask | None) -> Mask:
         """Return the states (N,) in a slot, from the last word that decided, or ``before`` in ``floor``."""
         agents = self._words.agents
         bad = np.zeros(agents, dtype=np.bool_) if before is None else before[0].copy()
@@ -138,7 +166,9 @@ class Chains:
         while len(todo) and end > floor + 1:
             first = max(floor + 1, end - step)
             words = self._words.span(first, end)
-            value, decided = self._decide((words if len(todo) == agents else words[:, todo]) * factor, first)
+            every = len(todo) == agents
+            some = limits if every else limits.of(todo)
+            value, decided = self._decide((words if every else words[:, todo]) * factor, first, some)
             last = len(words) - 1 - np.argmax(decided[::-1], axis=0)
             columns = np.arange(len(todo))
             known = decided[last, columns]
@@ -147,12 +177,13 @@ class Chains:
             end, step = first, min(2 * step, 4 * self._words.rows)
         return bad
 
-    def _decide(self, words: Words, first: int) -> tuple[Mask, Mask]:
+    @staticmethod
+    def _decide(words: Words, first: int, limits: _Limits) -> tuple[Mask, Mask]:
         """Return (bad, decided) for rows of words that begin with slot ``first``."""
-        bad = words < self._enter
-        decided = bad | (words >= self._keep)
+        bad = words < limits.enter
+        decided = bad | (words >= limits.keep)
         if first == 0:
-            bad[0] = words[0] < self._share
+            bad[0] = words[0] < limits.share
             decided[0] = True
         return bad, decided
 
@@ -160,12 +191,13 @@ class Chains:
         """Work out the states of all receivers in one block of slots."""
         rows = self._words.rows
         first, end = number * rows, (number + 1) * rows
-        bad, decided = self._decide(self._words.span(first, end), first)
+        limits = self._limits[0]
+        bad, decided = self._decide(self._words.span(first, end), first, limits)
         if first > 0:
             if first == self._end:
                 before = self._block[-1]
             else:
-                before = self._look_back(first - 1, np.uint64(1), -1, None)
+                before = self._look_back(first - 1, np.uint64(1), limits, -1, None)
             bad[0] = np.where(decided[0], bad[0], before)
             decided[0] = True
         last = np.where(decided, np.arange(len(bad))[:, None], 0)

@@ -1,4 +1,4 @@
-"""Which receivers lose a frame to noise: independent losses, bursts, and losses of single links."""
+"""Which receivers lose a frame to noise: independent losses, bursts, losses of single links, measured ones."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .config import ChannelConfig
 from .draws import LOSS, STATE, WordBlocks, sender_factors, threshold
 from .gilbert import Chains, GilbertElliott
+from .measured import MeasuredLosses
 from .topology import link_matrix
 
 Mask = NDArray[np.bool_]
@@ -35,22 +36,31 @@ class NoiseSource:
 class Losses:
     """Losses under one set of settings.
 
-    Noise and the loss of a link are independent causes: P(received) = (1 - loss) (1 - link loss).
+    Noise, the loss of a link and a loss that was measured are independent causes:
+    P(received) = (1 - loss) (1 - link loss) (1 - measured loss).
 
     :param config: the settings.
     :param source: the random numbers.
     """
 
-    __slots__ = ("_bad", "_certain", "_chains", "_good", "_per_link", "_source", "none")
+    __slots__ = ("_bad", "_certain", "_chains", "_good", "_per_link", "_record", "_source", "none")
 
     def __init__(self, config: ChannelConfig, source: NoiseSource) -> None:
         self._source = source
         links = link_matrix(config.loss_matrix, config.link_loss, config.agents)
         #: True when no frame is ever lost to noise.
-        self.none = config.loss == 0.0 and links is None
+        measured = config.losses if isinstance(config.losses, MeasuredLosses) else None
+        self.none = config.loss == 0.0 and links is None and measured is None
         self._chains: Chains | None = None
+        self._record = None if measured is None or not measured.record else measured.replay(config.agents)
         self._per_link = config.burst_scope == "link"
-        if config.burst_length and config.loss:
+        if measured is not None and self._record is None:
+            fitted = measured.fitted(config.agents)
+            self._per_link = True
+            self._chains = Chains(fitted.chains, source.state_words, source.state_factors)
+            self._good = _thresholds(config.loss, _both(links, fitted.loss_good), config.agents)
+            self._bad = _thresholds(config.loss, _both(links, fitted.loss_bad), config.agents)
+        elif config.burst_length and config.loss:
             model = GilbertElliott.from_means(config.loss, config.burst_length, config.p_good, config.p_bad)
             factors = source.state_factors if self._per_link else ()
             self._chains = Chains(model, source.state_words, factors)
@@ -59,7 +69,7 @@ class Losses:
         else:
             self._good = self._bad = _thresholds(config.loss, links, config.agents)
         # The plain Gilbert channel needs no second draw: bad loses all, good loses none.
-        self._certain = config.p_good == 0.0 and config.p_bad == 1.0 and links is None
+        self._certain = measured is None and config.p_good == 0.0 and config.p_bad == 1.0 and links is None
 
     def lost(self, slot: int, sender: int) -> Mask:
         """Return who would lose a frame to noise, (1, N); the sender's own entry has no meaning.
@@ -68,7 +78,8 @@ class Losses:
         :param sender: id of the sender.
         """
         if self._chains is None:
-            return self._source.words.row(slot) * self._source.factors[sender] < self._good[sender]
+            lost = self._source.words.row(slot) * self._source.factors[sender] < self._good[sender]
+            return lost if self._record is None else lost | self._record.lost(slot, sender)
         bad = self._chains.links(slot, sender) if self._per_link else self._chains.receivers(slot)
         if self._certain:
             return bad
@@ -82,3 +93,8 @@ def _thresholds(loss: float, links: NDArray[np.float64] | None, agents: int) -> 
         return [threshold(loss)] * (agents + 1)
     both = threshold(1.0 - (1.0 - loss) * (1.0 - links))
     return [both[0], *both]
+
+
+def _both(links: NDArray[np.float64] | None, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the loss of every link by two causes, (N, N)."""
+    return measured if links is None else 1.0 - (1.0 - links) * (1.0 - measured)

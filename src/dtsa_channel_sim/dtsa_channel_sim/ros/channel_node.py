@@ -46,7 +46,7 @@ def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str
     :param config: settings that are the parameters' defaults.
     :raises ConfigError: for values that are not allowed.
     """
-    defaults = {} if config is None else config.to_dict()
+    defaults = {} if config is None else {**config.to_dict(), "losses": str(config.losses)}  # their name
     return declare_settings(node, ChannelConfig, changeable=True, defaults=defaults)
 
 

@@ -16,8 +16,9 @@ from typing import Any, TypeVar
 
 from dtsa_agent.core.errors import ConfigError, range_text
 
-#: What a setting holds. ``vector``: three numbers; ``values``: numbers by name; ``structure``: files only.
-KINDS = ("int", "float", "bool", "text", "vector", "values", "structure")
+#: What a setting holds. ``vector``: three numbers; ``values``: numbers by name; ``file``: the path of one;
+#: ``structure``: files only.
+KINDS = ("int", "float", "bool", "text", "vector", "values", "file", "structure")
 #: The default of a setting that has none.
 REQUIRED: Any = dataclasses.MISSING
 
@@ -162,7 +163,7 @@ class Setting:
         :raises ConfigError: if it is of another kind.
         """
         try:
-            if self.kind == "text":
+            if self.kind in ("text", "file"):
                 return text
             if self.kind == "int":
                 return int(text)

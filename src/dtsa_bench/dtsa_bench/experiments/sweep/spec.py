@@ -19,7 +19,7 @@ from dtsa_agent.core.settings.declaration import Settings, check, setting, setti
 from dtsa_agent.yaml_file import read_yaml
 from dtsa_bench.experiments.batch.task import Task, key_of
 from dtsa_bench.runs.config import FROM_SWARM, RunConfig, RunLimits, from_swarm
-from dtsa_channel_sim import ChannelConfig
+from dtsa_channel_sim import ChannelConfig, MeasuredLosses
 
 from .columns import RESERVED
 
@@ -110,7 +110,7 @@ def cost_of(settings: Mapping[str, Any]) -> float:
     agents = float(settings.get("agents", 12))
     slot_ms = float(settings.get("slot_ms", 10.0))
     slots = min(float(settings.get("timeout_s", 60.0)), 3.0 + agents / 5) * 1000.0 / slot_ms
-    lossy = any(settings.get(name) for name in ("loss", "burst_length", "range_m", "loss_matrix", "schedule"))
+    lossy = any(settings.get(name) for name in ("loss", "burst_length", "range_m", "loss_matrix", "losses", "schedule"))
     policy = POLICIES.row(settings.get("policy", "dtsa"))
     tables = 1.0 if policy.may_share and not lossy else agents
     priority = 0.05 if policy.weighs_all else 0.002
@@ -191,9 +191,28 @@ def make_sweep(
     spec = dataclasses.replace(spec, base={**spec.base, **(base or {})}, seeds=list(chosen))
     levels = [_settings_of_levels(axis, values) for axis, values in spec.axes.items()]
     cells = tuple(_cells(spec.base, list(spec.axes), levels))
-    for cell in cells:
-        cell.run(chosen[0])
+    _check(cells, chosen[0])
     return Sweep(name, spec.title or name, spec.text.strip(), cells, chosen, tuple(spec.axes), spec.figures, spec)
+
+
+def _check(cells: Sequence[Cell], seed: int) -> None:
+    """Checks every run, and puts into its settings what files of losses say: who flies it may not have the files.
+
+    :param cells: the cells.
+    :param seed: any seed.
+    :raises ConfigError: naming what is not usable.
+    """
+    known: dict[tuple[Any, Any], dict[str, Any]] = {}  # by file and length of a slot
+    for cell in cells:
+        losses = cell.settings.get("losses")
+        if not losses or isinstance(losses, Mapping):
+            cell.run(seed)
+            continue
+        key = str(losses), cell.settings.get("slot_ms")
+        cell.settings["losses"] = known.get(key, losses)
+        found = cell.run(seed).air.losses
+        if isinstance(found, MeasuredLosses):
+            cell.settings["losses"] = known.setdefault(key, found.to_dict())
 
 
 def _cells(

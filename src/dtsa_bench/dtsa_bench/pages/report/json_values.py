@@ -20,8 +20,15 @@ def flatten(config: Mapping[str, Any], section: str = "") -> list[list[Any]]:
         if isinstance(value, Mapping) and not section:
             rows.extend(flatten(value, str(name)))
         else:
-            rows.append([section, str(name), value])
+            rows.append([section, str(name), _shown(value)])
     return rows
+
+
+def _shown(value: Any) -> Any:
+    """A setting's value; of a file whose contents it is, the name and the beginning of its hash."""
+    if isinstance(value, Mapping) and {"name", "sha256"} <= value.keys():
+        return f"{value['name']} ({str(value['sha256'])[:12]})"
+    return value
 
 
 def reduce_bins(values: NDArray[Any], how: Any) -> NDArray[np.float64]:
