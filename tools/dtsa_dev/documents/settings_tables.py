@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
+from dtsa_agent.air.serial.settings import SerialSettings
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp.settings import UdpSettings
 from dtsa_agent.core.errors import ConfigError
@@ -147,6 +148,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "AgentSettings": partial(settings_table, AgentSettings),
     "VehicleSettings": _vehicle,
     "UdpSettings": partial(settings_table, UdpSettings),
+    "SerialSettings": partial(settings_table, SerialSettings),
     "robots": partial(settings_table, RobotSettings, skip=("name", "id")),
     "battery": partial(settings_table, BatterySettings),
     "station": partial(settings_table, StationSettings),

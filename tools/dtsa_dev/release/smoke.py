@@ -156,6 +156,7 @@ class Trial:
         for words, extra in (
             (("export", "flight"), "tables"),
             (("view", "flight"), "view"),
+            (("sniff", "--air", "serial", "--device", "x", "--no-seal"), "serial"),
             (("sweep", "--file", "sweep.yaml", "--out", "far", "--cluster", "tcp://127.0.0.1:1"), "cluster"),
         ):
             self.dtsa(*words, code=2, says=f"pip install 'dtsa[{extra}]'")

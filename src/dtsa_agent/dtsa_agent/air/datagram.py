@@ -21,11 +21,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from dtsa_agent.core.agents.authentication import Authenticator
+from dtsa_agent.core.agents.pacing import BETWEEN
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import named_in
+from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.agreement import agreed_settings, settings_hash
 from dtsa_agent.core.settings.config import SwarmConfig
 
@@ -48,7 +51,18 @@ def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
     :param config: what all agents share.
     :param port: what carries the frames.
     """
-    return port.flight_time_ns + port.byte_time_ns * (port.header(config.auth).size + config.frame_length)
+    length = port.header(config.auth).size + config.frame_length
+    return port.flight_time_ns + port.byte_time_ns * length + port.turn_ns * config.agents // 2  # half a round
+
+
+def shortest_slot_ns(config: SwarmConfig, port: PortProperties) -> int:
+    """The shortest slot that a port can carry, ns: a frame that waits for a whole round is there in time.
+
+    :param config: what all agents share.
+    :param port: what carries the frames.
+    """
+    longest = flight_ns(config, port) + port.turn_ns * config.agents // 2
+    return max(port.shortest_slot_ns, round(longest / (1 - BETWEEN)) if port.slots_hold_flights else 0)
 
 
 def frame_in(datagram: bytes, config: SwarmConfig) -> bytes:
@@ -67,8 +81,20 @@ def check_fits(config: SwarmConfig, port: PortProperties) -> None:
     :param port: what is to carry them.
     :raises ConfigError: if they are.
     """
-    if config.slot_ns < port.shortest_slot_ns:
-        raise ConfigError("slot_ms", config.slot_ms, f"at least {port.shortest_slot_ns / 1e6:g} over {port.name}")
+    shortest_ns = shortest_slot_ns(config, port)
+    if config.slot_ns < shortest_ns:
+        allowed = f"at least {-(-shortest_ns // 100_000) / 10:g} over {port.name}"
+        if port.slots_hold_flights:
+            allowed += f" with frames of {config.frame_length} bytes"
+            if config.extended:
+                row = config.policy_row
+                policy = next(other.name for other in POLICIES.rows.values() if not other.extended)
+                short = replace(config, frame="paper", policy=policy if row.extended else row.name)
+                less_ns = shortest_slot_ns(short, port)
+                allowed += (
+                    f", {-(-less_ns // 100_000) / 10:g} with {short.frame_length} (policy {short.policy}, frame paper)"
+                )
+        raise ConfigError("slot_ms", config.slot_ms, allowed)
     room = port.longest - port.header(config.auth).size
     if config.frame_length > room:
         by = f"policy {config.policy}, frame {config.frame}{', sealed' if config.auth else ''}"

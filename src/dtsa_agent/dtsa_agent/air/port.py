@@ -77,6 +77,8 @@ class PortProperties:
     longest: int = 512  # bytes of the longest datagram
     bare_sealed: bool = False  # a sealed frame is the whole datagram: its tag tells the swarm from others
     shortest_slot_ns: int = 0  # shorter slots are refused
+    turn_ns: int = 0  # of radios that take turns by themselves, how long one of them has its turn
+    slots_hold_flights: bool = False  # slots in which a frame may arrive too late for the next one are refused
 
     def header(self, sealed: bool) -> Header:
         """What stands before a frame.

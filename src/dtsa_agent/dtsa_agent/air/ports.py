@@ -23,6 +23,7 @@ _KINDS = {
     "crazyradio": _Kind(
         "crazyradio.settings.CrazyradioSettings", "crazyradio.port.CrazyradioPort", "crazyradio.port.CrazyradioPort"
     ),
+    "serial": _Kind("serial.settings.SerialSettings", "serial.port.SerialPort", "serial.port.SerialPort"),
 }
 AIRS = tuple(_KINDS)
 

@@ -64,6 +64,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
     ),
     "fake-crazyflie": (("--count 12", "twelve vehicles for the official library"),),
+    "fake-modem": (("--dir runs/modems --modem sik-64k --count 3", "three modems: runs/modems/modem1 and so on"),),
     "completion": (
         ("bash > ~/.dtsa-completion.bash", "then, in ~/.bashrc: . ~/.dtsa-completion.bash"),
         ("zsh > ~/.dtsa-completion.zsh", "then, in ~/.zshrc: . ~/.dtsa-completion.zsh"),

@@ -17,6 +17,7 @@ _HOW = {
     **dict.fromkeys(
         ("rclpy", "ament_index_python", "builtin_interfaces", "geometry_msgs", "nav_msgs", "std_msgs"), _ROS
     ),
+    **dict.fromkeys(("serial", "cobs"), "pip install 'dtsa[serial]', or pip install pyserial cobs"),
     "yaml": "apt install python3-yaml, or pip install pyyaml",
     **dict.fromkeys(("numpy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
 }

@@ -22,6 +22,7 @@ COMMANDS = {
     "export": "a bag's contents as CSV or Parquet",
     "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
     "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
+    "fake-modem": "simulated serial modems on pseudo terminals that agents and other programs open",
     "completion": "a script that completes commands, options and their values in bash or zsh",
 }
 

@@ -51,6 +51,16 @@ sys.exit({function}({arguments}))
             "['view', 'x']",
             "aiohttp is missing: pip install 'dtsa[view]'",
         ),
+        *(
+            (
+                package,
+                "dtsa_bench.commands.cli",
+                "main",
+                "['sniff', '--air', 'serial', '--device', 'x', '--no-seal']",
+                f"{package} is missing: pip install 'dtsa[serial]'",
+            )
+            for package in ("serial", "cobs")
+        ),
         ("rclpy", "dtsa_bench.commands.cli", "main", "['demo']", "rclpy is missing: source an installation of ROS 2"),
         ("mcap", "dtsa_bench.entry", "recorded_channel", "", "recorded_channel: error: the Python package mcap"),
         ("dtsa_msgs", "dtsa_bench.entry", "recorded_channel", "", "dtsa_msgs is missing: build the workspace"),

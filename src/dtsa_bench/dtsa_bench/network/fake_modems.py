@@ -1,0 +1,331 @@
+"""Simulated modems on pseudo terminals: half duplex, on the one medium of the simulator, in wall-clock time.
+
+A program opens the pseudo terminal of a modem as it opens a real one. What it writes takes its time on the line, waits
+in the modem's buffer, is on the air as one packet or several, and comes out of all modems that have received it after
+its time on their lines. What overlaps, who is deaf and what is lost says the medium.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import termios
+import threading
+import time
+import tty
+from contextlib import suppress
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dtsa_agent.air.serial.modems import MODEMS, Modem
+from dtsa_agent.core.settings.declaration import Settings, check, setting
+from dtsa_channel_sim import Channel, ChannelConfig
+from dtsa_channel_sim.model.medium import OnAir
+
+_SECOND = 1_000_000_000
+_BITS = 10  # of a byte on the line
+_SLOT_NS = 1_000_000  # of the channel: losses are drawn anew in each
+_PATIENCE_S = 0.2
+_READ = 4096
+_SEND, _END, _OUT = range(3)  # kinds of event
+
+
+@dataclass(frozen=True, slots=True)
+class FakeModemSettings(Settings):
+    """Simulated modems.
+
+    :raises ConfigError: at creation, naming the field, the value and what is allowed.
+    """
+
+    modem: str = setting("sik-64k", "the modem that they are", choices=tuple(MODEMS))
+    count: int = setting(2, "number of modems", minimum=1, maximum=200)
+    baud: int | None = setting(
+        None, "speed of their lines; default: as of their kind", unit="bit/s", minimum=1200, maximum=4_000_000
+    )
+    latency_ms: float = setting(0.0, "for how long a USB adapter keeps bytes", unit="ms", minimum=0, maximum=1000)
+    jitter_ms: float = setting(0.0, "and up to so much longer, anew each time", unit="ms", minimum=0, maximum=1000)
+    garbage: float = setting(0.0, "share of packets before which other bytes come out", minimum=0, maximum=1)
+    echo: bool = setting(False, "modems give back what they are given")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    @property
+    def kind(self) -> Modem:
+        """The modem's row."""
+        return MODEMS[self.modem]
+
+    @property
+    def line_baud(self) -> int:
+        """Speed of the lines."""
+        return self.kind.baud if self.baud is None else self.baud
+
+
+class _Packet(NamedTuple):
+    data: bytes
+    on_air: OnAir
+
+
+@dataclass(slots=True)
+class _One:
+    """One modem."""
+
+    master: int = -1  # of its pseudo terminal; -1: it is unplugged
+    slave: int = -1  # held open, so that its program may come and go
+    buffer: bytes = b""
+    last_ns: int = 0  # when the last byte in the buffer has come over the line
+    sending_ns: int = 0  # until then it sends
+    out_ns: int = 0  # until then its line to the computer is in use
+    due_ns: int = 0  # when it sends next; 0: it has nothing
+
+
+class FakeModems:
+    """Modems that hear each other, in a thread of their own.
+
+    :param settings: what they are.
+    :param channel: losses, groups that do not hear each other; its number of agents counts.
+    :param directory: where ``modem1``, ``modem2``, ... lead to their devices.
+    """
+
+    def __init__(self, settings: FakeModemSettings, channel: ChannelConfig, directory: Path) -> None:
+        self.settings, self._kind = settings, settings.kind
+        self._byte_ns = _BITS * _SECOND // settings.line_baud
+        self._channel, self._began_ns = Channel(channel), time.monotonic_ns()
+        self._draw = random.Random(channel.seed)
+        self._ones = [_One() for _ in range(settings.count)]
+        #: Paths of the devices.
+        self.devices = [directory / f"modem{number}" for number in range(1, settings.count + 1)]
+        self._events: list[tuple[int, int, int, int, bytes]] = []  # a heap: ns, entry, kind, modem, bytes
+        self._entry = 0
+        self._air: list[_Packet] = []  # packets that may still overlap others
+        self._round = (0, 0)  # of their own time division: from when on whose turn it is
+        self._lock = threading.Lock()
+        self._wake_read, self._wake_write = os.pipe()
+        self._stopped = False
+        #: Packets sent, received, lost and destroyed; bytes for which a buffer had no room.
+        self.counts = dict.fromkeys(("packets", "received", "lost", "collided", "overflowed_bytes"), 0)
+        for index in range(settings.count):
+            self._plug(index)
+        self._thread = threading.Thread(target=self._run, name="modems", daemon=True)
+
+    @staticmethod
+    def channel(count: int, **values: Any) -> ChannelConfig:
+        """Settings of the channel of so many modems.
+
+        :param count: number of modems.
+        :param values: settings by name: ``loss``, ``partition``, ``seed`` and others.
+        """
+        return ChannelConfig.from_dict({"agents": count, "slot_ns": _SLOT_NS, **values})
+
+    # -- from outside -----------------------------------------------------------------------------------------------
+    def set(self, **values: Any) -> None:
+        """Changes the channel from now on.
+
+        :param values: settings that may change: ``loss``, ``partition`` and others.
+        """
+        with self._lock:
+            self._channel.advance(self._slot(time.monotonic_ns()))
+            self._channel.set(**values)
+
+    def unplug(self, number: int) -> None:
+        """Takes a modem away from its computer; what it holds is lost.
+
+        :param number: from 1.
+        """
+        with self._lock:
+            one = self._ones[number - 1]
+            self.devices[number - 1].unlink()
+            os.close(one.master)
+            os.close(one.slave)
+            one.master = one.slave = -1
+            one.buffer = b""
+        self._wake()
+
+    def plug(self, number: int) -> None:
+        """Puts a modem back, as another device.
+
+        :param number: from 1.
+        """
+        with self._lock:
+            self._plug(number - 1)
+        self._wake()
+
+    def inject(self, number: int, data: bytes) -> None:
+        """Lets other bytes come out of a modem.
+
+        :param number: from 1.
+        :param data: the bytes.
+        """
+        with self._lock:
+            self._write(number - 1, data)
+
+    def __enter__(self) -> FakeModems:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self._stopped = True
+        self._wake()
+        if self._thread.ident is not None:
+            self._thread.join()
+        for index, one in enumerate(self._ones):
+            if one.master >= 0:
+                self.devices[index].unlink(missing_ok=True)
+                os.close(one.master)
+                os.close(one.slave)
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def _plug(self, index: int) -> None:
+        one = self._ones[index]
+        one.master, one.slave = os.openpty()
+        tty.setraw(one.slave)
+        os.set_blocking(one.master, False)
+        path = self.devices[index]
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(one.slave))
+
+    def _wake(self) -> None:
+        os.write(self._wake_write, b"x")
+
+    # -- the thread -------------------------------------------------------------------------------------------------
+    def _run(self) -> None:
+        while not self._stopped:
+            with self._lock:
+                masters = {one.master: index for index, one in enumerate(self._ones) if one.master >= 0}
+                wait_ns = self._events[0][0] - time.monotonic_ns() if self._events else _SECOND
+            wait_s = min(max(wait_ns, 0) / _SECOND, _PATIENCE_S)
+            ready = select.select([self._wake_read, *masters], [], [], wait_s)[0]
+            now = time.monotonic_ns()
+            with self._lock:
+                for descriptor in ready:
+                    if descriptor == self._wake_read:
+                        os.read(self._wake_read, _READ)
+                    elif self._ones[masters[descriptor]].master == descriptor:
+                        self._read(masters[descriptor], now)
+                while self._events and self._events[0][0] <= now:
+                    self._happen(*heappop(self._events))
+
+    def _at(self, when_ns: int, kind: int, index: int, data: bytes = b"") -> None:
+        self._entry += 1
+        heappush(self._events, (when_ns, self._entry, kind, index, data))
+
+    def _happen(self, when_ns: int, _entry: int, kind: int, index: int, data: bytes) -> None:
+        if kind == _SEND:
+            if when_ns == self._ones[index].due_ns:  # else it was put off
+                self._send(index, when_ns)
+        elif kind == _END:
+            self._end(when_ns, index, data)
+        else:
+            self._write(index, data)
+
+    def _read(self, index: int, now_ns: int) -> None:
+        """A program has written: its bytes come over the line one after the other."""
+        one = self._ones[index]
+        try:
+            data = os.read(one.master, _READ)
+        except OSError:
+            return
+        if self._wrong_speed(one):
+            data = bytes(self._draw.randrange(256) for _ in data)
+        if self.settings.echo:
+            self._out(index, data, now_ns)
+        room = self._kind.buffer - len(one.buffer)
+        self.counts["overflowed_bytes"] += max(0, len(data) - room)
+        data = data[: max(room, 0)]
+        one.buffer += data
+        one.last_ns = max(one.last_ns, now_ns) + len(data) * self._byte_ns
+        self._plan(index, now_ns)
+
+    def _wrong_speed(self, one: _One) -> bool:
+        """Whether the program has set another speed than the modem's."""
+        with suppress(termios.error):
+            speed: int = termios.tcgetattr(one.slave)[5]
+            return speed != getattr(termios, f"B{self.settings.line_baud}", speed)
+        return False
+
+    def _plan(self, index: int, now_ns: int) -> None:
+        """When a modem sends next what it has."""
+        one, kind = self._ones[index], self._kind
+        if not one.buffer:
+            one.due_ns = 0
+            return
+        # Bytes that a program wrote at once are on the line one after the other: a packet is full before the last.
+        first_ns = one.last_ns - max(0, len(one.buffer) - kind.packet) * self._byte_ns
+        ready_ns = first_ns if len(one.buffer) >= kind.packet else one.last_ns + kind.gap_bytes * self._byte_ns
+        due_ns = max(ready_ns, one.sending_ns, now_ns)
+        if kind.turn_ns:
+            due_ns = self._turn(index, due_ns)
+        one.due_ns = due_ns
+        self._at(due_ns, _SEND, index)
+
+    def _turn(self, index: int, when_ns: int) -> int:
+        """When a modem's next turn begins in a time division of their own: who has nothing passes its turn on."""
+        since_ns, whose = self._round
+        turn_ns = self._kind.turn_ns
+        passed = max(0, -(-(when_ns - since_ns) // turn_ns))
+        ahead = (index - whose - passed) % len(self._ones)
+        return since_ns + (passed + ahead) * turn_ns
+
+    def _send(self, index: int, now_ns: int) -> None:
+        one, kind = self._ones[index], self._kind
+        packet, one.buffer = one.buffer[: kind.packet], one.buffer[kind.packet :]
+        if not packet:
+            one.due_ns = 0
+            return
+        air_ns = now_ns + kind.turn_round_ns
+        end_ns = air_ns + kind.on_air_ns(len(packet))
+        one.sending_ns = end_ns
+        self._air.append(_Packet(packet, OnAir(index + 1, now_ns, air_ns, end_ns)))
+        self.counts["packets"] += 1
+        self._at(end_ns, _END, index, packet)
+        if kind.turn_ns:
+            self._round = (end_ns, (index + 1) % len(self._ones))
+            for other in range(len(self._ones)):
+                if self._ones[other].due_ns:
+                    self._plan(other, end_ns)
+        else:
+            self._plan(index, end_ns)
+
+    def _end(self, now_ns: int, index: int, data: bytes) -> None:
+        """A packet has left the air: the medium says who has it."""
+        packet = next(p for p in self._air if p.on_air.sender == index + 1 and p.on_air.end_ns == now_ns)
+        frame = packet.on_air
+        others = [
+            p.on_air
+            for p in self._air
+            if p is not packet and p.on_air.start_ns < frame.end_ns and p.on_air.end_ns > frame.start_ns
+        ]
+        slot = self._slot(frame.start_ns)
+        received, lost, collided = self._channel.medium(slot).judge(slot, frame, others)
+        self._channel.advance(slot)
+        self.counts["lost"] += lost
+        self.counts["collided"] += collided
+        for receiver in received.nonzero()[0].tolist():
+            self.counts["received"] += 1
+            self._out(receiver, data, now_ns)
+        oldest_ns = min((p.on_air.start_ns for p in self._air if p.on_air.end_ns > now_ns), default=now_ns)
+        self._air = [p for p in self._air if p.on_air.end_ns > oldest_ns]
+
+    def _out(self, index: int, data: bytes, now_ns: int) -> None:
+        """A modem gives its computer what it has, and a USB adapter keeps it for a while."""
+        settings, one = self.settings, self._ones[index]
+        if self._draw.random() < settings.garbage:
+            data = self._draw.randbytes(self._draw.randrange(1, 60)) + data
+        one.out_ns = max(one.out_ns, now_ns) + len(data) * self._byte_ns
+        late_ms = settings.latency_ms + settings.jitter_ms * self._draw.random()
+        self._at(one.out_ns + round(late_ms * 1e6), _OUT, index, data)
+
+    def _write(self, index: int, data: bytes) -> None:
+        one = self._ones[index]
+        if one.master >= 0:
+            if self._wrong_speed(one):
+                data = self._draw.randbytes(len(data))
+            with suppress(OSError):  # its program reads nothing: a real line would lose it, too
+                os.write(one.master, data)
+
+    def _slot(self, now_ns: int) -> int:
+        return max(0, now_ns - self._began_ns) // _SLOT_NS
