@@ -17,6 +17,7 @@ from dtsa_agent.core.agents.agent import AgentGroup
 from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.agents.pacing import BETWEEN, LEAD, MOST_EARLY, latest_send_ns, too_long_ns
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
+from dtsa_agent.core.frame import condition_in
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
@@ -239,7 +240,8 @@ class AirAgent:
         accepted = self.swarm.hear(slot, frame)
         if self._awaits and slot >= self.slot:
             self._awaits = False
-        self.tally.heard += accepted
+        if accepted:
+            self.tally.hear(sender, slot, condition_in(frame)[0])
         if self.watcher is not None:
             heard = Heard(sender, slot, arrival, datagram, bool(accepted))
             (self._before if self._record is None else self._record.heard).append(heard)
@@ -313,7 +315,10 @@ class AirAgent:
     def _judge(self, slot: int) -> None:
         """Looks whether it has a quorum, and whether slots are long enough."""
         contact = Contact(*self.hearing.contact(slot, slot < self._first + self._new_slots))
-        self._hold.judge(contact, self._group.newcomers.some, time.monotonic_ns())
+        new = self._group.newcomers.some
+        self._hold.judge(contact, new, time.monotonic_ns())
+        if not new:
+            self.tally.look(contact.there, contact.hears)
         if not self._short_slots.found:
             self._short_slots.judge(*self.hearing.timing())
 
@@ -394,7 +399,7 @@ class AirAgent:
             "slot_ms": self.config.slot_ms,
             "sealed": self.config.auth,
             "no_priority": self._ordinary,
-            **self.tally.summary(),
+            **self.tally.summary(self.slot),
             "state": STATES[state],
             "times_taken_over": restarts,
             "times_corrected": corrected,

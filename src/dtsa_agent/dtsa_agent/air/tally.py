@@ -25,17 +25,50 @@ class Tally:
         self.first_slot = -1  # with which it began for the first time
         self.joined_ns = -1  # CLOCK_MONOTONIC, when
         self._joined_s = 0.0  # processor time until then
+        self._there = self._hears = 0  # others that are there, and of these those that it hears, over all looks
+        self._last: dict[int, int] = {}  # slot of the last frame, by sender
+        self._oldest, self._oldest_of = 0, 0  # slots, and of whom
         self._late = Delays()  # frames sent, by how late they left
         self._on_time = 0
 
     def begun(self, slot: int, now_ns: int) -> None:
-        """It begins, or begins anew.
+        """It begins, or begins anew: then slots count differently, and who was heard before counts as not heard yet.
 
         :param slot: the first slot.
         :param now_ns: ns, CLOCK_MONOTONIC.
         """
         if self.first_slot < 0:
             self.first_slot, self.joined_ns, self._joined_s = slot, now_ns, _processor_s()
+        self._last.clear()
+
+    def hear(self, sender: int, slot: int, leaves: bool) -> None:
+        """A frame of another agent was taken in.
+
+        :param sender: id.
+        :param slot: in which it was sent.
+        :param leaves: it says that it leaves: its silence is no outage.
+        """
+        self.heard += 1
+        if sender in self._last:
+            self._grow(sender, slot)
+        if leaves:
+            self._last.pop(sender, None)
+        else:
+            self._last[sender] = slot
+
+    def _grow(self, sender: int, slot: int) -> None:
+        age = slot - self._last[sender]
+        if age > self._oldest and self._there:
+            self._oldest, self._oldest_of = age, sender
+
+    def look(self, there: int, hears: int) -> None:
+        """How it stands with the others while it flies, or could.
+
+        :param there: number of others that are there.
+        :param hears: of these, those that it hears.
+        """
+        self._there += there
+        self._hears += hears
 
     def sent(self, late_ns: int) -> None:
         """A frame was sent.
@@ -45,8 +78,13 @@ class Tally:
         self._late.add(late_ns)
         self._on_time += late_ns <= _ON_TIME_NS
 
-    def summary(self) -> dict[str, Any]:
-        """The counts as plain values."""
+    def summary(self, slot: int = -1) -> dict[str, Any]:
+        """The counts as plain values.
+
+        :param slot: the present one.
+        """
+        for sender in self._last:
+            self._grow(sender, slot)
         sent = self._late.count()
         used = _processor_s()
         ended = self.ended_ns or time.monotonic_ns()
@@ -65,6 +103,9 @@ class Tally:
                 "max": self._late.largest_ms(),
             },
             "heard": self.heard,
+            "heard_share": self._hears / self._there if self._there else None,
+            "oldest_heard_slots": self._oldest if self._there else None,
+            "oldest_heard_of": self._oldest_of or None,
             "processor_s": used,
             "processor_us_per_slot": (used - self._joined_s) / self.slots * 1e6 if self.slots else None,
             "memory_mb": _memory_mb(),

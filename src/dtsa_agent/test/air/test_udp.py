@@ -387,3 +387,22 @@ def test_an_agent_goes_first_and_what_it_starts_does_not() -> None:
     assert os.sched_getscheduler(0) == before
     with going_first(0) as problem:
         assert (problem, os.sched_getscheduler(0)) == ("", before)
+
+
+def test_the_tally_shows_an_outage() -> None:
+    tally = Tally()
+    tally.begun(100, 1)
+    for slot in (101, 140):  # it is new
+        tally.hear(2, slot, leaves=False)
+    assert (tally.summary(150)["heard_share"], tally.summary(150)["oldest_heard_slots"]) == (None, None)
+    tally.look(2, 2)
+    for slot in range(141, 200, 4):
+        tally.hear(2, slot, leaves=False)
+        tally.hear(3, slot, leaves=False)
+    tally.look(2, 1)
+    tally.hear(3, 260, leaves=True)
+    found = tally.summary(250)
+    assert found["heard"] == 33
+    assert (found["heard_share"], found["oldest_heard_slots"], found["oldest_heard_of"]) == (0.75, 63, 3)
+    assert tally.summary(400)["oldest_heard_of"] == 2  # not heard any more; the other one has left
+    assert tally.summary(400)["oldest_heard_slots"] == 203
