@@ -136,6 +136,12 @@ def _vehicle() -> str:
     return settings_table(VehicleSettings)
 
 
+def _radios() -> str:
+    from .radio_table import radio_table  # flies
+
+    return radio_table()
+
+
 #: What a page may ask for, and what makes it.
 TABLES: dict[str, Callable[[], str]] = {
     "SwarmConfig": partial(grouped_tables, SwarmConfig),
@@ -154,6 +160,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "station": partial(settings_table, StationSettings),
     "positions": partial(settings_table, PositionSettings),
     "safety": partial(settings_table, SafetySettings),
+    "radios": _radios,
     **{f"node {name}": partial(_node, name) for name in NODES},
 }
 
