@@ -24,7 +24,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     from dtsa_bench.runs.options import add_options
 
     parser = subparsers.add_parser("agent", help="one agent on a real network or radio", description=DESCRIPTION)
-    parser.usage = "%(prog)s --id N (--interface NAME | --air serial --device PATH | --air crazyradio --uri URI) [OPTIONS]"
+    parser.usage = "%(prog)s --id N (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
     add_air(parser)
     add_options(parser.add_argument_group("this agent"), AgentSettings, "own")
     add_ports(parser)

@@ -16,7 +16,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     from .agent import add_air, add_ports, add_swarm
 
     parser = subparsers.add_parser("sniff", help="listen to agents on a real network or radio", description=DESCRIPTION)
-    parser.usage = "%(prog)s --interface NAME [OPTIONS]"
+    parser.usage = "%(prog)s (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
     add_air(parser)
     parser.add_argument("--duration-s", metavar="X", default="0", help="for so long; 0: until Ctrl-C [0]")
     add_ports(parser)
