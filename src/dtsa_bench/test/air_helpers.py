@@ -1,4 +1,4 @@
-"""Agents over UDP on the loopback interface, in threads of the test, with a bag each."""
+"""Agents over UDP on the loopback interface, or another port, in threads of the test, with a bag each."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ import pytest
 from waiting import wait_for
 
 from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.port import PortSettings
+from dtsa_agent.air.ports import open_port
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings
+from dtsa_agent.air.udp import MulticastSocket, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.network.sniffer import Sniffer
@@ -51,11 +53,11 @@ def need_multicast() -> None:
 class Flying:
     """One agent in a thread; a watcher of it beside its recorder."""
 
-    def __init__(self, own: AgentSettings, config: SwarmConfig, udp: UdpSettings, path: Path) -> None:
-        self.port = UdpPort(udp)
+    def __init__(self, own: AgentSettings, config: SwarmConfig, settings: PortSettings, path: Path) -> None:
+        self.port = open_port(settings)
         self.said: list[str] = []  # in flight
         self.agent = AirAgent(own, config, self.port, say=self.said.append)
-        self.recorder = AgentRecorder(path, own, config, udp)
+        self.recorder = AgentRecorder(path, own, config, settings)
         self.agent.watcher = self
         self.stop = Stop()
         self.heard: Counter[int] = Counter()  # frames by sender, since it began anew
@@ -92,8 +94,8 @@ class Flying:
 class Sniffing:
     """Somebody who listens, in a thread."""
 
-    def __init__(self, config: SwarmConfig, udp: UdpSettings) -> None:
-        self.sniffer = Sniffer(config, udp)
+    def __init__(self, config: SwarmConfig, settings: PortSettings, *files: Path) -> None:
+        self.sniffer = Sniffer(config, settings, *files)
         self._stop = Stop()
         self._thread = threading.Thread(target=self.sniffer.run, args=(self._stop,))
 

@@ -122,6 +122,8 @@ class DatagramPort(Protocol):
 class Listener(Protocol):
     """What hears the datagrams of a swarm and sends none."""
 
+    say: Callable[[str], None] | None  # is told a line when the port fails or is back
+
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
 
@@ -130,6 +132,9 @@ class Listener(Protocol):
 
         :param most: number of datagrams at a time.
         """
+
+    def counts(self) -> dict[str, int]:
+        """What it counts, by name, for the summary."""
 
     def __enter__(self) -> Listener: ...
 

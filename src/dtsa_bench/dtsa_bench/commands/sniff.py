@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from pathlib import Path
 
 DESCRIPTION = """\
 Listens to a swarm on a network or a radio without taking part, records what it hears, and judges it: two senders in a
@@ -19,6 +21,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.usage = "%(prog)s (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
     add_air(parser)
     parser.add_argument("--duration-s", metavar="X", default="0", help="for so long; 0: until Ctrl-C [0]")
+    parser.add_argument(
+        "--pcap", metavar="FILE", type=Path, help="with --air crazyradio: all packets that it hears, for Wireshark"
+    )
     add_ports(parser)
     add_swarm(parser)
 
@@ -41,7 +46,11 @@ def run(args: argparse.Namespace) -> int:
     port, config = port_of(args), swarm_of(args)
     directory = None if args.out is None else new_directory(args.out)
     path = None if directory is None else directory / "sniffed.mcap"
-    with Stop() as stop, Sniffer(config, port, path) as sniffer:
+
+    def say(line: str) -> None:
+        print(f"dtsa: {line}", file=sys.stderr, flush=True)
+
+    with Stop() as stop, Sniffer(config, port, path, args.pcap, say) as sniffer:
         sniffer.run(stop, duration)
     summary = sniffer.summary()
     text = json.dumps(summary, indent=2) + "\n"
@@ -50,4 +59,6 @@ def run(args: argparse.Namespace) -> int:
     print(text if args.json else "\n".join(lines(summary)) + "\n", end="")
     if sniffer.bag is not None and sniffer.bag.failure:
         raise BagError(sniffer.bag.failure)
+    if sniffer.packets is not None and sniffer.packets.failure:
+        raise BagError(sniffer.packets.failure)
     return 1 if summary["rules_broken"] else 0

@@ -6,19 +6,24 @@ import json
 import select
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.air.crazyradio import CrazyradioSettings
 from dtsa_agent.air.datagram import Wrapping, frame_in
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_listener
-from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 from dtsa_bench.recordings.losses.sniffed import FRAME, METADATA
 from dtsa_bench.recordings.merge.agent_recorder import about_port
 from dtsa_bench.recordings.merge.json_bag import JsonBag, described
 from dtsa_bench.recordings.rules.judge import Judge
+
+from .pcap import PacketFile
 
 FRAME_SCHEMA = described(
     "dtsa.SniffedFrame",
@@ -40,10 +45,22 @@ class Sniffer:
     :param config: the settings that all agents share.
     :param port: what carries the frames.
     :param path: file for what was heard; None: it is only judged.
+    :param pcap: file for all packets that a Crazyradio hears; None: there is none.
+    :param say: is told a line when the port fails or is back; None: nobody is.
     :raises ConfigError: for a port that cannot be used, or without the key of sealed frames.
+    :raises BagError: if a file cannot be made.
     """
 
-    def __init__(self, config: SwarmConfig, port: PortSettings, path: Path | None = None) -> None:
+    def __init__(
+        self,
+        config: SwarmConfig,
+        port: PortSettings,
+        path: Path | None = None,
+        pcap: Path | None = None,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        if pcap is not None and not isinstance(port, CrazyradioSettings):
+            raise ConfigError("pcap", str(pcap), "only with --air crazyradio")
         self._config, self._judge = config, Judge(config)
         self._wrapping = Wrapping(config, authenticator(config), port=port.properties)
         self._slots: dict[int, dict[int, bytes]] = {}  # not judged yet
@@ -51,9 +68,18 @@ class Sniffer:
         self.refused: Counter[str] = Counter()
         self.heard: Counter[int] = Counter()  # frames, by sender
         self._kept = 0  # refused datagrams since the last flush
-        self._listener = open_listener(port)
+        self._listener: Any = open_listener(port)
+        self._listener.say = say
+        self.packets: PacketFile | None = None
         about = {"swarm": json.dumps(config.to_dict(), sort_keys=True), **about_port(port)}
-        self.bag = None if path is None else JsonBag(path, {FRAME: FRAME_SCHEMA}, METADATA, about)
+        try:
+            if isinstance(port, CrazyradioSettings) and pcap is not None:
+                self.packets = PacketFile(pcap, port)
+                self._listener.heard = self.packets.write
+            self.bag = None if path is None else JsonBag(path, {FRAME: FRAME_SCHEMA}, METADATA, about)
+        except DtsaError:
+            self._listener.__exit__()
+            raise
 
     def run(self, stop: Stop, seconds: float = 0.0) -> None:
         """Listens until a signal comes, or for a time.
@@ -101,12 +127,15 @@ class Sniffer:
         return {
             "heard": {f"cf{agent}": count for agent, count in sorted(self.heard.items())},
             "not_taken_in": dict(sorted(self.refused.items())),
+            **self._listener.counts(),
             **self._judge.summary(),
         }
 
     def close(self) -> None:
         """Ends the record, and leaves the air."""
         self._listener.__exit__()
+        if self.packets is not None:
+            self.packets.close()
         if self.bag is not None:
             self.bag.__exit__()
 

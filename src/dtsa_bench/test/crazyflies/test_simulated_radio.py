@@ -15,12 +15,14 @@ from dtsa_bench.crazyflies.simulated.radio.dongle import (
     SCAN_CHANNELS,
     SET_ADDRESS,
     SET_CHANNEL,
+    SET_RADIO_MODE,
     SET_RATE,
+    SET_SNIFFER_ADDRESS,
     Dongle,
 )
 from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, Receiver
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
-from dtsa_bench.crazyflies.simulated.radio.sniffer import Sniffer
+from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import SnifferMode
 
 NULL, SAFELINK = b"\xff", b"\xff\x05\x01"
 PACKET = b"\x3c" + bytes(14)
@@ -49,7 +51,7 @@ class Room:
         ]
         by_id = {first + k: receiver for k, receiver in enumerate(self.receivers)}
         air = RadioAir(first - 1 + len(by_id), self.settings.loss, self.settings.seed)
-        sniffers: dict[int, Sniffer] = {}
+        sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
             Dongle(
                 k,
@@ -188,3 +190,125 @@ def test_what_the_devices_cannot_do() -> None:
         assert (room.exchange(PACKET)[0][1] != b"\0") is there, (device, rate, channel)
         room.dongles[0].request(SCAN_CHANNELS, 0, 125, NULL, 0)
         assert room.dongles[0].scanned == (bytes((channel,)) if there else b"")
+
+
+# -- sniffer mode ----------------------------------------------------------------------------------------------------
+
+SHARED = Station("", 80, "2M", esb.BROADCAST)
+SPOKEN = bytes((0xFF, 0x87)) + bytes(range(60))
+THREE = RadioSettings(dongles=3, request_ms=0.0)
+
+
+@dataclass
+class Ears:
+    """What a host reads of a dongle in sniffer mode, as long as it reads."""
+
+    dongle: Dongle
+    room: Room
+    reads: bool = True
+    packets: list[tuple[int, bytes]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.room.now = 0
+        self.dongle.request(SET_RADIO_MODE, 1, 0, b"", 0)
+        self.dongle.sniffer.give = self._take
+        if self.reads:
+            self.dongle.sniffer.read()
+
+    def _take(self, data: bytes) -> None:
+        self.packets.append((self.room.now, data))
+        if self.reads:
+            self.dongle.sniffer.read()
+
+    @property
+    def payloads(self) -> list[bytes]:
+        return [data[7:] for _, data in self.packets]
+
+
+def sniffing(settings: RadioSettings = THREE, stations: tuple[Station, ...] = ()) -> tuple[Room, list[Ears]]:
+    room = Room(settings, stations)
+    for k in range(settings.dongles):
+        room.tune(k, SHARED)
+    return room, [Ears(dongle, room) for dongle in room.dongles]
+
+
+def test_in_sniffer_mode_a_packet_leaves_within_a_millisecond_and_others_hear_it_whole() -> None:
+    waits = []
+    for seed in range(20):
+        room, (one, two, three) = sniffing(RadioSettings(dongles=3, request_ms=0.0, seed=seed))
+        assert room.exchange(esb.BROADCAST + SPOKEN, at_ns=5_000 * US) == []
+        assert one.packets == []
+        assert two.payloads == three.payloads == [SPOKEN]
+        ((when, data),) = two.packets
+        assert data[:3] == bytes((7 + 62, 45, 0))
+        on_air = (73 + 8 * 62) * 500
+        whole = when - 100 * US  # USB, one way
+        assert int.from_bytes(data[3:7], "little") == pytest.approx(whole / US, abs=2)
+        waits.append(whole - on_air - 5_100 * US)
+    assert min(waits) >= 214 * US + 130 * US
+    assert max(waits) <= 1_040 * US + 245 * US + 130 * US
+    assert max(waits) - min(waits) > 500 * US, "nobody knows when"
+
+
+def test_who_sends_is_deaf_and_two_at_a_time_destroy_each_other() -> None:
+    room, ears = sniffing(RadioSettings(dongles=3, request_ms=0.0, seed=5))
+    lost = 0
+    for number in range(40):
+        at = 5_000 * US * (number + 1)
+        for dongle in (0, 1):
+            room.dongles[dongle].transfer(esb.BROADCAST + SPOKEN[:2] + bytes((number, dongle)), at, lambda _: None)
+        room.run()
+        heard = [{p[3] for p in each.payloads if p[2] == number} for each in ears]
+        assert heard[0] <= {1}
+        assert heard[1] <= {0}
+        lost += len(heard[2]) < 2
+        assert len(heard[2]) != 1 or not heard[0] & heard[1], "the third one has missed what overlapped for all"
+    assert 5 < lost < 40
+
+
+def test_packets_that_are_not_fetched_wait_and_more_than_eight_are_dropped_and_counted() -> None:
+    room = Room(THREE, ())
+    for k in (0, 1):
+        room.tune(k, SHARED)
+    ears = Ears(room.dongles[1], room, reads=False)
+    Ears(room.dongles[0], room)
+    for number in range(12):
+        room.exchange(esb.BROADCAST + SPOKEN[:2] + bytes((number,)), at_ns=5_000 * US * (number + 1))
+    assert ears.packets == []
+    assert room.dongles[1].sniffer.dropped == 4
+    ears.reads = True
+    room.dongles[1].sniffer.read()
+    assert [p[2] for p in ears.payloads] == list(range(8))
+    ears.dongle.request(SET_RADIO_MODE, 0, 0, b"", 0)
+    ears.dongle.request(SET_RADIO_MODE, 1, 0, b"", 0)
+    assert ears.dongle.sniffer.dropped == 0
+
+
+def test_a_sniffer_hears_polls_and_acknowledgements_to_its_two_addresses() -> None:
+    room = Room(THREE, (station(1), station(2)))
+    room.tune(0, room.stations[0])
+    room.tune(1, room.stations[0])
+    room.dongles[1].request(SET_SNIFFER_ADDRESS, 1, 0, room.stations[1].address, 0)
+    ears = Ears(room.dongles[1], room)
+    room.exchange(PACKET)
+    room.tune(0, room.stations[1])
+    room.exchange(PACKET, at_ns=50_000 * US)
+    room.tune(0, station(9))
+    room.exchange(PACKET, at_ns=100_000 * US)
+    empty = bytes((0xF3, 0x01, 45))
+    assert [(data[2], data[7:]) for _, data in ears.packets] == [(0, PACKET), (0, empty), (1, PACKET), (1, empty)]
+
+
+def test_broadcasts_between_crazyflies_are_not_for_the_ground_link() -> None:
+    room, _ = sniffing(THREE, (station(1),))
+    room.exchange(esb.BROADCAST + SPOKEN, at_ns=5_000 * US)
+    assert room.heard == []
+    room.exchange(esb.BROADCAST + PACKET, at_ns=10_000 * US)
+    assert room.heard == [(0, PACKET)]
+    room.exchange(esb.BROADCAST, at_ns=15_000 * US)  # an address alone is no packet
+
+
+def test_a_crazyradio_pa_has_no_sniffer_mode() -> None:
+    room = Room(RadioSettings(dongles=2, device="pa"), ())
+    room.dongles[0].request(SET_RADIO_MODE, 1, 0, b"", 0)
+    assert room.dongles[0].sniffer.tuned is None

@@ -138,11 +138,9 @@ def _found(settings: CrazyradioSettings) -> Any:
     """
     import usb.core
 
+    backend, radio = _backend(settings), settings.place.radio
     try:
-        found = list(
-            usb.core.find(idVendor=_VENDOR, idProduct=_PRODUCT, find_all=True, backend=_backend(settings)) or ()
-        )
-        radio = settings.place.radio
+        found = list(usb.core.find(idVendor=_VENDOR, idProduct=_PRODUCT, find_all=True, backend=backend) or ())
         if len(radio) <= _BY_NUMBER and radio.isdigit():
             chosen = found[int(radio) : int(radio) + 1]
         else:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from dtsa_agent.air import _queue
 from dtsa_agent.air.port import Datagram
+from dtsa_agent.air.precision import going_first
 from dtsa_agent.core.errors import ConfigError
 
 from .dongle import Dongle, DongleError
@@ -16,6 +17,7 @@ from .settings import CrazyradioSettings
 from .stamps import DongleClock
 
 _SECOND = 1_000_000_000
+_PRIORITY = 20
 _LOOK_S = 0.5  # between two looks whether a dongle that has gone is back
 _UNPLUGGED = "the dongle is not there"
 
@@ -38,6 +40,7 @@ class CrazyradioPort:
         self.compiled = _queue.open_queue()
         self._dongle: Dongle | None = Dongle(settings)
         self._others = self._dropped = self._dropped_before = self._unplugged = self._garbled = self._strange = 0
+        self._lock = threading.Lock()  # the thread that reads closes the dongle, another one writes to it
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="crazyradio", daemon=True)
         self._thread.start()
@@ -51,13 +54,13 @@ class CrazyradioPort:
 
         :param data: the datagram.
         """
-        dongle = self._dongle
-        if dongle is None:
-            return _UNPLUGGED
-        try:
-            dongle.write(broadcast(data, self._settings.p2p_port))
-        except DongleError as error:
-            return str(error)
+        with self._lock:
+            if self._dongle is None:
+                return _UNPLUGGED
+            try:
+                self._dongle.write(broadcast(data, self._settings.p2p_port))
+            except DongleError as error:
+                return str(error)
         return ""
 
     def receive(self, most: int) -> list[Datagram]:
@@ -80,6 +83,10 @@ class CrazyradioPort:
 
     # -- the thread that reads --------------------------------------------------------------------------------------
     def _run(self) -> None:
+        with going_first(_PRIORITY):  # as agents do: what they wait for comes by this thread
+            self._serve()
+
+    def _serve(self) -> None:
         while not self._stopped.is_set():
             dongle = self._dongle
             if dongle is None:
@@ -119,10 +126,11 @@ class CrazyradioPort:
             _queue.put(self.compiled, datagram, arrival_ns, False)
 
     def _go(self, dongle: Dongle, why: str) -> None:
-        self._dongle = None
+        with self._lock:
+            self._dongle = None
+            dongle.close()
         self._dropped_before, self._dropped = self._dropped_before + self._dropped, 0
         self._unplugged += 1
-        dongle.close()
         self._tell(f"has gone ({why}): no frame leaves or arrives until it is back")
 
     def _come_back(self) -> None:

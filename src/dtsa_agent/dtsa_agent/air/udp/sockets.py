@@ -202,10 +202,13 @@ class MulticastSocket:
         when, own = self._stamps.arrival_ns, self.address
         return [Datagram(data, when(_stamp(notes)), source == own) for data, notes, _, source in arrived]
 
-    @property
-    def clock_steps(self) -> int:
-        """How often the computer's time of day has been set."""
-        return self._stamps.steps
+    def counts(self) -> dict[str, int]:
+        """Failed reads, how often the clock has been set, and how often the interface was another one."""
+        return {
+            "unreadable": self.unreadable,
+            "clock_steps": self._stamps.steps,
+            "interface_changes": self.interface_changes,
+        }
 
     def close(self) -> None:
         """Leaves the group."""

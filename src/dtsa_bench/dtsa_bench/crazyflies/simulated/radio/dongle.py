@@ -17,7 +17,7 @@ from .agenda import Agenda
 from .air import RadioAir
 from .receiver import Receiver
 from .settings import DEVICES, RadioSettings
-from .sniffer import FIRST_FIRMWARE, Sniffer, Tuned
+from .sniffer_mode import FIRST_FIRMWARE, SnifferMode, Tuned
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_POWER, SET_ARD, SET_ARC = range(1, 7)
 ACK_ENABLE, SET_CARRIER, SCAN_CHANNELS = 0x10, 0x20, 0x21
@@ -58,14 +58,14 @@ class Dongle:
         agenda: Agenda,
         receivers: dict[int, Receiver],
         passes: Callable[[int, bool], bool],
-        sniffers: dict[int, Sniffer],
+        sniffers: dict[int, SnifferMode],
     ) -> None:
         self._radio, self._settings, self._air, self._agenda = radio, settings, air, agenda
         self._receivers, self._passes = receivers, passes
         self.packets = 0  # transfers since the start
         self._busy_ns = 0
         self._scanned = b""
-        self.sniffer = Sniffer(radio, air, agenda, round(settings.usb_ms * 0.5e6), settings.seed)
+        self.sniffer = SnifferMode(radio, air, agenda, round(settings.usb_ms * 0.5e6), settings.seed)
         self.sniffer.arrived = self._broadcast
         sniffers[radio] = self.sniffer
         self._sniffers = sniffers

@@ -31,7 +31,7 @@ from .air import RadioAir
 from .dongle import Dongle
 from .receiver import Receiver
 from .settings import DEVICES, RadioSettings
-from .sniffer import Sniffer
+from .sniffer_mode import SnifferMode
 
 LIST, CLAIM, REQUEST, PACKET, SCANNED, READ, DROPPED = range(7)
 _REQUEST = struct.Struct("<BBHH")
@@ -71,7 +71,7 @@ class RadioSide:
         ]
         by_id = {first + index: receiver for index, receiver in enumerate(self.receivers)}
         air = RadioAir(settings.dongles + len(by_id), settings.loss, settings.seed)
-        sniffers: dict[int, Sniffer] = {}
+        sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
             Dongle(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
             for k in range(1, first)

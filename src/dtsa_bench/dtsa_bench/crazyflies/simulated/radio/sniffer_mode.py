@@ -40,7 +40,7 @@ class Tuned(NamedTuple):
     addresses: tuple[bytes, bytes]  # of the pipes
 
 
-class Sniffer:
+class SnifferMode:
     """A dongle in this mode.
 
     :param radio: its id on the air.
