@@ -5,7 +5,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 NAME = "dtsa_bench"
-ASSETS = ["html", "js", "css", "json", "yaml", "svg"]
+ASSETS = ["html", "js", "css", "json", "yaml", "svg", "c", "h"]
 
 setup(
     name=NAME,

@@ -30,6 +30,11 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--file own.yaml --json", "a sweep of your own, its groups as JSON"),
         ("--preset loss --paper pdf", "with figures and tables for a paper"),
     ),
+    "peer-lab": (
+        ("beacons --agents 12 --seconds 20", "twelve vehicles that broadcast their states"),
+        ("dtr --loss 0.1 --polls 10", "a token ring with lost frames, beside a ground station that polls"),
+        ("my_app --source lib/more.c --include lib --out runs/lab", "an app of your own, with files"),
+    ),
     "new-plugin": (("my-policy --out plugins/my-policy", "then as its README.md says"),),
     "replay": (
         ("runs/a", "in real time"),

@@ -23,6 +23,7 @@ COMMANDS = {
     "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
     "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
     "fake-modem": "simulated serial modems on pseudo terminals that agents and other programs open",
+    "peer-lab": "copies of a Crazyflie app (C) on this machine: peer to peer, in virtual time",
     "completion": "a script that completes commands, options and their values in bash or zsh",
 }
 

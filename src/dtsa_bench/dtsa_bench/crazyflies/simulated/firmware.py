@@ -25,7 +25,7 @@ FLY = "fly"  # follows a velocity command
 LEVEL = "level"  # attitude level: drifts on, only drag slows it down; height is still controlled
 
 POSITION_GAIN = 2.0  # 1/s
-PRIORITY_NONE, PRIORITY_LOWEST, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 1, 2
+PRIORITY_NONE, PRIORITY_LOWEST, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 1, 2  # an app's may be higher
 
 
 @dataclass(slots=True)
@@ -141,17 +141,33 @@ class Firmware:
         *_, thrust = struct.unpack_from("<3fH", data)
         self._accept(Setpoint(t, velocity=(0.0, 0.0, 0.0), motors=thrust > 0))
 
+    @property
+    def priority(self) -> int:
+        """Priority of the source whose setpoint counts."""
+        return self._priority
+
     def _accept(self, setpoint: Setpoint) -> None:
-        self._priority = PRIORITY_STREAM
+        self.offer(setpoint, PRIORITY_STREAM)
+
+    def offer(self, setpoint: Setpoint, priority: int) -> bool:
+        """Take a setpoint from a source; False: one of a higher priority counts.
+
+        :param priority: of the source.
+        """
+        if priority < self._priority:
+            return False
+        self._priority = priority
         self.setpoint = setpoint
-        self.planner.stop()
-        if not self._streaming:
-            self._streaming = True
-            self._report("streaming")
+        if priority > PRIORITY_HIGH_LEVEL:
+            self.planner.stop()
+            if not self._streaming:
+                self._streaming = True
+                self._report("streaming")
+        return True
 
     def notify_stop(self) -> None:
         """The stream of setpoints is over: high-level commands count again."""
-        if self._priority == PRIORITY_STREAM:
+        if self._priority > PRIORITY_HIGH_LEVEL:
             self._priority = PRIORITY_LOWEST
             self._streaming = False
             self._report("stream ended")
@@ -255,7 +271,8 @@ class Firmware:
             height = s.height if s.height is not None else position[2]
             return c * vx - n * vy, n * vx + c * vy, _limit(POSITION_GAIN * (height - position[2]))
         if s.position is None:
-            return s.velocity or (0.0, 0.0, 0.0)
+            x, y, z = s.velocity or (0.0, 0.0, 0.0)
+            return x, y, z if s.height is None else _limit(POSITION_GAIN * (s.height - position[2]))
         # With a speed of its own (planner, full state) the correction is added to it and not limited to 1 m/s.
         error = [POSITION_GAIN * (s.position[i] - position[i]) for i in range(3)]
         if s.velocity is None:

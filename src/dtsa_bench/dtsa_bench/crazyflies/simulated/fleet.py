@@ -11,32 +11,22 @@ import selectors
 import socket
 import time
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings.flight_models import flight_model
 from dtsa_bench.crazyflies.simulated.radio.side import Host, RadioSide
 
 from .cameras import Cameras
 from .control import check_fault
-from .estimate import Estimate
-from .firmware import OFF, Firmware
 from .fleet_config import FleetConfig
 from .peer import Peer
-from .position_filter import PositionFilter
 from .truth import TruthLog
-from .vehicles import Vehicles
+from .world import TICK_S, World
 
-TICK_S = 0.01
 NUMBERS = ("rate", "direction", "voltage", "distance", "seconds")
 MAX_LAG_S = 0.5  # a machine that lags further behind skips time, and the record says so
-POSITION_NOISE_M = 0.002
-VELOCITY_NOISE_MPS = 0.01
-IMU_NOISE_MPS2 = 0.2  # with vibrations
 
 
 @dataclass(slots=True)
@@ -79,26 +69,15 @@ class Fleet:
             self.close()
             raise ConfigError("truth", str(config.truth), f"a file that can be written ({error.strerror})") from error
         self.tick = 0
-        vehicle = flight_model(config.model).vehicle
-        self.vehicles = Vehicles(config.start, vehicle)
-        self.firmware = [
-            Firmware(partial(self._report, k), vehicle.tau, auto_arming=config.arms_itself(k))
-            for k in range(config.count)
-        ]
-        host = config.positions == "host"
-        self.estimates = [Estimate(filter=PositionFilter() if host else None) for _ in range(config.count)]
+        self.world = World(config, self._report)
+        self.vehicles, self.firmware, self.estimates = self.world.vehicles, self.world.firmware, self.world.estimates
         self.peers = [
             Peer(f, e, config.protocol, k)
             for k, (f, e) in enumerate(zip(self.firmware, self.estimates, strict=True), 1)
         ]
         self.cameras = Cameras(config.tracking_port, config.count) if config.tracking_port else None
-        streams = np.random.SeedSequence(config.seed).spawn(3)
-        self._noise = np.random.default_rng(streams[0])
-        self._imu = np.random.default_rng(streams[2])
-        self._loss = np.random.default_rng(streams[1])
-        self._close_pairs: set[tuple[int, int]] = set()
+        self._loss = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(3)[1])
         self._running = True
-        self._estimate()
 
     # -- life cycle -------------------------------------------------------------------------------------------------
     def _bind(self, port: int) -> socket.socket:
@@ -171,18 +150,7 @@ class Fleet:
     # -- motion -----------------------------------------------------------------------------------------------------
     def step(self) -> None:
         """Fly for one tick of 10 ms and send what is due."""
-        t = self.time
-        modes, command = [], np.zeros_like(self.vehicles.position)
-        for k, firmware in enumerate(self.firmware):
-            mode, wanted = firmware.step(t, TICK_S, self.estimates[k].position, self.estimates[k].velocity)
-            modes.append(mode)
-            command[:, k] = wanted
-        for k in self.vehicles.step(TICK_S, modes, command):
-            self._report(k, "hard landing")
-            self.firmware[k].supervisor.tumbled = True
-        self.tick += 1
-        self._estimate()
-        self._proximity(modes)
+        self.world.step(self.time, self._tick)
         self.truth.positions(self.time, self.vehicles.position)
         if self.cameras is not None:
             self.cameras.look(self.vehicles.position, [f.yaw for f in self.firmware])
@@ -191,42 +159,8 @@ class Fleet:
             if link.heal_at is not None and self.time >= link.heal_at:
                 self._apply("heal", k, {})
 
-    def _estimate(self) -> None:
-        state = np.concatenate([self.vehicles.position, self.vehicles.velocity])
-        if self.config.noise:
-            noise = self._noise.standard_normal(state.shape)
-            state[:3] += POSITION_NOISE_M * noise[:3]
-            state[3:] += VELOCITY_NOISE_MPS * noise[3:]
-        acceleration = self.vehicles.acceleration.T.tolist()
-        if self.config.positions == "host":
-            measured = self.vehicles.acceleration + IMU_NOISE_MPS2 * self._imu.standard_normal((3, self.config.count))
-            for estimate, row in zip(self.estimates, measured.T.tolist(), strict=True):
-                assert estimate.filter is not None
-                estimate.filter.predict(TICK_S, (row[0], row[1], row[2]))
-        for k, (row, a) in enumerate(zip(state.T.tolist(), acceleration, strict=True)):
-            estimate = self.estimates[k]
-            position, velocity = (row[0], row[1], row[2]), (row[3], row[4], row[5])
-            if estimate.filter is not None:
-                position, velocity = estimate.filter.position, estimate.filter.velocity
-            estimate.tell(position, velocity, (a[0], a[1], a[2]))
-
-    def _proximity(self, modes: list[str]) -> None:
-        """Two flying vehicles that come too close, and what that does to them."""
-        flying = [k for k, mode in enumerate(modes) if mode != OFF and self.vehicles.position[2, k] > 0.05]
-        p = self.vehicles.position[:, flying]
-        gap: NDArray[np.float64] = p[:, :, None] - p[:, None, :]
-        distance = np.sqrt((gap * gap).sum(axis=0))
-        near = set()
-        for i, j in np.argwhere(np.triu(distance < self.config.collision_m, 1)):
-            a, b, d = flying[i], flying[j], float(distance[i, j])
-            near.add((a, b))
-            if (a, b) not in self._close_pairs:
-                self._report(a, "collision", other=b + 1, distance=round(d, 3))
-            if d < self.config.crash_m:
-                for k in (a, b):
-                    self._report(k, "crash")
-                    self.firmware[k].supervisor.tumbled = True
-        self._close_pairs = near
+    def _tick(self) -> None:
+        self.tick += 1
 
     def _report(self, index: int, name: str, **details: Any) -> None:
         self.truth.event(self.time, index + 1, name, **details)

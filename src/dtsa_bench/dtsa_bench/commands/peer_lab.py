@@ -1,0 +1,100 @@
+"""`dtsa peer-lab`: copies of a Crazyflie app fly on this machine, in virtual time."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+DESCRIPTION = """\
+Flies copies of a Crazyflie app (C, a function appMain) on this machine, in virtual time, on simulated Crazyflies over
+one medium with the radio's true times. The app is compiled against own declarations of the firmware's documented
+functions. The same seed gives the same bits: the digest says so. Apps that come with it: beacons, dtr."""
+
+_SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "channel", "rate")
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    from dtsa_agent.core.settings.declaration import settings_of
+    from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
+
+    text = "copies of a Crazyflie app on this machine, in virtual time"
+    parser = subparsers.add_parser("peer-lab", help=text, description=DESCRIPTION)
+    parser.add_argument("app", metavar="APP", help="directory of the app, or the name of one that comes with it")
+    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="virtual time [60]")
+    specs = {spec.name: spec for spec in settings_of(LabSettings)}
+    for name in _SETTINGS:
+        spec = specs[name]
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", type={"int": int, "float": float}.get(spec.kind, str), metavar="X",
+            help=f"{spec.help} [{spec.default}]".replace("%", "%%"),
+        )  # fmt: skip
+    parser.add_argument("--source", action="append", default=[], metavar="FILE", help="a further C file of the app")
+    parser.add_argument("--include", action="append", default=[], metavar="DIR", help="a further directory of headers")
+    parser.add_argument("--flag", action="append", default=[], metavar="F", help="a flag for the compiler: --flag=-O0")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=X", help="a parameter of the app")
+    parser.add_argument("--out", metavar="DIR", help="directory for summary.json, packets.jsonl and truth.jsonl")
+    parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly and print what came of it."""
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_bench.crazyflies.peer_lab.process import fly
+    from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
+    from dtsa_bench.runs.options import new_directory
+
+    if not 0.0 < args.seconds <= 1e6:
+        raise ConfigError("seconds", args.seconds, "more than 0, up to 1000000")
+    given = {name: getattr(args, name) for name in _SETTINGS if getattr(args, name) is not None}
+    settings = LabSettings(**given)
+    parameters = dict(map(_parameter, args.set))
+    out = None if args.out is None else new_directory(args.out)
+    summary = fly(
+        args.app, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
+        flags=tuple(args.flag), parameters=parameters, out=out,
+    )  # fmt: skip
+    console, warnings = summary.pop("console"), summary.pop("warnings")
+    if out is not None:
+        _write(out, summary, console)
+    if warnings:
+        print(warnings, end="", file=sys.stderr)
+    print(json.dumps(summary, indent=2) if args.json else _lines(summary, len(console)))
+    return 0
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    from dtsa_agent.core.errors import ConfigError
+
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise ConfigError("set", text, "GROUP.NAME=NUMBER") from None
+
+
+def _write(out: Path, summary: dict[str, Any], console: list[Any]) -> None:
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    lines = (f"{time:.6f} {agent} {line}\n" for time, agent, line in console)
+    (out / "console.txt").write_text("".join(lines), encoding="utf-8")
+
+
+def _lines(summary: dict[str, Any], printed: int) -> str:
+    near, mean = summary["min_distance_m"], summary["mean_age_ms"]
+    pair = " and ".join(map(str, summary["min_distance_pair"] or ()))
+    rows = (
+        ("app", f"{summary['app']}, {summary['agents']} agents, {summary['seconds']:g} s, seed {summary['seed']}"),
+        ("ages", "no states were heard" if mean is None else f"{mean:.1f} ms on average, "
+         f"{summary['largest_age_ms']:.1f} at most; {100 * summary['pairs_known']:.0f} % of pairs known"),
+        ("packets", f"{summary['sent']} sent, {summary['heard']} heard, {summary['queue_overflows']} lost in full "
+         f"queues; {100 * summary['share_of_air']:.1f} % of the air"),
+        ("nearest", "fewer than two flew" if near is None
+         else f"{near:.3f} m (agents {pair} at {summary['min_distance_time_s']:.2f} s)"),
+        ("crashed", f"{len(summary['crashed'])}/{summary['agents']}" + "".join(f" {k}" for k in summary["crashed"])),
+        ("printed", f"{printed} lines"),
+        ("digest", summary["digest"]),
+    )  # fmt: skip
+    return "\n".join(f"{name:<9}{text}" for name, text in rows)

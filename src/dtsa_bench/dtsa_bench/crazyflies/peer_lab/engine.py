@@ -1,0 +1,144 @@
+"""The engine's face in Python: one process has one."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, Structure, c_char_p, c_double, c_int, c_int32, c_int64, c_uint8, c_uint64
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dtsa_agent.core.errors import DtsaError
+
+
+class Event(IntEnum):
+    """What the engine tells (engine/lab.h)."""
+
+    NONE, SEND, HEARD, COMMAND, PRINT, APP_CHANNEL, ENDED, SPINS, ASSERT, MISUSE = range(10)
+
+
+class Command(IntEnum):
+    """What an app asks for (engine/lab.h)."""
+
+    SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER = range(8)
+
+
+class AppError(DtsaError):
+    """An app did what no app may do."""
+
+
+class _Told(Structure):
+    _fields_ = [
+        ("kind", c_int32), ("vehicle", c_int32), ("code", c_int32), ("size", c_int32), ("time_ns", c_int64),
+        ("other_ns", c_int64), ("answer", c_int32), ("data", c_uint8 * 260),
+    ]  # fmt: skip
+
+
+_SIGNATURES = {
+    "lab_begin": (c_int, [c_int, c_int, POINTER(c_char_p), c_int64, c_int64, c_int64]),
+    "lab_run": (POINTER(_Told), [c_int64]),
+    "lab_world": (POINTER(c_double), [c_int]),
+    "lab_off": (None, [c_int]),
+    "lab_boot": (c_char_p, [c_int, c_char_p, c_int64, c_int64, c_int64, c_uint64, c_int, c_int]),
+    "lab_hear": (c_int, [c_int, c_int64, c_char_p, c_int, c_int]),
+    "lab_app_channel": (c_int, [c_int, c_int64, c_char_p, c_int]),
+    "lab_count": (c_int, [c_int, c_int]),
+    "lab_name": (c_char_p, [c_int, c_int, c_int]),
+    "lab_type": (c_int, [c_int, c_int, c_int]),
+    "lab_get": (c_double, [c_int, c_int, c_int]),
+    "lab_set": (None, [c_int, c_int64, c_int, c_double]),
+    "lab_end": (None, []),
+}
+
+
+class Engine:
+    """Apps of many vehicles in virtual time. Vehicles are numbered from 0, times are ns.
+
+    :param library: the compiled engine.
+    :param count: number of vehicles.
+    :param names: of the firmware's own log variables.
+    :param line_fixed_ns: ns that any packet takes on the line to the radio. :param line_byte_ns: ns that a byte adds.
+    :param spin_ns: ns after which a task that does not wait is an error.
+    """
+
+    def __init__(
+        self, library: Path, count: int, names: list[str], line_fixed_ns: int, line_byte_ns: int, spin_ns: int
+    ) -> None:
+        self._library = ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)  # apps find the firmware's functions in it
+        for name, (result, arguments) in _SIGNATURES.items():
+            function = getattr(self._library, name)
+            function.restype, function.argtypes = result, arguments
+        texts = (c_char_p * len(names))(*(name.encode() for name in names))
+        if self._library.lab_begin(count, len(names), texts, line_fixed_ns, line_byte_ns, spin_ns):
+            raise MemoryError
+        self._run = self._library.lab_run
+        #: Values of the firmware's log variables by vehicle, in the order of their names: written by the owner.
+        self.world: list[NDArray[np.float64]] = [
+            np.ctypeslib.as_array(self._library.lab_world(k), (len(names),)) for k in range(count)
+        ]
+        self._variables: dict[tuple[int, int], dict[str, int]] = {}
+        self._told = _Told()
+
+    def close(self) -> None:
+        """Switch all off."""
+        self._library.lab_end()
+
+    def run(self, until_ns: int) -> _Told:
+        """Run the apps until a time, or until one asks or tells something: then `kind` is not NONE.
+
+        :param until_ns: ns; not before what was told last.
+        """
+        self._told = self._run(until_ns).contents
+        return self._told
+
+    def boot(
+        self, vehicle: int, app: Path, now_ns: int, drift_ppb: int, address: int, channel: int, speed: int
+    ) -> None:
+        """Switch a vehicle on.
+
+        :param vehicle: its number. :param app: a copy of the app that no other vehicle has. :param now_ns: ns.
+        :param drift_ppb: by so much its clock is fast. :param address: of its radio. :param channel: likewise.
+        :param speed: likewise, 0 to 2.
+        :raises AppError: the app cannot be loaded.
+        """
+        wrong = self._library.lab_boot(vehicle, str(app).encode(), now_ns, 0, drift_ppb, address, channel, speed)
+        if wrong:
+            raise AppError(f"app of agent {vehicle + 1}: {wrong.decode(errors='replace').replace(str(app), 'app')}")
+        for parameters in (0, 1):
+            count = self._library.lab_count(vehicle, parameters)
+            names = (self._library.lab_name(vehicle, parameters, i).decode() for i in range(count))
+            self._variables[vehicle, parameters] = {name: i for i, name in enumerate(names)}
+
+    def off(self, vehicle: int) -> None:
+        """Switch a vehicle off: its app and all that it knew are gone."""
+        self._library.lab_off(vehicle)
+        self._variables.pop((vehicle, 0), None)
+        self._variables.pop((vehicle, 1), None)
+
+    def hear(self, vehicle: int, now_ns: int, raw: bytes, rssi: int) -> bool:
+        """A packet (port, data) has come to a vehicle's processor; False: its queue is full."""
+        return bool(self._library.lab_hear(vehicle, now_ns, raw, len(raw), rssi))
+
+    def app_channel(self, vehicle: int, now_ns: int, data: bytes) -> bool:
+        """A packet of the app channel has come to a vehicle; False: its queue is full."""
+        return bool(self._library.lab_app_channel(vehicle, now_ns, data, len(data)))
+
+    def names(self, vehicle: int, *, parameters: bool) -> list[str]:
+        """Names of the app's parameters, or of its log variables, as group.name."""
+        return list(self._variables.get((vehicle, int(parameters)), ()))
+
+    def get(self, vehicle: int, name: str, *, parameter: bool) -> float:
+        """Value of a parameter or a log variable of the app.
+
+        :raises KeyError: it has none of that name, or is switched off.
+        """
+        return float(self._library.lab_get(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
+
+    def set(self, vehicle: int, now_ns: int, name: str, value: float) -> None:
+        """Set a parameter of the app.
+
+        :raises KeyError: it has none of that name, or is switched off.
+        """
+        self._library.lab_set(vehicle, now_ns, self._variables[vehicle, 1][name], value)

@@ -1,0 +1,6 @@
+// Own declarations of functions that the documentation of the Crazyflie firmware names: apps are compiled against them
+// for this machine. No text of the firmware is in here.
+#pragma once
+
+// The app: called once after the start, in a task of its own.
+void appMain(void);

@@ -1,0 +1,7 @@
+// Own declarations of functions that the documentation of the Crazyflie firmware names: apps are compiled against them
+// for this machine. No text of the firmware is in here.
+#pragma once
+
+#include "debug.h"
+
+#define consolePrintf(...) labPrint(__VA_ARGS__)

@@ -1,0 +1,10 @@
+// Own declarations of functions that the documentation of the Crazyflie firmware names: apps are compiled against them
+// for this machine. No text of the firmware is in here.
+#pragma once
+
+#include <stdint.h>
+
+// What only the laboratory has; `PEER_LAB` is defined when an app is compiled for it.
+
+// The app computes for so long before it goes on: a Cortex-M4 is slower than this machine.
+void peerLabSpend(uint32_t microseconds);

@@ -1,0 +1,12 @@
+// Own declarations of functions that the documentation of the Crazyflie firmware names: apps are compiled against them
+// for this machine. No text of the firmware is in here.
+#pragma once
+
+#include <stdbool.h>
+
+typedef enum { battery, charging, charged, lowPower, shutDown } PMStates;
+
+float pmGetBatteryVoltage(void);
+bool pmIsBatteryLow(void);
+bool pmIsCharging(void);
+bool pmIsDischarging(void);

@@ -1,0 +1,8 @@
+// Own declarations of functions that the documentation of the Crazyflie firmware names: apps are compiled against them
+// for this machine. No text of the firmware is in here.
+#pragma once
+
+#include <stdint.h>
+
+// Microseconds since power on, by the vehicle's own clock.
+uint64_t usecTimestamp(void);

@@ -1,0 +1,385 @@
+"""A flight in the laboratory: apps, radios, air, vehicles and ground on one time line."""
+
+from __future__ import annotations
+
+import math
+import struct
+import tempfile
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.crazyflies.simulated.estimate import log_values
+from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
+from dtsa_bench.crazyflies.simulated.radio import esb
+from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
+from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
+from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES
+from dtsa_bench.crazyflies.simulated.truth import TruthLog
+from dtsa_bench.crazyflies.simulated.world import TICK_S, World
+from dtsa_channel_sim.model.medium import OnAir
+from dtsa_channel_sim.model.radio_table import RADIOS
+
+from .app import App, Order
+from .compiling import compile_app, engine_library, private_copy
+from .engine import AppError, Command, Engine, Event
+from .nrf51 import Nrf51, Packet
+from .polling import Polling
+from .record import Record
+from .setpoints import setpoint_of
+from .settings import LabSettings
+
+TICK_NS = round(TICK_S * 1e9)
+ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the id
+_NAMES = [entry.full_name for entry in LOG_ENTRIES]
+_PRIORITY = "lab.priority"
+_NEAR_RSSI, _NEAREST_M = 40, 0.1  # -dBm at 1 m
+
+
+class Laboratory:
+    """Apps that fly. One process has one at a time; a crash of an app ends the process with a line that names it.
+
+    :param app: the app.
+    :param settings: vehicles, air and ground.
+    :param out: directory for files; None: none are written.
+    :raises CompileError: the app does not compile.
+    """
+
+    def __init__(self, app: App, settings: LabSettings | None = None, out: Path | None = None) -> None:
+        self.settings = settings = settings or LabSettings()
+        self.app = app
+        self.now_ns = 0
+        count = settings.agents
+        line = RADIOS["crazyflie"].airtime.line
+        self._directory = tempfile.TemporaryDirectory(prefix="dtsa-peer-lab-")
+        self._library = Path(self._directory.name) / "app.so"
+        self.warnings = compile_app(app, self._library)
+        self._copies = 0
+        self._engine = Engine(
+            engine_library(), count, [*_NAMES, _PRIORITY], line.to_fixed_ns, line.to_byte_ns,
+            round(settings.spin_ms * 1e6),
+        )  # fmt: skip
+        self.record = Record(count, app.state, out)
+        config = FleetConfig(
+            count=count, start=settings.start, seed=settings.seed, noise=settings.noise, arming=settings.arming
+        )
+        header = {"count": count, "seed": settings.seed, "start": np.asarray(config.start).tolist()}
+        self._truth = TruthLog(out / "truth.jsonl" if out else None, header)
+        self.world = World(config, self._report)
+        self.agenda = Agenda()
+        ground = 1 if settings.polls else 0
+        streams = np.random.SeedSequence(settings.seed).spawn(2)
+        self.air = RadioAir(count + ground, settings.loss, int(streams[0].generate_state(1)[0]))
+        tuned = settings.channel, settings.rate
+        self.radios = [
+            Nrf51(k + 1, self.air, self.agenda, line, tuned, self._left, self._deliver_to(k)) for k in range(count)
+        ]
+        self._handed: list[deque[Packet]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
+        self.from_apps: list[tuple[float, int, bytes]] = []  # s, id, packet of the app channel to the ground
+        self._on = [False] * count
+        self._parameters: list[dict[str, float]] = [dict(app.parameters) for _ in range(count)]
+        self.polling = Polling(self.air, self.agenda, settings, self.radios) if ground else None
+        generator = np.random.default_rng(streams[1])
+        starts = (generator.random(count) * settings.boot_s * 1e9).astype(np.int64).tolist()
+        drifts = np.rint(generator.uniform(-1.0, 1.0, count) * settings.drift_ppm * 1000).astype(np.int64)
+        self._drifts: list[int] = drifts.tolist()
+        for k, start in enumerate(starts):
+            self.at(start / 1e9, lambda k=k: self.switch_on(k + 1))  # type: ignore[misc]
+        for order in app.orders:
+            self.at(order.at, lambda order=order: self._obey(order))  # type: ignore[misc]
+        self.agenda.at(TICK_NS, self._tick)
+
+    def __enter__(self) -> Laboratory:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End of the flight."""
+        self.record.close()
+        self._truth.close()
+        self._engine.close()
+        self._directory.cleanup()
+
+    # -- time -------------------------------------------------------------------------------------------------------
+    @property
+    def time(self) -> float:
+        """Virtual time, s."""
+        return self.now_ns / 1e9
+
+    def at(self, time_s: float, action: Callable[[], None]) -> None:
+        """Let the ground do something at an instant.
+
+        :param time_s: s, now or later.
+        :param action: what it does; it may call all that is below.
+        """
+        self.agenda.at(max(self.now_ns, round(time_s * 1e9)), action)
+
+    def run(self, until_s: float) -> None:
+        """Fly on.
+
+        :param until_s: s, virtual time.
+        :raises AppError: an app did what no app may do.
+        """
+        until_ns = round(until_s * 1e9)
+        while True:
+            due = self.agenda.next_ns
+            target = until_ns if due is None else min(due, until_ns)
+            told = self._engine.run(target)
+            if told.kind != Event.NONE:
+                self.now_ns = told.time_ns
+                self._hear_app(told)
+                continue
+            self.now_ns = target
+            if due is None or due >= until_ns:
+                return
+            self.agenda.run(due)
+
+    def summary(self) -> dict[str, Any]:
+        """What came of it."""
+        return {
+            "app": self.app.name,
+            "seed": self.settings.seed,
+            **self.record.summary(self.now_ns),
+            "queue_overflows": sum(radio.overflows for radio in self.radios),
+        }
+
+    # -- what apps tell and ask -------------------------------------------------------------------------------------
+    def _hear_app(self, told: Any) -> None:
+        k, now, data = told.vehicle, told.time_ns, bytes(told.data[: told.size])
+        kind = Event(told.kind)
+        if kind is Event.SEND:
+            packet = Packet(k + 1, data, now)
+            self.record.on_sent(k + 1, now, packet)
+            radio = self.radios[k]
+            self.agenda.at(told.other_ns, lambda: radio.order(packet, told_at))
+            told_at = told.other_ns
+        elif kind is Event.HEARD:
+            packet = self._handed[k].popleft()
+            if told.code >= 0:
+                self.record.on_heard(k + 1, now, packet)
+        elif kind is Event.COMMAND:
+            told.answer = self._command(k, Command(told.code), data)
+            self.record.on_command(k + 1, now, told.code, data)
+            self._show(k)
+        elif kind is Event.PRINT:
+            self.record.on_print(k + 1, now, data.decode("utf-8", "replace"))
+        elif kind is Event.APP_CHANNEL:
+            self.from_apps.append((now / 1e9, k + 1, data))
+        elif kind is not Event.ENDED:
+            text = data.decode("utf-8", "replace")
+            reason = {
+                Event.SPINS: f"task {text} has not waited for {self.settings.spin_ms:g} ms: it never yields",
+                Event.ASSERT: f"assertion failed in {text}",
+            }.get(kind, f"it used {text}")
+            raise AppError(f"app of agent {k + 1} at {now / 1e9:.6f} s: {reason}")
+
+    def _command(self, k: int, command: Command, data: bytes) -> int:
+        firmware, t = self.world.firmware[k], self.time
+        if command is Command.SETPOINT:
+            priority, setpoint = setpoint_of(data, t, firmware.yaw)
+            self.record.setpoints += 1
+            firmware.offer(setpoint, priority)
+            return 0
+        if command is Command.RELAX:
+            firmware.notify_stop()
+            return 0
+        if command is Command.STOP:
+            return firmware.high_level(bytes((3, 0)), t)
+        values = struct.unpack(f"<{len(data) // 4}f", data)
+        if command is Command.GO_TO:
+            return self._go_to(k, values[:3], values[3], values[4], bool(values[5]))
+        if command is Command.ARM:
+            return int(firmware.supervisor.request_arming(bool(values[0])))
+        if command is Command.RECOVER:
+            return int(firmware.supervisor.request_recovery())
+        height, duration, yaw, keep = values
+        return self._rise(k, command is Command.TAKEOFF, height, duration, yaw, bool(keep))
+
+    def _rise(self, k: int, up: bool, height: float, duration: float, yaw: float = 0.0, keep: bool = True) -> int:
+        packet = struct.pack("<BBff?f", 7 if up else 8, 0, height, yaw, keep, duration)
+        return self.world.firmware[k].high_level(packet, self.time)
+
+    def _go_to(self, k: int, place: Any, yaw: float, duration: float, relative: bool) -> int:
+        packet = struct.pack("<BB??5f", 12, 0, relative, False, *place, yaw, duration)
+        return self.world.firmware[k].high_level(packet, self.time)
+
+    # -- world ------------------------------------------------------------------------------------------------------
+    def _tick(self) -> None:
+        self.world.step((self.now_ns - TICK_NS) / 1e9)
+        position = self.world.vehicles.position
+        self.record.on_positions(self.now_ns, position)
+        self._truth.positions(self.time, position)
+        for k, on in enumerate(self._on):
+            if on:
+                self._show(k)
+        self.agenda.at(self.now_ns + TICK_NS, self._tick)
+
+    def _show(self, k: int) -> None:
+        """Tell a vehicle's app what its firmware knows."""
+        values = log_values(self.world.estimates[k], self.world.firmware[k], self.time)
+        self._engine.world[k][:] = [*(values[name] for name in _NAMES), self.world.firmware[k].priority]
+
+    def _report(self, index: int, name: str, **details: Any) -> None:
+        self.record.on_event(index + 1, self.now_ns, name)
+        self._truth.event(self.time, index + 1, name, **details)
+
+    # -- air --------------------------------------------------------------------------------------------------------
+    def _left(self, packet: Packet, frame: OnAir) -> None:
+        """A packet has left the air: who has it?"""
+        self.record.on_air_ns += frame.end_ns - frame.air_ns
+        heard = self.air.heard(self.settings.channel, frame)
+        for agent in sorted(heard):
+            if agent <= self.settings.agents and self._on[agent - 1]:
+                self.radios[agent - 1].receive(packet, frame.end_ns)
+
+    def _deliver_to(self, k: int) -> Callable[[int, Packet], None]:
+        def deliver(now_ns: int, packet: Packet) -> None:
+            if not packet.sender:  # the ground's: no app hears it
+                return
+            gap = self.world.vehicles.position[:, packet.sender - 1] - self.world.vehicles.position[:, k]
+            distance = max(_NEAREST_M, math.sqrt(float(gap @ gap)))
+            rssi = round(_NEAR_RSSI + 20.0 * math.log10(distance))
+            if self._engine.hear(k, now_ns, packet.raw, rssi):
+                self._handed[k].append(packet)
+
+        return deliver
+
+    # -- the ground -------------------------------------------------------------------------------------------------
+    def _index(self, agent: int) -> int:
+        if not 1 <= agent <= self.settings.agents:
+            raise ConfigError("agent", agent, f"1 to {self.settings.agents}")
+        return agent - 1
+
+    def switch_on(self, agent: int) -> None:
+        """Power on: the app begins anew, with the parameters that the ground has set."""
+        k = self._index(agent)
+        if self._on[k]:
+            return
+        self._copies += 1
+        copy = private_copy(self._library, Path(self._directory.name), f"agent_{agent}_{self._copies}")
+        self._show(k)
+        speed = esb.RATE_NAMES.index(self.settings.rate)
+        self._engine.boot(k, copy, self.now_ns, self._drifts[k], ADDRESS + agent, self.settings.channel, speed)
+        copy.unlink()
+        self._on[k] = True
+        for name, value in self._parameters[k].items():
+            self.set_parameter(agent, name, value)
+
+    def switch_off(self, agent: int) -> None:
+        """Power off: app and firmware forget all."""
+        k = self._index(agent)
+        if self._on[k]:
+            self._on[k] = False
+            self._engine.off(k)
+            self.radios[k].reset()
+            self._handed[k].clear()
+            self.world.firmware[k].reset()
+
+    def set_parameter(self, agent: int, name: str, value: float) -> None:
+        """Set a parameter of the app, now and after each power on.
+
+        :param name: group.name.
+        :raises ConfigError: the app has none of that name.
+        """
+        k = self._index(agent)
+        self._parameters[k][name] = value
+        if self._on[k]:
+            self._known(k, name, parameters=True)
+            self._engine.set(k, self.now_ns, name, value)
+
+    def parameter(self, agent: int, name: str) -> float:
+        """Value of a parameter of the app.
+
+        :raises ConfigError: the app has none of that name, or is switched off.
+        """
+        k = self._index(agent)
+        self._known(k, name, parameters=True)
+        return self._engine.get(k, name, parameter=True)
+
+    def log(self, agent: int, name: str) -> float:
+        """Value of a log variable, the firmware's or the app's.
+
+        :raises ConfigError: there is none of that name, or the vehicle is switched off.
+        """
+        k = self._index(agent)
+        if name in _NAMES:
+            return float(self._engine.world[k][_NAMES.index(name)])
+        self._known(k, name, parameters=False)
+        return self._engine.get(k, name, parameter=False)
+
+    def logs(self, agent: int) -> Mapping[str, float]:
+        """All log variables of the app; none while it is switched off."""
+        k = self._index(agent)
+        return {name: self._engine.get(k, name, parameter=False) for name in self._engine.names(k, parameters=False)}
+
+    def _known(self, k: int, name: str, *, parameters: bool) -> None:
+        names = self._engine.names(k, parameters=parameters)
+        if name not in names:
+            what = "parameter" if parameters else "log variable"
+            raise ConfigError(what, name, f"of agent {k + 1}: {', '.join(names) or 'none'}")
+
+    def send(self, agent: int, data: bytes) -> bool:
+        """A packet of the app channel; False: the app's queue of ten is full.
+
+        :raises ConfigError: it is too long.
+        """
+        if len(data) > 30:
+            raise ConfigError("app channel", len(data), "at most 30 bytes")
+        k = self._index(agent)
+        return not self._on[k] or self._engine.app_channel(k, self.now_ns, data)
+
+    def arm(self, agent: int, arm: bool = True) -> bool:
+        """Arm or disarm; False: the firmware refuses."""
+        return self._then_show(agent, self.world.firmware[self._index(agent)].supervisor.request_arming(arm))
+
+    def take_off(self, agent: int, height: float, duration: float) -> bool:
+        """High-level take-off (m, s); False: the firmware refuses."""
+        return self._then_show(agent, self._rise(self._index(agent), True, height, duration) == 0)
+
+    def land(self, agent: int, height: float, duration: float) -> bool:
+        """High-level landing (m, s); False: the firmware refuses."""
+        self.world.firmware[self._index(agent)].notify_stop()
+        return self._then_show(agent, self._rise(self._index(agent), False, height, duration) == 0)
+
+    def go_to(self, agent: int, x: float, y: float, z: float, duration: float) -> bool:
+        """High-level flight to a place (m, s); False: the firmware refuses."""
+        return self._then_show(agent, self._go_to(self._index(agent), (x, y, z), 0.0, duration, False) == 0)
+
+    def emergency(self, agent: int) -> None:
+        """Emergency stop: latches until it is switched off and on."""
+        self.world.firmware[self._index(agent)].supervisor.stop("emergency stop")
+
+    def _then_show(self, agent: int, done: bool) -> bool:
+        self._show(agent - 1)
+        return done
+
+    def _obey(self, order: Order) -> None:
+        values = order.values
+        for agent in order.agents or range(1, self.settings.agents + 1):
+            if order.order in ("arm", "disarm"):
+                self.arm(agent, order.order == "arm")
+            elif order.order == "takeoff":
+                self.take_off(agent, values["height"], values["duration"])
+            elif order.order == "land":
+                self.land(agent, values["height"], values["duration"])
+            elif order.order == "goto":
+                self.go_to(agent, values["x"], values["y"], values["z"], values["duration"])
+            elif order.order == "parameter":
+                self.set_parameter(agent, values["name"], values["value"])
+            elif order.order == "send":
+                self.send(agent, bytes.fromhex(values["data"]))
+            elif order.order == "emergency":
+                self.emergency(agent)
+            elif order.order == "off":
+                self.switch_off(agent)
+            else:
+                self.switch_on(agent)
+
+
+__all__ = ["AppError", "Laboratory"]

@@ -1,0 +1,78 @@
+"""A ground station on the air: a simulated Crazyradio that asks each vehicle for news, as cflib does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
+from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
+from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, Dongle
+from dtsa_bench.crazyflies.simulated.radio.esb import RATE_NAMES
+from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, Receiver
+from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+
+from .nrf51 import Nrf51, Packet
+from .settings import LabSettings
+
+_POLL = bytes((NULL | 0x0C,))  # an empty packet
+
+
+class _Polled(Receiver):
+    """The vehicle's end of the link: what comes goes over the line to the flight processor, too."""
+
+    def __init__(self, station: Station, radio: Nrf51) -> None:
+        super().__init__(station, lambda packet, t: None)
+        self._radio = radio
+
+    def hear(self, packet: bytes, t: float) -> bytes:
+        self._radio.receive(Packet(0, packet, 0), round(t * 1e9))
+        return super().hear(packet, t)
+
+
+class Polling:
+    """One dongle that polls all vehicles in turn.
+
+    :param air: the air. :param agenda: what happens when. :param settings: how often.
+    :param radios: of the vehicles.
+    """
+
+    def __init__(self, air: RadioAir, agenda: Agenda, settings: LabSettings, radios: Sequence[Nrf51]) -> None:
+        self.answered = self.unanswered = 0
+        self._agenda = agenda
+        self._stations = [
+            Station("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1)))
+            for k in range(len(radios))
+        ]
+        receivers: dict[int, Receiver] = {
+            k + 1: _Polled(station, radio)
+            for k, (station, radio) in enumerate(zip(self._stations, radios, strict=True))
+        }
+        radio = RadioSettings(seed=settings.seed, request_ms=0.0)
+        self._dongle = Dongle(len(radios) + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
+        self._dongle.request(SET_CHANNEL, settings.channel, 0, b"", 0)
+        self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), 0, b"", 0)
+        self._gap_ns = round(1e9 / (settings.polls * len(radios)))
+        self._next = 0
+        self._busy = False
+        self._due_ns = self._gap_ns
+        agenda.at(self._due_ns, self._poll)
+
+    def _poll(self) -> None:
+        """The next vehicle's turn; one transfer at a time, so a dongle that is behind skips turns."""
+        now = self._due_ns
+        self._due_ns += self._gap_ns
+        self._agenda.at(self._due_ns, self._poll)
+        if self._busy:
+            return
+        station = self._stations[self._next]
+        self._next = (self._next + 1) % len(self._stations)
+        self._busy = True
+        self._dongle.request(SET_ADDRESS, 0, 0, station.address, now)
+        self._dongle.transfer(_POLL, now, self._answer)
+
+    def _answer(self, data: bytes) -> None:
+        self._busy = False
+        if data and data[0] & 1:
+            self.answered += 1
+        else:
+            self.unanswered += 1

@@ -1,0 +1,97 @@
+"""A flight in a process of its own, which an app that crashes ends alone."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dtsa_agent.core.errors import ConfigError, DtsaError
+
+from .app import read_app
+from .compiling import CompileError
+from .engine import AppError
+from .laboratory import Laboratory
+from .settings import LabSettings
+
+_CRASHED = 70  # engine/crash.c
+_HEAD = "peer-lab: "
+
+
+def fly(
+    place: str,
+    seconds: float,
+    settings: LabSettings | None = None,
+    *,
+    sources: tuple[str, ...] = (),
+    include: tuple[str, ...] = (),
+    flags: tuple[str, ...] = (),
+    parameters: Mapping[str, float] | None = None,
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Fly an app; the summary, with what the apps printed as `console` and what the compiler warned of as `warnings`.
+
+    :param place: directory of the app, or the name of one that comes with the laboratory.
+    :param seconds: s, virtual time.
+    :param settings: vehicles, air and ground; start positions must be the default.
+    :param sources: further C files. :param include: further directories. :param flags: further ones of the compiler.
+    :param parameters: values of the app's parameters, beside those of app.yaml.
+    :param out: directory for files.
+    :raises ConfigError: a setting is not usable. :raises CompileError: the app does not compile.
+    :raises AppError: an app crashed, or did what no app may do.
+    """
+    read_app(place, sources=sources, include=include, flags=flags)  # mistakes are said before a process starts
+    settings = settings or LabSettings()
+    values = {name: value for name, value in settings.to_dict().items() if name != "start"}
+    request = {
+        "place": place, "seconds": seconds, "settings": values, "sources": sources, "include": include, "flags": flags,
+        "parameters": dict(parameters or {}), "out": None if out is None else str(out),
+    }  # fmt: skip
+    command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
+    done = subprocess.run(command, input=json.dumps(request), capture_output=True, text=True, check=False)
+    lines = done.stderr.splitlines()
+    said = next((line.removeprefix(_HEAD) for line in reversed(lines) if line.startswith(_HEAD)), None)
+    if done.returncode == _CRASHED and said is not None:
+        raise AppError(said)
+    answer = json.loads(done.stdout) if done.returncode == 0 else None
+    if answer is None:
+        if done.returncode == -signal.SIGINT:
+            raise KeyboardInterrupt
+        last = lines[-1] if lines else "it said nothing"
+        raise AppError(f"the laboratory's process ended with {done.returncode}: {last}")
+    if "error" not in answer:
+        return dict(answer)
+    raise {"CompileError": CompileError, "AppError": AppError}.get(answer["kind"], DtsaError)(answer["error"])
+
+
+def _serve(request: dict[str, Any]) -> dict[str, Any]:
+    paths = {key: tuple(request[key]) for key in ("sources", "include", "flags")}
+    app = read_app(request["place"], **paths)
+    out = None if request["out"] is None else Path(request["out"])
+    with Laboratory(app, LabSettings(**request["settings"]), out) as lab:
+        for name, value in request["parameters"].items():
+            for agent in range(1, lab.settings.agents + 1):
+                lab.set_parameter(agent, name, value)
+        lab.run(request["seconds"])
+        return {**lab.summary(), "console": lab.record.console, "warnings": lab.warnings}
+
+
+def main() -> int:
+    """The process: a request on standard input, the answer on standard output."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        answer = _serve(json.loads(sys.stdin.read()))
+    except ConfigError as error:
+        answer = {"kind": "ConfigError", "error": str(error)}
+    except DtsaError as error:
+        answer = {"kind": type(error).__name__, "error": str(error)}
+    print(json.dumps(answer))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

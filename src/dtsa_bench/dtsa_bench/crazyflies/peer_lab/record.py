@@ -1,0 +1,173 @@
+"""What was observed of a flight in the laboratory: packets, ages, distances, and the digest of all of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .app import StateRule
+from .nrf51 import Packet
+
+_FLYING_M = 0.05  # higher than that it is in the air
+
+
+class Ages:
+    """How old what each vehicle knows of each other one is, from the first packet that it heard of it on.
+
+    :param agents: number of vehicles.
+    """
+
+    def __init__(self, agents: int) -> None:
+        shape = (agents, agents)  # receiver, sender
+        self._stamp = np.full(shape, -1, dtype=np.int64)  # ns, when the newest was ordered
+        self._since = np.zeros(shape, dtype=np.int64)
+        self._last = np.zeros(shape, dtype=np.int64)
+        self._area = np.zeros(shape)  # ms s
+        self._worst = np.zeros(shape, dtype=np.int64)
+
+    def heard(self, receiver: int, sender: int, stamp_ns: int, now_ns: int) -> None:
+        """A state has come.
+
+        :param receiver: id. :param sender: id. :param stamp_ns: ns, its time. :param now_ns: ns.
+        """
+        pair = receiver - 1, sender - 1
+        if stamp_ns <= self._stamp[pair]:
+            return
+        if self._stamp[pair] < 0:
+            self._since[pair] = now_ns
+        else:
+            self._add(pair, now_ns)
+        self._stamp[pair], self._last[pair] = stamp_ns, now_ns
+
+    def _add(self, pair: tuple[int, int], now_ns: int) -> None:
+        first, last = int(self._last[pair] - self._stamp[pair]), int(now_ns - self._stamp[pair])
+        self._area[pair] += (first + last) / 2e6 * (now_ns - int(self._last[pair])) / 1e9
+        self._worst[pair] = max(int(self._worst[pair]), last)
+
+    def summary(self, now_ns: int) -> dict[str, Any]:
+        """Mean and largest age in ms, and the share of pairs that know each other.
+
+        :param now_ns: ns, the end.
+        """
+        known = list(zip(*(index.tolist() for index in np.nonzero(self._stamp >= 0)), strict=True))
+        for pair in known:
+            self._add(pair, now_ns)
+            self._last[pair] = now_ns
+        pairs = len(self._stamp) * (len(self._stamp) - 1)
+        seconds = sum((now_ns - int(self._since[pair])) / 1e9 for pair in known)
+        return {
+            "mean_age_ms": sum(float(self._area[pair]) for pair in known) / seconds if seconds else None,
+            "largest_age_ms": max(int(self._worst[pair]) for pair in known) / 1e6 if known else None,
+            "pairs_known": len(known) / pairs if pairs else 1.0,
+        }
+
+
+class Record:
+    """Takes in what happens.
+
+    :param agents: number of vehicles.
+    :param rule: which packets carry a state.
+    :param directory: where files are written; None: nowhere.
+    """
+
+    def __init__(self, agents: int, rule: StateRule, directory: Path | None = None) -> None:
+        self._rule, self._ages, self._digest = rule, Ages(agents), hashlib.sha256()
+        self.agents = agents
+        self.sent, self.heard = [0] * agents, [0] * agents
+        self.collided = 0  # receptions that another packet, or the receiver's own, destroyed or noise took
+        self.setpoints = 0
+        self.on_air_ns = 0
+        self.nearest: tuple[float, float, int, int] | None = None  # m, s, ids
+        self.crashed: dict[int, float] = {}  # s, by id
+        self.console: list[tuple[float, int, str]] = []  # s, id, line
+        self._lines: dict[int, str] = {}
+        self._file: IO[str] | None = None
+        if directory is not None:
+            self._file = (directory / "packets.jsonl").open("w", encoding="utf-8")
+
+    def _note(self, kind: int, agent: int, now_ns: int, data: bytes) -> None:
+        self._digest.update(struct.pack("<BHqI", kind, agent, now_ns, len(data)) + data)
+
+    def _line(self, **entry: Any) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(entry) + "\n")
+
+    def on_sent(self, agent: int, now_ns: int, packet: Packet) -> None:
+        """An app has ordered a packet."""
+        self.sent[agent - 1] += 1
+        self._note(0, agent, now_ns, packet.raw)
+        self._line(t_ns=now_ns, sent=agent, port=packet.raw[0], data=packet.data.hex())
+
+    def on_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
+        """An app's callback gets a packet."""
+        self.heard[agent - 1] += 1
+        self._note(1, agent, now_ns, packet.raw)
+        self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
+        if packet.sender and self._rule.counts(packet.data, agent):
+            self._ages.heard(agent, packet.sender, packet.ordered_ns, now_ns)
+
+    def on_command(self, agent: int, now_ns: int, code: int, data: bytes) -> None:
+        """An app has commanded its vehicle."""
+        self._note(2 + code, agent, now_ns, data)
+
+    def on_print(self, agent: int, now_ns: int, text: str) -> None:
+        """An app has printed."""
+        self._note(20, agent, now_ns, text.encode())
+        *lines, rest = (self._lines.get(agent, "") + text).split("\n")
+        self._lines[agent] = rest
+        self.console += [(now_ns / 1e9, agent, line) for line in lines]
+
+    def on_event(self, agent: int, now_ns: int, name: str) -> None:
+        """Something happened to a vehicle."""
+        self._note(21, agent, now_ns, name.encode())
+        if name in ("crash", "hard landing"):
+            self.crashed.setdefault(agent, now_ns / 1e9)
+
+    def on_positions(self, now_ns: int, position: NDArray[np.float64]) -> None:
+        """True places.
+
+        :param now_ns: ns. :param position: (3, N), m, world.
+        """
+        self._note(22, 0, now_ns, np.ascontiguousarray(position).tobytes())
+        flying = np.flatnonzero(position[2] > _FLYING_M)
+        if len(flying) > 1:
+            p = position[:, flying]
+            first, second = np.triu_indices(len(flying), 1)
+            distance = np.sqrt(((p[:, first] - p[:, second]) ** 2).sum(axis=0))
+            k = int(distance.argmin())
+            if self.nearest is None or distance[k] < self.nearest[0]:
+                pair = int(flying[first[k]]) + 1, int(flying[second[k]]) + 1
+                self.nearest = float(distance[k]), now_ns / 1e9, *pair
+
+    def close(self) -> None:
+        """End of the record."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def summary(self, now_ns: int) -> dict[str, Any]:
+        """What came of it.
+
+        :param now_ns: ns, the end.
+        """
+        near = self.nearest
+        return {
+            "agents": self.agents,
+            "seconds": now_ns / 1e9,
+            **self._ages.summary(now_ns),
+            "sent": sum(self.sent),
+            "heard": sum(self.heard),
+            "share_of_air": self.on_air_ns / now_ns if now_ns else 0.0,
+            "setpoints": self.setpoints,
+            "min_distance_m": near[0] if near else None,
+            "min_distance_time_s": near[1] if near else None,
+            "min_distance_pair": list(near[2:]) if near else None,
+            "crashed": sorted(self.crashed),
+            "digest": self._digest.hexdigest(),
+        }

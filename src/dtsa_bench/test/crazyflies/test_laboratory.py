@@ -1,0 +1,381 @@
+"""Apps in the peer-to-peer laboratory: what they may do, what the radio does, and that a seed gives its bits again."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.crazyflies.peer_lab import Laboratory, LabSettings, read_app
+from dtsa_bench.crazyflies.peer_lab.compiling import ENGINE, FIRMWARE, CompileError, compiler
+from dtsa_bench.crazyflies.peer_lab.engine import AppError
+from dtsa_bench.crazyflies.peer_lab.process import fly
+from dtsa_channel_sim.model.radio_table import CRAZYFLIE_LINE
+
+pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
+
+HEAD = """
+#include "app.h"
+#include "app_channel.h"
+#include "cfassert.h"
+#include "commander.h"
+#include "configblock.h"
+#include "crtp_commander_high_level.h"
+#include "debug.h"
+#include "log.h"
+#include "param.h"
+#include "peer_lab.h"
+#include "pm.h"
+#include "radiolink.h"
+#include "semphr.h"
+#include "static_mem.h"
+#include "supervisor.h"
+#include "timers.h"
+#include "usec_time.h"
+#include <string.h>
+"""
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    """Makes the directory of an app from its C code."""
+
+    def make(code: str, name: str = "trial", settings: str = "") -> str:
+        directory = tmp_path / name
+        directory.mkdir()
+        (directory / "app.c").write_text(HEAD + code)
+        if settings:
+            (directory / "app.yaml").write_text(settings)
+        return str(directory)
+
+    return make
+
+
+def lines(code_place: str, seconds: float = 1.0, **settings: object) -> list[str]:
+    """What the first vehicle's app prints in a flight."""
+    app = read_app(code_place)
+    with Laboratory(app, LabSettings(**{"agents": 1, "boot_s": 0.0, **settings})) as lab:
+        lab.run(seconds)
+        return [line for _, agent, line in lab.record.console if agent == 1]
+
+
+@pytest.mark.parametrize("app", ["beacons", "dtr"])
+def test_engine_and_own_apps_compile_without_warnings(app: str, tmp_path: Path) -> None:
+    flags = ["-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{FIRMWARE}", f"-I{ENGINE}", "-fsyntax-only"]
+    sources = [*ENGINE.glob("*.c"), *read_app(app).sources]
+    subprocess.run([*compiler(), *flags, *map(str, sources)], check=True)
+
+
+def test_every_header_stands_alone(tmp_path: Path) -> None:
+    for header in FIRMWARE.glob("*.h"):
+        (tmp_path / f"{header.stem}.c").write_text(f'#include "{header.name}"\n')
+    command = [*compiler(), "-std=gnu11", "-Wall", "-Wextra", "-Werror", f"-I{FIRMWARE}", "-fsyntax-only"]
+    subprocess.run([*command, *map(str, tmp_path.glob("*.c"))], check=True)
+
+
+def test_a_seed_gives_its_bits_again_and_another_one_does_not() -> None:
+    def digest(seed: int) -> str:
+        settings = LabSettings(agents=5, seed=seed, loss=0.1, drift_ppm=50.0, polls=20.0)
+        return str(fly("beacons", 3.0, settings)["digest"])
+
+    assert digest(1) == digest(1) != digest(2)
+
+
+def test_each_vehicle_has_variables_of_its_own(write) -> None:
+    place = write("""
+static int count;
+void appMain(void) {
+    count += (int)(configblockGetRadioAddress() & 255);
+    vTaskDelay(M2T(10));
+    DEBUG_PRINT("%d\\n", count);
+}""")
+    with Laboratory(read_app(place), LabSettings(agents=3, boot_s=0.0)) as lab:
+        lab.run(0.1)
+        assert sorted((agent, line) for _, agent, line in lab.record.console) == [(1, "1"), (2, "2"), (3, "3")]
+        lab.switch_off(2)
+        lab.at(0.2, lambda: lab.switch_on(2))
+        lab.run(0.3)
+        assert [line for _, agent, line in lab.record.console if agent == 2] == ["2", "2"]
+
+
+def test_time_goes_on_by_ticks_and_by_calls(write) -> None:
+    place = write("""
+void appMain(void) {
+    TickType_t ticks = xTaskGetTickCount();
+    vTaskDelay(M2T(5));
+    DEBUG_PRINT("%d\\n", (int)(xTaskGetTickCount() - ticks));
+    uint64_t end = usecTimestamp() + 300;
+    int calls = 0;
+    while (usecTimestamp() < end) calls++;
+    DEBUG_PRINT("%d\\n", calls > 250 && calls <= 300);
+    uint64_t before = usecTimestamp();
+    peerLabSpend(2500);
+    DEBUG_PRINT("%d\\n", usecTimestamp() - before >= 2500);
+    TickType_t due = xTaskGetTickCount();
+    for (int i = 0; i < 3; i++) vTaskDelayUntil(&due, 7);
+    DEBUG_PRINT("%lu\\n", (unsigned long)(xTaskGetTickCount() - due));
+}""")
+    assert lines(place) == ["5", "1", "1", "0"]
+
+
+def test_a_clock_drifts(write) -> None:
+    place = write("""
+void appMain(void) { vTaskDelay(M2T(20000)); DEBUG_PRINT("%u\\n", (unsigned)usecTimestamp()); }""")
+    with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.0, drift_ppm=1000.0)) as lab:
+        lab.run(21.0)
+        times = [time for time, _, _ in lab.record.console]
+    assert len(times) == 2
+    assert all(abs(time - 20.0) < 0.021 for time in times)
+    assert abs(times[0] - times[1]) > 1e-4
+
+
+def test_queues_wait_for_items_and_for_room(write) -> None:
+    place = write("""
+STATIC_MEM_QUEUE_ALLOC(numbers, 2, sizeof(int));
+static QueueHandle_t numbers;
+static void other(void *argument) {
+    (void)argument;
+    for (int i = 0; i < 4; i++) { xQueueSend(numbers, &i, portMAX_DELAY); vTaskDelay(3); }
+    vTaskDelete(NULL);
+}
+void appMain(void) {
+    numbers = STATIC_MEM_QUEUE_CREATE(numbers);
+    int got = -1;
+    DEBUG_PRINT("%d\\n", (int)xQueueReceive(numbers, &got, 4));
+    xTaskCreate(other, "other", 200, NULL, 1, NULL);
+    for (int i = 0; i < 4; i++) { xQueueReceive(numbers, &got, M2T(100)); DEBUG_PRINT("%d\\n", got); }
+    for (int i = 0; i < 3; i++) DEBUG_PRINT("%d\\n", (int)xQueueSend(numbers, &i, 2));
+    SemaphoreHandle_t mutex = xSemaphoreCreateMutex();
+    for (int i = 0; i < 2; i++) DEBUG_PRINT("%d\\n", (int)xSemaphoreTake(mutex, 3));
+    xSemaphoreGive(mutex);
+    DEBUG_PRINT("%d\\n", (int)xSemaphoreTake(mutex, 0));
+}""")
+    assert lines(place) == ["0", "0", "1", "2", "3", "1", "1", "0", "1", "0", "1"]
+
+
+def test_a_timer_runs_until_it_is_stopped(write) -> None:
+    place = write("""
+static int runs;
+static void tick(TimerHandle_t timer) { if (++runs == 3) xTimerStop(timer, 0); }
+void appMain(void) {
+    TimerHandle_t timer = xTimerCreate("t", 5, pdTRUE, NULL, tick);
+    xTimerStart(timer, 0);
+    vTaskDelay(12); DEBUG_PRINT("%d\\n", runs);
+    vTaskDelay(50); DEBUG_PRINT("%d\\n", runs);
+}""")
+    assert lines(place) == ["2", "3"]
+
+
+def test_parameters_and_log_variables_have_names(write) -> None:
+    place = write("""
+static uint8_t mode; static float gain = 0.5f; static int32_t seen; static int told;
+static void changed(void) { told++; }
+static float twice(uint32_t time, void *data) { (void)time; (void)data; return 2.0f * gain; }
+static logByFunction_t doubled = {.aquireFloat = twice};
+void appMain(void) {
+    for (;;) { seen = paramGetInt(paramGetVarId("own", "mode")) * 10 + told; vTaskDelay(1); }
+}
+PARAM_GROUP_START(own)
+PARAM_ADD_WITH_CALLBACK(PARAM_UINT8, mode, &mode, changed)
+PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, gain, &gain)
+PARAM_GROUP_STOP(own)
+LOG_GROUP_START(own)
+LOG_ADD(LOG_INT32, seen, &seen)
+LOG_ADD_BY_FUNCTION(LOG_FLOAT, doubled, &doubled)
+LOG_GROUP_STOP(own)
+""")
+    with Laboratory(read_app(place), LabSettings(agents=1, boot_s=0.0)) as lab:
+        lab.run(0.01)
+        assert lab.logs(1) == {"own.seen": 0.0, "own.doubled": 1.0}
+        lab.set_parameter(1, "own.mode", 3)
+        lab.set_parameter(1, "own.gain", 1.25)
+        lab.run(0.02)
+        assert lab.logs(1) == {"own.seen": 31.0, "own.doubled": 2.5}
+        assert lab.parameter(1, "own.mode") == 3
+        with pytest.raises(ConfigError, match=r"own\.mode"):
+            lab.set_parameter(1, "own.other", 1)
+
+
+def test_app_channel_carries_both_ways_and_says_when_it_overflowed(write) -> None:
+    place = write("""
+void appMain(void) {
+    char text[30];
+    vTaskDelay(20);
+    DEBUG_PRINT("%d\\n", appchannelHasOverflowOccurred());
+    for (;;) {
+        size_t length = appchannelReceiveDataPacket(text, sizeof text, 50);
+        DEBUG_PRINT("%d\\n", (int)length);
+        if (!length) break;
+    }
+    appchannelSendDataPacket("over", 4);
+}""")
+    with Laboratory(read_app(place), LabSettings(agents=1, boot_s=0.0)) as lab:
+        lab.run(0.005)
+        taken = [lab.send(1, bytes(k + 1)) for k in range(12)]
+        lab.run(0.2)
+        assert taken == [True] * 10 + [False] * 2
+        assert [line for _, _, line in lab.record.console] == ["1", *map(str, range(1, 11)), "0"]
+        assert [(agent, data) for _, agent, data in lab.from_apps] == [(1, b"over")]
+
+
+SENDER = """
+static void hear(P2PPacket *p) { DEBUG_PRINT("%u %d %d\\n", (unsigned)usecTimestamp(), p->size, p->data[0]); }
+void appMain(void) {
+    static P2PPacket packet;
+    uint8_t id = configblockGetRadioAddress() & 255;
+    p2pRegisterCB(hear);
+    packet.port = 3; packet.size = 20; packet.data[0] = id;
+    vTaskDelay(10);
+    BODY
+}"""
+
+
+def test_a_frame_takes_its_time_on_both_lines_and_on_the_air(write) -> None:
+    place = write(SENDER.replace("BODY", "if (id == 1) radiolinkSendP2PPacketBroadcast(&packet);"))
+    with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.0)) as lab:
+        lab.run(0.1)
+        ((heard_us, size, sender),) = [map(int, line.split()) for _, _, line in lab.record.console]
+    line = CRAZYFLIE_LINE
+    on_air_us = 130 + (73 + 8 * 22) / 2
+    way_us = (line.to_radio_ns(20) + line.from_radio_ns(20)) / 1000 + on_air_us
+    assert (size, sender) == (20, 1)
+    assert 10_000 + way_us <= heard_us <= 10_000 + way_us + 10  # and a few calls
+
+
+def test_who_sends_hears_nothing_and_two_at_a_time_destroy_each_other(write) -> None:
+    place = write(SENDER.replace("BODY", "if (id < 3) radiolinkSendP2PPacketBroadcast(&packet);"))
+    with Laboratory(read_app(place), LabSettings(agents=3, boot_s=0.0)) as lab:
+        lab.run(0.1)
+        assert sum(lab.record.sent) == 2
+        assert lab.record.heard == [0, 0, 0]
+
+
+def test_a_send_cuts_a_reception_at_its_sender_alone(write) -> None:
+    # Vehicle 2 turns to sending while the frame of 1 ends: 3 has it, as nothing of 2 is on the air yet.
+    wait = "if (id == 1) radiolinkSendP2PPacketBroadcast(&packet); if (id == 2) { peerLabSpend(150);"
+    place = write(SENDER.replace("BODY", wait + " radiolinkSendP2PPacketBroadcast(&packet); }"))
+    with Laboratory(read_app(place), LabSettings(agents=3, boot_s=0.0)) as lab:
+        lab.run(0.1)
+        heard = sorted((agent, line.split()[2]) for _, agent, line in lab.record.console)
+    assert heard == [(1, "2"), (3, "1"), (3, "2")]
+
+
+def test_receptions_that_find_the_queue_full_are_lost(write) -> None:
+    # Handing 60 bytes over takes longer than hearing them: two that send by turns fill the queue of a third.
+    code = """
+    packet.size = 60;
+    if (id == 2) peerLabSpend(330);
+    if (id < 3) for (int i = 0; i < 60; i++) radiolinkSendP2PPacketBroadcast(&packet);"""
+    place = write(SENDER.replace("BODY", code))
+    with Laboratory(read_app(place), LabSettings(agents=3, boot_s=0.0)) as lab:
+        lab.run(0.5)
+        assert lab.radios[2].overflows > 0
+        assert lab.summary()["queue_overflows"] >= lab.radios[2].overflows
+        assert lab.record.heard[2] > 60
+
+
+def test_an_app_flies_its_vehicle(write) -> None:
+    place = write("""
+static logVarId_t z, x;
+void appMain(void) {
+    z = logGetVarId("stateEstimate", "z"); x = logGetVarId("stateEstimate", "x");
+    while (!supervisorCanFly()) vTaskDelay(10);
+    DEBUG_PRINT("takeoff %d\\n", crtpCommanderHighLevelTakeoff(1.0f, 2.0f));
+    vTaskDelay(M2T(2500));
+    float start = logGetFloat(x);
+    DEBUG_PRINT("%d %d\\n", logGetFloat(z) > 0.9f, supervisorIsFlying());
+    DEBUG_PRINT("%d\\n", crtpCommanderHighLevelIsTrajectoryFinished());
+    static setpoint_t s;
+    s.mode.x = s.mode.y = s.mode.z = modeVelocity; s.velocity.x = 0.5f;
+    for (int i = 0; i < 200; i++) { commanderSetSetpoint(&s, COMMANDER_PRIORITY_EXTRX); vTaskDelay(M2T(10)); }
+    float way = logGetFloat(x) - start;
+    DEBUG_PRINT("%d %d\\n", way > 0.7f && way < 1.1f, commanderGetActivePriority());
+    commanderRelaxPriority();
+    DEBUG_PRINT("land %d\\n", crtpCommanderHighLevelLand(0.0f, 2.0f));
+    vTaskDelay(M2T(6000));
+    DEBUG_PRINT("%d %d\\n", supervisorIsFlying(), logGetFloat(z) < 0.1f);
+}""")
+    assert lines(place, 12.0) == ["takeoff 0", "1 1", "1", "1 3", "land 0", "0 1"]
+
+
+def test_an_app_whose_setpoints_cease_falls(write) -> None:
+    place = write("""
+void appMain(void) {
+    while (!supervisorCanFly()) vTaskDelay(10);
+    crtpCommanderHighLevelTakeoff(1.0f, 2.0f);
+    vTaskDelay(M2T(2500));
+    static setpoint_t s;
+    s.mode.x = s.mode.y = s.mode.z = modeVelocity;
+    commanderSetSetpoint(&s, COMMANDER_PRIORITY_EXTRX);
+    vTaskDelay(M2T(3000));
+    DEBUG_PRINT("%d\\n", supervisorIsLocked());
+}""")
+    assert lines(place, 7.0) == ["1"]
+
+
+def test_the_ground_gives_orders_at_instants(write) -> None:
+    place = write(
+        "static uint8_t go; void appMain(void) { for (;;) vTaskDelay(100); }\n"
+        "PARAM_GROUP_START(own)\nPARAM_ADD(PARAM_UINT8, go, &go)\nPARAM_GROUP_STOP(own)",
+        settings="""
+parameters: {own.go: 1}
+orders:
+- {at: 0.5, order: takeoff, height: 1, duration: 1}
+- {at: 2, order: parameter, name: own.go, value: 7, agents: 2}
+- {at: 2, order: "off", agents: [1]}
+""",
+    )
+    with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.0)) as lab:
+        lab.run(1.9)
+        assert [lab.parameter(agent, "own.go") for agent in (1, 2)] == [1, 1]
+        assert (lab.world.vehicles.position[2] > 0.8).all()
+        lab.run(3.0)
+        assert lab.parameter(2, "own.go") == 7
+        assert lab.summary()["crashed"] == [1]  # it fell: its power was off
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("void appMain(void) { for (;;) usecTimestamp(); }", "never yields"),
+        ("void appMain(void) { volatile int *p = 0; vTaskDelay(5); *p = 1; }", "agent 1, task app, at 0.005"),
+        ("void appMain(void) { ASSERT(1 == 2); }", r"assertion failed in app\.c:"),
+        ("void appMain(void) { xQueueSend(NULL, NULL, 0); }", "a queue that was not created"),
+        ("int deep(int n) { volatile char room[900]; room[0] = n; return n ? deep(n + 1) + room[0] : 0; }\n"
+         "void appMain(void) { deep(1); }", "stack overflowed"),
+        ("void appMain(void) { volatile int on = 1; while (on) { } }", "computes for ever"),
+    ],
+)  # fmt: skip
+def test_an_app_that_fails_is_named(write, code: str, said: str) -> None:
+    with pytest.raises(AppError, match=said) as error:
+        fly(write(code), 2.0, LabSettings(agents=1, boot_s=0.0))
+    assert "agent 1" in str(error.value)
+
+
+def test_bad_input_is_said_in_a_line(write, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="beacons, dtr"):
+        read_app(tmp_path / "nowhere")
+    with pytest.raises(CompileError, match="error"):
+        fly(write("void appMain(void) { nonsense(); } syntax", "a"), 1.0)
+    with pytest.raises(CompileError, match="eventQueueSend"):
+        fly(write("void eventQueueSend(void); void appMain(void) { eventQueueSend(); }", "e"), 1.0)
+    with pytest.raises(AppError, match="appMain"):
+        fly(write("int other;", "b"), 1.5)
+    with pytest.raises(ConfigError, match="orders"):
+        read_app(write("", "c", "orders: [{at: 1, order: fly}]"))
+    with pytest.raises(ConfigError, match="sorces"):
+        read_app(write("", "d", "sorces: [x.c]"))
+
+
+def test_a_ground_station_that_polls_takes_air_and_frames_survive_between_its_packets() -> None:
+    def heard(polls: float) -> float:
+        with Laboratory(read_app("beacons"), LabSettings(agents=4, polls=polls)) as lab:
+            lab.run(4.0)
+            if lab.polling is not None:
+                assert lab.polling.answered > 0.9 * 4.0 * 4 * polls
+            return sum(lab.record.heard) / sum(lab.record.sent) / 3
+
+    assert heard(0.0) >= heard(50.0) > 0.5
