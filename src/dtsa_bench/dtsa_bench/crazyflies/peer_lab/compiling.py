@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import ConfigError, DtsaError
 from .app import App
 
 _HERE = Path(__file__).parent
-FIRMWARE, ENGINE = _HERE / "firmware", _HERE / "engine"
+FIRMWARE, ENGINE = _HERE / "firmware", _HERE / "native"
 #: An app is C as the firmware takes it; fused operations would make other bits than the core's.
 FLAGS = ("-shared", "-fPIC", "-std=gnu11", "-g", "-Wall", "-ffp-contract=off")
 _SHOWN_LINES = 12

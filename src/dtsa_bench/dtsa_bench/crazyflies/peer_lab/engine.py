@@ -14,13 +14,13 @@ from dtsa_agent.core.errors import DtsaError
 
 
 class Event(IntEnum):
-    """What the engine tells (engine/lab.h)."""
+    """What the engine tells (native/lab.h)."""
 
     NONE, SEND, HEARD, COMMAND, PRINT, APP_CHANNEL, ENDED, SPINS, ASSERT, MISUSE = range(10)
 
 
 class Command(IntEnum):
-    """What an app asks for (engine/lab.h)."""
+    """What an app asks for (native/lab.h)."""
 
     SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER = range(8)
 

@@ -18,7 +18,7 @@ from .engine import AppError
 from .laboratory import Laboratory
 from .settings import LabSettings
 
-_CRASHED = 70  # engine/crash.c
+_CRASHED = 70  # native/crash.c
 _HEAD = "peer-lab: "
 
 

@@ -7,7 +7,7 @@ import struct
 
 from dtsa_bench.crazyflies.simulated.firmware import Setpoint
 
-_FORM = struct.Struct("<9i13f")  # engine/crazyflie.c
+_FORM = struct.Struct("<9i13f")  # native/crazyflie.c
 _ABSOLUTE, _VELOCITY = 1, 2  # modes of an axis
 
 
