@@ -77,13 +77,31 @@ class Contacts:
         self._says: dict[int, bool] = {}  # whether it hears this agent, as far as it has said
         self._unnamed: dict[int, int] = {}  # its datagrams since it named this agent
         self._left: set[int] = set()
+        self._seen: dict[int, int] = {}  # largest slot in a frame of its own, of whatever time
         self._last = 0  # slot of the last frame of all
 
-    def reset(self) -> None:
-        """Another time was taken over."""
-        for each in (self._heard, self._named, self._still, self._probation, self._says, self._unnamed, self._left):
+    def reset(self, slot: int) -> None:
+        """Another time was taken over: those that were there still are, and nothing else is known of them.
+
+        :param slot: the present one, of the new time.
+        """
+        there = [agent for agent in self._heard.keys() | self._named.keys() if self._is_there(agent, False)]
+        for each in (self._heard, self._named, self._still, self._probation, self._says, self._unnamed):
             each.clear()
+        self._named.update(dict.fromkeys(there, slot))
         self._last = 0
+
+    def see(self, sender: int, slot: int, now: int) -> None:
+        """A frame of another time was heard: its sender is there, unless the frame was played again.
+
+        :param sender: id.
+        :param slot: in which it says that it was sent.
+        :param now: the present slot, of the own time.
+        """
+        if slot > self._seen.get(sender, -1):
+            self._seen[sender] = slot
+            if sender not in self._left:
+                self._named[sender] = max(self._named.get(sender, 0), now)
 
     def hear(self, sender: int, slot: int, frame: bytes, names: Sequence[int]) -> None:
         """A frame was heard.
@@ -95,6 +113,7 @@ class Contacts:
         """
         named, left = self._named, self._left
         self._last = max(self._last, slot)
+        self._seen[sender] = max(self._seen.get(sender, 0), slot)
         self._heard[sender] = max(self._heard.get(sender, 0), slot)
         leaves, rests, probation = condition_in(frame)
         self._still[sender], self._probation[sender] = rests or probation, probation

@@ -71,11 +71,12 @@ class PlainHearing:
             self.off += off > self._config.slot_ns // 4
         outcome = self.time.hear(said.slot, began - self.delay.error_ns)
         if outcome == FOREIGN:
+            self.contacts.see(said.sender, said.slot, self.time.slot(began) or 0)
             return Taken(OTHER_TIME)
         self._last[said.sender] = said.slot
         if outcome == RESTARTED:
             self.delay.reset()
-            self.contacts.reset()
+            self.contacts.reset(said.slot)
         else:
             self.delay.hear(said.sender, began - before, said.peers)
             self.delay.moved(self.time.slot_start_ns(said.slot) - before)

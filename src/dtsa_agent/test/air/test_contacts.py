@@ -84,8 +84,28 @@ def test_the_dead_are_there_for_a_while_and_those_that_leave_no_longer() -> None
     assert contacts.count(151, True) == Contact(3, 1, 3, 1)  # one that is new waits for longer
     contacts.hear(5, 200, extended(), [1])  # it is back
     assert contacts.count(200, False).there == 2
-    contacts.reset()
-    assert contacts.count(200, False) == Contact(0, 0, 0, 0)
+
+
+def test_those_that_were_there_are_so_in_a_new_time_and_those_of_another_time_as_well() -> None:
+    contacts = Contacts(6, 1, LIMITS, 4)
+    contacts.hear(2, 0, extended(), [1, 3])
+    contacts.hear(4, 1, extended(leaving=True), [1])
+    contacts.see(5, 700, 1)
+    assert contacts.count(1, True) == Contact(3, 1, 1, 1)
+    contacts.hear(2, 60, MOVES, [1])
+    assert contacts.count(60, False).there == 1
+    contacts.see(5, 701, 60)
+    contacts.see(3, 0, 60)
+    contacts.see(3, 0, 120)  # played again
+    contacts.see(4, 30, 60)  # it has left
+    contacts.hear(2, 115, MOVES, [1])
+    assert contacts.count(115, False).there == 1
+    contacts.see(5, 702, 115)
+    contacts.reset(800)
+    contacts.hear(6, 800, MOVES, [1])
+    assert contacts.count(800, True) == Contact(3, 1, 1, 1)
+    contacts.reset(900)
+    assert contacts.count(900, True) == Contact(3, 0, 0, 0)
 
 
 def test_an_agent_known_by_name_is_there_and_not_heard() -> None:

@@ -7,10 +7,43 @@ enum { LEAVES = 255, MOVES = 1, PROBATION = 2 }; /* of an extended frame, see fr
 
 static int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
 
-void contacts_reset(contacts *c)
+void contacts_clear(contacts *c)
 {
-    for (int k = 0; k < c->agents; k++) c->of[k] = (contact){.heard = -1, .named = -1};
+    for (int k = 0; k < c->agents; k++) c->of[k] = (contact){.heard = -1, .named = -1, .seen = -1};
     c->last = 0;
+}
+
+static int64_t limit_of(const contacts *c, const contact *one)
+{
+    return one->still ? c->resting : c->moving;
+}
+
+static int is_there(const contacts *c, const contact *one, int strict)
+{
+    const int64_t by_frame = (strict ? c->resting : limit_of(c, one)) + c->named,
+                  by_name = (strict ? c->resting : 0) + c->named;
+    return !one->left && ((one->heard >= 0 && c->last - one->heard <= by_frame) ||
+                          (one->named >= 0 && c->last - one->named <= by_name));
+}
+
+void contacts_reset(contacts *c, int64_t slot)
+{
+    for (int k = 0; k < c->agents; k++) {
+        contact *one = &c->of[k];
+        *one = (contact){.heard = -1,
+                         .named = is_there(c, one, 0) ? slot : -1,
+                         .seen = one->seen,
+                         .left = one->left};
+    }
+    c->last = 0;
+}
+
+void contacts_see(contacts *c, int sender, int64_t slot, int64_t now)
+{
+    contact *one = &c->of[sender - 1];
+    if (slot <= one->seen) return; /* played again */
+    one->seen = slot;
+    if (!one->left) one->named = larger(one->named, now < 0 ? 0 : now);
 }
 
 /* 1: the sender of the list hears the agent, -1: it does not, 0: the list does not say. */
@@ -34,6 +67,7 @@ void contacts_hear(contacts *c, int sender, int64_t slot, const uint8_t *frame, 
     const int extended = (frame[0] & 0xf) == DTSA_PROFILE_EXTENDED;
     c->last = larger(c->last, slot);
     one->heard = larger(one->heard, slot);
+    one->seen = larger(one->seen, slot);
     one->left = extended && frame[2] == LEAVES;
     one->probation = extended && (frame[3] & PROBATION);
     one->still = one->probation || (extended && !(frame[3] & MOVES));
@@ -49,23 +83,10 @@ void contacts_hear(contacts *c, int sender, int64_t slot, const uint8_t *frame, 
     if (says > 0) one->unnamed = 0;
 }
 
-static int64_t limit_of(const contacts *c, const contact *one)
-{
-    return one->still ? c->resting : c->moving;
-}
-
 int contacts_hears(const contacts *c, int index, int64_t slot)
 {
     const contact *one = &c->of[index];
     return one->heard >= 0 && !one->left && slot - one->heard <= limit_of(c, one);
-}
-
-static int is_there(const contacts *c, const contact *one, int strict)
-{
-    const int64_t by_frame = (strict ? c->resting : limit_of(c, one)) + c->named,
-                  by_name = (strict ? c->resting : 0) + c->named;
-    return !one->left && ((one->heard >= 0 && c->last - one->heard <= by_frame) ||
-                          (one->named >= 0 && c->last - one->named <= by_name));
 }
 
 contact_count contacts_count(const contacts *c, int64_t slot, int strict)

@@ -8,6 +8,7 @@ enum { CYCLES = 8 };
 
 typedef struct contact {
     int64_t heard, named; /* slot of its last frame, and in which others named it last; -1: none */
+    int64_t seen;           /* largest slot in a frame of its own, of whatever time; -1: none */
     int64_t unnamed;     /* its datagrams since it named this agent */
     uint8_t still, probation, left;
     int8_t says; /* 1: it hears this agent; -1: it does not; 0: it has not said */
@@ -24,7 +25,9 @@ typedef struct contact_count {
     int there, hears, heard_by, both;
 } contact_count;
 
-void contacts_reset(contacts *c);
+void contacts_clear(contacts *c);
+void contacts_reset(contacts *c, int64_t slot); /* another time was taken over */
+void contacts_see(contacts *c, int sender, int64_t slot, int64_t now); /* a frame of another time */
 /* frame: at least 8 bytes; names: count ids. */
 void contacts_hear(contacts *c, int sender, int64_t slot, const uint8_t *frame, const int *names,
                    int count);

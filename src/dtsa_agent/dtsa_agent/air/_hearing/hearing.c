@@ -236,12 +236,15 @@ verdict hearing_take(hearing *h, const uint8_t *data, long length, int64_t arriv
     const int64_t before = dtsa_timebase_slot_start(&h->base, out->slot);
     note_time(h, began - h->delay.error - before);
     const int outcome = slots_hear(h, out->slot, began - h->delay.error);
-    if (outcome == DTSA_FOREIGN) return OTHER_TIME;
+    if (outcome == DTSA_FOREIGN) {
+        contacts_see(&h->contact, out->sender, out->slot, dtsa_timebase_slot(&h->base, began));
+        return OTHER_TIME;
+    }
     h->last[k] = out->slot;
     if (outcome == DTSA_RESTARTED) {
         *restarted = 1;
         delay_reset(h);
-        contacts_reset(&h->contact);
+        contacts_reset(&h->contact, out->slot);
     } else {
         delay_hear(h, out, began - before);
         delay_moved(h, dtsa_timebase_slot_start(&h->base, out->slot) - before);
@@ -259,7 +262,7 @@ int hearing_open(hearing *h)
     h->contact.peers = h->peers;
     h->contact.of = calloc(n, sizeof *h->contact.of);
     if (!h->memory || !h->contact.of) return hearing_close(h), 0;
-    contacts_reset(&h->contact);
+    contacts_clear(&h->contact);
     h->last = h->memory;
     h->delay.hears = h->memory + n;
     h->delay.says = h->memory + 2 * n;
