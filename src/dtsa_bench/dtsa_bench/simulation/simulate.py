@@ -69,6 +69,8 @@ class Flight:
 def may_share(run: RunConfig) -> bool:
     """Whether one table may stand for all agents: nothing is ever lost, and all would decide the same.
 
+    In slots that a frame may outlast the channel names each frame's receivers, for which one table has no room.
+
     :param run: the run.
     """
     air, swarm = run.air, run.swarm
@@ -84,6 +86,7 @@ def may_share(run: RunConfig) -> bool:
         or air.link_loss
         or air.losses
         or air.schedule
+        or air.airtime.total_ns(air.airtime.longest) > air.slot_ns
     )
     return lossless and shareable(swarm)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from dtsa_dev.documents.radio_tables import SCHEMES, shortest_ns
 
 from dtsa_bench.commands import cli
 from dtsa_bench.experiments.sweep import spec
@@ -89,6 +90,16 @@ def test_slots_of_slow_radios_hold_their_frames() -> None:
         swarm = cell.run(1001).swarm
         radio = next(name for name in times if cell.labels["radio and scheme"].startswith(name))
         assert swarm.slot_ms == math.ceil(times[radio][swarm.extended] + 5.0)
+
+
+def test_slots_of_a_crazyflies_radio_are_the_shortest_that_fit() -> None:
+    """Rounded up to 0.01 ms; those called constant with 0.3 ms each way."""
+    schemes = {(scheme.policy, scheme.frame == "extended"): scheme for scheme in SCHEMES if not scheme.sealed}
+    for cell in spec.load_preset("crazyflie-radio").cells:
+        run = cell.run(1001)
+        assert (run.air.radio == "plain") == ("constant" in cell.labels["scheme and radio"])
+        shortest_ms = shortest_ns(run.air.airtime, schemes[run.swarm.policy, run.swarm.extended]) / 1e6
+        assert run.swarm.slot_ms == math.ceil(round(shortest_ms * 100, 6)) / 100
 
 
 def test_the_papers_figures_have_its_settings() -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from dtsa_dev.documents.radio_tables import rewritten
 from dtsa_dev.protocol.experiment import Experiment
 from dtsa_dev.protocol.optimum import optimum
 
@@ -21,6 +21,7 @@ from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings.config import StationSettings, SwarmSettings
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
+from dtsa_bench.experiments.sweep import spec
 from dtsa_bench.experiments.sweep.spec import run_config
 from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
@@ -28,7 +29,7 @@ from dtsa_bench.simulation.schemes.knowledge import whittle_index
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_channel_sim.model.airtime import Airtime, Line
+from dtsa_channel_sim.model.airtime import Airtime
 from dtsa_channel_sim.model.verdict import COLLISION
 
 LEAGUE = Path(__file__).resolve().parents[4] / "docs" / "evidence" / "league.md"
@@ -409,17 +410,31 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
 
 
 def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
-    rows = [line.split("|")[1:-1] for line in LEAGUE.read_text().splitlines() if line.startswith("| nRF51")]
-    assert len(rows) == 4
-    for radio, policy, turn, frame, guard, links, decision, shortest in (map(str.strip, row) for row in rows):
-        airtime = Airtime(bitrate=2_000_000 if "2 Mbit" in radio else 1_000_000)
-        length = int(policy.split(", ")[1])
-        assert length == SwarmConfig(policy=policy.split(",")[0]).frame_length
-        assert float(turn.split()[0]) == airtime.ramp_up_ns / 1e6
-        assert float(frame.split()[0]) == pytest.approx(airtime.on_air_ns(length) / 1e6, abs=5e-4)
-        guard_ns, link_ns, decide_ns = (
-            round(float(text.split("x ")[-1].split()[0]) * 1e6) if text else 0 for text in (guard, links, decision)
+    text = LEAGUE.read_text(encoding="utf-8")
+    assert rewritten(text, ["slots"]) == text, "run: python -m dtsa_dev.documents.radio_tables docs/evidence/league.md"
+    rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| nRF51")]
+    assert len(rows) >= 10
+    for _, policy, *parts, shortest, constant in (map(str.strip, row) for row in rows):
+        turn, frame, guard, from_radio, decide, to_radio = (
+            float(part.split("x ")[-1].split()[0]) if part else 0.0 for part in parts
         )
-        airtime = replace(airtime, line=Line(link_ns, 0, link_ns, 0))
-        slot_ns = airtime.shortest_slot_ns(length, guard_ns=guard_ns, decide_ns=decide_ns, needs_frame=bool(link_ns))
-        assert float(shortest.split()[0]) == pytest.approx(slot_ns / 1e6, abs=6e-3)
+        length = int(policy.rsplit(", ", 1)[1])
+        assert from_radio == pytest.approx((8 + length) / 100)
+        assert to_radio == pytest.approx((7 + length) / 100 if policy.startswith("dtsa") else 0.0)
+        on_air = turn + frame + 2 * guard
+        slot_ms, constant_ms = (float(text.strip("* ms")) for text in (shortest, constant))
+        assert slot_ms == pytest.approx(on_air + from_radio + decide + to_radio, abs=6e-3)
+        assert constant_ms == pytest.approx(on_air + (0.6 + decide if decide else 0.0), abs=6e-3)
+
+
+def test_the_table_of_ages_at_these_slots_is_what_the_flights_give() -> None:
+    """Its first column of `lease`."""
+    text = LEAGUE.read_text(encoding="utf-8").split("<!-- radios: ages -->")[1]
+    (row,) = (line for line in text.splitlines() if line.startswith("| lease |"))
+    sweep = spec.load_preset("crazyflie-radio")
+    labels = {"swarm": "12, 2 moving", "frames lost": "none", "scheme and radio": "lease"}
+    (cell,) = (cell for cell in sweep.cells if cell.labels == labels)
+    flown = [simulate(cell.run(seed)).summary() for seed in sweep.seeds]
+    assert not any(summary["collided"] for summary in flown)
+    age_ms = sum(summary["age_mean_ms"] for summary in flown) / len(flown)
+    assert [part.strip() for part in row.split("|")[2:4]] == [f"{cell.run(1001).swarm.slot_ms:g} ms", f"{age_ms:.1f}"]

@@ -79,6 +79,13 @@ def test_where_views_may_differ_everyone_has_a_table(more: dict[str, Any]) -> No
     assert simulate(config).swarm.sent_slot.shape == (6, 6)
 
 
+def test_slots_that_a_long_frame_would_outlast_are_flown_with_a_table_each() -> None:
+    """The channel names the receivers of each frame there, for which one table has no room."""
+    config = run(agents=4, policy="tdma", slot_ms=0.5, timeout_s=1.0)
+    assert not may_share(config)
+    assert simulate(config).summary()["age_mean_slots"] == pytest.approx(1.5, abs=0.01)
+
+
 def test_loss_makes_the_tables_of_dtsa_differ_and_wastes_slots() -> None:
     lossless, lossy = (
         simulate(run(agents=12, loss=loss, timeout_s=2.0, stop_on_crash=False), shared_table=False)
