@@ -13,12 +13,13 @@
 
 #define PORT 15
 #define SILENCE_MS 4000
+#define DATA_SIZE 24 // the state, and room for what else others need
 
 enum { DATA, TOKEN, CLEAR, REQUEST, ACKNOWLEDGE };    // kinds of packets
 enum { IDLE, WAIT_CLEAR, WAIT_REQUEST, WAIT_ANSWER }; // what it waits for
 
 typedef struct {
-    uint8_t kind, source, target;
+    uint8_t size, kind, source, target, data_size; // sizes in bytes
 } Head;
 
 static uint8_t count = 12;
@@ -45,7 +46,8 @@ static uint8_t before(uint8_t id) { return (id + count - 2) % count + 1; }
 static void send(uint8_t what, uint8_t to)
 {
     static P2PPacket packet;
-    Head head = {what, own, to};
+    uint8_t data_size = what == DATA ? DATA_SIZE : 0;
+    Head head = {sizeof head + data_size, what, own, to, data_size};
     packet.port = PORT;
     packet.size = sizeof head;
     memcpy(packet.data, &head, sizeof head);
@@ -55,7 +57,7 @@ static void send(uint8_t what, uint8_t to)
             memcpy(packet.data + packet.size, &value, sizeof value);
             packet.size += sizeof value;
         }
-        packet.size += 14; // as long as a frame with what the others need
+        packet.size = sizeof head + DATA_SIZE;
     }
     radiolinkSendP2PPacketBroadcast(&packet);
 }
