@@ -18,8 +18,8 @@ from .app import App
 _HERE = Path(__file__).parent
 FIRMWARE, ENGINE = _HERE / "firmware", _HERE / "native"
 #: An app is C as the firmware takes it; fused operations would make other bits than the core's.
-FLAGS = ("-shared", "-fPIC", "-std=gnu11", "-g", "-Wall", "-ffp-contract=off")
-_SHOWN_LINES = 12
+FLAGS = ("-shared", "-fPIC", "-std=gnu11", "-g", "-Wall", "-Wno-psabi", "-ffp-contract=off")
+_SHOWN = 3  # errors of the compiler that a message repeats
 
 
 class CompileError(DtsaError):
@@ -41,8 +41,9 @@ def _run(command: Sequence[str], what: str) -> str:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         lines = done.stderr.splitlines()
-        more = f"\n... {len(lines) - _SHOWN_LINES} more lines" if len(lines) > _SHOWN_LINES else ""
-        raise CompileError(f"{what} does not compile:\n" + "\n".join(lines[:_SHOWN_LINES]) + more)
+        errors = [line for line in lines if "error:" in line or "undefined reference" in line] or lines
+        more = f" ... {len(errors) - _SHOWN} more" if len(errors) > _SHOWN else ""
+        raise CompileError(f"{what} does not compile: " + " | ".join(errors[:_SHOWN]) + more)
     return done.stderr
 
 
