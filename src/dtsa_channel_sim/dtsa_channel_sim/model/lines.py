@@ -61,6 +61,21 @@ class Lines:
             last = max(last, held[-1])
         return taken, last
 
+    def handed_ns(self, agent: int) -> int:
+        """Return when the newest reception that a radio took in is through, ns.
+
+        :param agent: id of one that has just taken one in.
+        """
+        return self._held[agent - 1][-1]
+
+    def reset(self, agent: int) -> None:
+        """Forget what a radio holds: its power was off.
+
+        :param agent: id.
+        """
+        self._held[agent - 1].clear()
+        self._sending_ns[agent - 1] = 0
+
     def _release(self, index: int, now_ns: int) -> deque[int]:
         """Return what a radio still holds: what is through has left it."""
         held = self._held[index]

@@ -21,13 +21,15 @@ from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
 from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
 from dtsa_bench.crazyflies.simulated.world import TICK_S, World
-from dtsa_channel_sim.model.medium import OnAir
-from dtsa_channel_sim.model.radio_table import RADIOS
+from dtsa_channel_sim.model.airtime import HEADER_BYTES
+from dtsa_channel_sim.model.lines import Lines
+from dtsa_channel_sim.model.medium import Mask, OnAir
+from dtsa_channel_sim.model.radio_table import airtime_of
 
 from .app import App, Order
 from .compiling import compile_app, engine_library, private_copy
 from .engine import AppError, Command, Engine, Event
-from .nrf51 import Nrf51, Packet
+from .packet import Packet
 from .polling import Polling
 from .record import Record
 from .setpoints import setpoint_of
@@ -54,7 +56,8 @@ class Laboratory:
         self.app = app
         self.now_ns = 0
         count = settings.agents
-        line = RADIOS["crazyflie"].airtime.line
+        airtime = airtime_of("crazyflie", esb.BITRATES[settings.rate], esb.TURN_NS, 0)
+        line = airtime.line
         self._directory = tempfile.TemporaryDirectory(prefix="dtsa-peer-lab-")
         self._library = Path(self._directory.name) / "app.so"
         self.warnings = compile_app(app, self._library)
@@ -74,15 +77,14 @@ class Laboratory:
         ground = 1 if settings.polls else 0
         streams = np.random.SeedSequence(settings.seed).spawn(2)
         self.air = RadioAir(count + ground, settings.loss, int(streams[0].generate_state(1)[0]))
-        tuned = settings.channel, settings.rate
-        self.radios = [
-            Nrf51(k + 1, self.air, self.agenda, line, tuned, self._left, self._deliver_to(k)) for k in range(count)
-        ]
+        self._lines = Lines(airtime, count)
+        self.overflows = [0] * count  # receptions that found a radio's queue full
         self._handed: list[deque[Packet]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
         self.from_apps: list[tuple[float, int, bytes]] = []  # s, id, packet of the app channel to the ground
         self._on = [False] * count
+        self._lives = [0] * count  # how often each was switched off
         self._parameters: list[dict[str, float]] = [dict(app.parameters) for _ in range(count)]
-        self.polling = Polling(self.air, self.agenda, settings, self.radios) if ground else None
+        self.polling = Polling(self.air, self.agenda, settings, self._polled) if ground else None
         generator = np.random.default_rng(streams[1])
         starts = (generator.random(count) * settings.boot_s * 1e9).astype(np.int64).tolist()
         drifts = np.rint(generator.uniform(-1.0, 1.0, count) * settings.drift_ppm * 1000).astype(np.int64)
@@ -146,7 +148,7 @@ class Laboratory:
             "app": self.app.name,
             "seed": self.settings.seed,
             **self.record.summary(self.now_ns),
-            "queue_overflows": sum(radio.overflows for radio in self.radios),
+            "queue_overflows": sum(self.overflows),
         }
 
     # -- what apps tell and ask -------------------------------------------------------------------------------------
@@ -156,9 +158,8 @@ class Laboratory:
         if kind is Event.SEND:
             packet = Packet(k + 1, data, now)
             self.record.on_sent(k + 1, now, packet)
-            radio = self.radios[k]
-            self.agenda.at(told.other_ns, lambda: radio.order(packet, told_at))
-            told_at = told.other_ns
+            at_ns = told.other_ns
+            self.agenda.at(at_ns, lambda: self._order_to_send(packet, at_ns))
         elif kind is Event.HEARD:
             packet = self._handed[k].popleft()
             if told.code >= 0:
@@ -230,25 +231,44 @@ class Laboratory:
         self._truth.event(self.time, index + 1, name, **details)
 
     # -- air --------------------------------------------------------------------------------------------------------
+    def _order_to_send(self, packet: Packet, at_ns: int) -> None:
+        """A packet has come over the line to a radio: it is sent as soon as the radio can."""
+        length = len(packet.data)
+        start_ns = self._lines.start_ns(packet.sender, at_ns, length)
+        settings = self.settings
+        frame = self.air.send(settings.channel, settings.rate, packet.sender, start_ns, HEADER_BYTES + length)
+        self.agenda.at(frame.end_ns, lambda: self._left(packet, frame))
+
     def _left(self, packet: Packet, frame: OnAir) -> None:
         """A packet has left the air: who has it?"""
         self.record.on_air_ns += frame.end_ns - frame.air_ns
         heard = self.air.heard(self.settings.channel, frame)
-        for agent in sorted(heard):
-            if agent <= self.settings.agents and self._on[agent - 1]:
-                self.radios[agent - 1].receive(packet, frame.end_ns)
+        received = np.array([on and k in heard for k, on in enumerate(self._on, 1)])
+        for agent in self._take_in(frame.end_ns, len(packet.data), received):
+            done_ns, life = self._lines.handed_ns(agent), self._lives[agent - 1]
+            self.agenda.at(done_ns, lambda agent=agent, at=done_ns, life=life: self._deliver(agent, at, packet, life))  # type: ignore[misc]
 
-    def _deliver_to(self, k: int) -> Callable[[int, Packet], None]:
-        def deliver(now_ns: int, packet: Packet) -> None:
-            if not packet.sender:  # the ground's: no app hears it
-                return
-            gap = self.world.vehicles.position[:, packet.sender - 1] - self.world.vehicles.position[:, k]
-            distance = max(_NEAREST_M, math.sqrt(float(gap @ gap)))
-            rssi = round(_NEAR_RSSI + 20.0 * math.log10(distance))
-            if self._engine.hear(k, now_ns, packet.raw, rssi):
-                self._handed[k].append(packet)
+    def _take_in(self, now_ns: int, length: int, received: Mask) -> list[int]:
+        """Radios that have received something hand it over, if their queues have room; the ids of these."""
+        taken, _ = self._lines.receive(now_ns, length, received)
+        for k in np.flatnonzero(received & ~taken).tolist():
+            self.overflows[k] += 1
+        return [int(k) + 1 for k in np.flatnonzero(taken)]
 
-        return deliver
+    def _polled(self, agent: int, now_ns: int) -> None:
+        """A packet of the ground station's has come to a radio."""
+        received = np.zeros(self.settings.agents, dtype=np.bool_)
+        received[agent - 1] = self._on[agent - 1]
+        self._take_in(now_ns, 0, received)
+
+    def _deliver(self, agent: int, now_ns: int, packet: Packet, life: int) -> None:
+        k = agent - 1
+        if life != self._lives[k]:
+            return  # its power was off meanwhile
+        gap = self.world.vehicles.position[:, packet.sender - 1] - self.world.vehicles.position[:, k]
+        rssi = round(_NEAR_RSSI + 20.0 * math.log10(max(_NEAREST_M, math.sqrt(float(gap @ gap)))))
+        if self._engine.hear(k, now_ns, packet.raw, rssi):
+            self._handed[k].append(packet)
 
     # -- the ground -------------------------------------------------------------------------------------------------
     def _index(self, agent: int) -> int:
@@ -277,7 +297,8 @@ class Laboratory:
         if self._on[k]:
             self._on[k] = False
             self._engine.off(k)
-            self.radios[k].reset()
+            self._lives[k] += 1
+            self._lines.reset(agent)
             self._handed[k].clear()
             self.world.firmware[k].reset()
 

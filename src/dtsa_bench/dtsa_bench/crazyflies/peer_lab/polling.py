@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 
 from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
 from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
@@ -11,7 +12,6 @@ from dtsa_bench.crazyflies.simulated.radio.esb import RATE_NAMES
 from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, Receiver
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
 
-from .nrf51 import Nrf51, Packet
 from .settings import LabSettings
 
 _POLL = bytes((NULL | 0x0C,))  # an empty packet
@@ -20,12 +20,12 @@ _POLL = bytes((NULL | 0x0C,))  # an empty packet
 class _Polled(Receiver):
     """The vehicle's end of the link: what comes goes over the line to the flight processor, too."""
 
-    def __init__(self, station: Station, radio: Nrf51) -> None:
+    def __init__(self, station: Station, taken: Callable[[int], None]) -> None:
         super().__init__(station, lambda packet, t: None)
-        self._radio = radio
+        self._taken = taken
 
     def hear(self, packet: bytes, t: float) -> bytes:
-        self._radio.receive(Packet(0, packet, 0), round(t * 1e9))
+        self._taken(round(t * 1e9))
         return super().hear(packet, t)
 
 
@@ -33,25 +33,24 @@ class Polling:
     """One dongle that polls all vehicles in turn.
 
     :param air: the air. :param agenda: what happens when. :param settings: how often.
-    :param radios: of the vehicles.
+    :param taken: called with an id and the time (ns) when a vehicle's radio has a packet.
     """
 
-    def __init__(self, air: RadioAir, agenda: Agenda, settings: LabSettings, radios: Sequence[Nrf51]) -> None:
+    def __init__(self, air: RadioAir, agenda: Agenda, settings: LabSettings, taken: Callable[[int, int], None]) -> None:
+        count = settings.agents
         self.answered = self.unanswered = 0
         self._agenda = agenda
         self._stations = [
-            Station("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1)))
-            for k in range(len(radios))
+            Station("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1))) for k in range(count)
         ]
         receivers: dict[int, Receiver] = {
-            k + 1: _Polled(station, radio)
-            for k, (station, radio) in enumerate(zip(self._stations, radios, strict=True))
+            agent: _Polled(station, partial(taken, agent)) for agent, station in enumerate(self._stations, 1)
         }
         radio = RadioSettings(seed=settings.seed, request_ms=0.0)
-        self._dongle = Dongle(len(radios) + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
+        self._dongle = Dongle(count + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
         self._dongle.request(SET_CHANNEL, settings.channel, 0, b"", 0)
         self._dongle.request(SET_RATE, RATE_NAMES.index(settings.rate), 0, b"", 0)
-        self._gap_ns = round(1e9 / (settings.polls * len(radios)))
+        self._gap_ns = round(1e9 / (settings.polls * count))
         self._next = 0
         self._busy = False
         self._due_ns = self._gap_ns

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .app import StateRule
-from .nrf51 import Packet
+from .packet import Packet
 
 _FLYING_M = 0.05  # higher than that it is in the air
 
@@ -109,7 +109,7 @@ class Record:
         self.heard[agent - 1] += 1
         self._note(1, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
-        if packet.sender and self._rule.counts(packet.data, agent):
+        if self._rule.counts(packet.data, agent):
             self._ages.heard(agent, packet.sender, packet.ordered_ns, now_ns)
 
     def on_command(self, agent: int, now_ns: int, code: int, data: bytes) -> None:
