@@ -13,7 +13,7 @@ Flies copies of a Crazyflie app (C, a function appMain) on this machine, in virt
 one medium with the radio's true times. The app is compiled against own declarations of the firmware's documented
 functions. The same seed gives the same bits: the digest says so. Apps that come with it: beacons, dtr."""
 
-_SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "channel", "rate")
+_SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -57,9 +57,9 @@ def run(args: argparse.Namespace) -> int:
         args.app, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
         flags=tuple(args.flag), parameters=parameters, out=out,
     )  # fmt: skip
-    console, warnings = summary.pop("console"), summary.pop("warnings")
+    console, warnings, logs = (summary.pop(key) for key in ("console", "warnings", "logs"))
     if out is not None:
-        _write(out, summary, console)
+        _write(out, {**summary, "logs": logs}, console)
     if warnings:
         print(warnings, end="", file=sys.stderr)
     print(json.dumps(summary, indent=2) if args.json else _lines(summary, len(console)))

@@ -12,7 +12,9 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.peer_lab import Laboratory, LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import ENGINE, FIRMWARE, CompileError, compiler
 from dtsa_bench.crazyflies.peer_lab.engine import AppError
+from dtsa_bench.crazyflies.peer_lab.packet import Packet
 from dtsa_bench.crazyflies.peer_lab.process import fly
+from dtsa_bench.crazyflies.peer_lab.record import Observer
 from dtsa_channel_sim.model.radio_table import CRAZYFLIE_LINE
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
@@ -222,7 +224,10 @@ void appMain(void) {
 
 
 SENDER = """
-static void hear(P2PPacket *p) { DEBUG_PRINT("%u %d %d\\n", (unsigned)usecTimestamp(), p->size, p->data[0]); }
+static void hear(P2PPacket *p) {
+    peerLabRecord(p->data, p->size);
+    DEBUG_PRINT("%u %d %d\\n", (unsigned)usecTimestamp(), p->size, p->data[0]);
+}
 void appMain(void) {
     static P2PPacket packet;
     uint8_t id = configblockGetRadioAddress() & 255;
@@ -379,3 +384,44 @@ def test_a_ground_station_that_polls_takes_air_and_frames_survive_between_its_pa
             return sum(lab.record.heard) / sum(lab.record.sent) / 3
 
     assert heard(0.0) >= heard(50.0) > 0.5
+
+
+def test_a_foreign_radio_is_heard_and_disturbs_and_losses_change_in_flight(write) -> None:
+    place = write(SENDER.replace("BODY", "for (;;) { radiolinkSendP2PPacketBroadcast(&packet); vTaskDelay(50); }"))
+
+    class Heard(Observer):
+        def __init__(self) -> None:
+            self.senders: list[int] = []
+            self.recorded: list[bytes] = []
+
+        def on_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
+            self.senders.append(packet.sender)
+
+        def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
+            self.recorded.append(data)
+
+    heard = Heard()
+    with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.05), observers=[heard]) as lab:
+        for k in range(5):
+            lab.at(0.3 + 0.1 * k, lambda: lab.transmit(b"hello", port=3))
+        lab.run(1.0)
+        assert heard.senders.count(0) == heard.recorded.count(b"hello") > 5
+        assert len(heard.recorded) == len(heard.senders)
+        before = len(heard.senders)
+        lab.set_loss(1.0)
+        lab.run(2.0)
+        assert len(heard.senders) == before
+
+
+def test_sanitizers_find_what_an_app_does(write) -> None:
+    place = write("""
+static volatile char room[8]; volatile int place = 9; int top = 2147483647;
+void appMain(void) { vTaskDelay(7); top += place; room[place] = (char)top; }""")
+    settings = LabSettings(agents=1, boot_s=0.0)
+    for name in ("libubsan.so", "libasan.so"):
+        asked = subprocess.run([*compiler(), f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+        if asked.stdout.strip() == name:
+            pytest.skip(f"no {name}")
+    assert "signed integer overflow" in fly(place, 0.1, settings, flags=("-fsanitize=undefined",))["warnings"]
+    with pytest.raises(AppError, match="global-buffer-overflow"):
+        fly(place, 0.1, settings, flags=("-fsanitize=address",))

@@ -16,7 +16,7 @@ from dtsa_agent.core.errors import DtsaError
 class Event(IntEnum):
     """What the engine tells (native/lab.h)."""
 
-    NONE, SEND, HEARD, COMMAND, PRINT, APP_CHANNEL, ENDED, SPINS, ASSERT, MISUSE = range(10)
+    NONE, SEND, HEARD, COMMAND, PRINT, APP_CHANNEL, ENDED, SPINS, ASSERT, MISUSE, RECORD = range(11)
 
 
 class Command(IntEnum):
@@ -32,7 +32,7 @@ class AppError(DtsaError):
 class _Told(Structure):
     _fields_ = [
         ("kind", c_int32), ("vehicle", c_int32), ("code", c_int32), ("size", c_int32), ("time_ns", c_int64),
-        ("other_ns", c_int64), ("answer", c_int32), ("data", c_uint8 * 260),
+        ("other_ns", c_int64), ("answer", c_int32), ("data", c_uint8 * 1024),
     ]  # fmt: skip
 
 

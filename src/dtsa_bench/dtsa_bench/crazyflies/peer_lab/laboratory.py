@@ -6,7 +6,7 @@ import math
 import struct
 import tempfile
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from .compiling import compile_app, engine_library, private_copy
 from .engine import AppError, Command, Engine, Event
 from .packet import Packet
 from .polling import Polling
-from .record import Record
+from .record import Observer, Record
 from .setpoints import setpoint_of
 from .settings import LabSettings
 
@@ -40,6 +40,7 @@ ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the i
 _NAMES = [entry.full_name for entry in LOG_ENTRIES]
 _PRIORITY = "lab.priority"
 _NEAR_RSSI, _NEAREST_M = 40, 0.1  # -dBm at 1 m
+_FOREIGN_RSSI = 60
 
 
 class Laboratory:
@@ -48,10 +49,17 @@ class Laboratory:
     :param app: the app.
     :param settings: vehicles, air and ground.
     :param out: directory for files; None: none are written.
+    :param observers: look on beside the record.
     :raises CompileError: the app does not compile.
     """
 
-    def __init__(self, app: App, settings: LabSettings | None = None, out: Path | None = None) -> None:
+    def __init__(
+        self,
+        app: App,
+        settings: LabSettings | None = None,
+        out: Path | None = None,
+        observers: Sequence[Observer] = (),
+    ) -> None:
         self.settings = settings = settings or LabSettings()
         self.app = app
         self.now_ns = 0
@@ -67,6 +75,7 @@ class Laboratory:
             round(settings.spin_ms * 1e6),
         )  # fmt: skip
         self.record = Record(count, app.state, out)
+        self._observers = (self.record, *observers)
         config = FleetConfig(
             count=count, start=settings.start, seed=settings.seed, noise=settings.noise, arming=settings.arming
         )
@@ -74,9 +83,8 @@ class Laboratory:
         self._truth = TruthLog(out / "truth.jsonl" if out else None, header)
         self.world = World(config, self._report)
         self.agenda = Agenda()
-        ground = 1 if settings.polls else 0
         streams = np.random.SeedSequence(settings.seed).spawn(2)
-        self.air = RadioAir(count + ground, settings.loss, int(streams[0].generate_state(1)[0]))
+        self.air = RadioAir(count + 2, settings.loss, int(streams[0].generate_state(1)[0]))
         self._lines = Lines(airtime, count)
         self.overflows = [0] * count  # receptions that found a radio's queue full
         self._handed: list[deque[Packet]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
@@ -84,7 +92,7 @@ class Laboratory:
         self._on = [False] * count
         self._lives = [0] * count  # how often each was switched off
         self._parameters: list[dict[str, float]] = [dict(app.parameters) for _ in range(count)]
-        self.polling = Polling(self.air, self.agenda, settings, self._polled) if ground else None
+        self.polling = Polling(self.air, self.agenda, settings, self._polled) if settings.polls else None
         generator = np.random.default_rng(streams[1])
         starts = (generator.random(count) * settings.boot_s * 1e9).astype(np.int64).tolist()
         drifts = np.rint(generator.uniform(-1.0, 1.0, count) * settings.drift_ppm * 1000).astype(np.int64)
@@ -157,19 +165,21 @@ class Laboratory:
         kind = Event(told.kind)
         if kind is Event.SEND:
             packet = Packet(k + 1, data, now)
-            self.record.on_sent(k + 1, now, packet)
+            self._tell("on_sent", k + 1, now, packet)
             at_ns = told.other_ns
             self.agenda.at(at_ns, lambda: self._order_to_send(packet, at_ns))
         elif kind is Event.HEARD:
             packet = self._handed[k].popleft()
             if told.code >= 0:
-                self.record.on_heard(k + 1, now, packet)
+                self._tell("on_heard", k + 1, now, packet)
         elif kind is Event.COMMAND:
             told.answer = self._command(k, Command(told.code), data)
-            self.record.on_command(k + 1, now, told.code, data)
+            self._tell("on_command", k + 1, now, told.code, data)
             self._show(k)
         elif kind is Event.PRINT:
-            self.record.on_print(k + 1, now, data.decode("utf-8", "replace"))
+            self._tell("on_print", k + 1, now, data.decode("utf-8", "replace"))
+        elif kind is Event.RECORD:
+            self._tell("on_record", k + 1, now, data)
         elif kind is Event.APP_CHANNEL:
             self.from_apps.append((now / 1e9, k + 1, data))
         elif kind is not Event.ENDED:
@@ -179,6 +189,10 @@ class Laboratory:
                 Event.ASSERT: f"assertion failed in {text}",
             }.get(kind, f"it used {text}")
             raise AppError(f"app of agent {k + 1} at {now / 1e9:.6f} s: {reason}")
+
+    def _tell(self, what: str, *values: Any) -> None:
+        for observer in self._observers:
+            getattr(observer, what)(*values)
 
     def _command(self, k: int, command: Command, data: bytes) -> int:
         firmware, t = self.world.firmware[k], self.time
@@ -214,7 +228,7 @@ class Laboratory:
     def _tick(self) -> None:
         self.world.step((self.now_ns - TICK_NS) / 1e9)
         position = self.world.vehicles.position
-        self.record.on_positions(self.now_ns, position)
+        self._tell("on_positions", self.now_ns, position)
         self._truth.positions(self.time, position)
         for k, on in enumerate(self._on):
             if on:
@@ -227,7 +241,7 @@ class Laboratory:
         self._engine.world[k][:] = [*(values[name] for name in _NAMES), self.world.firmware[k].priority]
 
     def _report(self, index: int, name: str, **details: Any) -> None:
-        self.record.on_event(index + 1, self.now_ns, name)
+        self._tell("on_event", index + 1, self.now_ns, name)
         self._truth.event(self.time, index + 1, name, **details)
 
     # -- air --------------------------------------------------------------------------------------------------------
@@ -265,10 +279,16 @@ class Laboratory:
         k = agent - 1
         if life != self._lives[k]:
             return  # its power was off meanwhile
-        gap = self.world.vehicles.position[:, packet.sender - 1] - self.world.vehicles.position[:, k]
-        rssi = round(_NEAR_RSSI + 20.0 * math.log10(max(_NEAREST_M, math.sqrt(float(gap @ gap)))))
-        if self._engine.hear(k, now_ns, packet.raw, rssi):
+        if self._engine.hear(k, now_ns, packet.raw, self._rssi(packet.sender, k)):
             self._handed[k].append(packet)
+
+    def _rssi(self, sender: int, k: int) -> int:
+        """Strength of a reception, in -dBm: by the distance, without fading."""
+        if not sender:
+            return _FOREIGN_RSSI
+        position = self.world.vehicles.position
+        distance = max(_NEAREST_M, float(np.linalg.norm(position[:, sender - 1] - position[:, k])))
+        return round(_NEAR_RSSI + 20.0 * math.log10(distance))
 
     # -- the ground -------------------------------------------------------------------------------------------------
     def _index(self, agent: int) -> int:
@@ -354,6 +374,20 @@ class Laboratory:
             raise ConfigError("app channel", len(data), "at most 30 bytes")
         k = self._index(agent)
         return not self._on[k] or self._engine.app_channel(k, self.now_ns, data)
+
+    def transmit(self, data: bytes, port: int = 0) -> None:
+        """A foreign radio on the channel sends a peer-to-peer packet now, whoever else does.
+
+        :param data: at most 60 bytes.
+        """
+        packet, settings = Packet(0, bytes((port,)) + data, self.now_ns), self.settings
+        radio = settings.agents + 2
+        frame = self.air.send(settings.channel, settings.rate, radio, self.now_ns, HEADER_BYTES + len(data))
+        self.agenda.at(frame.end_ns, lambda: self._left(packet, frame))
+
+    def set_loss(self, loss: float) -> None:
+        """From now on receivers lose another share of frames."""
+        self.air.set_loss(loss)
 
     def arm(self, agent: int, arm: bool = True) -> bool:
         """Arm or disarm; False: the firmware refuses."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class Packet:
     """A peer-to-peer packet.
 
-    :param sender: id of its sender.
+    :param sender: id of its sender; 0: a foreign one.
     :param raw: port and data.
     :param ordered_ns: ns, when the app ordered to send it.
     """

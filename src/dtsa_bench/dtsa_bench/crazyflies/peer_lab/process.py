@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
 from .app import read_app
-from .compiling import CompileError
+from .compiling import CompileError, sanitizer_environment
 from .engine import AppError
 from .laboratory import Laboratory
 from .settings import LabSettings
@@ -33,7 +34,7 @@ def fly(
     parameters: Mapping[str, float] | None = None,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Fly an app; the summary, with what the apps printed as `console` and what the compiler warned of as `warnings`.
+    """Fly an app; the summary, with `console` (what the apps printed), `warnings` (compiler, sanitizers), `logs`.
 
     :param place: directory of the app, or the name of one that comes with the laboratory.
     :param seconds: s, virtual time.
@@ -44,7 +45,7 @@ def fly(
     :raises ConfigError: a setting is not usable. :raises CompileError: the app does not compile.
     :raises AppError: an app crashed, or did what no app may do.
     """
-    read_app(place, sources=sources, include=include, flags=flags)  # mistakes are said before a process starts
+    app = read_app(place, sources=sources, include=include, flags=flags)  # mistakes are said before a process starts
     settings = settings or LabSettings()
     values = {name: value for name, value in settings.to_dict().items() if name != "start"}
     request = {
@@ -52,7 +53,10 @@ def fly(
         "parameters": dict(parameters or {}), "out": None if out is None else str(out),
     }  # fmt: skip
     command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
-    done = subprocess.run(command, input=json.dumps(request), capture_output=True, text=True, check=False)
+    environment = {**os.environ, **sanitizer_environment(app)}
+    done = subprocess.run(
+        command, input=json.dumps(request), capture_output=True, text=True, check=False, env=environment
+    )
     lines = done.stderr.splitlines()
     said = next((line.removeprefix(_HEAD) for line in reversed(lines) if line.startswith(_HEAD)), None)
     if done.returncode == _CRASHED and said is not None:
@@ -61,10 +65,11 @@ def fly(
     if answer is None:
         if done.returncode == -signal.SIGINT:
             raise KeyboardInterrupt
-        last = lines[-1] if lines else "it said nothing"
+        found = [line for line in lines if "ERROR: " in line or "runtime error: " in line]  # a sanitizer's
+        last = (found or lines or ["it said nothing"])[-1]
         raise AppError(f"the laboratory's process ended with {done.returncode}: {last}")
     if "error" not in answer:
-        return dict(answer)
+        return {**answer, "warnings": answer["warnings"] + done.stderr}
     raise {"CompileError": CompileError, "AppError": AppError}.get(answer["kind"], DtsaError)(answer["error"])
 
 
@@ -77,7 +82,8 @@ def _serve(request: dict[str, Any]) -> dict[str, Any]:
             for agent in range(1, lab.settings.agents + 1):
                 lab.set_parameter(agent, name, value)
         lab.run(request["seconds"])
-        return {**lab.summary(), "console": lab.record.console, "warnings": lab.warnings}
+        logs = {str(agent): dict(lab.logs(agent)) for agent in range(1, lab.settings.agents + 1)}
+        return {**lab.summary(), "console": lab.record.console, "warnings": lab.warnings, "logs": logs}
 
 
 def main() -> int:

@@ -68,8 +68,36 @@ class Ages:
         }
 
 
-class Record:
-    """Takes in what happens.
+class Observer:
+    """What may look on. Times are ns; agents are ids; each method may be left out."""
+
+    def on_sent(self, agent: int, now_ns: int, packet: Packet) -> None:
+        """An app has ordered a packet."""
+
+    def on_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
+        """An app's callback gets a packet."""
+
+    def on_command(self, agent: int, now_ns: int, code: int, data: bytes) -> None:
+        """An app has commanded its vehicle (engine.Command)."""
+
+    def on_print(self, agent: int, now_ns: int, text: str) -> None:
+        """An app has printed."""
+
+    def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
+        """An app has handed something over (peerLabRecord)."""
+
+    def on_event(self, agent: int, now_ns: int, name: str) -> None:
+        """Something happened to a vehicle."""
+
+    def on_positions(self, now_ns: int, position: NDArray[np.float64]) -> None:
+        """True places, every 10 ms.
+
+        :param position: (3, N), m, world.
+        """
+
+
+class Record(Observer):
+    """Counts, ages, distances, and the digest of all of it.
 
     :param agents: number of vehicles.
     :param rule: which packets carry a state.
@@ -99,41 +127,35 @@ class Record:
             self._file.write(json.dumps(entry) + "\n")
 
     def on_sent(self, agent: int, now_ns: int, packet: Packet) -> None:
-        """An app has ordered a packet."""
         self.sent[agent - 1] += 1
         self._note(0, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, sent=agent, port=packet.raw[0], data=packet.data.hex())
 
     def on_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
-        """An app's callback gets a packet."""
         self.heard[agent - 1] += 1
         self._note(1, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
-        if self._rule.counts(packet.data, agent):
+        if packet.sender and self._rule.counts(packet.data, agent):
             self._ages.heard(agent, packet.sender, packet.ordered_ns, now_ns)
 
     def on_command(self, agent: int, now_ns: int, code: int, data: bytes) -> None:
-        """An app has commanded its vehicle."""
         self._note(2 + code, agent, now_ns, data)
 
     def on_print(self, agent: int, now_ns: int, text: str) -> None:
-        """An app has printed."""
         self._note(20, agent, now_ns, text.encode())
         *lines, rest = (self._lines.get(agent, "") + text).split("\n")
         self._lines[agent] = rest
         self.console += [(now_ns / 1e9, agent, line) for line in lines]
 
+    def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
+        self._note(23, agent, now_ns, data)
+
     def on_event(self, agent: int, now_ns: int, name: str) -> None:
-        """Something happened to a vehicle."""
         self._note(21, agent, now_ns, name.encode())
         if name in ("crash", "hard landing"):
             self.crashed.setdefault(agent, now_ns / 1e9)
 
     def on_positions(self, now_ns: int, position: NDArray[np.float64]) -> None:
-        """True places.
-
-        :param now_ns: ns. :param position: (3, N), m, world.
-        """
         self._note(22, 0, now_ns, np.ascontiguousarray(position).tobytes())
         flying = np.flatnonzero(position[2] > _FLYING_M)
         if len(flying) > 1:

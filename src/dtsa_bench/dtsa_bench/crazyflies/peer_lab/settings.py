@@ -7,6 +7,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
+from dtsa_bench.crazyflies.simulated import layout
 from dtsa_bench.crazyflies.simulated.radio.esb import BITRATES
 
 
@@ -14,7 +15,7 @@ from dtsa_bench.crazyflies.simulated.radio.esb import BITRATES
 class LabSettings(Settings):
     """Vehicles, air and ground.
 
-    :param start: start positions, (3, agents), m, world; None: an ellipse.
+    :param start: start positions, (3, agents), m, world; None: as `radius_m` says.
     :raises ConfigError: a value is out of range.
     """
 
@@ -42,9 +43,16 @@ class LabSettings(Settings):
     spin_ms: float = setting(
         500.0, "an app's task that does not wait for so long ends the flight", unit="ms", minimum=1.0, maximum=1e6
     )
+    radius_m: float = setting(
+        0.0, "vehicles start on a circle of this radius around the origin; 0: on an ellipse of 1.2 m by 2 m", unit="m",
+        minimum=0.0, maximum=100.0,
+    )  # fmt: skip
     start: Any = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         check(self)
+        if self.start is None and self.radius_m:
+            circle = layout.positions("ellipse", self.agents, (self.radius_m, self.radius_m))
+            object.__setattr__(self, "start", circle)
         if self.polls * self.agents > 5000:
             raise ConfigError("polls", self.polls, f"at most {5000 / self.agents:g} for {self.agents} vehicles")

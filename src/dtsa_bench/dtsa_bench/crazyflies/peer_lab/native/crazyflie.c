@@ -400,6 +400,17 @@ bool appchannelHasOverflowOccurred(void)
 
 bool appchannelHasOverflowOccured(void) { return appchannelHasOverflowOccurred(); }
 
+void peerLabRecord(const void *data, uint32_t size)
+{
+    if (!lab.running) return;
+    if (size > EVENT_BYTES) misuse("peerLabRecord with more than 1024 bytes");
+    lab.calls++;
+    lab.event.kind = EVENT_RECORD;
+    lab.event.size = (int)size;
+    memcpy(lab.event.data, data, size);
+    yield_event();
+}
+
 void labPrint(const char *format, ...)
 {
     // On the Cortex-M4 a long has 32 bits: `%lu` is read as `%u`.
@@ -416,7 +427,7 @@ void labPrint(const char *format, ...)
             narrow[used++] = *++c;
     }
     narrow[used] = 0;
-    char text[sizeof lab.event.data];
+    char text[256];
     va_list arguments;
     va_start(arguments, format);
     vsnprintf(text, sizeof text, narrow, arguments);

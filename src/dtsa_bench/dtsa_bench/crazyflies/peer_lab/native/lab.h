@@ -22,6 +22,7 @@
 #define MAX_TASKS 12
 #define MAX_VARIABLES 512
 #define MAX_INBOX 8
+#define EVENT_BYTES 1024
 #define APP_PRIORITY 0
 #define STACK_BYTES (256 * 1024)
 
@@ -36,7 +37,8 @@ enum {
     EVENT_ENDED,
     EVENT_SPINS,
     EVENT_ASSERT,
-    EVENT_MISUSE
+    EVENT_MISUSE,
+    EVENT_RECORD
 };
 
 // Commands that the owner answers. Values: peer_lab/engine.py.
@@ -56,7 +58,7 @@ typedef struct {
     int64_t time_ns;  // when
     int64_t other_ns; // EVENT_SEND: when the radio has it
     int32_t answer;   // EVENT_COMMAND: written by the owner before it goes on
-    uint8_t data[260];
+    uint8_t data[EVENT_BYTES];
 } Event;
 
 typedef struct Vehicle Vehicle;

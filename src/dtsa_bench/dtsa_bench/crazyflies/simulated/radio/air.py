@@ -21,9 +21,17 @@ class RadioAir:
     """
 
     def __init__(self, radios: int, loss: float, seed: int) -> None:
-        self._medium = Medium(ChannelConfig(agents=radios, loss=loss, seed=seed))
+        self._config = ChannelConfig(agents=radios, loss=loss, seed=seed)
+        self._medium = Medium(self._config)
         self._by_channel: dict[int, list[OnAir]] = {}
         self._judged = 0  # each transmission has random numbers of its own
+
+    def set_loss(self, loss: float) -> None:
+        """From now on another share of packets is lost to noise.
+
+        :param loss: the share.
+        """
+        self._medium = Medium(self._config.changed({"loss": loss}))
 
     def send(
         self, channel: int, rate: str, sender: int, start_ns: int, length: int, turn_ns: int = esb.TURN_NS
