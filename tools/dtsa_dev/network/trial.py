@@ -293,5 +293,7 @@ def swarm_words(swarm: SwarmConfig) -> list[str]:
         option = name.replace("_", "-")
         if name in ("agents", "policy", "auth") or value == plain[name]:
             continue
+        if isinstance(value, dict):
+            value = ",".join(f"{key}={number}" for key, number in value.items())
         words.append(f"--{option}={value}" if not isinstance(value, bool) else f"--{'' if value else 'no-'}{option}")
     return [*words, "--seal" if swarm.auth else "--no-seal"]

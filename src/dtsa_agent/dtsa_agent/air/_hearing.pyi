@@ -17,7 +17,7 @@ class Hearing:
     def __new__(
         cls, agents: int, id: int, anchor_every: int, slot_ns: int, seed: int, header: bytes, late_bytes: int,
         peers: int, key: bytes, session: int, flight_ns: int, position_step: float, length: int, own_bytes: int,
-        limit_ns: int, clock_began_ns: int, clock_offset_ns: int, clock_drift_ppb: int, moving: int,
+        limit_ns: int, trust_ns: int, clock_began_ns: int, clock_offset_ns: int, clock_drift_ppb: int, moving: int,
         resting: int, named: int, port: _Port, /,
     ) -> Hearing: ...  # fmt: skip
 

@@ -42,6 +42,7 @@ NO_FRAME, UNKNOWN, REJECTED = "no frame", "unknown agent", "rejected"
 OTHER_TIME, REPEATED, OWN_ID, EARLY = "other time", "repeated", "own id", "too early"
 _MAGIC = b"DT\x01\x00"
 _WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
+_TRUST_NS = 1_000_000
 _UNIT_NS = 10_000  # of times in the header
 
 
@@ -53,6 +54,15 @@ def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
     """
     length = port.header(config.auth).size + config.frame_length
     return port.flight_time_ns + port.byte_time_ns * length + port.turn_ns * config.agents // 2  # half a round
+
+
+def trust_ns(config: SwarmConfig, port: PortProperties) -> int:
+    """By how much a frame may be off its slot and still say what time it is, ns.
+
+    :param config: what all agents share.
+    :param port: what carries the frames.
+    """
+    return config.slot_ns // 4 if port.varies else _TRUST_NS
 
 
 def shortest_slot_ns(config: SwarmConfig, port: PortProperties) -> int:

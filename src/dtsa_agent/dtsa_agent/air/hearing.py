@@ -22,6 +22,7 @@ from .datagram import (
     UNKNOWN,
     Wrapping,
     flight_ns,
+    trust_ns,
 )
 from .port import DatagramPort
 from .settings import AgentSettings
@@ -62,6 +63,7 @@ def make_hearing(config: SwarmConfig, own: AgentSettings, wrapping: Wrapping, po
         wrapping.length,
         config.own_bytes,
         config.slot_ns // 4,
+        trust_ns(config, port.properties),
         time.monotonic_ns(),
         own.clock_offset_ns,
         own.clock_drift_ppb,

@@ -34,14 +34,21 @@ class PlainHearing:
     :param wrapping: opens datagrams.
     :param flight_ns: ns, from the order to send a frame to its arrival, as supposed.
     :param clock: the own one.
+    :param trust_ns: ns by which a frame may be off its slot and still say what time it is.
     """
 
     def __init__(
-        self, config: SwarmConfig, agent: int, wrapping: Wrapping, flight_ns: int, clock: OwnClock | None = None
+        self,
+        config: SwarmConfig,
+        agent: int,
+        wrapping: Wrapping,
+        flight_ns: int,
+        clock: OwnClock | None = None,
+        trust_ns: int = 1_000_000,
     ) -> None:
         self._config, self._agent, self._wrapping, self._flight_ns = config, agent, wrapping, flight_ns
         self._clock = OwnClock() if clock is None else clock
-        self.time = SlotTime(config, agent)
+        self.time = SlotTime(config, agent, trust_ns)
         self.delay = Delay(agent, config.slot_ns // 4, wrapping.peers)
         self.contacts = Contacts(config.agents, agent, limits_of(config, wrapping.peers), wrapping.peers)
         #: Frames of about the same time, and of these those that were off by more than a quarter of a slot.

@@ -79,6 +79,7 @@ class PortProperties:
     shortest_slot_ns: int = 0  # shorter slots are refused
     turn_ns: int = 0  # of radios that take turns by themselves, how long one of them has its turn
     slots_hold_flights: bool = False  # slots in which a frame may arrive too late for the next one are refused
+    varies: bool = False  # frames arrive by milliseconds earlier or later than others: see `datagram.trust_ns`
 
     def header(self, sealed: bool) -> Header:
         """What stands before a frame.

@@ -17,12 +17,13 @@ class SlotTime(TimeBase):
 
     :param config: the settings that all agents share.
     :param agent: own id.
+    :param trust_ns: ns by which a frame may be off its slot and still say what time it is.
     """
 
     __slots__ = ("_aligner_of_own", "corrected")
 
-    def __init__(self, config: SwarmConfig, agent: int) -> None:
-        self._aligner_of_own = ClockAligner()
+    def __init__(self, config: SwarmConfig, agent: int, trust_ns: int = 1_000_000) -> None:
+        self._aligner_of_own = ClockAligner(limit_ns=trust_ns)
         #: How often the time of the own group was taken anew.
         self.corrected = 0
         super().__init__(

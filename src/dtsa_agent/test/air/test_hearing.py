@@ -20,7 +20,7 @@ from waiting import wait_for
 
 import dtsa_agent
 from dtsa_agent.air.clock import OwnClock
-from dtsa_agent.air.datagram import HEADER, NOT_OURS, Wrapping, flight_ns
+from dtsa_agent.air.datagram import HEADER, NOT_OURS, Wrapping, flight_ns, trust_ns
 from dtsa_agent.air.hearing import REASONS, STATES, Hearing, make_hearing
 from dtsa_agent.air.plain_hearing import PlainHearing
 from dtsa_agent.air.port import PortProperties
@@ -39,7 +39,7 @@ SLOT_NS, OWN, UDP = OPEN.slot_ns, 2, UdpSettings(interface="lo", group="239.255.
 
 PORTS = (
     UDP.properties,
-    PortProperties("serial", 900_000, 17_361, agreed_bytes=2, peers=1),
+    PortProperties("serial", 900_000, 17_361, agreed_bytes=2, peers=1, varies=True),
     PortProperties("radio", 500_000, 14_000, agreed_bytes=2, peers=0, bare_sealed=True),
     PortProperties("radio", 500_000, 14_000, agreed_bytes=4, peers=3),
 )
@@ -83,7 +83,7 @@ class Both:
             self.compiled = make_hearing(config, own, self.wrapping, NoPort(port))
             clock = OwnClock(offset_ns, drift_ppb)
         flight = flight_ns(config, port)
-        self.plain = PlainHearing(config, OWN, self.wrapping, flight, clock)
+        self.plain = PlainHearing(config, OWN, self.wrapping, flight, clock, trust_ns(config, port))
         self.clock = clock
 
     def take(self, data: bytes) -> str:
@@ -324,7 +324,7 @@ def given_values() -> dict[str, Any]:
     return {
         "agents": 5, "id": 2, "anchor_every": 3, "slot_ns": SLOT_NS, "seed": 1, "header": bytes(8), "late_bytes": 2,
         "peers": 4, "key": b"", "session": 0, "flight_ns": 0, "position_step": 0.002, "length": 45,
-        "own_bytes": 0, "limit_ns": 1, "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0,
+        "own_bytes": 0, "limit_ns": 1, "trust_ns": 1, "clock_began_ns": 0, "clock_offset_ns": 0, "clock_drift_ppb": 0,
         "moving": 9, "resting": 9, "named": 9, "port": NoPort().compiled,
     }  # fmt: skip
 
@@ -363,6 +363,7 @@ def test_the_hearing_compiles_for_32_bits(tmp_path: Path) -> None:
         {"length": 18},
         {"key": bytes(33)},
         {"slot_ns": 0},
+        {"trust_ns": 0},
         {"clock_drift_ppb": 500_000_001},
         {"clock_drift_ppb": -500_000_001},
     ],

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from dtsa_agent.air.serial.modems import MODEMS, Modem
 from dtsa_agent.core.settings.declaration import Settings, check, setting
@@ -64,11 +64,6 @@ class FakeModemSettings(Settings):
         return self.kind.baud if self.baud is None else self.baud
 
 
-class _Packet(NamedTuple):
-    data: bytes
-    on_air: OnAir
-
-
 @dataclass(slots=True)
 class _One:
     """One modem."""
@@ -100,13 +95,15 @@ class FakeModems:
         self.devices = [directory / f"modem{number}" for number in range(1, settings.count + 1)]
         self._events: list[tuple[int, int, int, int, bytes]] = []  # a heap: ns, entry, kind, modem, bytes
         self._entry = 0
-        self._air: list[_Packet] = []  # packets that may still overlap others
+        self._air: list[OnAir] = []  # packets that may still overlap others
         self._round = (0, 0)  # of their own time division: from when on whose turn it is
         self._lock = threading.Lock()
         self._wake_read, self._wake_write = os.pipe()
         self._stopped = False
         #: Packets sent, received, lost and destroyed; bytes for which a buffer had no room.
         self.counts = dict.fromkeys(("packets", "received", "lost", "collided", "overflowed_bytes"), 0)
+        #: Packets sent, by number of the modem.
+        self.packets_of = dict.fromkeys(range(1, settings.count + 1), 0)
         for index in range(settings.count):
             self._plug(index)
         self._thread = threading.Thread(target=self._run, name="modems", daemon=True)
@@ -279,8 +276,9 @@ class FakeModems:
         air_ns = now_ns + kind.turn_round_ns
         end_ns = air_ns + kind.on_air_ns(len(packet))
         one.sending_ns = end_ns
-        self._air.append(_Packet(packet, OnAir(index + 1, now_ns, air_ns, end_ns)))
+        self._air.append(OnAir(index + 1, now_ns, air_ns, end_ns))
         self.counts["packets"] += 1
+        self.packets_of[index + 1] += 1
         self._at(end_ns, _END, index, packet)
         if kind.turn_ns:
             self._round = (end_ns, (index + 1) % len(self._ones))
@@ -292,12 +290,9 @@ class FakeModems:
 
     def _end(self, now_ns: int, index: int, data: bytes) -> None:
         """A packet has left the air: the medium says who has it."""
-        packet = next(p for p in self._air if p.on_air.sender == index + 1 and p.on_air.end_ns == now_ns)
-        frame = packet.on_air
+        frame = next(one for one in self._air if one.sender == index + 1 and one.end_ns == now_ns)
         others = [
-            p.on_air
-            for p in self._air
-            if p is not packet and p.on_air.start_ns < frame.end_ns and p.on_air.end_ns > frame.start_ns
+            one for one in self._air if one is not frame and one.start_ns < frame.end_ns and one.end_ns > frame.start_ns
         ]
         slot = self._slot(frame.start_ns)
         received, lost, collided = self._channel.medium(slot).judge(slot, frame, others)
@@ -307,8 +302,8 @@ class FakeModems:
         for receiver in received.nonzero()[0].tolist():
             self.counts["received"] += 1
             self._out(receiver, data, now_ns)
-        oldest_ns = min((p.on_air.start_ns for p in self._air if p.on_air.end_ns > now_ns), default=now_ns)
-        self._air = [p for p in self._air if p.on_air.end_ns > oldest_ns]
+        oldest_ns = min((one.start_ns for one in self._air if one.end_ns >= now_ns), default=now_ns)
+        self._air = [one for one in self._air if one.end_ns > oldest_ns]
 
     def _out(self, index: int, data: bytes, now_ns: int) -> None:
         """A modem gives its computer what it has, and a USB adapter keeps it for a while."""

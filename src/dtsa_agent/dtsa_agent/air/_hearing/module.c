@@ -39,17 +39,17 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     Py_ssize_t header_length, key_length;
     int id, anchor_every;
     long long moving, resting, named;
-    long long slot_ns, flight, limit, began, offset, drift;
+    long long slot_ns, flight, limit, trust, began, offset, drift;
     unsigned long long seed, session;
     hearing *h = PyMem_Calloc(1, sizeof *h);
     PyObject *self = NULL, *capsule;
     air_port *port;
     (void)unused;
     if (!h) return PyErr_NoMemory();
-    if (!PyArg_ParseTuple(args, "iiiLKy#iiy#KLdiiLLLLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
+    if (!PyArg_ParseTuple(args, "iiiLKy#iiy#KLdiiLLLLLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
                           &seed, &header, &header_length, &h->late_bytes, &h->peers, &key,
                           &key_length, &session, &flight, &h->position_step, &h->length,
-                          &h->own_bytes, &limit, &began, &offset,
+                          &h->own_bytes, &limit, &trust, &began, &offset,
                           &drift, &moving, &resting, &named, &capsule))
         goto failed;
     port = PyCapsule_GetPointer(capsule, DTSA_PORT);
@@ -59,7 +59,7 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
         h->peers > PEERS ||
         key_length > (Py_ssize_t)sizeof h->key || h->length > LONGEST ||
         h->length <= header_length + h->late_bytes + 4 * h->peers + DTSA_TAG_BYTES ||
-        h->own_bytes < 0 ||
+        h->own_bytes < 0 || trust < 1 ||
         drift < -DRIFT_MOST || drift > DRIFT_MOST || !(h->position_step > 0.0) ||
         !dtsa_timebase_init(&h->base, h->agents, anchor_every, slot_ns, id, seed)) {
         PyErr_SetString(PyExc_ValueError, "what is heard: a value is out of range");
@@ -75,6 +75,7 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     h->flight = flight;
     h->slot_ns = slot_ns;
     h->delay.limit = limit;
+    h->base.aligner.limit_ns = trust;
     h->contact.moving = moving;
     h->contact.resting = resting;
     h->contact.named = named;

@@ -73,6 +73,7 @@ class SerialSettings(Settings):
             longest=min(LONGEST, kind.packet - OVERHEAD),
             turn_ns=kind.turn_ns,
             slots_hold_flights=True,
+            varies=True,
         )
 
     @property

@@ -1,0 +1,260 @@
+"""Integration: agents over simulated modems on pseudo terminals, whose air is the medium of the simulator."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import air_helpers as helpers
+import pytest
+from waiting import wait_for
+
+from dtsa_agent.air.serial import SerialSettings
+from dtsa_agent.air.serial.frames import to_line
+from dtsa_agent.air.serial.modems import MODEMS
+from dtsa_agent.air.serial.port import SerialPort
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.core import SwarmConfig
+from dtsa_bench.commands.cli import main
+from dtsa_bench.network.fake_modems import FakeModems, FakeModemSettings
+from dtsa_bench.pages.report.data import run_data
+from dtsa_bench.pages.view.network_listener import NetworkListener
+from dtsa_bench.pages.view.track import Track
+from dtsa_bench.recordings.merge.agent_bag import read
+from dtsa_bench.recordings.merge.merge import Merge, verified
+from dtsa_bench.recordings.merge.merged_run import lay
+from dtsa_bench.recordings.merge.merged_writer import write
+from dtsa_bench.recordings.verify import verify_bag
+
+# Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
+CONFIG = SwarmConfig(agents=3, policy="lease", slot_ms=50.0, open_every=0, adoption=False)
+QUICK = FakeModemSettings(modem="esp-now", count=4)
+LISTENER = 4
+
+
+@contextmanager
+def modems(settings: FakeModemSettings, directory: Path, **channel: Any) -> Iterator[FakeModems]:
+    """Modems, and the air between them."""
+    with FakeModems(settings, FakeModems.channel(settings.count, **channel), directory) as made:
+        yield made
+
+
+def port_settings(made: FakeModems, number: int) -> SerialSettings:
+    """What an agent says of a modem."""
+    kind = made.settings
+    return SerialSettings(device=str(made.devices[number - 1]), baud=kind.line_baud, modem=kind.modem)
+
+
+@dataclass
+class Flight:
+    """Three agents; the second one's modem was unplugged, and the third one was cut off for a while."""
+
+    bags: list[Path]
+    agents: list[helpers.Flying]
+    sniffed: dict[str, Any]
+    shown: str
+    merged: dict[str, Any]
+    whole: Path
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    directory = tmp_path_factory.mktemp("serial")
+    paths = [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
+    flying: list[helpers.Flying] = []
+    with modems(QUICK, directory, loss=0.05, seed=3) as made:
+        sniffing = helpers.Sniffing(CONFIG, port_settings(made, LISTENER))
+        try:
+            for agent, path in enumerate(paths, 1):
+                own = AgentSettings(id=agent, clock_offset_ns=agent * 10**9, clock_drift_ppb=30_000 * (agent - 2))
+                flying.append(helpers.Flying(own, CONFIG, port_settings(made, agent), path))
+            wait_for(lambda: all(len(one.heard) == 2 and min(one.heard.values()) > 5 for one in flying))
+            sniffing.start()
+            go_on(flying, 60)
+            made.unplug(2)
+            wait_for(lambda: any("has gone" in line for line in flying[1].said))
+            go_on(flying, 20)
+            made.plug(2)
+            wait_for(lambda: any("is back" in line for line in flying[1].said))
+            made.set(partition="1,2,4 | 3")
+            go_on(flying, 30)
+            made.set(partition="")
+            go_on(flying, 100)
+        finally:
+            for one in flying:
+                one.end()
+            sniffed = sniffing.end()
+        track = Track("listener")
+        source = NetworkListener(track, CONFIG, port_settings(made, LISTENER))
+        source.stopped = True
+        source.run()
+    together = Merge([read(path) for path in paths])
+    merged, whole = together.judge(), directory / "whole"
+    write(whole, lay(together, merged), merged)
+    return Flight(paths, flying, sniffed, track.name, merged, whole)
+
+
+def go_on(flying: list[helpers.Flying], slots: int) -> None:
+    """All go on for so many slots."""
+    seen = [len(one.slots) for one in flying]
+    wait_for(lambda: all(len(one.slots) > before + slots for one, before in zip(flying, seen, strict=True)))
+
+
+def test_groups_become_one_and_no_slot_has_two_senders(flight: Flight) -> None:
+    assert flight.merged["common_slot"] is not None
+    assert flight.merged["slots_with_two_senders"] == 0
+    assert flight.merged["frames_sent"] > 60
+    for one in flight.agents:
+        found = one.agent.summary()
+        assert found["state"] == "joined"
+        assert found["dropped_by_computer"] == 0
+    assert flight.agents[1].agent.summary()["times_unplugged"] == 1
+    assert flight.agents[1].agent.summary()["unsent_because"].keys() <= {"the device is not there", "too late"}
+
+
+def test_who_listens_by_a_modem_finds_that_all_keep_the_rules(flight: Flight) -> None:
+    assert flight.sniffed["heard"].keys() == {"cf1", "cf2", "cf3"}
+    assert flight.sniffed["slots_with_two_senders"] == 0  # it misses frames: of rules it cannot be sure
+    assert flight.shown == "listener"
+
+
+def test_the_bags_are_one_flight_whose_decisions_are_made_again(flight: Flight) -> None:
+    again = flight.merged["decisions_again"]
+    assert verified(flight.merged)
+    assert again["equal"] == again["of"] > 200
+    checked = verify_bag(flight.whole)
+    assert checked.ok, checked.difference
+    assert run_data(flight.whole)["slots"]["count"] > 100
+    kind = MODEMS["esp-now"]
+    length = 13 + CONFIG.frame_length
+    line_ns = (2 * length + kind.gap_bytes) * 10 * 1e9 / kind.baud
+    whole_ms = (line_ns + kind.turn_round_ns + kind.on_air_ns(length)) / 1e6
+    assert flight.merged["time_line"]["flight_time_us"] / 1e3 == pytest.approx(whole_ms, abs=5.0)
+
+
+def test_packets_that_overlap_are_lost_and_a_modem_that_sends_is_deaf(tmp_path: Path) -> None:
+    with modems(FakeModemSettings(modem="e22-19k", count=3), tmp_path) as made:
+        ends = [SerialPort(port_settings(made, number)) for number in (1, 2, 3)]
+        try:
+            assert ends[0].send(b"one") == ""
+            wait_for(lambda: made.counts["received"] == 2)
+            with made._lock:  # both are read at one time
+                assert ends[0].send(b"two") == ends[1].send(b"three") == ""
+            wait_for(lambda: made.counts["packets"] == 3)
+            wait_for(lambda: made.counts["collided"] == 4)
+            assert made.counts["received"] == 2
+            got: list[list[bytes]] = [[], [], []]
+            wait_for(lambda: gather(ends, got) == [[], [b"one"], [b"one"]])
+        finally:
+            for end in ends:
+                end.close()
+
+
+def gather(ends: list[SerialPort], got: list[list[bytes]]) -> list[list[bytes]]:
+    """What has come out of the modems so far."""
+    for found, end in zip(got, ends, strict=True):
+        found.extend(datagram.data for datagram in end.receive(16))
+    return got
+
+
+def test_modems_with_a_time_division_of_their_own_take_turns(tmp_path: Path) -> None:
+    with modems(FakeModemSettings(modem="sik-64k", count=3), tmp_path) as made:
+        ends = [SerialPort(port_settings(made, number)) for number in (1, 2, 3)]
+        try:
+            with made._lock:
+                for number, end in enumerate(ends):
+                    assert end.send(bytes([number]) * 60) == ""
+            wait_for(lambda: made.counts["received"] == 6)
+            assert (made.counts["packets"], made.counts["collided"]) == (3, 0)
+        finally:
+            for end in ends:
+                end.close()
+
+
+def test_a_line_of_another_speed_garbles_what_goes_over_it(tmp_path: Path) -> None:
+    with modems(FakeModemSettings(modem="esp-now", count=2), tmp_path) as made:
+        wrong = SerialSettings(device=str(made.devices[0]), baud=9600)
+        with SerialPort(wrong) as one, SerialPort(port_settings(made, 2)) as other:
+            for _ in range(3):
+                one.send(b"unheard")
+                time.sleep(0.05)  # else they overlap
+                other.send(b"unheard")
+                time.sleep(0.05)
+            wait_for(lambda: made.counts["received"] >= 2)
+            wait_for(lambda: other.counts()["garbled_bytes"] > 0 or other.counts()["garbled_pieces"] > 0)
+            assert one.receive(16) == other.receive(16) == []
+
+
+def test_echoes_garbage_and_late_bytes_lose_no_frame(tmp_path: Path) -> None:
+    settings = FakeModemSettings(modem="esp-now", count=2, echo=True, garbage=1.0, latency_ms=3.0, jitter_ms=5.0)
+    with (
+        modems(settings, tmp_path) as made,
+        SerialPort(port_settings(made, 1)) as one,
+        SerialPort(port_settings(made, 2)) as other,
+    ):
+        heard: list[bytes] = []
+        own: list[bytes] = []
+        for number in range(5):
+            assert one.send(bytes([number]) * 30) == ""
+            wait_for(lambda number=number: heard.extend(d.data for d in other.receive(16)) or len(heard) > number)
+            own.extend(d.data for d in one.receive(16) if d.own)
+        assert heard == [bytes([number]) * 30 for number in range(5)]
+        wait_for(lambda: own.extend(d.data for d in one.receive(16) if d.own) or len(own) == 5)
+        assert other.counts()["garbled_pieces"] >= 5
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--device=/dev/nothing"], "device: got '/dev/nothing'; allowed: a device that is there"),
+        (["--device=/dev/null"], "device: got '/dev/null'; allowed: a serial device"),
+        ([], "device: got None; allowed: the serial device of the modem, as /dev/ttyUSB0"),
+        (["--device=/dev/null", "--interface=lo"], "interface: got 'lo'; allowed: only with --air udp"),
+    ],
+)
+def test_what_cannot_be_is_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sniff", "--air=serial", "--no-seal", "--modem=sik-64k", *words]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_slots_that_are_too_short_are_refused_before_anything_is_made(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["agent", "--air=serial", "--id=1", "--no-seal", "--modem=sik-64k", "--device=/dev/null", "--slot-ms=20"]
+    assert main(words) == 2
+    assert "slot_ms: got 20.0; allowed: at least" in capsys.readouterr().err
+
+
+def test_a_device_that_may_not_be_opened_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if os.geteuid() == 0:
+        pytest.skip("root may open every device")
+    device = tmp_path / "modem"
+    device.touch()
+    device.chmod(0)
+    assert main(["sniff", "--air=serial", "--no-seal", f"--device={device}"]) == 2
+    assert "dialout" in capsys.readouterr().err
+
+
+def test_bytes_of_mavlink_are_told_and_the_bag_is_whole(tmp_path: Path) -> None:
+    config = SwarmConfig(agents=2, policy="lease", slot_ms=50.0)
+    with modems(FakeModemSettings(modem="esp-now", count=2), tmp_path) as made:
+        one = helpers.Flying(AgentSettings(id=1), config, port_settings(made, 1), tmp_path / "cf1.mcap")
+        try:
+            heartbeat = bytes.fromhex("fd09000000010100000000000000000203045103")
+            for _ in range(40):
+                made.inject(1, heartbeat * 10)
+                time.sleep(0.005)
+            wait_for(lambda: any("MAVLink" in line for line in one.said))
+            made.inject(1, to_line(b"a stranger's"))
+            wait_for(lambda: one.agent.tally.refused.total() > 0)
+            go_on([one], 10)
+        finally:
+            one.end()
+    bag = read(tmp_path / "cf1.mcap")
+    assert not bag.broken_off
+    assert len(bag.slots) > 10
