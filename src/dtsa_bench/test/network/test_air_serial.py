@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import errno
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +12,7 @@ from typing import Any
 
 import air_helpers as helpers
 import pytest
+import serial
 from waiting import wait_for
 
 from dtsa_agent.air.serial import SerialSettings
@@ -230,14 +231,17 @@ def test_slots_that_are_too_short_are_refused_before_anything_is_made(capsys: py
     assert "slot_ms: got 20.0; allowed: at least" in capsys.readouterr().err
 
 
-def test_a_device_that_may_not_be_opened_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    if os.geteuid() == 0:
-        pytest.skip("root may open every device")
-    device = tmp_path / "modem"
-    device.touch()
-    device.chmod(0)
-    assert main(["sniff", "--air=serial", "--no-seal", f"--device={device}"]) == 2
-    assert "dialout" in capsys.readouterr().err
+def test_a_device_that_may_not_be_opened_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(*words: object, **more: object) -> None:  # root may open every device
+        raise serial.SerialException(errno.EACCES, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", refused)
+    assert main(["sniff", "--air=serial", "--no-seal", "--device=/dev/ttyUSB0"]) == 2
+    assert "allowed: a device that this user may open: add the user to its group, mostly dialout" in (
+        capsys.readouterr().err
+    )
 
 
 def test_bytes_of_mavlink_are_told_and_the_bag_is_whole(tmp_path: Path) -> None:
