@@ -201,6 +201,21 @@ LOG_GROUP_STOP(own)
             lab.set_parameter(1, "own.other", 1)
 
 
+def test_an_app_sets_parameters_of_the_firmware(write) -> None:
+    place = write("""
+void appMain(void) {
+    paramVarId_t deck = paramGetVarId("deck", "bcLighthouse4"), effect = paramGetVarId("ring", "effect");
+    paramSetInt(effect, 9);
+    vTaskDelay(M2T(20));
+    paramVarId_t none = paramGetVarId("no", "one");
+    DEBUG_PRINT("%u %d %d\\n", paramGetUint(deck), paramGetInt(effect), PARAM_VARID_IS_VALID(none));
+    paramSetInt(paramGetVarId("stabilizer", "stop"), 1);
+    vTaskDelay(M2T(20));
+    DEBUG_PRINT("%d\\n", supervisorIsLocked());
+}""")
+    assert lines(place) == ["1 9 0", "1"]
+
+
 def test_app_channel_carries_both_ways_and_says_when_it_overflowed(write) -> None:
     place = write("""
 void appMain(void) {

@@ -22,7 +22,7 @@ class Event(IntEnum):
 class Command(IntEnum):
     """What an app asks for (native/lab.h)."""
 
-    SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER = range(8)
+    SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER, PARAMETER = range(9)
 
 
 class AppError(DtsaError):
@@ -37,9 +37,10 @@ class _Told(Structure):
 
 
 _SIGNATURES = {
-    "lab_begin": (c_int, [c_int, c_int, POINTER(c_char_p), c_int64, c_int64, c_int64]),
+    "lab_begin": (c_int, [c_int, c_int, POINTER(c_char_p), c_int, POINTER(c_char_p), c_int64, c_int64, c_int64]),
     "lab_run": (POINTER(_Told), [c_int64]),
     "lab_world": (POINTER(c_double), [c_int]),
+    "lab_known": (POINTER(c_double), [c_int]),
     "lab_off": (None, [c_int]),
     "lab_boot": (c_char_p, [c_int, c_char_p, c_int64, c_int64, c_int64, c_uint64, c_int, c_int]),
     "lab_hear": (c_int, [c_int, c_int64, c_char_p, c_int, c_int]),
@@ -58,25 +59,37 @@ class Engine:
 
     :param library: the compiled engine.
     :param count: number of vehicles.
-    :param names: of the firmware's own log variables.
+    :param names: of the firmware's own log variables. :param parameters: of its own parameters.
     :param line_fixed_ns: ns that any packet takes on the line to the radio. :param line_byte_ns: ns that a byte adds.
     :param spin_ns: ns after which a task that does not wait is an error.
     """
 
     def __init__(
-        self, library: Path, count: int, names: list[str], line_fixed_ns: int, line_byte_ns: int, spin_ns: int
+        self,
+        library: Path,
+        count: int,
+        names: list[str],
+        parameters: list[str],
+        line_fixed_ns: int,
+        line_byte_ns: int,
+        spin_ns: int,
     ) -> None:
         self._library = ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)  # apps find the firmware's functions in it
         for name, (result, arguments) in _SIGNATURES.items():
             function = getattr(self._library, name)
             function.restype, function.argtypes = result, arguments
-        texts = (c_char_p * len(names))(*(name.encode() for name in names))
-        if self._library.lab_begin(count, len(names), texts, line_fixed_ns, line_byte_ns, spin_ns):
+        texts, more = ((c_char_p * len(some))(*(name.encode() for name in some)) for some in (names, parameters))
+        times = line_fixed_ns, line_byte_ns, spin_ns
+        if self._library.lab_begin(count, len(names), texts, len(parameters), more, *times):
             raise MemoryError
         self._run = self._library.lab_run
         #: Values of the firmware's log variables by vehicle, in the order of their names: written by the owner.
         self.world: list[NDArray[np.float64]] = [
             np.ctypeslib.as_array(self._library.lab_world(k), (len(names),)) for k in range(count)
+        ]
+        #: Values of the firmware's parameters by vehicle, likewise.
+        self.known: list[NDArray[np.float64]] = [
+            np.ctypeslib.as_array(self._library.lab_known(k), (len(parameters),)) for k in range(count)
         ]
         self._variables: dict[tuple[int, int], dict[str, int]] = {}
         self._told = _Told()

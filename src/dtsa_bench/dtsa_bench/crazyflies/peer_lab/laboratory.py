@@ -15,10 +15,11 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated.estimate import log_values
 from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
+from dtsa_bench.crazyflies.simulated.peer import Peer
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
 from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
-from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES
+from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
 from dtsa_bench.crazyflies.simulated.world import TICK_S, World
 from dtsa_channel_sim.model.airtime import HEADER_BYTES
@@ -38,6 +39,7 @@ from .settings import LabSettings
 TICK_NS = round(TICK_S * 1e9)
 ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the id
 _NAMES = [entry.full_name for entry in LOG_ENTRIES]
+_KNOWN = [entry.full_name for entry in PARAM_ENTRIES]
 _PRIORITY = "lab.priority"
 _NEAR_RSSI, _NEAREST_M = 40, 0.1  # -dBm at 1 m
 _FOREIGN_RSSI = 60
@@ -71,7 +73,7 @@ class Laboratory:
         self.warnings = compile_app(app, self._library)
         self._copies = 0
         self._engine = Engine(
-            engine_library(), count, [*_NAMES, _PRIORITY], line.to_fixed_ns, line.to_byte_ns,
+            engine_library(), count, [*_NAMES, _PRIORITY], _KNOWN, line.to_fixed_ns, line.to_byte_ns,
             round(settings.spin_ms * 1e6),
         )  # fmt: skip
         self.record = Record(count, app.state, out)
@@ -82,6 +84,7 @@ class Laboratory:
         header = {"count": count, "seed": settings.seed, "start": np.asarray(config.start).tolist()}
         self._truth = TruthLog(out / "truth.jsonl" if out else None, header)
         self.world = World(config, self._report)
+        self.peers = [Peer(*both) for both in zip(self.world.firmware, self.world.estimates, strict=True)]
         self.agenda = Agenda()
         streams = np.random.SeedSequence(settings.seed).spawn(2)
         self.air = RadioAir(count + 2, settings.loss, int(streams[0].generate_state(1)[0]))
@@ -213,6 +216,9 @@ class Laboratory:
             return int(firmware.supervisor.request_arming(bool(values[0])))
         if command is Command.RECOVER:
             return int(firmware.supervisor.request_recovery())
+        if command is Command.PARAMETER:
+            self.peers[k].set_parameter(round(values[0]), values[1], t)
+            return 0
         height, duration, yaw, keep = values
         return self._rise(k, command is Command.TAKEOFF, height, duration, yaw, bool(keep))
 
@@ -239,6 +245,7 @@ class Laboratory:
         """Tell a vehicle's app what its firmware knows."""
         values = log_values(self.world.estimates[k], self.world.firmware[k], self.time)
         self._engine.world[k][:] = [*(values[name] for name in _NAMES), self.world.firmware[k].priority]
+        self._engine.known[k][:] = self.peers[k].values
 
     def _report(self, index: int, name: str, **details: Any) -> None:
         self._tell("on_event", index + 1, self.now_ns, name)
@@ -321,6 +328,7 @@ class Laboratory:
             self._lines.reset(agent)
             self._handed[k].clear()
             self.world.firmware[k].reset()
+            self.peers[k].reset()
 
     def set_parameter(self, agent: int, name: str, value: float) -> None:
         """Set a parameter of the app, now and after each power on.

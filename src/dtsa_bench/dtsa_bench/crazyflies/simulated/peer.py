@@ -240,7 +240,7 @@ class Peer:
         (index,) = struct.unpack_from("<H", data)
         if index >= len(self.values):
             return data[:2] + bytes((errno.ENOENT,))
-        self._set(index, struct.unpack_from(self._param_format(index), data, 2)[0], t)
+        self.set_parameter(index, struct.unpack_from(self._param_format(index), data, 2)[0], t)
         return data[:2] + self._packed(index)
 
     def _param_misc(self, data: bytes, t: float) -> bytes | None:
@@ -260,10 +260,14 @@ class Peer:
         head = b"\0" + parts[0] + b"\0" + parts[1] + b"\0"
         if index < 0:
             return head + bytes((errno.ENOENT,))
-        self._set(index, struct.unpack_from(self._param_format(index), parts[2], 1)[0], t)
+        self.set_parameter(index, struct.unpack_from(self._param_format(index), parts[2], 1)[0], t)
         return head + b"\0"
 
-    def _set(self, index: int, value: float, t: float) -> None:
+    def set_parameter(self, index: int, value: float, t: float) -> None:
+        """Set one of the firmware's parameters, unless it can only be read.
+
+        :param index: in `toc.PARAM_ENTRIES`. :param value: what it is set to. :param t: s, the fleet's clock.
+        """
         entry = toc.PARAM_ENTRIES[index]
         if entry.read_only:
             return

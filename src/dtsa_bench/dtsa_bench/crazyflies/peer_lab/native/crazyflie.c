@@ -333,6 +333,8 @@ paramVarId_t paramGetVarIdFromComplete(const char *name)
 {
     spend(CALL_NS);
     int id = find(own()->parameters, own()->parameter_count, name);
+    for (int i = 0; id < 0 && i < lab.known_count; i++)
+        if (!strcmp(lab.known_names[i], name)) id = MAX_VARIABLES + i; // the firmware's own
     return (paramVarId_t){id < 0 ? 0xffff : (uint16_t)id, id < 0 ? 0xffff : (uint16_t)id};
 }
 
@@ -343,25 +345,39 @@ paramVarId_t paramGetVarId(const char *group, const char *name)
     return paramGetVarIdFromComplete(full);
 }
 
-static Variable *parameter(paramVarId_t id)
+static bool is_own(paramVarId_t id)
 {
     spend(CALL_NS);
+    if (id.id >= MAX_VARIABLES && id.id < MAX_VARIABLES + lab.known_count) return false;
     if (id.id >= own()->parameter_count) misuse("a parameter that does not exist");
-    return &own()->parameters[id.id];
+    return true;
 }
 
-float paramGetFloat(paramVarId_t id) { return (float)variable_value(parameter(id)); }
-
-int paramGetInt(paramVarId_t id) { return (int)variable_value(parameter(id)); }
-
-unsigned int paramGetUint(paramVarId_t id) { return (unsigned int)variable_value(parameter(id)); }
-
-void paramSetInt(paramVarId_t id, int value) { set_variable(own(), parameter(id), value); }
-
-void paramSetFloat(paramVarId_t id, float value)
+static double parameter(paramVarId_t id)
 {
-    set_variable(own(), parameter(id), (double)value);
+    if (is_own(id)) return variable_value(&own()->parameters[id.id]);
+    return own()->known[id.id - MAX_VARIABLES];
 }
+
+static void set_parameter(paramVarId_t id, double value)
+{
+    if (is_own(id)) {
+        set_variable(own(), &own()->parameters[id.id], value);
+        return;
+    }
+    float told[2] = {(float)(id.id - MAX_VARIABLES), (float)value};
+    command(COMMAND_PARAMETER, told, sizeof told);
+}
+
+float paramGetFloat(paramVarId_t id) { return (float)parameter(id); }
+
+int paramGetInt(paramVarId_t id) { return (int)parameter(id); }
+
+unsigned int paramGetUint(paramVarId_t id) { return (unsigned int)parameter(id); }
+
+void paramSetInt(paramVarId_t id, int value) { set_parameter(id, value); }
+
+void paramSetFloat(paramVarId_t id, float value) { set_parameter(id, (double)value); }
 
 // ---- app channel, console, assertions --------------------------------------------------------------------------------
 

@@ -50,7 +50,8 @@ enum {
     COMMAND_STOP,
     COMMAND_GO_TO,
     COMMAND_ARM,
-    COMMAND_RECOVER
+    COMMAND_RECOVER,
+    COMMAND_PARAMETER
 };
 
 typedef struct {
@@ -121,6 +122,7 @@ struct Vehicle {
     Variable logs[MAX_VARIABLES], parameters[MAX_VARIABLES];
     int log_count, parameter_count;
     double *world; // values of the firmware's own log variables
+    double *known; // values of the firmware's own parameters
     P2PCallback callback;
     struct Queue radio_jobs, parameter_jobs, app_channel;
     uint8_t radio_storage[MAX_INBOX * sizeof(Job)], parameter_storage[MAX_INBOX * sizeof(Job)];
@@ -134,8 +136,9 @@ struct Vehicle {
 };
 
 typedef struct {
-    int count, world_count;
-    char (*world_names)[64];
+    int count, world_count, known_count;
+    char (*world_names)[64]; // the firmware's own log variables
+    char (*known_names)[64]; // the firmware's own parameters
     Vehicle *vehicles;
     int64_t now_ns, horizon_ns, until_ns, turns, spin_ns;
     int64_t line_fixed_ns, line_byte_ns;

@@ -256,8 +256,16 @@ void wake(Vehicle *vehicle, struct Queue *queue, bool room)
 
 // ---- the owner's side ------------------------------------------------------------------------------------------------
 
-int lab_begin(int count, int world_count, const char *const *names, int64_t line_fixed_ns,
-              int64_t line_byte_ns, int64_t spin_ns)
+static char (*copied(int count, const char *const *names))[64]
+{
+    char (*copy)[64] = calloc((size_t)count + 1, sizeof *copy);
+    for (int i = 0; copy && i < count; i++) snprintf(copy[i], sizeof copy[i], "%s", names[i]);
+    return copy;
+}
+
+int lab_begin(int count, int world_count, const char *const *names, int known_count,
+              const char *const *known, int64_t line_fixed_ns, int64_t line_byte_ns,
+              int64_t spin_ns)
 {
     memset(&lab, 0, sizeof lab);
     lab.count = count;
@@ -266,20 +274,23 @@ int lab_begin(int count, int world_count, const char *const *names, int64_t line
     lab.line_byte_ns = line_byte_ns;
     lab.spin_ns = spin_ns;
     lab.vehicles = calloc((size_t)count, sizeof *lab.vehicles);
-    lab.world_names = calloc((size_t)world_count, sizeof *lab.world_names);
-    if (!lab.vehicles || !lab.world_names) return -1;
-    for (int i = 0; i < world_count; i++)
-        snprintf(lab.world_names[i], sizeof lab.world_names[i], "%s", names[i]);
+    lab.world_names = copied(world_count, names);
+    lab.known_names = copied(known_count, known);
+    lab.known_count = known_count;
+    if (!lab.vehicles || !lab.world_names || !lab.known_names) return -1;
     for (int k = 0; k < count; k++) {
         lab.vehicles[k].number = k;
         lab.vehicles[k].world = calloc((size_t)world_count, sizeof(double));
-        if (!lab.vehicles[k].world) return -1;
+        lab.vehicles[k].known = calloc((size_t)known_count + 1, sizeof(double));
+        if (!lab.vehicles[k].world || !lab.vehicles[k].known) return -1;
     }
     watch_for_crashes();
     return 0;
 }
 
 double *lab_world(int vehicle) { return lab.vehicles[vehicle].world; }
+
+double *lab_known(int vehicle) { return lab.vehicles[vehicle].known; }
 
 void lab_off(int number)
 {
@@ -296,9 +307,11 @@ void lab_end(void)
     for (int k = 0; k < lab.count; k++) {
         lab_off(k);
         free(lab.vehicles[k].world);
+        free(lab.vehicles[k].known);
     }
     free(lab.vehicles);
     free(lab.world_names);
+    free(lab.known_names);
     memset(&lab, 0, sizeof lab);
 }
 
