@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dtsa_dev.documents.radio_tables import SCHEMES, shortest_ns
+from dtsa_dev.documents.slot_lengths import SCHEMES, shortest_ns
 
 from dtsa_bench.commands import cli
 from dtsa_bench.experiments.sweep import spec

@@ -204,6 +204,13 @@ def test_untouched_bags_pass_and_what_is_not_checked_is_said(flown: Path, tmp_pa
     assert result.checked["frames that nobody heard together with another"] == sent
 
 
+def test_bags_from_before_radios_had_names_are_checked_as_they_were(flown: Path, tmp_path: Path) -> None:
+    with Bag(flown / "bag") as bag:
+        channel = {name: value for name, value in bag.config["channel"].items() if name != "radio"}
+    result = rewritten(flown, tmp_path / "old", lambda message, value, pack: message.data, channel=channel)
+    assert result.ok, result.difference
+
+
 def test_radios_behind_lines_are_checked_by_their_times(waiting: Path, tmp_path: Path) -> None:
     """Frames that waited began later than they were handed over, and receptions that queued arrived later."""
     result = rewritten(waiting, tmp_path / "same", lambda message, value, pack: message.data)

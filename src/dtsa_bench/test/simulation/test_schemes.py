@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.documents.radio_tables import rewritten
+from dtsa_dev.documents.slot_lengths import rewritten
 from dtsa_dev.protocol.experiment import Experiment
 from dtsa_dev.protocol.optimum import optimum
 
@@ -191,6 +191,35 @@ def test_the_token_ring_takes_as_long_as_its_packets_and_stops_with_one_agent() 
     after = [air.slot(slot) for slot in range(1000, 1400)]
     assert {int(mask.argmax()) for slot in after[200:] for _, mask in slot.heard} == {7}  # sent to it again and again
     assert sum(len(slot.lengths) for slot in after[200:]) == pytest.approx(20, abs=1)  # one agent, every 20 ms
+
+
+def test_the_token_ring_behind_the_lines_of_crazyflies_takes_their_times() -> None:
+    """Each packet crosses the line to its sender's radio, the air, and the line from the radio of who answers."""
+    settings = {"agents": 20, "policy": "dtr", "seed": 3, "options": {"dtr.react_ms": 0.0}}
+    config = SwarmConfig(**settings)
+    channel = ChannelConfig(agents=20, slot_ns=config.slot_ns, radio="crazyflie")
+    air, airtime = UnslottedTraffic(make_swarm(config), Channel(channel)), channel.airtime
+    frame_ns, short_ns = (
+        airtime.to_radio_ns(length) + airtime.total_ns(length) + airtime.from_radio_ns(length)
+        for length in (5 + config.frame_length, 5)
+    )
+    turn_ns = 19 * (frame_ns + short_ns) + 3 * short_ns
+    heard = sum(len(air.slot(slot).heard) for slot in range(1000))
+    assert heard == pytest.approx(19 * 1000 * config.slot_ns / turn_ns, abs=19)
+
+
+def test_beacons_behind_lines_wait_for_receptions_and_are_heard_all_the_same() -> None:
+    """Two of three begin while the third one's frame is on the line: they wait, and meet on the air."""
+    flown = []
+    for radio in ("plain", "crazyflie"):
+        config = SwarmConfig(agents=12, policy="beacons", slot_ms=2, seed=4, frame="extended")
+        channel = ChannelConfig(agents=12, slot_ns=config.slot_ns, seed=4, radio=radio)
+        air = UnslottedTraffic(make_swarm(config), Channel(channel))
+        carried = [air.slot(slot) for slot in range(1000)]
+        flown.append((sum(len(slot.lengths) for slot in carried), sum(len(slot.heard) for slot in carried)))
+    (sent, heard), (sent_behind, heard_behind) = flown
+    assert sent == sent_behind
+    assert 0 < heard_behind < heard
 
 
 def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
@@ -411,7 +440,9 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
 
 def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
     text = LEAGUE.read_text(encoding="utf-8")
-    assert rewritten(text, ["slots"]) == text, "run: python -m dtsa_dev.documents.radio_tables docs/evidence/league.md"
+    assert rewritten(text, ["lengths"]) == text, (
+        "run: python -m dtsa_dev.documents.slot_lengths FILE"
+    )
     rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| nRF51")]
     assert len(rows) >= 10
     for _, policy, *parts, shortest, constant in (map(str.strip, row) for row in rows):
@@ -429,7 +460,7 @@ def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
 
 def test_the_table_of_ages_at_these_slots_is_what_the_flights_give() -> None:
     """Its first column of `lease`."""
-    text = LEAGUE.read_text(encoding="utf-8").split("<!-- radios: ages -->")[1]
+    text = LEAGUE.read_text(encoding="utf-8").split("<!-- slots: ages -->")[1]
     (row,) = (line for line in text.splitlines() if line.startswith("| lease |"))
     sweep = spec.load_preset("crazyflie-radio")
     labels = {"swarm": "12, 2 moving", "frames lost": "none", "scheme and radio": "lease"}

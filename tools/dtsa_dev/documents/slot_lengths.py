@@ -1,7 +1,7 @@
-"""The tables of radios in the documentation, made from the model.
+"""The tables of the shortest slots, and of ages in them, in the documentation, made from the model.
 
-A table stands between ``<!-- radios: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`TABLES`. The command
-``python -m dtsa_dev.documents.radio_tables docs/*/*.md`` rewrites all tables of these files; for ``ages`` it flies the
+A table stands between ``<!-- slots: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`TABLES`. The command
+``python -m dtsa_dev.documents.slot_lengths docs/*/*.md`` rewrites all tables of these files; for ``ages`` it flies the
 preset ``crazyflie-radio``, some minutes.
 """
 
@@ -30,7 +30,7 @@ GUARD_NS = 70_000  # what clocks differ by that agents align at +-50 ppm and 20 
 # Most instructions of a slot of dtsa at N = 18 on a Cortex-M4F at 168 MHz: docs/evidence/embedded.md.
 DECIDE_NS = {"dtsa": 780_000}
 CONSTANT = Line(300_000, 0, 300_000, 0)
-_BLOCK = re.compile(r"(<!-- radios: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+_BLOCK = re.compile(r"(<!-- slots: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 class Scheme(NamedTuple):
@@ -65,7 +65,7 @@ SCHEMES = (
 )
 
 
-def rewritten(text: str, wanted: Sequence[str] = ("slots", "ages")) -> str:
+def rewritten(text: str, wanted: Sequence[str] = ("lengths", "ages")) -> str:
     """A page with its tables made again.
 
     :param text: the page, Markdown.
@@ -76,7 +76,7 @@ def rewritten(text: str, wanted: Sequence[str] = ("slots", "ages")) -> str:
     def renewed(found: re.Match[str]) -> str:
         name = found["name"]
         if name not in TABLES:
-            raise ConfigError("radios", name, ", ".join(TABLES))
+            raise ConfigError("slots", name, ", ".join(TABLES))
         if name not in wanted:
             return found[0]
         return f"{found[1]}{TABLES[name]()}{found[3]}"
@@ -94,7 +94,7 @@ def shortest_ns(airtime: Airtime, scheme: Scheme) -> int:
     return airtime.shortest_slot_ns(scheme.length, guard_ns=GUARD_NS, decide_ns=decide_ns, needs_frame=needs)
 
 
-def slots() -> str:
+def lengths() -> str:
     """The parts of the shortest slots on a Crazyflie's radio, and what a constant 0.3 ms would make of them."""
     rows = []
     for bitrate in (2_000_000, 1_000_000):
@@ -147,7 +147,7 @@ def _ms(time_ns: int) -> str:
     return f"{time_ns / 1e6:.4f}".rstrip("0").rstrip(".") + " ms"
 
 
-TABLES: dict[str, Callable[[], str]] = {"slots": slots, "ages": ages}
+TABLES: dict[str, Callable[[], str]] = {"lengths": lengths, "ages": ages}
 
 
 def main(paths: Sequence[str]) -> int:
