@@ -26,7 +26,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("agent", help="one agent on a real network or radio", description=DESCRIPTION)
     parser.usage = "%(prog)s --id N (--interface NAME | --device PATH | --uri URI) [OPTIONS]"
     add_air(parser)
-    add_options(parser.add_argument_group("this agent"), AgentSettings, "own")
+    own = parser.add_argument_group("this agent")
+    add_options(own, AgentSettings, "own")
+    own.add_argument(
+        "--check",
+        nargs="?",
+        const="0",
+        metavar="SECONDS",
+        help="does not fly: tells who is heard, in time, and by whom; exit code 0: all hear all [until all can tell]",
+    )
     add_ports(parser)
     add_swarm(parser)
 
@@ -109,6 +117,22 @@ def swarm_of(args: argparse.Namespace) -> SwarmConfig:
     return config
 
 
+def _check_of(args: argparse.Namespace) -> float | None:
+    """How long to check, s, 0: as long as it takes; None: it flies.
+
+    :raises ConfigError: for another text than a number, and for options that only a flight has.
+    """
+    from dtsa_agent.core.errors import ConfigError
+    from dtsa_agent.core.settings.declaration import Setting
+
+    if args.check is None:
+        return None
+    for name, value in (("out", args.out), ("duration_s", getattr(args, "own.duration_s"))):
+        if value is not None:
+            raise ConfigError(name, value, "only without --check")
+    return float(Setting("check", "float", 0.0, "how long", unit="s", minimum=0, maximum=3600).read(args.check))
+
+
 def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C, and print what came of it."""
     from dtsa_agent.air.datagram import check_fits
@@ -116,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.air.prepared import prepare
     from dtsa_agent.air.settings import AgentSettings
     from dtsa_agent.core.agents.joining import check_joinable
-    from dtsa_bench.network.flying import Order, become, fly
+    from dtsa_bench.network.flying import Order, become, check, fly
     from dtsa_bench.runs.options import given
 
     take_swarm_file(args, AIRS[0])
@@ -124,7 +148,10 @@ def run(args: argparse.Namespace) -> int:
     port, config = port_of(args), swarm_of(args)
     check_joinable(config.policy)  # before anything is made
     check_fits(config, port.properties)
+    seconds = _check_of(args)
     order = Order(own, config, port, prepare(config, port.properties), args.out, args.json)
+    if seconds is not None:
+        return check(order, seconds)
     if args.own_process:
         become(order, "dtsa_bench.commands.agent_process")
     return fly(order)

@@ -17,6 +17,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "agent": (
         ("--id 3 --interface eth0 --auth-session 41", "the third of twelve; the key is in DTSA_AUTH_KEY"),
         ("--id 1 --agents 4 --interface lo --no-seal --duration-s 10 --out runs/cf1", "ten seconds, with a bag"),
+        ("--swarm swarm.yaml --id 3 --auth-session 40 --check", "before a flight: do all hear all"),
     ),
     "simulate": (
         ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),

@@ -7,10 +7,12 @@ imports there.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import pickle
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -53,6 +55,43 @@ def become(order: Order, program: str) -> None:
         os.execve(sys.executable, words, {**os.environ, "PYTHONPATH": paths})
 
 
+def check(order: Order, seconds: float) -> int:
+    """Flies with the vehicle held, and prints who is heard, and by whom.
+
+    :param order: the agent; its bag is not made.
+    :param seconds: how long; 0: as long as it takes.
+    :returns: exit code: 0 if all hear all in time.
+    :raises ConfigError: for a port or an id that cannot be used.
+    """
+    from dtsa_agent.air.agent import AirAgent
+    from dtsa_agent.air.ports import open_port
+    from dtsa_agent.stop import Stop
+
+    from .check import Check, HeldVehicle, lasts_s, table
+
+    duration = seconds or lasts_s(order.config)
+    own = dataclasses.replace(order.own, duration_s=duration, quorum="0")  # it hovers anyway
+    say = _speaker(own.id)
+    say(f"checks for {duration:.0f} s who is heard; its vehicle is held")
+    watcher = Check(own.id, order.config, order.port.properties)
+    with Stop() as stop, open_port(order.port) as port:
+        AirAgent(own, order.config, port, watcher, HeldVehicle(), order.prepared, say).run(stop)
+    result = watcher.result()
+    print(json.dumps(result, indent=2) + "\n" if order.as_json else table(result), end="")
+    if result["missing"]:
+        say(f"not all hear all in time: {'; '.join(result['missing'])}")
+    return int(bool(result["missing"]))
+
+
+def _speaker(agent: int) -> Callable[[str], None]:
+    """Says a line in flight, on stderr."""
+
+    def say(line: str) -> None:
+        print(f"dtsa: cf{agent}: {line}", file=sys.stderr, flush=True)
+
+    return say
+
+
 def fly(order: Order) -> int:
     """Flies until a signal comes, and prints what came of it.
 
@@ -65,12 +104,9 @@ def fly(order: Order) -> int:
     from dtsa_agent.air.ports import open_port
     from dtsa_agent.stop import Stop
 
-    def say(line: str) -> None:
-        print(f"dtsa: cf{order.own.id}: {line}", file=sys.stderr, flush=True)
-
     failure = ""
     with Stop() as stop, open_port(order.port) as port:
-        agent = AirAgent(order.own, order.config, port, prepared=order.prepared, say=say)
+        agent = AirAgent(order.own, order.config, port, prepared=order.prepared, say=_speaker(order.own.id))
         if order.out is None:
             agent.run(stop)
             summary = agent.summary()

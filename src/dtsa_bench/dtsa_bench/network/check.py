@@ -1,0 +1,221 @@
+"""`tools/dtsa agent --check`: whether all agents hear all, and in time, before they fly. Nothing moves."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+from dtsa_agent.air.contacts import said_of
+from dtsa_agent.air.datagram import Wrapping
+from dtsa_agent.air.port import PortProperties
+from dtsa_agent.air.record import SlotRecord
+from dtsa_agent.air.vehicle import SimulatedVehicle
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.agents.pacing import BETWEEN
+from dtsa_agent.core.frame import condition_in
+from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.keys import authenticator
+
+ENOUGH = 0.8  # of the frames that are expected of an agent have to be heard in time
+_LEAST_S = 5.0
+_ROUNDS = 20  # in which frames are counted, after all have settled
+_SILENT = 0.25  # of the check: an agent that began earlier and has ended may be silent for so long
+_FEWEST = 5  # frames expected, of which a share says something
+
+
+def lasts_s(config: SwarmConfig) -> float:
+    """How long a check takes, s: until agents that begin cold have settled, and some rounds in which frames count.
+
+    :param config: the settings that all agents share.
+    """
+    begun = 3 * config.anchor_every * config.agents  # at the latest, where nothing is lost
+    return max(_LEAST_S, (begun + _settled_after(config) + _ROUNDS * config.agents) * config.slot_s)
+
+
+def _settled_after(config: SwarmConfig) -> int:
+    """Slots after which an agent knows whom to expect: its probation is over."""
+    return (2 * config.main_every if config.policy_row.probation else 1) * config.agents
+
+
+class HeldVehicle(SimulatedVehicle):
+    """A vehicle that stays where it is, whatever its agent wants; it is never at its goal, so that all speak alike."""
+
+    def sense(self, swarm: AbstractSwarm) -> None:
+        """An agent at its goal would rest, and speak seldom: it says that it is below it.
+
+        :param swarm: the agent.
+        """
+        away = swarm.goal[:, 0] - swarm.position[:, 0]
+        if float(away @ away) <= swarm.config.r_min**2:
+            swarm.position[2, 0] -= 2.0 * swarm.config.r_min
+
+    def fly(self, swarm: AbstractSwarm, slot: int) -> None:
+        """Nothing.
+
+        :param swarm: the agent.
+        :param slot: the slot.
+        """
+
+
+@dataclass(slots=True)
+class _Other:
+    """What was heard of another agent."""
+
+    left: bool = False  # has said that it leaves: its check is over
+    new: bool = True  # on probation: it speaks at its anchors only, or in turns of which others need not know yet
+    expected: set[int] = field(default_factory=set)  # slots in which it was taken for the sender
+    came: set[int] = field(default_factory=set)  # slots of its frames
+    in_time: set[int] = field(default_factory=set)
+    delays_ns: list[int] = field(default_factory=list)
+    says: dict[int, int] = field(default_factory=dict)  # by id: how often it said to hear it, less how often not
+
+    def hears(self, agent: int) -> bool | None:
+        """Whether it hears another one: what it said more often, for others may end their check before it.
+
+        :param agent: id.
+        """
+        return self.says[agent] > 0 if agent in self.says else None
+
+
+class Check:
+    """A watcher of an agent that only listens and speaks.
+
+    :param agent: its id.
+    :param config: the settings that all agents share.
+    :param port: what carries the frames.
+    """
+
+    def __init__(self, agent: int, config: SwarmConfig, port: PortProperties) -> None:
+        self._agent, self._config = agent, config
+        self._wrapping = Wrapping(config, authenticator(config), port=port)
+        self._others: dict[int, _Other] = {}
+        self._refused: Counter[str] = Counter()
+        self._last = -1
+        self._slots = 0  # since it began, or began anew
+        self._settled = _settled_after(config)
+        self._expects = False  # whether the policy says at all who is to send
+
+    def slot(self, record: SlotRecord) -> None:
+        """A slot is over.
+
+        :param record: all of it.
+        """
+        if record.anew:  # another time: what was heard before counts its slots differently
+            self._others.clear()
+            self._slots = 0
+        self._slots, self._last = self._slots + 1, record.slot
+        if record.chosen not in (0, self._agent):
+            self._expects = True
+            other = self._of(record.chosen)
+            if self._slots > self._settled and not other.new:
+                other.expected.add(record.slot)
+        for one in (*record.before, *record.heard):
+            other = self._of(one.sender)
+            other.came.add(one.slot)
+            delay = one.arrival_ns - record.start_ns - (one.slot - record.slot) * self._config.slot_ns
+            other.delays_ns.append(delay)
+            if delay <= (1.0 - BETWEEN) * self._config.slot_ns:
+                other.in_time.add(one.slot)
+            self._read(other, one.datagram)
+
+    def _of(self, agent: int) -> _Other:
+        return self._others.setdefault(agent, _Other())
+
+    def _read(self, other: _Other, datagram: bytes) -> None:
+        """Whether the sender is new, and whom it says to hear."""
+        said = self._wrapping.read(datagram)
+        other.left, _, other.new = condition_in(said.frame)
+        if other.left or not self._wrapping.peers:  # an agent that leaves need hear nobody
+            return
+        names = [peer for peer, _ in said.peers]
+        for agent in range(1, self._config.agents + 1):
+            says = said_of(agent, names, self._wrapping.peers)
+            if agent != said.sender and says is not None:
+                other.says[agent] = other.says.get(agent, 0) + (1 if says else -1)
+
+    def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
+        """A datagram has not been taken in.
+
+        :param reason: why.
+        :param data: its bytes.
+        :param arrival_ns: ns, own clock.
+        """
+        self._refused[reason] += 1
+
+    def result(self) -> dict[str, Any]:
+        """What was found, as plain values; ``missing``: what keeps all from hearing all in time, a line each."""
+        others = {agent: self._told(agent) for agent in range(1, self._config.agents + 1) if agent != self._agent}
+        heard_by = [k for k in others if any(other.hears(k) for other in self._others.values())]
+        lost = {k for k, told in others.items() if not told["heard"] and k not in heard_by}
+        missing = [f"cf{k} is heard by no agent" for k in sorted(lost)]
+        for agent in sorted(others.keys() - lost):
+            missing += self._missing(agent, others[agent], lost)
+        return {
+            "id": self._agent,
+            "agents": self._config.agents,
+            "slot_ms": self._config.slot_ms,
+            "slots": self._slots,
+            "others": {f"cf{agent}": told for agent, told in others.items()},
+            "not_taken_in": dict(sorted(self._refused.items())),
+            "missing": missing,
+        }
+
+    def _told(self, agent: int) -> dict[str, Any]:
+        other = self._others.get(agent, _Other())
+        counted = {slot for slot in other.expected if slot <= max(other.came, default=-1)}  # until it ended its check
+        delays = [delay / 1e6 for delay in other.delays_ns]
+        return {
+            "heard": len(other.came),
+            "expected": len(counted),
+            "heard_share": len(counted & other.came) / len(counted) if counted else None,
+            "in_time_share": len(counted & other.in_time) / len(counted) if counted else None,
+            "delay_ms": {"p50": statistics.median(delays), "max": max(delays)} if delays else None,
+            "silent_slots": 0 if other.left or not other.came else self._last - max(other.came),
+            "hears_this_agent": other.hears(self._agent),
+            "does_not_hear": sorted(k for k in other.says if not other.hears(k) and k != self._agent),
+        }
+
+    def _missing(self, agent: int, told: dict[str, Any], lost: set[int]) -> list[str]:
+        """What is missing between an agent and others, but for those that no agent hears."""
+        if not told["heard"]:
+            return [f"cf{agent} is not heard"]
+        found, share = [], told["in_time_share"]
+        if told["silent_slots"] > max(_SILENT * self._slots, self._config.anchor_every * self._config.agents):
+            found.append(f"cf{agent} was not heard in the last {told['silent_slots']} slots")
+        elif self._expects and told["expected"] < _FEWEST:
+            found.append(f"of cf{agent} {told['expected']} frames were expected, too few to tell: check for longer")
+        elif share is not None and share < ENOUGH:
+            found.append(f"{share:.0%} of {told['expected']} frames of cf{agent} heard in time, {ENOUGH:.0%} needed")
+        if told["hears_this_agent"] is False:
+            found.append(f"cf{agent} does not hear cf{self._agent}")
+        if told["hears_this_agent"] is None and self._wrapping.peers:
+            found.append(f"cf{agent} has not said yet that it hears cf{self._agent}")
+        return found + [f"cf{agent} does not hear cf{k}" for k in told["does_not_hear"] if k not in lost]
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result for people.
+
+    :param result: of :meth:`Check.result`.
+    """
+    head = ("", "frames", "heard", "in time", "delay ms", "largest", f"hears cf{result['id']}", "does not hear")
+    rows = [head]
+    for name, told in result["others"].items():
+        delay = told["delay_ms"]
+        rows.append((
+            name, str(told["heard"]), _percent(told["heard_share"]), _percent(told["in_time_share"]),
+            f"{delay['p50']:.2f}" if delay else "-", f"{delay['max']:.2f}" if delay else "-",
+            {True: "yes", False: "no", None: "-"}[told["hears_this_agent"]],
+            ", ".join(f"cf{k}" for k in told["does_not_hear"]) or "-",
+        ))  # fmt: skip
+    widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
+    lines = ["  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    about = f"cf{result['id']}: {result['agents']} agents, slots of {result['slot_ms']:g} ms, {result['slots']} slots"
+    refused = "; ".join(f"{count} {reason}" for reason, count in result["not_taken_in"].items())
+    return "\n".join([about, *lines, *([f"not taken in: {refused}"] if refused else [])]) + "\n"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{share:.0%}"
