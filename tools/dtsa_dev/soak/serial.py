@@ -22,7 +22,7 @@ from .item import Item, NotMet, Soak
 
 AGE_MARGIN = 0.10  # mean age may differ from the simulator's by this share
 _FAULT_S = 6.0
-_SLOW = {"v_max": 0.4, "a_max": 1.0}  # m/s, m/s^2: slots are long
+_SLOW = {"v_max": 0.25, "a_max": 1.0, "radius": 0.35}  # m/s, m/s^2, m: slots are long
 #: What goes wrong in a flight, and what it does to it.
 FAULTS = {
     "kill": "an agent's process is killed, and started again after 2 s",
