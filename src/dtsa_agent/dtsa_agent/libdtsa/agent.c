@@ -135,6 +135,8 @@ void dtsa_agent_leave(dtsa_agent *a)
 
 int dtsa_agent_is_on(const dtsa_agent *a) { return a->present != 0; }
 
+void dtsa_agent_hover(dtsa_agent *a, int hovers) { a->active = !hovers; }
+
 void dtsa_agent_set_state(dtsa_agent *a, const double position[3], const double velocity[3])
 {
     for (int i = 0; i < 3; i++) {
@@ -200,6 +202,8 @@ int dtsa_agent_slot(dtsa_agent *a, int64_t slot, uint8_t frame[DTSA_FRAME_MAX])
     memcpy(frame, a->frame, a->frame_length);
     return a->frame_length;
 }
+
+void dtsa_agent_unsent(dtsa_agent *a) { a->frame_length = 0; }
 
 dtsa_decision dtsa_agent_decision(const dtsa_agent *a) { return a->decision; }
 

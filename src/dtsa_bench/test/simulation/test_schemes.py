@@ -440,9 +440,7 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
 
 def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
     text = LEAGUE.read_text(encoding="utf-8")
-    assert rewritten(text, ["lengths"]) == text, (
-        "run: python -m dtsa_dev.documents.slot_lengths FILE"
-    )
+    assert rewritten(text, ["lengths"]) == text, "run: python -m dtsa_dev.documents.slot_lengths FILE"
     rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| nRF51")]
     assert len(rows) >= 10
     for _, policy, *parts, shortest, constant in (map(str.strip, row) for row in rows):

@@ -253,23 +253,30 @@ verdict hearing_take(hearing *h, const uint8_t *data, long length, int64_t arriv
     return TAKEN;
 }
 
+void hearing_lay(hearing *h, int64_t *memory, contact *of)
+{
+    const size_t n = (size_t)h->agents;
+    h->contact.agents = h->agents;
+    h->contact.self = h->self;
+    h->contact.peers = h->peers;
+    h->contact.of = of;
+    contacts_clear(&h->contact);
+    h->last = memory;
+    h->delay.hears = memory + n;
+    h->delay.says = memory + 2 * n;
+    h->delay.sum = memory + 3 * n;
+    h->delay.sums = memory + 4 * n;
+    h->delay.known = (uint8_t *)(memory + 5 * n);
+    for (size_t k = 0; k < n; k++) h->last[k] = -1;
+}
+
 int hearing_open(hearing *h)
 {
     const size_t n = (size_t)h->agents;
     h->memory = calloc(6 * n, sizeof *h->memory);
-    h->contact.agents = h->agents;
-    h->contact.self = h->self;
-    h->contact.peers = h->peers;
     h->contact.of = calloc(n, sizeof *h->contact.of);
     if (!h->memory || !h->contact.of) return hearing_close(h), 0;
-    contacts_clear(&h->contact);
-    h->last = h->memory;
-    h->delay.hears = h->memory + n;
-    h->delay.says = h->memory + 2 * n;
-    h->delay.sum = h->memory + 3 * n;
-    h->delay.sums = h->memory + 4 * n;
-    h->delay.known = (uint8_t *)(h->memory + 5 * n);
-    for (size_t k = 0; k < n; k++) h->last[k] = -1;
+    hearing_lay(h, h->memory, h->contact.of);
     return 1;
 }
 

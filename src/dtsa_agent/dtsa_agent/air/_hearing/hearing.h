@@ -83,8 +83,10 @@ typedef struct hearing {
     int64_t *memory;
 } hearing;
 
-int hearing_open(
-    hearing *h); /* after what is given is filled in, and the time base made; 0: no memory */
+/* After what is given is filled in, and the time base made; 0: no memory. */
+int hearing_open(hearing *h);
+/* The same in the caller's memory: (6 n) all zero, (n). */
+void hearing_lay(hearing *h, int64_t *memory, contact *of);
 void hearing_close(hearing *h);
 
 int64_t clock_local(const own_clock *clock, int64_t monotonic);

@@ -34,7 +34,7 @@
 extern "C" {
 #endif
 
-#define DTSA_VERSION 100
+#define DTSA_VERSION 101
 
 #if defined(__GNUC__)
 #define DTSA_API __attribute__((visibility("default")))
@@ -210,6 +210,9 @@ DTSA_API void dtsa_agent_switch(dtsa_agent *agent, int on);
 DTSA_API void dtsa_agent_leave(dtsa_agent *agent);
 DTSA_API int dtsa_agent_is_on(const dtsa_agent *agent);
 
+/* It hovers: what it commands is zero, and so is the command in its frames. */
+DTSA_API void dtsa_agent_hover(dtsa_agent *agent, int hovers);
+
 /* Own true state. Within r_min of its goal it is idle; farther away it wakes. */
 DTSA_API void dtsa_agent_set_state(dtsa_agent *agent, const double position[3],
                                    const double velocity[3]);
@@ -220,6 +223,8 @@ DTSA_API void dtsa_agent_set_goal(dtsa_agent *agent, const double goal[3], int f
 /* A slot opens. Returns the length of the frame to send in it, 0: it is silent. Slots ascend; none
  * has to be missed, but they may be. */
 DTSA_API int dtsa_agent_slot(dtsa_agent *agent, int64_t slot, uint8_t frame[DTSA_FRAME_MAX]);
+/* The frame of this slot has not been sent: the agent has been silent. */
+DTSA_API void dtsa_agent_unsent(dtsa_agent *agent);
 DTSA_API dtsa_decision dtsa_agent_decision(const dtsa_agent *agent);
 
 /* A frame was heard in a slot, before the slot's end; also the own one may be handed in. Returns

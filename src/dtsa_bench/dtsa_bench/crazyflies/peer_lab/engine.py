@@ -22,7 +22,7 @@ class Event(IntEnum):
 class Command(IntEnum):
     """What an app asks for (native/lab.h)."""
 
-    SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER, PARAMETER = range(9)
+    SETPOINT, RELAX, TAKEOFF, LAND, STOP, GO_TO, ARM, RECOVER, PARAMETER, DISABLE = range(10)
 
 
 class AppError(DtsaError):

@@ -16,6 +16,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated.estimate import log_values
 from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
 from dtsa_bench.crazyflies.simulated.peer import Peer
+from dtsa_bench.crazyflies.simulated.planner import DISABLED, FLYING, IDLE, LANDING
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
 from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
@@ -40,7 +41,8 @@ TICK_NS = round(TICK_S * 1e9)
 ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the id
 _NAMES = [entry.full_name for entry in LOG_ENTRIES]
 _KNOWN = [entry.full_name for entry in PARAM_ENTRIES]
-_PRIORITY = "lab.priority"
+_OWN_NAMES = ["lab.priority", "lab.planner"]
+_PLANNER = {IDLE: 0, FLYING: 1, LANDING: 3, DISABLED: 4}  # firmware/crtp_commander_high_level.h
 _NEAR_RSSI, _NEAREST_M = 40, 0.1  # -dBm at 1 m
 _FOREIGN_RSSI = 60
 
@@ -73,7 +75,7 @@ class Laboratory:
         self.warnings = compile_app(app, self._library)
         self._copies = 0
         self._engine = Engine(
-            engine_library(), count, [*_NAMES, _PRIORITY], _KNOWN, line.to_fixed_ns, line.to_byte_ns,
+            engine_library(), count, [*_NAMES, *_OWN_NAMES], _KNOWN, line.to_fixed_ns, line.to_byte_ns,
             round(settings.spin_ms * 1e6),
         )  # fmt: skip
         self.record = Record(count, app.state, out)
@@ -207,6 +209,9 @@ class Laboratory:
         if command is Command.RELAX:
             firmware.notify_stop()
             return 0
+        if command is Command.DISABLE:
+            firmware.planner.disable()
+            return 0
         if command is Command.STOP:
             return firmware.high_level(bytes((3, 0)), t)
         values = struct.unpack(f"<{len(data) // 4}f", data)
@@ -243,8 +248,10 @@ class Laboratory:
 
     def _show(self, k: int) -> None:
         """Tell a vehicle's app what its firmware knows."""
-        values = log_values(self.world.estimates[k], self.world.firmware[k], self.time)
-        self._engine.world[k][:] = [*(values[name] for name in _NAMES), self.world.firmware[k].priority]
+        firmware = self.world.firmware[k]
+        values = log_values(self.world.estimates[k], firmware, self.time)
+        own = firmware.priority, _PLANNER[firmware.planner.state]
+        self._engine.world[k][:] = [*(values[name] for name in _NAMES), *own]
         self._engine.known[k][:] = self.peers[k].values
 
     def _report(self, index: int, name: str, **details: Any) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from .battery import Battery
-from .planner import Goal, Planner, Triple
+from .planner import DISABLED, Goal, Planner, Triple
 from .supervisor import LEVEL_OUT, Supervisor
 from .trajectories import Trajectory, TrajectoryMemory
 
@@ -237,7 +237,7 @@ class Firmware:
             self.planner.stop()
         goal = self.planner.goal(t)
         self._here = goal or Goal(position, velocity, yaw=self.yaw)
-        if allowed and self._priority <= PRIORITY_HIGH_LEVEL:
+        if allowed and self._priority <= PRIORITY_HIGH_LEVEL and self.planner.state != DISABLED:
             self._follow_planner(t, goal)
         setpoint = self.setpoint if allowed else None
         thrust = setpoint is not None and setpoint.motors

@@ -11,6 +11,7 @@ Triple = tuple[float, float, float]
 IDLE = "idle"  # holds the motors off: nothing was ordered yet, a landing is over, or a streamed command took over
 FLYING = "flying"
 LANDING = "landing"
+DISABLED = "disabled"  # neither wants motors on nor off: somebody else gives set-points
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +98,10 @@ class Planner:
         """Motors off, and the path is forgotten."""
         self.state = IDLE
 
+    def disable(self) -> None:
+        """The path is forgotten; nothing is commanded until the next order."""
+        self.state = DISABLED
+
     def takeoff(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
         """Climb to `height` (m above the floor) within `duration` (s), from rest; False: only an idle planner does.
 
@@ -158,6 +163,6 @@ class Planner:
         """
         if self.state == LANDING and self.finished(t):
             self.state = IDLE
-        if self.state == IDLE or self.path is None:
+        if self.state in (IDLE, DISABLED) or self.path is None:
             return None
         return self.path.goal(t)

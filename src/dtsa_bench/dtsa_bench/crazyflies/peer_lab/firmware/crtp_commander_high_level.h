@@ -4,6 +4,16 @@
 
 #include "stabilizer_types.h"
 
+// What the high-level commander does; disabled it wants motors neither on nor off.
+enum trajectory_state {
+    TRAJECTORY_STATE_IDLE = 0,
+    TRAJECTORY_STATE_FLYING = 1,
+    TRAJECTORY_STATE_LANDING = 3,
+    TRAJECTORY_STATE_DISABLED = 4,
+};
+
+int crtpCommanderHighLevelDisable(void);
+enum trajectory_state crtpCommanderHighLevelGetPlannerState(void);
 int crtpCommanderHighLevelTakeoff(float height_m, float duration_s);
 int crtpCommanderHighLevelTakeoffYaw(float height_m, float duration_s, float yaw);
 int crtpCommanderHighLevelLand(float height_m, float duration_s);

@@ -120,6 +120,8 @@ int crtpCommanderHighLevelLandYaw(float height_m, float duration_s, float yaw)
 
 int crtpCommanderHighLevelStop(void) { return high_level(COMMAND_STOP, NULL, 0); }
 
+int crtpCommanderHighLevelDisable(void) { return high_level(COMMAND_DISABLE, NULL, 0); }
+
 int crtpCommanderHighLevelGoTo(float x, float y, float z, float yaw, float duration_s,
                                bool relative)
 {
@@ -149,6 +151,11 @@ static double world(const char *name)
 }
 
 int commanderGetActivePriority(void) { return (int)world("lab.priority"); }
+
+enum trajectory_state crtpCommanderHighLevelGetPlannerState(void)
+{
+    return (enum trajectory_state)world("lab.planner");
+}
 
 // Bits of `supervisor.info`.
 uint16_t supervisorGetInfoBitfield(void) { return (uint16_t)world("supervisor.info"); }

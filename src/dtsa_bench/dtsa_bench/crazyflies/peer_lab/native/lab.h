@@ -51,7 +51,8 @@ enum {
     COMMAND_GO_TO,
     COMMAND_ARM,
     COMMAND_RECOVER,
-    COMMAND_PARAMETER
+    COMMAND_PARAMETER,
+    COMMAND_DISABLE
 };
 
 typedef struct {

@@ -1,0 +1,418 @@
+/* The protocol as an app of a Crazyflie: what is between the firmware and board.c and safety.c.
+ *
+ * How it is built and flown: docs/how-to/on-board.md. It was never flown on hardware.
+ *
+ * The ground sets the parameters dtsa.*, says by the app channel where everybody starts and goes,
+ * starts the agent, takes off by the high-level commander, and then sets dtsa.enable. */
+#include <math.h>
+#include <stdbool.h>
+#include <string.h>
+
+#include "FreeRTOS.h"
+#include "app.h"
+#include "app_channel.h"
+#include "commander.h"
+#include "configblock.h"
+#include "crtp_commander_high_level.h"
+#include "log.h"
+#include "param.h"
+#include "pm.h"
+#include "queue.h"
+#include "radiolink.h"
+#include "static_mem.h"
+#include "supervisor.h"
+#include "task.h"
+#include "usec_time.h"
+
+#include "board.h"
+#include "safety.h"
+#include "watch.h"
+
+enum {
+    QUEUE_LENGTH = 16,   /* datagrams between the radio's task and this one */
+    CONTROL_US = 10000,  /* from one set-point to the next */
+    TICK_US = 1000,
+    NEAR_US = 1500,      /* nearer than this to what is due it does not sleep */
+    KEY_BYTES = 16
+};
+static const float DOWN_M_S = 0.4f; /* how fast it lands */
+
+/* ---- what the ground sets and sees ---- */
+
+static uint8_t mute, enable, agents = 12, policy = DTSA_POLICY_LEASE, p2pPort = 7, started;
+static uint16_t headerWord = 0x5444, steps = 1;
+static uint32_t slotUs = 10000, flightUs = 1500, seed = 1;
+static float height = 1.0f, vMax = 1.5f, pairRadius = 0.336f, horizon = 1.0f;
+static safety_settings limits = {
+    .news_s = 3.0f, .unheard_s = 0.5f, .land_s = 5.0f, .well_s = 0.5f, .battery_v = 3.2f,
+    .sag_s = 2.0f, .low = {-2.0f, -2.0f, 0.2f}, .high = {2.0f, 2.0f, 2.0f},
+};
+
+static uint32_t slotNow, digest, lost, sent, heard, unsent, refused;
+static uint16_t lateUs;
+static uint8_t chosen, reason, mode, why, timeState;
+static float oldest, nearest;
+
+/* ---- from the radio's task ---- */
+
+typedef struct reception {
+    uint64_t us;
+    uint8_t length, data[BOARD_DATAGRAM];
+} reception;
+
+STATIC_MEM_QUEUE_ALLOC(receptions, QUEUE_LENGTH, sizeof(reception));
+static QueueHandle_t queue;
+
+static void on_packet(P2PPacket *packet)
+{
+    reception r = {.us = usecTimestamp()};
+    if (packet->port != p2pPort || packet->size > sizeof r.data) return;
+    r.length = packet->size;
+    memcpy(r.data, packet->data, packet->size);
+    if (xQueueSend(queue, &r, 0) != pdTRUE) lost++;
+}
+
+/* ---- the agent ---- */
+
+static board agent;
+static safety guard;
+static double starts[3 * BOARD_AGENTS], targets[3 * BOARD_AGENTS];
+static uint8_t key[KEY_BYTES], sealed, ordered;
+static uint64_t session, lots;
+static int64_t heardLast; /* ns */
+static float hold[3];
+
+static int64_t now_ns(void) { return (int64_t)usecTimestamp() * 1000; }
+
+static void configure(dtsa_config *c)
+{
+    static double places[6 * BOARD_AGENTS]; /* as many as there are: the three planes of libdtsa */
+    const int n = agents;
+    for (int i = 0; i < 3; i++)
+        for (int k = 0; k < n; k++) {
+            places[i * n + k] = starts[i * BOARD_AGENTS + k];
+            places[(3 + i) * n + k] = targets[i * BOARD_AGENTS + k];
+        }
+    *c = (dtsa_config){
+        .agents = n,
+        .slot_s = (double)slotUs * 1e-6,
+        .steps = steps,
+        .policy = policy,
+        .estimator = DTSA_ESTIMATE_LINEAR,
+        .avoider = DTSA_AVOID_ORCA,
+        .profile = policy == DTSA_POLICY_LEASE ? DTSA_PROFILE_EXTENDED : DTSA_PROFILE_PAPER,
+        .epsilon = 0.5,
+        .age_cap = 1.5,
+        .boot_round = 1,
+        .return_every = 20,
+        .r_min = 0.3,
+        .c_r = 1,
+        .targets_known = 1,
+        .gossip = 1,
+        .position_step = 0.002,
+        .key = lots,
+        .avoid = {.v_max = (double)vMax,
+                  .gain = 2.0,
+                  .radius = (double)pairRadius,
+                  .horizon = (double)horizon,
+                  .softness = 30.0,
+                  .bias = 0.2,
+                  .period = 0.2},
+        .lease = {5, 11, 1, 0.2, 1.0, 0, 15},
+        .start = places,
+        .target = places + 3 * n,
+    };
+}
+
+static const char *start(void)
+{
+    const board_settings settings = {
+        .id = (int)(configblockGetRadioAddress() & 0xff),
+        .slot_ns = (int64_t)slotUs * 1000,
+        .flight_ns = (int64_t)flightUs * 1000,
+        .seed = seed,
+        .header = {(uint8_t)headerWord, (uint8_t)(headerWord >> 8)},
+        .key = sealed ? key : NULL,
+        .key_length = KEY_BYTES,
+        .session = session,
+    };
+    if (agents < 1 || agents > BOARD_AGENTS) return "agents";
+    configure(&agent.config);
+    agent.watch = WATCH;
+    safety_reset(&guard);
+    heardLast = INT64_MIN;
+    ordered = 0;
+    return board_start(&agent, &settings, now_ns());
+}
+
+static void see(void)
+{
+    const dtsa_decision d = dtsa_agent_decision(agent.agent);
+    slotNow = (uint32_t)agent.slot;
+    chosen = (uint8_t)d.chosen;
+    reason = (uint8_t)d.reason;
+    digest = d.digest;
+    sent = agent.counts.sent;
+    heard = agent.counts.heard;
+    unsent = agent.counts.unsent;
+    timeState = (uint8_t)agent.hearing.base.state;
+}
+
+static void send(const uint8_t *data, int length)
+{
+    static P2PPacket packet;
+    if (mute) return;
+    packet.port = p2pPort;
+    packet.size = (uint8_t)length;
+    memcpy(packet.data, data, (size_t)length);
+    radiolinkSendP2PPacketBroadcast(&packet);
+}
+
+/* ---- the ground ---- */
+
+enum { ORDER_START = 'S', ORDER_FROM = 'F', ORDER_TO = 'T', ORDER_KEY = 'K', ORDER_LOTS = 'D', ORDER_LAND = 'L' };
+
+static bool place(double *planes, const uint8_t *data, size_t length)
+{
+    double at[3];
+    const int k = (int)data[1] - 1;
+    if (length != 2 + sizeof at || k < 0 || k >= BOARD_AGENTS) return false;
+    memcpy(at, data + 2, sizeof at);
+    for (int i = 0; i < 3; i++) {
+        if (!isfinite(at[i])) return false;
+        planes[i * BOARD_AGENTS + k] = at[i];
+    }
+    if (planes == targets && started && k == agent.settings.id - 1) {
+        dtsa_agent_set_goal(agent.agent, at, 1);
+    }
+    return true;
+}
+
+/* What the ground says; it hears the order's letter and 1, or 0 and why not. */
+static void obey(const uint8_t *data, size_t length)
+{
+    const char *fault = strchr("FTKDSL", data[0]) ? "length" : "order";
+    if (data[0] == ORDER_FROM && !started && place(starts, data, length)) fault = NULL;
+    else if (data[0] == ORDER_TO && place(targets, data, length)) fault = NULL;
+    else if (data[0] == ORDER_LAND && length == 1) ordered = 1, fault = NULL;
+    else if (data[0] == ORDER_KEY && !started && length == 1 + KEY_BYTES + sizeof session) {
+        memcpy(key, data + 1, KEY_BYTES);
+        memcpy(&session, data + 1 + KEY_BYTES, sizeof session);
+        sealed = 1;
+        fault = NULL;
+    } else if (data[0] == ORDER_LOTS && !started && length == 1 + sizeof lots) {
+        memcpy(&lots, data + 1, sizeof lots);
+        fault = NULL;
+    } else if (data[0] == ORDER_START && length == 1) {
+        fault = guard.mode == SAFETY_OFF ? start() : "in flight";
+        started = !fault;
+    }
+    uint8_t answer[2 + 16] = {data[0], !fault};
+    if (fault) strncpy((char *)answer + 2, fault, sizeof answer - 3);
+    appchannelSendDataPacket(answer, fault ? 2 + strlen((char *)answer + 2) : 2);
+}
+
+static void listen_to_ground(void)
+{
+    uint8_t data[30];
+    const size_t length = appchannelReceiveDataPacket(data, sizeof data, 0);
+    if (length > 0) obey(data, length);
+}
+
+/* ---- the vehicle ---- */
+
+static logVarId_t ids[6];
+
+static void sense(double position[3], double velocity[3])
+{
+    for (int i = 0; i < 3; i++) {
+        position[i] = (double)logGetFloat(ids[i]);
+        velocity[i] = (double)logGetFloat(ids[3 + i]);
+    }
+}
+
+static void set_point(const double velocity[3])
+{
+    setpoint_t s;
+    memset(&s, 0, sizeof s);
+    s.mode.yaw = modeVelocity;
+    if (velocity) {
+        s.mode.x = s.mode.y = s.mode.z = modeVelocity;
+        s.velocity.x = (float)velocity[0];
+        s.velocity.y = (float)velocity[1];
+        s.velocity.z = (float)velocity[2];
+    } else {
+        s.mode.x = s.mode.y = s.mode.z = modeAbs;
+        s.position.x = hold[0];
+        s.position.y = hold[1];
+        s.position.z = hold[2];
+    }
+    /* The lowest there is: whatever the ground commands wins. */
+    commanderSetSetpoint(&s, COMMANDER_PRIORITY_LOWEST);
+}
+
+/* Of the others; their places and the own one are in the frame map. */
+static void look_around(safety_view *v, const double place[3], int64_t now)
+{
+    oldest = 0.0f;
+    nearest = INFINITY;
+    for (int k = 0; k < agent.config.agents; k++) {
+        if (k == agent.settings.id - 1) continue;
+        const int64_t age = board_age(&agent, k);
+        float distance = 0.0f;
+        if (age < 0) oldest = -1.0f;
+        else if (oldest >= 0.0f) oldest = fmaxf(oldest, (float)age * (float)slotUs * 1e-6f);
+        if (age < 0) continue;
+        for (int i = 0; i < 3; i++) {
+            const float d = (float)(board_place(&agent, k, i) - place[i]);
+            distance += d * d;
+        }
+        nearest = fminf(nearest, sqrtf(distance));
+    }
+    v->oldest_s = oldest;
+    v->unheard_s = heardLast == INT64_MIN ? -1.0f : (float)(now - heardLast) * 1e-9f;
+    if (agent.config.agents == 1) v->unheard_s = v->oldest_s = 0.0f;
+}
+
+/* Someone else steers: set-points of a higher priority, or the high-level commander. */
+static int ground_steers(void)
+{
+    return commanderGetActivePriority() > COMMANDER_PRIORITY_LOWEST ||
+           crtpCommanderHighLevelGetPlannerState() != TRAJECTORY_STATE_DISABLED;
+}
+
+static void land(const double position[3])
+{
+    const float height = (float)position[2] > 0.1f ? (float)position[2] : 0.1f;
+    crtpCommanderHighLevelLand(0.0f, height / DOWN_M_S);
+}
+
+static void steer(const double position[3], const double place[3], int64_t now, float elapsed)
+{
+    const safety_mode before = guard.mode;
+    safety_view view = {
+        .enabled = enable,
+        .ordered = ordered,
+        /* While it steers; before that it is the ground that holds the vehicle in the air. */
+        .ground = (before == SAFETY_FLY || before == SAFETY_HOVER) && ground_steers(),
+        .can_fly = supervisorCanFly(),
+        .in_air = supervisorIsFlying(),
+        .newcomer = agent.newcomer,
+        .battery_v = pmGetBatteryVoltage(),
+        .position = {(float)position[0], (float)position[1], (float)position[2]},
+    };
+    double command[3];
+    look_around(&view, place, now);
+    const safety_mode next = safety_step(&guard, &limits, &view, elapsed);
+    mode = (uint8_t)next;
+    why = (uint8_t)guard.reason;
+    if (next == SAFETY_FLY || next == SAFETY_HOVER) {
+        if (before == SAFETY_OFF) crtpCommanderHighLevelDisable(); /* it takes over */
+        if (next != before)
+            for (int i = 0; i < 3; i++) hold[i] = (float)position[i];
+        const int flies = next == SAFETY_FLY && board_command(&agent, now, command);
+        set_point(flies ? command : NULL);
+    } else if (next == SAFETY_LAND && before != SAFETY_LAND) {
+        land(position);
+    } else if (next == SAFETY_OFF && (before == SAFETY_FLY || before == SAFETY_HOVER) &&
+               guard.reason == SAFETY_DISABLED) { /* the ground takes it back, hovering */
+        crtpCommanderHighLevelGoTo((float)position[0], (float)position[1], (float)position[2],
+                                   0.0f, 1.0f, false);
+    }
+    if (next == SAFETY_OFF && !enable) ordered = 0;
+}
+
+/* ---- the app ---- */
+
+static void take_in(const reception *r)
+{
+    if (!started) return;
+    if (board_hear(&agent, r->data, r->length, (int64_t)r->us * 1000) == TAKEN)
+        heardLast = (int64_t)r->us * 1000;
+    else
+        refused++;
+}
+
+void appMain(void)
+{
+    static const char *const NAMES[] = {"x", "y", "z", "vx", "vy", "vz"};
+    static uint8_t datagram[BOARD_DATAGRAM];
+    static reception r;
+    uint64_t controlled = usecTimestamp();
+    for (int i = 0; i < 6; i++) ids[i] = logGetVarId("stateEstimate", NAMES[i]);
+    queue = STATIC_MEM_QUEUE_CREATE(receptions);
+    p2pRegisterCB(on_packet);
+    while (1) {
+        double position[3], velocity[3]; /* world */
+        int64_t due;
+        int length = 0;
+        listen_to_ground();
+        if (!started) {
+            if (xQueueReceive(queue, &r, M2T(10)) == pdTRUE) lost = 0;
+            continue;
+        }
+        while (xQueueReceive(queue, &r, 0) == pdTRUE) take_in(&r);
+        sense(position, velocity);
+        const double place[3] = {position[0], position[1], position[2] - (double)height};
+        due = board_step(&agent, now_ns(), place, velocity, datagram, &length);
+        if (length > 0) {
+            const int64_t late = now_ns() - dtsa_timebase_slot_start(&agent.hearing.base, agent.slot);
+            lateUs = (uint16_t)(late / 1000);
+            send(datagram, length);
+        }
+        see();
+        const uint64_t us = usecTimestamp();
+        if (us - controlled >= CONTROL_US) {
+            steer(position, place, now_ns(), (float)(us - controlled) * 1e-6f);
+            controlled = us;
+        }
+        /* Until something arrives, or a tick is over; what is due within it is waited for awake. */
+        if (due - now_ns() > NEAR_US * 1000 && xQueueReceive(queue, &r, M2T(1)) == pdTRUE)
+            take_in(&r);
+    }
+}
+
+PARAM_GROUP_START(dtsa)
+PARAM_ADD(PARAM_UINT8, enable, &enable)
+PARAM_ADD(PARAM_UINT8, agents, &agents)
+PARAM_ADD(PARAM_UINT8, policy, &policy)
+PARAM_ADD(PARAM_UINT8, mute, &mute) /* for trials: it sends nothing */
+PARAM_ADD(PARAM_UINT8, port, &p2pPort)
+PARAM_ADD(PARAM_UINT16, header, &headerWord)
+PARAM_ADD(PARAM_UINT16, steps, &steps)
+PARAM_ADD(PARAM_UINT32, slotUs, &slotUs)
+PARAM_ADD(PARAM_UINT32, flightUs, &flightUs)
+PARAM_ADD(PARAM_UINT32, seed, &seed)
+PARAM_ADD(PARAM_FLOAT, height, &height)
+PARAM_ADD(PARAM_FLOAT, vMax, &vMax)
+PARAM_ADD(PARAM_FLOAT, radius, &pairRadius)
+PARAM_ADD(PARAM_FLOAT, horizon, &horizon)
+PARAM_ADD(PARAM_FLOAT, newsS, &limits.news_s)
+PARAM_ADD(PARAM_FLOAT, unheardS, &limits.unheard_s)
+PARAM_ADD(PARAM_FLOAT, landS, &limits.land_s)
+PARAM_ADD(PARAM_FLOAT, batteryV, &limits.battery_v)
+PARAM_ADD(PARAM_FLOAT, lowX, &limits.low[0])
+PARAM_ADD(PARAM_FLOAT, lowY, &limits.low[1])
+PARAM_ADD(PARAM_FLOAT, lowZ, &limits.low[2])
+PARAM_ADD(PARAM_FLOAT, highX, &limits.high[0])
+PARAM_ADD(PARAM_FLOAT, highY, &limits.high[1])
+PARAM_ADD(PARAM_FLOAT, highZ, &limits.high[2])
+PARAM_GROUP_STOP(dtsa)
+
+LOG_GROUP_START(dtsa)
+LOG_ADD(LOG_UINT32, slot, &slotNow)
+LOG_ADD(LOG_UINT8, chosen, &chosen)
+LOG_ADD(LOG_UINT8, reason, &reason)
+LOG_ADD(LOG_UINT32, digest, &digest)
+LOG_ADD(LOG_UINT8, time, &timeState)
+LOG_ADD(LOG_UINT8, mode, &mode)
+LOG_ADD(LOG_UINT8, why, &why)
+LOG_ADD(LOG_FLOAT, oldest, &oldest)
+LOG_ADD(LOG_FLOAT, nearest, &nearest)
+LOG_ADD(LOG_UINT16, lateUs, &lateUs)
+LOG_ADD(LOG_UINT32, sent, &sent)
+LOG_ADD(LOG_UINT32, heard, &heard)
+LOG_ADD(LOG_UINT32, unsent, &unsent)
+LOG_ADD(LOG_UINT32, refused, &refused)
+LOG_ADD(LOG_UINT32, lost, &lost)
+LOG_GROUP_STOP(dtsa)

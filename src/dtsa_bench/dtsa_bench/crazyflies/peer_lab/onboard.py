@@ -1,0 +1,202 @@
+"""The protocol on board, in the laboratory: what the ground does, and a bag of each agent's flight."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import dtsa_agent
+from dtsa_agent.air.datagram import check_fits, header_of
+from dtsa_agent.air.port import PortProperties
+from dtsa_agent.air.record import Heard, SlotRecord
+from dtsa_agent.air.settings import AgentSettings
+from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core.agents.joining import check_joinable
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.scenario import policy_key
+from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
+
+from .app import read_app
+from .laboratory import Laboratory
+from .record import Observer
+from .settings import LabSettings
+
+APP = Path(dtsa_agent.__file__).parent / "onboard"
+MOST = 20  # agents: BOARD_AGENTS of board.h
+_POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
+_OPENED, _HEARD = struct.Struct("<4B3q2HI13d60s"), struct.Struct("<4B2q60s")  # onboard/watch.c
+_ORDER_S = 0.02  # from one packet of the app channel to the next
+_CLIMB_S = 3.0
+_KEY_BYTES = 16
+_MARGIN_M = 0.8  # of the box around all places
+HEIGHT_M = 1.2  # of the frame map above the floor
+_UP = np.array([[0.0], [0.0], [HEIGHT_M]])
+FLIGHT_US = 1500
+_PORT = PortProperties("p2p", FLIGHT_US * 1000, 0, agreed_bytes=2, peers=0, longest=60, bare_sealed=True)
+
+
+class _P2P:
+    """The port of a Crazyflie, for the bag."""
+
+    properties, where = _PORT, "peer to peer"
+
+    def to_dict(self) -> dict[str, Any]:
+        """No settings."""
+        return {}
+
+
+class _Flight:
+    """What one agent has noted, and its bag."""
+
+    def __init__(self, agent: int, config: SwarmConfig, path: Path) -> None:
+        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _P2P())
+        self._record: SlotRecord | None = None
+        self._before: list[Heard] = []
+        self._slots = config.steps
+        self.last = -1
+
+    def note(self, data: bytes) -> None:
+        """Takes in what the app has noted."""
+        if data[:1] == b"O":
+            self._open(data)
+            return
+        kind, accepted, sender, length, slot, at_ns, frame = _HEARD.unpack(data)
+        if kind == ord("S"):
+            self._sent(frame[:length], at_ns)
+            return
+        if kind == ord("A"):
+            self.close_slot()
+            self._before.clear()
+            return
+        heard = Heard(sender, slot, at_ns, frame[:length], bool(accepted))
+        (self._before if self._record is None else self._record.heard).append(heard)
+
+    def _open(self, data: bytes) -> None:
+        _, anew, reason, length, slot, start, opened, present, chosen, digest, score, *rest = _OPENED.unpack(data)
+        self.close_slot()
+        position, velocity, command, goal = (np.array(rest[3 * i : 3 * i + 3]) for i in range(4))
+        frame, before = rest[12][:length], self._before
+        self._before = []
+        track = np.repeat(position[None], self._slots, axis=0)
+        self._record = SlotRecord(
+            slot, start, opened, bool(anew), present, chosen, reason, digest, score, track, velocity, command, goal,
+            frame, before=before,
+        )  # fmt: skip
+
+    def _sent(self, datagram: bytes, now_ns: int) -> None:
+        if self._record is not None:
+            self._record.sent_ns, self._record.datagram = now_ns, datagram
+
+    def close_slot(self) -> None:
+        """The present slot is over."""
+        if self._record is not None:
+            self.last = self._record.slot
+            self._recorder.slot(self._record)
+            self._record = None
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """The flight is over."""
+        self.close_slot()
+        self._recorder.finish(summary)
+        self._recorder.__exit__()
+
+
+class OnBoard(Observer):
+    """A swarm that flies the protocol on board, and its ground.
+
+    :param swarm: what all agents share; the app has the defaults of the rest.
+    :param lab: vehicles, air and ground.
+    :param out: directory for bags; None: none are made.
+    :param key: 16 bytes, of sealed frames.
+    :param enable_s: s, when the agents may steer.
+    :raises ConfigError: for a swarm that the app cannot be.
+    """
+
+    def __init__(
+        self, swarm: SwarmConfig, lab: LabSettings, out: Path | None = None, key: bytes = b"", enable_s: float = 8.0
+    ) -> None:
+        if swarm.agents > MOST:
+            raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
+        check_joinable(swarm.policy)
+        check_fits(swarm, _PORT)
+        if swarm.auth and len(key) != _KEY_BYTES:
+            raise ConfigError("key", len(key) or "none", f"{_KEY_BYTES} bytes on board")
+        self.swarm, self.scenario = swarm, make_scenario(swarm)
+        start = np.array(self.scenario.start)
+        start[2] = 0.0  # on the floor
+        settings = dataclasses.replace(lab, agents=swarm.agents, start=start)
+        self.lab = Laboratory(read_app(APP), settings, out, [self])
+        self._flights = [
+            None if out is None else _Flight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
+        ]
+        self._key = key
+        for agent in range(1, swarm.agents + 1):
+            self.lab.at(settings.boot_s + 0.1, lambda agent=agent: self.prepare(agent))  # type: ignore[misc]
+            height = HEIGHT_M + float(self.scenario.start[2, agent - 1])
+            self._at(enable_s - _CLIMB_S - 0.5, self.lab.take_off, agent, height, _CLIMB_S)
+            self._at(enable_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
+
+    def _at(self, time_s: float, action: Callable[..., object], *given: Any) -> None:
+        self.lab.at(time_s, lambda: action(*given) and None)
+
+    def prepare(self, agent: int) -> None:
+        """Now, and in the time that follows: its settings, everybody's places, and the start.
+
+        :param agent: id of one that has just been switched on.
+        """
+        lab, swarm, scenario, now = self.lab, self.swarm, self.scenario, self.lab.time
+        header = int.from_bytes(header_of(swarm, _PORT) or b"\0\0", "little")
+        values: dict[str, float] = {
+            "agents": swarm.agents, "policy": _POLICIES.index(swarm.policy), "header": header, "steps": swarm.steps,
+            "slotUs": swarm.slot_ns // 1000, "flightUs": FLIGHT_US, "seed": swarm.seed, "height": HEIGHT_M,
+        }  # fmt: skip
+        places = np.concatenate((scenario.start, scenario.target), axis=1) + _UP
+        for axis, least, most in zip(
+            "XYZ", places.min(axis=1) - _MARGIN_M, places.max(axis=1) + _MARGIN_M, strict=True
+        ):
+            values |= {f"low{axis}": float(least), f"high{axis}": float(most)}
+        for name, value in values.items():
+            lab.set_parameter(agent, f"dtsa.{name}", value)
+        orders = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]
+        for letter, places in ((b"F", scenario.start), (b"T", scenario.target)):
+            for k in range(swarm.agents):
+                orders.append(letter + struct.pack("<B3d", k + 1, *(float(places[i, k]) for i in range(3))))
+        if swarm.auth:
+            orders.append(b"K" + self._key + struct.pack("<Q", swarm.auth_session))
+        orders.append(b"S")
+        for i, order in enumerate(orders):
+            self._at(now + 0.1 + i * _ORDER_S, lab.send, agent, order)
+
+    def mute(self, agent: int) -> None:
+        """No frame of an agent gets on the air any more.
+
+        :param agent: id.
+        """
+        self.lab.set_parameter(agent, "dtsa.mute", 1)
+
+    def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
+        """What an app has noted."""
+        flight = self._flights[agent - 1]
+        if flight is not None:
+            flight.note(data)
+
+    def __enter__(self) -> OnBoard:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.lab.close()
+
+    def finish(self) -> dict[str, Any]:
+        """The flight is over: bags are closed; what came of it."""
+        goal = np.array(self.scenario.target) + _UP
+        away = np.sqrt(((goal - self.lab.world.vehicles.position) ** 2).sum(axis=0))
+        summary = {**self.lab.summary(), "away_m": [round(float(x), 3) for x in away]}
+        for flight in self._flights:
+            if flight is not None:
+                flight.finish({"ended": True})
+        return summary

@@ -1,0 +1,151 @@
+"""The protocol on board: twelve apps in the laboratory decide, bit for bit, what agents on computers decide."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.crazyflies.peer_lab.app import read_app
+from dtsa_bench.crazyflies.peer_lab.compiling import FIRMWARE, compiler
+from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
+from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
+from dtsa_bench.recordings.merge.agent_bag import read
+from dtsa_bench.recordings.merge.merge import Merge, verified
+
+pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
+
+OFF, FLY, HOVER, LAND = range(4)
+DISABLED, GROUND, ORDERED, UNHEARD = 1, 2, 4, 7
+LEASE = SwarmConfig(agents=5, policy="lease")
+
+
+def merged(folder: Path) -> dict[str, Any]:
+    """What came of the bags of all agents, made one flight."""
+    return Merge([read(path) for path in sorted(folder.glob("cf*.mcap"))]).judge()
+
+
+@pytest.mark.parametrize(
+    ("swarm", "lab"),
+    [
+        (LEASE, LabSettings(drift_ppm=50.0)),
+        (LEASE, LabSettings(loss=0.1, seed=2)),
+        (SwarmConfig(agents=5, policy="tdma", slot_ms=5.0), LabSettings(loss=0.1)),
+        (SwarmConfig(agents=5, policy="lease", auth=True, auth_session=3), LabSettings()),
+    ],
+)
+def test_apps_decide_what_agents_on_computers_decide(swarm: SwarmConfig, lab: LabSettings, tmp_path: Path) -> None:
+    with OnBoard(swarm, lab, tmp_path, key=bytes(range(16)) if swarm.auth else b"", enable_s=6.0) as flight:
+        assert flight.lab.warnings == ""
+        flight.lab.run(11.5)
+        summary = flight.finish()
+    found = merged(tmp_path)
+    assert verified(found)
+    assert found["decisions_again"]["differences"] == []
+    assert found["decisions_again"]["equal"] > 600 * swarm.agents
+    assert found["turns"]["slots_with_two_senders"] == 0
+    assert summary["crashed"] == []
+    assert max(summary["away_m"]) < 0.3
+    assert summary["min_distance_m"] > 0.2
+    assert summary["pairs_known"] == 1.0
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    digests = []
+    for seed in (1, 1, 2):
+        with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings(seed=seed, loss=0.2)) as flight:
+            flight.lab.run(9.0)
+            digests.append(flight.finish()["digest"])
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_one_is_switched_off_and_on_again_and_the_others_fly_on(tmp_path: Path) -> None:
+    with OnBoard(LEASE, LabSettings(), tmp_path) as flight:
+        lab = flight.lab
+        lab.at(10.0, lambda: lab.switch_off(4))
+        lab.at(10.5, lambda: lab.switch_on(4))
+        lab.at(10.6, lambda: flight.prepare(4))
+        lab.run(16.0)
+        assert lab.log(4, "dtsa.heard") > 50  # from the floor, it takes part
+        assert [lab.log(k, "dtsa.mode") for k in (1, 2, 3, 5)] == [FLY] * 4
+        flight.finish()
+    assert merged(tmp_path)["decisions_again"]["differences"] == []
+
+
+def in_flight(flight: OnBoard) -> None:
+    """Until all steer."""
+    flight.lab.run(9.5)
+    assert [flight.lab.log(k, "dtsa.mode") for k in range(1, 4)] == [FLY] * 3
+
+
+def test_the_ground_takes_a_vehicle_back_in_three_ways() -> None:
+    with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
+        in_flight(flight)
+        lab = flight.lab
+        lab.set_parameter(1, "dtsa.enable", 0)
+        lab.go_to(2, 0.0, 0.0, 2.5, 2.0)  # a command of the ground's, without a word to the app
+        lab.send(3, b"L")
+        lab.run(10.0)
+        assert [lab.log(k, "dtsa.mode") for k in range(1, 4)] == [OFF, OFF, LAND]
+        assert [lab.log(k, "dtsa.why") for k in range(1, 4)] == [DISABLED, GROUND, ORDERED]
+        lab.run(16.0)
+        height = lab.world.vehicles.position[2]
+        assert height[0] == pytest.approx(1.2, abs=0.15)  # it holds its place
+        assert height[1] == pytest.approx(2.5, abs=0.15)
+        assert height[2] < 0.05
+        assert lab.record.crashed == {}
+
+
+def test_who_hears_nobody_hovers_and_then_lands() -> None:
+    with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
+        in_flight(flight)
+        lab = flight.lab
+        for agent in (2, 3):
+            lab.set_parameter(agent, "dtsa.enable", 0)
+            lab.send(agent, b"Z")  # an order that there is not
+        lab.run(9.6)
+        assert lab.from_apps[-1][2] == b"Z\0order"
+        for agent in (2, 3):  # their radios only: they hang in the air by the high-level commander
+            flight.mute(agent)
+        lab.run(11.0)
+        assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) == (HOVER, UNHEARD)
+        lab.run(18.0)
+        assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) in [(LAND, UNHEARD), (OFF, UNHEARD)]
+        assert lab.world.vehicles.position[2, 0] < 0.05
+        assert lab.record.crashed == {}
+
+
+@pytest.mark.parametrize(
+    ("swarm", "said"),
+    [
+        (SwarmConfig(agents=21, policy="lease"), "agents: got 21; allowed: 1 to 20"),
+        (SwarmConfig(agents=4, policy="dtsa"), "policy: got 'dtsa'"),
+        (SwarmConfig(agents=4, policy="lease", auth=True, auth_session=1), "key: got 'none'"),
+    ],
+)
+def test_a_swarm_that_cannot_fly_on_board_is_refused(swarm: SwarmConfig, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        OnBoard(swarm, LabSettings())
+
+
+def test_the_app_compiles_for_its_microcontroller_without_a_warning(tmp_path: Path) -> None:
+    found = shutil.which("arm-none-eabi-gcc")
+    if found is None:
+        pytest.skip("no arm-none-eabi-gcc on this machine")
+    board = ["-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-Os", "-std=gnu11"]
+    words = [found, *board, "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror", "-c"]
+    app = read_app(str(APP))
+    places = [f"-I{path}" for path in (*app.include, FIRMWARE)]
+    for path in app.sources:
+        if path.parent == APP.resolve():
+            subprocess.run([*words, *places, "-o", tmp_path / f"{path.stem}.o", path], check=True, timeout=60)
+    sizes = subprocess.run(
+        ["arm-none-eabi-size", *map(str, tmp_path.glob("*.o"))], check=True, capture_output=True, text=True
+    ).stdout
+    ram = sum(int(line.split()[1]) + int(line.split()[2]) for line in sizes.splitlines()[1:])
+    assert ram < 20_000, sizes
