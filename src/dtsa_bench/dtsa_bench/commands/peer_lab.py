@@ -11,7 +11,10 @@ from typing import Any
 DESCRIPTION = """\
 Flies copies of a Crazyflie app (C, a function appMain) on this machine, in virtual time, on simulated Crazyflies over
 one medium with the radio's true times. The app is compiled against own declarations of the firmware's documented
-functions. The same seed gives the same bits: the digest says so. Apps that come with it: beacons, dtr."""
+functions. The same seed gives the same bits: the digest says so. Apps that come with it: beacons, dtr, and `protocol`:
+policies tdma, aloha and lease on board, with a bag for each agent in --out, for `dtsa merge`."""
+PROTOCOL = "protocol"
+_OF_PROTOCOL = ("policy", "slot_ms", "moving")
 
 _SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
 
@@ -24,6 +27,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     text = "copies of a Crazyflie app on this machine, in virtual time"
     parser = subparsers.add_parser("peer-lab", help=text, description=DESCRIPTION)
     parser.add_argument("app", metavar="APP", help="directory of the app, or the name of one that comes with it")
+    for name in _OF_PROTOCOL:
+        parser.add_argument(f"--{name.replace('_', '-')}", metavar="X", help=f"with {PROTOCOL}: as for `dtsa simulate`")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="virtual time [60]")
     specs = {spec.name: spec for spec in settings_of(LabSettings)}
     for name in _SETTINGS:
@@ -53,9 +58,16 @@ def run(args: argparse.Namespace) -> int:
     settings = LabSettings(**given)
     parameters = dict(map(_parameter, args.set))
     out = None if args.out is None else new_directory(args.out)
+    swarm, place = None, args.app
+    of_protocol = {name: getattr(args, name) for name in _OF_PROTOCOL if getattr(args, name) is not None}
+    if args.app == PROTOCOL:
+        swarm, place = _swarm(of_protocol, settings), _folder()
+    elif of_protocol:
+        name, value = next(iter(of_protocol.items()))
+        raise ConfigError(name, value, f"only with {PROTOCOL}")
     summary = fly(
-        args.app, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
-        flags=tuple(args.flag), parameters=parameters, out=out,
+        place, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
+        flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm,
     )  # fmt: skip
     console, warnings, logs = (summary.pop(key) for key in ("console", "warnings", "logs"))
     if out is not None:
@@ -64,6 +76,25 @@ def run(args: argparse.Namespace) -> int:
         print(warnings, end="", file=sys.stderr)
     print(json.dumps(summary, indent=2) if args.json else _lines(summary, len(console)))
     return 0
+
+
+def _swarm(given: dict[str, str], settings: Any) -> dict[str, Any]:
+    """Settings of the swarm that flies the protocol."""
+    from dtsa_agent.core import SwarmConfig
+    from dtsa_agent.core.settings.declaration import settings_of
+    from dtsa_bench.crazyflies.peer_lab.onboard import check_on_board
+
+    specs = {spec.name: spec for spec in settings_of(SwarmConfig)}
+    values = {"policy": "lease", **{name: specs[name].parse(text) for name, text in given.items()}}
+    swarm = SwarmConfig.from_dict({**values, "agents": settings.agents, "seed": settings.seed})
+    check_on_board(swarm)
+    return swarm.to_dict()
+
+
+def _folder() -> str:
+    from dtsa_bench.crazyflies.peer_lab.onboard import APP
+
+    return str(APP)
 
 
 def _parameter(text: str) -> tuple[str, float]:

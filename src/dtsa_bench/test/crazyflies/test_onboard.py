@@ -11,6 +11,7 @@ import pytest
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.peer_lab.app import read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import FIRMWARE, compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
@@ -149,3 +150,19 @@ def test_the_app_compiles_for_its_microcontroller_without_a_warning(tmp_path: Pa
     ).stdout
     ram = sum(int(line.split()[1]) + int(line.split()[2]) for line in sizes.splitlines()[1:])
     assert ram < 20_000, sizes
+
+
+def test_the_command_flies_the_protocol_and_says_what_cannot_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = ["peer-lab", "protocol", "--agents", "3", "--seconds", "7", "--out", str(tmp_path / "flight")]
+    assert main([*short, "--policy", "tdma"]) == 0
+    assert "digest" in capsys.readouterr().out
+    assert len(list((tmp_path / "flight").glob("cf*.mcap"))) == 3
+    for words, said in (
+        (["protocol", "--policy", "dtsa"], "policy: got 'dtsa'"),
+        (["protocol", "--agents", "21"], "agents: got 21"),
+        (["beacons", "--slot-ms", "5"], "slot_ms: got '5'; allowed: only with protocol"),
+    ):
+        assert main(["peer-lab", *words]) == 2
+        assert said in capsys.readouterr().err

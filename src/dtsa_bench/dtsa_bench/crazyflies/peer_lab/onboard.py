@@ -106,6 +106,18 @@ class _Flight:
         self._recorder.__exit__()
 
 
+def check_on_board(swarm: SwarmConfig) -> None:
+    """Refuses a swarm that the app cannot be.
+
+    :param swarm: what all agents share.
+    :raises ConfigError: if it cannot.
+    """
+    if swarm.agents > MOST:
+        raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
+    check_joinable(swarm.policy)
+    check_fits(swarm, _PORT)
+
+
 class OnBoard(Observer):
     """A swarm that flies the protocol on board, and its ground.
 
@@ -120,10 +132,7 @@ class OnBoard(Observer):
     def __init__(
         self, swarm: SwarmConfig, lab: LabSettings, out: Path | None = None, key: bytes = b"", enable_s: float = 8.0
     ) -> None:
-        if swarm.agents > MOST:
-            raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
-        check_joinable(swarm.policy)
-        check_fits(swarm, _PORT)
+        check_on_board(swarm)
         if swarm.auth and len(key) != _KEY_BYTES:
             raise ConfigError("key", len(key) or "none", f"{_KEY_BYTES} bytes on board")
         self.swarm, self.scenario = swarm, make_scenario(swarm)

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 
 from .app import read_app
@@ -33,6 +34,7 @@ def fly(
     flags: tuple[str, ...] = (),
     parameters: Mapping[str, float] | None = None,
     out: Path | None = None,
+    swarm: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Fly an app; the summary, with `console` (what the apps printed), `warnings` (compiler, sanitizers), `logs`.
 
@@ -42,6 +44,7 @@ def fly(
     :param sources: further C files. :param include: further directories. :param flags: further ones of the compiler.
     :param parameters: values of the app's parameters, beside those of app.yaml.
     :param out: directory for files.
+    :param swarm: settings of the swarm that flies the protocol on board; None: the app is another one.
     :raises ConfigError: a setting is not usable. :raises CompileError: the app does not compile.
     :raises AppError: an app crashed, or did what no app may do.
     """
@@ -51,6 +54,7 @@ def fly(
     request = {
         "place": place, "seconds": seconds, "settings": values, "sources": sources, "include": include, "flags": flags,
         "parameters": dict(parameters or {}), "out": None if out is None else str(out),
+        "swarm": None if swarm is None else dict(swarm),
     }  # fmt: skip
     command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
     environment = {**os.environ, **sanitizer_environment(app)}
@@ -77,13 +81,30 @@ def _serve(request: dict[str, Any]) -> dict[str, Any]:
     paths = {key: tuple(request[key]) for key in ("sources", "include", "flags")}
     app = read_app(request["place"], **paths)
     out = None if request["out"] is None else Path(request["out"])
+    if request["swarm"] is not None:
+        return _serve_protocol(request, LabSettings(**request["settings"]), out)
     with Laboratory(app, LabSettings(**request["settings"]), out) as lab:
         for name, value in request["parameters"].items():
             for agent in range(1, lab.settings.agents + 1):
                 lab.set_parameter(agent, name, value)
         lab.run(request["seconds"])
-        logs = {str(agent): dict(lab.logs(agent)) for agent in range(1, lab.settings.agents + 1)}
-        return {**lab.summary(), "console": lab.record.console, "warnings": lab.warnings, "logs": logs}
+        return {**lab.summary(), **_told(lab)}
+
+
+def _serve_protocol(request: dict[str, Any], settings: LabSettings, out: Path | None) -> dict[str, Any]:
+    from .onboard import OnBoard  # recordings: others do without
+
+    with OnBoard(SwarmConfig.from_dict(request["swarm"]), settings, out) as flight:
+        for name, value in request["parameters"].items():
+            for agent in range(1, flight.swarm.agents + 1):
+                flight.lab.set_parameter(agent, name, value)
+        flight.lab.run(request["seconds"])
+        return {**flight.finish(), **_told(flight.lab)}
+
+
+def _told(lab: Laboratory) -> dict[str, Any]:
+    logs = {str(agent): dict(lab.logs(agent)) for agent in range(1, lab.settings.agents + 1)}
+    return {"console": lab.record.console, "warnings": lab.warnings, "logs": logs}
 
 
 def main() -> int:
