@@ -16,13 +16,18 @@ CHI2_95 = 3.841458820694124
 NUMBERS = ("enter", "leave", "loss_good", "loss_bad")
 _FAR = 14.0  # logits beyond this are taken as this: a probability below 1e-6
 _MEMORIES = (1.05, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, 40.0, 80.0, 160.0, 400.0, 1000.0)  # slots
-_STEPS = np.array([1.0, 0.3, 0.1, 0.02, 0.002])
+_STEPS = np.array([1.0, 0.25, 0.03])
 _LONGEST = 3.0  # step
 _DIFFERENCE = 1e-4
-_MOST = 400_000  # columns that are worked on at once
+_MOST_STEPS = 12  # towards the end of an interval
+_CLOSE = 0.03  # an end is found where the root of the likelihood ratio is so near to that of chi-square
+_TOGETHER = 16_000  # numbers that are worked on at once: they should fit into a processor's cache
+_BATCH = 400  # pieces of sequences whose links are fitted at once
 
 #: (S, M, d) points of M problems -> (S, M) values.
 Function = Callable[[Floats], Floats]
+#: The function of some of the problems, by their indices.
+Choice = Callable[[NDArray[np.int64]], Function]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +100,20 @@ def fit(data: Sequences) -> Chains:
 
     :param data: links with losses and with frames that were heard.
     """
+    pieces = np.cumsum(np.bincount(data.link, minlength=len(data.sent)))
+    parts = [_fit(data.some(links)) for links in np.split(np.arange(len(pieces)), _cuts(pieces))]
+    return Chains(*(
+        np.concatenate([getattr(part, name) for part in parts], axis=-1)
+        for name in ("numbers", "low", "high", "log_likelihood")
+    ))  # fmt: skip
+
+
+def _cuts(pieces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where batches of links begin, the first apart."""
+    return np.flatnonzero(np.diff((pieces - 1) // _BATCH)) + 1
+
+
+def _fit(data: Sequences) -> Chains:
     links = len(data.sent)
 
     def numbers(x: Floats) -> tuple[Floats, ...]:
@@ -146,11 +165,11 @@ def fit_pooled(data: Sequences) -> tuple[float, float, float, float, tuple[float
     first = int(np.argmin(value(grid)[:, 0]))
     x, values = minimise(value, grid[first], 40)
     ratio = max(0.0, 2.0 * float(-values[0] - independent(data).sum()))
-    sides = np.array([-1.0, 1.0])
-    ends = _profile(
-        lambda points: np.concatenate([value(points[:, k : k + 1]) for k in range(points.shape[1])], axis=1),
-        np.repeat(x, 2, axis=0), sides, np.repeat(values, 2),
-    )  # fmt: skip
+
+    def of_some(chosen: NDArray[np.int64]) -> Function:
+        return lambda points: np.concatenate([value(points[:, k : k + 1]) for k in range(len(chosen))], axis=1)
+
+    ends = _profile(of_some, np.repeat(x, 2, axis=0), np.array([-1.0, 1.0]), np.repeat(values, 2))
     kept, good, bad = float(sigmoid(x[0, :1])[0]), float(mean * sigmoid(x[0, 1:2])[0]), 0.0
     bad = float(mean + (1.0 - mean) * sigmoid(x[0, 2:])[0])
     return kept, good, bad, ratio, (float(ends[0]), float(ends[1]))
@@ -245,32 +264,31 @@ def _intervals(data: Sequences, found: Floats, best: Floats) -> tuple[Floats, Fl
         ]
     )  # fmt: skip  (4, L, 4): the number in question comes first
 
-    def value(points: Floats) -> Floats:
-        s = sigmoid(points).reshape(len(points), 2, 4, links, 4)
-        first, second, third, fourth = np.moveaxis(s, -1, 0)  # (S, 2, 4, L) each
-        enter, leave = np.empty_like(first), np.empty_like(first)
-        good, bad = np.empty_like(first), np.empty_like(first)
-        enter[:, :, 0], leave[:, :, 0] = first[:, :, 0], second[:, :, 0] * (1.0 - first[:, :, 0])
-        leave[:, :, 1], enter[:, :, 1] = first[:, :, 1], second[:, :, 1] * (1.0 - first[:, :, 1])
-        bad[:, :, :2] = fourth[:, :, :2]
-        good[:, :, :2] = third[:, :, :2] * bad[:, :, :2]
-        enter[:, :, 2:] = second[:, :, 2:]
-        leave[:, :, 2:] = third[:, :, 2:] * (1.0 - second[:, :, 2:])
-        good[:, :, 2], bad[:, :, 2] = first[:, :, 2], first[:, :, 2] + (1.0 - first[:, :, 2]) * fourth[:, :, 2]
-        bad[:, :, 3], good[:, :, 3] = first[:, :, 3], first[:, :, 3] * fourth[:, :, 3]
-        numbers = tuple(number.reshape(-1, links) for number in (enter, leave, good, bad))
-        return -_in_portions(data, numbers).reshape(len(points), -1)
+    problems = np.arange(8 * links)  # lower ends, then upper ones; in each the four numbers; in each the links
+    number, link = problems // links % 4, problems % links
+
+    def of_some(chosen: NDArray[np.int64]) -> Function:
+        kind, own = number[chosen], data.some(link[chosen])
+
+        def value(points: Floats) -> Floats:
+            first, second, third, fourth = np.moveaxis(sigmoid(points), -1, 0)
+            enter = np.choose(kind, [first, second * (1.0 - first), second, second])
+            leave = np.choose(kind, [second * (1.0 - first), first, third * (1.0 - second), third * (1.0 - second)])
+            good = np.choose(kind, [third * fourth, third * fourth, first, first * fourth])
+            bad = np.choose(kind, [fourth, fourth, first + (1.0 - first) * fourth, first])
+            return -_in_portions(own, (enter, leave, good, bad))
+
+        return value
 
     both = np.concatenate([starts.reshape(-1, 4)] * 2)
-    sides = np.repeat([-1.0, 1.0], 4 * links)
-    ends = _profile(value, both, sides, np.tile(-best, 8)).reshape(2, 4, links)
+    ends = _profile(of_some, both, np.repeat([-1.0, 1.0], 4 * links), np.tile(-best, 8)).reshape(2, 4, links)
     return ends[0], ends[1]
 
 
-def _profile(value: Function, start: Floats, sides: Floats, least: Floats) -> Floats:
+def _profile(function: Choice, start: Floats, sides: Floats, least: Floats) -> Floats:
     """Ends of intervals (M,): where the least value with the first number fixed lies half of chi-square above.
 
-    :param value: the functions, of logits.
+    :param function: the functions, of logits.
     :param start: (M, d) where each is least.
     :param sides: (M,) -1: lower end, 1: upper end.
     :param least: (M,) values there.
@@ -280,43 +298,53 @@ def _profile(value: Function, start: Floats, sides: Floats, least: Floats) -> Fl
     limit = sides * _FAR
     target = math.sqrt(CHI2_95)
 
-    def root(values: Floats) -> Floats:
-        return np.asarray(np.sqrt(np.maximum(0.0, 2.0 * (values - least))))
-
     # Where all other numbers are kept, the value rises soonest: the end lies there or beyond.
     parts = np.linspace(0.0, 1.0, 24)[1:] ** 2
     grid = here + parts[:, None] * (limit - here)
     points = np.repeat(start[None], len(parts), axis=0)
     points[:, :, 0] = grid
-    above = root(value(points)) >= target
+    above = _root(function(np.arange(count))(points), least) >= target
     crossed = np.where(above.any(axis=0), np.argmax(above, axis=0), len(parts) - 1)
     z = grid[crossed, np.arange(count)]
     inner, inner_root = here.copy(), np.zeros(count)  # the farthest point known to be inside
     outer, outer_root = limit.copy(), np.full(count, np.inf)  # the nearest one known to be outside
-    others = start[:, 1:].copy()
-    for _ in range(9):
+    others, todo = start[:, 1:].copy(), np.arange(count)
+    for _ in range(_MOST_STEPS):
+        value, own = function(todo), z[todo]
 
-        def fixed(rest: Floats, z: Floats = z) -> Floats:
-            return value(np.concatenate([np.broadcast_to(z[None, :, None], (*rest.shape[:2], 1)), rest], axis=2))
+        def fixed(rest: Floats, value: Function = value, own: Floats = own) -> Floats:
+            return value(np.concatenate([np.broadcast_to(own[None, :, None], (*rest.shape[:2], 1)), rest], axis=2))
 
-        others, values = minimise(fixed, others, 8, 1e-3)
-        now = root(values)
+        others[todo], values = minimise(fixed, others[todo], 8, 1e-3)
+        now = _root(values, least[todo])
         inside = now < target
-        inner, inner_root = np.where(inside, z, inner), np.where(inside, now, inner_root)
-        outer, outer_root = np.where(inside, outer, z), np.where(inside, outer_root, now)
+        near = todo[inside]
+        inner[near], inner_root[near] = z[near], now[inside]
+        far = todo[~inside]
+        outer[far], outer_root[far] = z[far], now[~inside]
+        # An end at the edge of what is told apart is known, too.
+        at_edge = inside & (np.abs(z[todo] - limit[todo]) < 1e-9)
+        todo = todo[(np.abs(now - target) > _CLOSE) & ~at_edge]
+        if not len(todo):
+            break
         with np.errstate(invalid="ignore", divide="ignore"):
-            between = inner + (outer - inner) * np.clip((target - inner_root) / (outer_root - inner_root), 0.1, 0.9)
+            share = np.clip((target - inner_root) / (outer_root - inner_root), 0.1, 0.9)
+            between = inner + (outer - inner) * share
             beyond = inner + sides * np.clip(np.abs(inner - here) * (target / inner_root - 1.0), 0.2, 4.0)
         beyond = np.where(sides > 0, np.minimum(beyond, limit), np.maximum(beyond, limit))
-        z = np.where(np.isfinite(outer_root), between, beyond)
-    edge = ~np.isfinite(outer_root)
-    ends = np.where(edge, limit, z)
-    return np.where(edge, np.where(sides > 0, 1.0, 0.0), sigmoid(ends))
+        z[todo] = np.where(np.isfinite(outer_root), between, beyond)[todo]
+    edge = ~np.isfinite(outer_root) & (np.abs(z - limit) < 1e-9)
+    return np.where(edge, np.where(sides > 0, 1.0, 0.0), sigmoid(z))
+
+
+def _root(values: Floats, least: Floats) -> Floats:
+    """Roots of likelihood ratios."""
+    return np.asarray(np.sqrt(np.maximum(0.0, 2.0 * (values - least))))
 
 
 def _portions(count: int, data: Sequences) -> list[slice]:
     """Slices of so many rows that together are worked on at once."""
-    step = max(1, _MOST // max(1, len(data.link)))
+    step = max(1, _TOGETHER // max(1, len(data.link)))
     return [slice(start, start + step) for start in range(0, count, step)]
 
 

@@ -90,7 +90,7 @@ def learn(flights: list[Observed]) -> dict[str, Any]:
             "likelihood_ratio": _short(ratio_of_all), "p_value": _short(chance_of_all),
             "pooled": None if pooled is None else {
                 "kept": _short(pooled[0]), "kept_interval": [_short(value) for value in pooled[4]],
-                "loss_good": _short(pooled[1]), "loss_bad": _short(pooled[2]),
+                "loss_good": _edge(pooled[1]), "loss_bad": _edge(pooled[2]),
             },
         },
         "others": _row(np.array(_steady(rate)) if others is None else np.array(others)[:, 0]),
@@ -151,9 +151,12 @@ def _row(numbers: Floats) -> dict[str, float]:
     """A chain's numbers for the file; enter and leave stay at most 1 together when they are rounded."""
     row = {name: min(1.0, max(0.0, _short(value))) for name, value in zip(NUMBERS, numbers, strict=True)}
     row["leave"] = min(row["leave"], 1.0 - row["enter"])
-    for name in ("loss_good", "loss_bad"):  # what is not told apart from never and always
-        row[name] = 0.0 if row[name] < 2e-6 else 1.0 if row[name] > 1.0 - 2e-6 else row[name]
-    return row
+    return row | {name: _edge(row[name]) for name in ("loss_good", "loss_bad")}
+
+
+def _edge(loss: float) -> float:
+    """A state's loss; what is not told apart from never and always is that."""
+    return 0.0 if loss < 2e-6 else 1.0 if loss > 1.0 - 2e-6 else _short(loss)
 
 
 def _short(value: Any) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +12,14 @@ from numpy.typing import NDArray
 from dtsa_channel_sim.model.loss_record import LOST, UNKNOWN
 from dtsa_channel_sim.model.loss_table import LossTable
 
-_PIECE = 1000  # observations; longer sequences are cut, and each piece begins in the chain's long-run mixture
+_PIECE = 400  # observations; longer sequences are cut, and each piece begins in the chain's long-run mixture
 _LEAST = 1e-12  # likelihood of a single observation
 _TOGETHER = 8  # observations whose likelihoods are multiplied before a logarithm is taken
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Sequences:
     """Observations of L links, in C pieces of at most T each; the longest first.
 
@@ -44,21 +45,31 @@ class Sequences:
         """(L,) share that was lost."""
         return np.asarray(self.lost / self.sent)
 
+    @cached_property
+    def steady(self) -> bool:
+        """Whether each piece has the same gap all along."""
+        pairs = enumerate(self.active)
+        return len(self.gap) > 1 and all((self.gap[k, :n] == self.gap[1, :n]).all() for k, n in pairs if k)
+
     def some(self, links: NDArray[np.int64]) -> Sequences:
-        """The sequences of some links, in the order given.
+        """The sequences of some links, in the order given; a link may come several times.
 
         :param links: their indices.
         """
-        place = np.full(len(self.sent), -1)
-        place[links] = np.arange(len(links))
-        pieces = np.flatnonzero(place[self.link] >= 0)
-        active = np.array([np.searchsorted(pieces, count) for count in self.active])
+        order = np.argsort(self.link, kind="stable")  # pieces, link by link
+        first = np.searchsorted(self.link[order], links)
+        count = np.searchsorted(self.link[order], links, side="right") - first
+        place = np.repeat(np.arange(len(links)), count)
+        pieces = order[np.arange(len(place)) + np.repeat(first - np.cumsum(count) + count, count)]
+        longest_first = np.argsort(pieces, kind="stable")
+        pieces, place = pieces[longest_first], place[longest_first]
+        active = np.searchsorted(pieces, self.active)
         steps = int(np.count_nonzero(active))
         return Sequences(
             self.ids[links],
             self.sent[links],
             self.lost[links],
-            place[self.link[pieces]],
+            place,
             self.heard[:steps, pieces],
             self.gap[:steps, pieces],
             active[:steps],
@@ -77,23 +88,32 @@ class Sequences:
         share = (enter / (enter + leave))[:, at]
         good, rise, bad = good[:, at], (bad - good)[:, at], bad[:, at]
         total, product = np.zeros_like(share), np.ones_like(share)
-        state = share  # P(bad) given all that was observed
-        steady = bool((self.gap[1:] == self.gap[1:2]).all()) if len(self.gap) > 1 else True
-        decay = np.exp(self.gap[1] * kept) if steady and len(self.gap) > 1 else kept
+        decay = np.exp(self.gap[1] * kept) if self.steady else kept
+        # Everything in place: this loop is what fitting costs.
+        everything = (share, decay, kept, good, rise, bad, product, total)
+        everything += (share.copy(), np.empty_like(share), np.empty_like(share))
+        width, views = -1, everything
         for step, count in enumerate(self.active):
-            if count < state.shape[1]:
-                state = state[:, :count]
-            here = share[:, :count]
+            if count != width:
+                width, views = int(count), tuple(array[:, :count] for array in everything)
+            here, moved, log, low, up, high, likelihoods, logs, state, likelihood, weight = views
             if step:
-                moved = decay[:, :count] if steady else np.exp(self.gap[step, :count] * kept[:, :count])
-                state = here + (state - here) * moved
+                if not self.steady:
+                    moved = np.exp(np.multiply(log, self.gap[step, :count], out=weight), out=weight)
+                state -= here
+                state *= moved
+                state += here
             heard = self.heard[step, :count]
-            likelihood = np.maximum(np.abs(heard - (good[:, :count] + state * rise[:, :count])), _LEAST)
-            state = state * np.abs(heard - bad[:, :count]) / likelihood
-            product[:, :count] *= likelihood
+            np.multiply(state, up, out=likelihood)
+            likelihood += low
+            np.abs(np.subtract(heard, likelihood, out=likelihood), out=likelihood)
+            np.maximum(likelihood, _LEAST, out=likelihood)
+            state *= np.abs(np.subtract(heard, high, out=weight), out=weight)
+            state /= likelihood
+            likelihoods *= likelihood
             if step % _TOGETHER == _TOGETHER - 1:
-                total[:, :count] += np.log(product[:, :count])
-                product[:, :count] = 1.0
+                logs += np.log(likelihoods, out=weight)
+                likelihoods[:] = 1.0
         total += np.log(product)
         result = np.zeros((len(total), len(self.sent)))
         for row, values in zip(result, total, strict=True):
