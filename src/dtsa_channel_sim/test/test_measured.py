@@ -37,6 +37,19 @@ def test_equal_chains_on_all_links_lose_what_bursts_of_links_lose(p_good, p_bad)
         assert np.array_equal(received(one, slot, slot % 9 + 1), received(two, slot, slot % 9 + 1))
 
 
+@pytest.mark.parametrize(("p_good", "p_bad"), [(0.0, 1.0), (0.1, 0.8)])
+def test_equal_chains_of_all_receivers_lose_what_bursts_of_receivers_lose(p_good, p_bad):
+    model = GilbertElliott.from_means(0.3, 6.0, p_good, p_bad)
+    rows = [[0, receiver, model.enter, model.leave, p_good, p_bad] for receiver in range(1, 10)]
+    losses = {"agents": 9, "scope": "receiver", "receivers": rows}
+    bursts = {"loss": 0.3, "burst_length": 6.0, "p_good": p_good, "p_bad": p_bad}
+    one = Channel(ChannelConfig(agents=9, seed=4, losses=losses))
+    two = Channel(ChannelConfig(agents=9, seed=4, **bursts))
+    for slot in (*range(0, 20_000, 7), 3, 50_000):
+        assert np.array_equal(received(one, slot, slot % 9 + 1), received(two, slot, slot % 9 + 1))
+    assert ChannelConfig.from_dict(one.config.to_dict()) == one.config
+
+
 @given(seed=st.integers(0, 2**32), order=st.randoms(use_true_random=False))
 @settings(max_examples=25, deadline=None)
 def test_chains_of_links_looked_at_anywhere_are_the_chains_walked(seed, order):
@@ -145,6 +158,9 @@ def test_a_packed_record_is_the_record(agents):
         (chains((1, 2, 0.5, 0.5, 0, 1)), "without the link from 1 to 3"),
         (chains((0, 0, 0.5, 0.5, 0, 1), format="dtsa-losses 9"), "losses.format"),
         (chains((0, 0, 0.5, 0.5, 0, 1), others=3), "losses.others"),
+        (chains((0, 0, 0.5, 0.5, 0, 1), scope="swarm"), "losses.scope"),
+        ({"agents": 4, "scope": "receiver", "links": [[0, 0, 0, 1, 0, 0]]}, "losses.receivers"),
+        ({"agents": 4, "scope": "receiver", "receivers": [[1, 2, 0, 1, 0, 0]]}, "sender 0: a receiver"),
         ({**chains((0, 0, 0.5, 0.5, 0, 1)), "slot_ns": 20_000_000}, "slots of 20 ms"),
         ({"agents": 3, "links": [{"sender": 0}]}, r"losses.links\[0\].receiver"),
     ],

@@ -92,16 +92,17 @@ def lines(losses: dict[str, Any]) -> list[str]:
 
 def _bursts(losses: dict[str, Any]) -> str:
     whole = losses["all"]
-    kinds = [link["chain"] for link in losses["links"]]
+    what = "receivers" if losses["scope"] == "receiver" else "links"
+    kinds = [one["chain"] for one in losses[what]]
     if whole["pooled"] is None and "own" not in kinds:
         return f"bursts: none found (p = {whole['p_value']:.2g}); losses are independent from slot to slot"
     pooled = whole["pooled"]
     memory = ""
     if pooled is not None:
         low, high = (1.0 / max(1e-9, 1.0 - value) for value in pooled["kept_interval"])
-        memory = (f"; all links together: losses {_percent(pooled['loss_good'])} and {_percent(pooled['loss_bad'])}, "
+        memory = (f"; all {what} together: losses {_percent(pooled['loss_good'])} and {_percent(pooled['loss_bad'])}, "
                   f"memory {1.0 / (1.0 - pooled['kept']):.3g} slots ({low:.3g} to {high:.3g})")  # fmt: skip
-    return f"bursts: {kinds.count('own')} links have chains of their own, {kinds.count('pooled')} a common one{memory}"
+    return f"bursts: {kinds.count('own')} {what} have chains of their own, {kinds.count('pooled')} a common one{memory}"
 
 
 def _link(link: dict[str, Any]) -> str:

@@ -97,9 +97,10 @@ def test_the_likelihood_is_that_of_the_textbook():
 
 def test_long_sequences_are_cut_and_lose_next_to_nothing():
     data = sequences([flown(2, 5000, 3, loss=0.2, burst_length=10.0)])
-    assert data.heard.shape == (1000, 6)
+    assert data.heard.shape == (400, 14)
     assert data.sent.tolist() == [2500, 2500]
-    assert data.lost.sum() == np.count_nonzero(1 - data.heard[:500]) + np.count_nonzero(1 - data.heard[500:, :4])
+    there = np.arange(14) < data.active[:, None]
+    assert data.lost.sum() == np.count_nonzero(data.heard[there] == 0)
 
 
 # -- learnt is what was flown ----------------------------------------------------------------------------------------
@@ -158,6 +159,25 @@ def test_a_file_that_was_learnt_is_a_channel_that_loses_as_much(tmp_path):
     assert {link["loss"] for link in again["links"] if (link["sender"], link["receiver"]) == (3, 4)} == {1.0}
     more = ChannelConfig(agents=9, losses=str(path))  # agents beyond those that were measured: as all others
     assert more.losses.agents == 4
+
+
+@pytest.mark.parametrize("scope", ["receiver", "link"])
+def test_what_disturbs_receivers_is_told_from_what_disturbs_links(scope):
+    learnt = learn([observed(flown(5, 6000, 3, loss=0.2, burst_length=15.0, burst_scope=scope))])
+    assert learnt["scope"] == scope
+    assert ("receivers" in learnt) == (scope == "receiver")
+    truth = GilbertElliott.from_means(0.2, 15.0)
+    low, high = learnt["all"]["pooled"]["kept_interval"]
+    assert abs(1 - truth.enter - truth.leave - (low + high) / 2) < 2 * (high - low)
+    for receiver in learnt.get("receivers", ()):
+        assert in_interval(
+            [end * side for end, side in zip(receiver["leave_interval"], (0.8, 1.25), strict=True)], 1 / 15
+        )
+    again = learn([observed(flown(5, 6000, 4, losses=learnt))])
+    assert again["scope"] == scope
+    assert abs(again["all"]["loss"] - learnt["all"]["loss"]) < 0.03
+    plain = learn([observed(flown(5, 6000, 3, loss_matrix=[[0.3 * (k > 2) for k in range(5)]] * 5))])
+    assert plain["scope"] == "link"
 
 
 def test_few_data_share_a_chain_and_none_share_nothing():
@@ -303,6 +323,22 @@ def test_a_listener_misses_what_was_due(tmp_path, policy):
     # Who flies in it hears each sender as the listener did.
     losses = MeasuredLosses.from_dict(learnt).fitted(3).loss_good
     assert losses[0, 1] == losses[0, 2]
+
+
+def test_a_listener_in_bursts_stands_for_all_receivers(tmp_path):
+    draw, bad = np.random.default_rng(1), False
+    about = {"swarm": json.dumps(SwarmConfig(agents=3, policy="tdma").to_dict())}
+    with JsonBag(tmp_path / "sniffed.mcap", {FRAME: FRAME_SCHEMA}, METADATA, about) as bag:
+        for slot in range(4000):
+            bad = draw.random() < (0.95 if bad else 0.02)
+            if not bad:
+                said = {"arrival_ns": slot, "sender": slot % 3 + 1, "slot": slot, "data": "", "reason": ""}
+                bag.write(FRAME, slot, said)
+    learnt = learn([observe(tmp_path)])
+    assert learnt["scope"] == "receiver"
+    assert [(row["sender"], row["receiver"]) for row in learnt["receivers"]] == [(0, 0)]
+    assert in_interval(learnt["receivers"][0]["leave_interval"], 0.05)
+    assert ChannelConfig(agents=3, losses=learnt).losses.scope == "receiver"
 
 
 def test_of_other_policies_a_listener_cannot_tell(tmp_path, capsys):

@@ -69,7 +69,7 @@ class GilbertElliott:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinkChains:
-    """The numbers of a chain of its own for each directed link, (N, N), row = sender, column = receiver.
+    """The numbers of a chain of its own for each directed link, (N, N), row = sender, or for each receiver, (1, N).
 
     :param bad_share: as in :class:`GilbertElliott`.
     :param enter: p of each.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .config import ChannelConfig
 from .draws import LOSS, STATE, WordBlocks, sender_factors, threshold
 from .gilbert import Chains, GilbertElliott
-from .measured import MeasuredLosses
+from .measured import LINK, MeasuredLosses
 from .topology import link_matrix
 
 Mask = NDArray[np.bool_]
@@ -56,7 +56,7 @@ class Losses:
         self._per_link = config.burst_scope == "link"
         if measured is not None and self._record is None:
             fitted = measured.fitted(config.agents)
-            self._per_link = True
+            self._per_link = measured.scope == LINK
             self._chains = Chains(fitted.chains, source.state_words, source.state_factors)
             self._good = _thresholds(config.loss, _both(links, fitted.loss_good), config.agents)
             self._bad = _thresholds(config.loss, _both(links, fitted.loss_bad), config.agents)

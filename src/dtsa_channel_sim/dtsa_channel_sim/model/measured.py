@@ -18,6 +18,8 @@ from .loss_record import LossRecord, unpack
 #: Numbers of a link's chain, in their order in a row.
 NUMBERS = ("enter", "leave", "loss_good", "loss_bad")
 FORMAT = "dtsa-losses 1"
+#: What has a chain: each directed link, or a receiver, which then loses all senders alike.
+LINK, RECEIVER = SCOPES = ("link", "receiver")
 _PROBABILITY = Setting("probability", "float", None, "probability", minimum=0.0, maximum=1.0)
 _ID = Setting("id", "int", None, "id of an agent; 0: all of which nothing else is said", minimum=0, maximum=65535)
 _AGENTS = Setting("agents", "int", None, "number of agents", minimum=1, maximum=65535)
@@ -28,9 +30,9 @@ Row = tuple[int, int, float, float, float, float]
 
 
 class Fitted(NamedTuple):
-    """The chains of all links of a swarm."""
+    """The chains of a swarm."""
 
-    chains: LinkChains
+    chains: LinkChains  # (N, N) of links, row = sender; or (1, N) of receivers
     loss_good: NDArray[np.float64]  # (N, N), row = sender
     loss_bad: NDArray[np.float64]  # (N, N)
 
@@ -46,6 +48,7 @@ class MeasuredLosses:
     :param links: sender, receiver, p = P(good -> bad), r = P(bad -> good), loss in the good state, in the bad one.
         A 0 for the sender or the receiver stands for all of which nothing else is said.
     :param record: the packed record to replay (:mod:`.loss_record`); empty: the chains count.
+    :param scope: what has a chain, one of :data:`SCOPES`; all links are those of sender 0 where receivers have.
     """
 
     name: str
@@ -54,6 +57,7 @@ class MeasuredLosses:
     slot_ns: int
     links: tuple[Row, ...] = ()
     record: str = ""
+    scope: str = LINK
 
     def __repr__(self) -> str:
         """The name of the file, and the beginning of its hash."""
@@ -63,7 +67,8 @@ class MeasuredLosses:
     def from_dict(cls, values: Mapping[str, Any], name: str = "", sha256: str = "") -> MeasuredLosses:
         """Return the losses that plain values say: those of :meth:`to_dict`, or of a file that `losses` has written.
 
-        :param values: ``agents``, ``slot_ns`` or ``slot_ms``, and ``links``, or ``record``; further names are notes.
+        :param values: ``agents``, ``slot_ns`` or ``slot_ms``, and ``links``, or ``scope: receiver`` and
+            ``receivers``, or ``record``; further names are notes.
         :param name: name of the file, unless the values tell.
         :param sha256: its hash, likewise.
         :raises ConfigError: naming the part that is wrong.
@@ -75,21 +80,29 @@ class MeasuredLosses:
         else:
             slot_ns = _SLOT_NS.check(values.get("slot_ns", 0), "losses.slot_ns")
         record = values.get("record", "")
-        links = values.get("links", ())
+        scope = values.get("scope", LINK)
+        if scope not in SCOPES:
+            raise ConfigError("losses.scope", scope, " or ".join(SCOPES))
+        part = "links" if scope == LINK else "receivers"
+        links = values.get(part, ())
         if not isinstance(record, str):
             raise ConfigError("losses.record", record, "text")
         if isinstance(links, str) or not isinstance(links, Sequence) or bool(links) == bool(record):
-            raise ConfigError("losses.links", links if links else None, "a list of links, or a record in its place")
-        rows = [_row(entry, f"losses.links[{place}]") for place, entry in enumerate(links)]
+            raise ConfigError(f"losses.{part}", links if links else None, f"a list of {part}, or a record in its place")
+        rows = [_row(entry, f"losses.{part}[{place}]") for place, entry in enumerate(links)]
         if "others" in values:
             others = values["others"]
             if not isinstance(others, Mapping):
                 raise ConfigError("losses.others", others, f"names with values: {', '.join(NUMBERS)}")
-            rows.append(_row({**others, "sender": 0, "receiver": 0}, "losses.others"))
+            row = _row({**others, "sender": 0, "receiver": 0}, "losses.others")
+            if all(other[:2] != row[:2] for other in rows):  # of a listener's losses, they may stand there already
+                rows.append(row)
         seen: set[tuple[int, int]] = set()
         for row in rows:
             if row[:2] in seen:
-                raise ConfigError("losses.links", f"sender {row[0]}, receiver {row[1]}", "each link once")
+                raise ConfigError(f"losses.{part}", f"sender {row[0]}, receiver {row[1]}", "each link once")
+            if scope == RECEIVER and row[0]:
+                raise ConfigError(f"losses.{part}", f"sender {row[0]}", "sender 0: a receiver loses all senders alike")
             seen.add(row[:2])
         found = cls(
             str(values.get("name", name)),
@@ -98,6 +111,7 @@ class MeasuredLosses:
             slot_ns,
             tuple(rows),
             record,
+            scope,
         )
         if record:
             found.replay(1)
@@ -106,7 +120,10 @@ class MeasuredLosses:
     def to_dict(self) -> dict[str, Any]:
         """Return the losses as :meth:`from_dict` reads them."""
         about = {"name": self.name, "sha256": self.sha256, "agents": self.agents, "slot_ns": self.slot_ns}
-        return about | ({"record": self.record} if self.record else {"links": [list(row) for row in self.links]})
+        if self.record:
+            return {**about, "record": self.record}
+        rows = [list(row) for row in self.links]
+        return {**about, **({"links": rows} if self.scope == LINK else {"scope": RECEIVER, "receivers": rows})}
 
     def check(self, agents: int, slot_ns: int) -> None:
         """Check that the losses fit a swarm.
@@ -143,7 +160,8 @@ class MeasuredLosses:
                 rows = slice(None) if sender == 0 else slice(sender - 1, sender)
                 columns = slice(None) if receiver == 0 else slice(receiver - 1, receiver)
                 numbers[:, rows, columns] = np.array(values)[:, None, None]
-        numbers[:, np.arange(agents), np.arange(agents)] = 0.0  # nobody hears itself
+        if self.scope == LINK:
+            numbers[:, np.arange(agents), np.arange(agents)] = 0.0  # nobody hears itself
         if np.isnan(numbers).any():
             sender, receiver = np.argwhere(np.isnan(numbers[0]))[0] + 1
             raise ConfigError(
@@ -153,7 +171,8 @@ class MeasuredLosses:
         moves = enter + leave
         leave[moves == 0.0] = 1.0  # a chain that never moves: it is in its good state
         share = np.divide(enter, moves, out=np.zeros_like(enter), where=moves > 0.0)
-        return Fitted(LinkChains(share, enter, leave), good, bad)
+        rows = slice(None) if self.scope == LINK else slice(1)
+        return Fitted(LinkChains(share[rows], enter[rows], leave[rows]), good, bad)
 
 
 def _row(entry: object, name: str) -> Row:

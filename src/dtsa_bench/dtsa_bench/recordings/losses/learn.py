@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench import __version__
 from dtsa_channel_sim.model.loss_record import HEARD
-from dtsa_channel_sim.model.measured import FORMAT
+from dtsa_channel_sim.model.loss_table import LossTable
+from dtsa_channel_sim.model.measured import FORMAT, LINK, RECEIVER
 
-from .chain_fit import NUMBERS, bursts, fit, fit_pooled, of_rate, wilson
+from .chain_fit import CHI2_95, NUMBERS, bursts, fit, fit_pooled, of_rate, wilson
 from .distance import by_distance
 from .observed import Observed, together
 from .sequences import Floats, Sequences, sequences
@@ -24,7 +26,81 @@ from .sequences import Floats, Sequences, sequences
 LEAST_P = 0.01
 #: and where it lost and heard so many frames at least.
 LEAST_LOST = 20
+_CLEARLY = 10.0  # chains of receivers are taken where their criterion is better by this
 OWN, POOLED, INDEPENDENT = "own", "pooled", "independent"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Learnt:
+    """Chains of links, or of receivers.
+
+    :param data: what was observed.
+    :param ratio: (L,) likelihood ratios of bursts.
+    :param chance: (L,) how probable larger ones are without bursts.
+    :param of_all: both, of all together.
+    :param numbers: (4, L) the chains.
+    :param kinds: (L,) where each comes from.
+    :param low: (4, L) lower ends of intervals, of chains of their own.
+    :param high: (4, L) upper ends.
+    :param pooled: what all share, see :func:`fit_pooled`; None: losses look independent.
+    """
+
+    data: Sequences
+    ratio: Floats
+    chance: Floats
+    of_all: tuple[float, float]
+    numbers: Floats
+    kinds: NDArray[Any]
+    low: Floats
+    high: Floats
+    pooled: tuple[float, float, float, float, tuple[float, float]] | None
+
+    @property
+    def criterion(self) -> float:
+        """Akaike's: less is better."""
+        likelihood = self.data.log_likelihood(*(np.clip(number, 1e-9, 1.0)[None] for number in self.numbers)).sum()
+        free = 4 * np.count_nonzero(self.kinds == OWN) + np.count_nonzero(self.kinds != OWN) + 3 * bool(self.pooled)
+        return float(2.0 * free - 2.0 * likelihood)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Each with its rate and its chain, for the file."""
+        data, spread = self.data, _spread(self.data, self.numbers)
+        low, high = wilson(data.lost / spread, data.sent / spread)
+        found = []
+        for k, (sender, receiver) in enumerate(data.ids.tolist()):
+            row: dict[str, Any] = {
+                "sender": sender, "receiver": receiver,
+                "sent": int(data.sent[k]), "heard": int(data.sent[k] - data.lost[k]),
+                "loss": _short(data.rate[k]), "loss_interval": [_short(low[k]), _short(high[k])],
+                "likelihood_ratio": _short(self.ratio[k]), "p_value": _short(self.chance[k]),
+                "chain": str(self.kinds[k]), **_row(self.numbers[:, k]),
+            }  # fmt: skip
+            if self.kinds[k] == OWN:
+                for name, lower, upper in zip(NUMBERS, self.low[:, k], self.high[:, k], strict=True):
+                    row[f"{name}_interval"] = [_short(lower), _short(upper)]
+            found.append(row)
+        return found
+
+
+def _learn(data: Sequences) -> _Learnt:
+    """The chains that fit sequences."""
+    ratio, chance, *of_all = bursts(data)
+    pooled = fit_pooled(data) if of_all[1] < LEAST_P else None
+    if pooled is None:
+        numbers, kinds = np.zeros((4, len(data.sent))), np.full(len(data.sent), INDEPENDENT, dtype=object)
+    else:
+        kept, good, bad = (np.full(len(data.sent), value) for value in pooled[:3])
+        numbers, kinds = np.array(of_rate(kept, good, bad, data.rate)), np.full(len(data.sent), POOLED, dtype=object)
+    kinds[(data.lost == 0) | (data.lost == data.sent)] = INDEPENDENT
+    for k in np.flatnonzero(kinds == INDEPENDENT):
+        numbers[:, k] = _steady(float(data.rate[k]))
+    enough = (data.lost >= LEAST_LOST) & (data.sent - data.lost >= LEAST_LOST)
+    own = np.flatnonzero(enough & (chance < LEAST_P))
+    low, high = np.full_like(numbers, np.nan), np.full_like(numbers, np.nan)
+    if len(own):
+        chains = fit(data.some(own))
+        numbers[:, own], low[:, own], high[:, own], kinds[own] = chains.numbers, chains.low, chains.high, OWN
+    return _Learnt(data, ratio, chance, (of_all[0], of_all[1]), numbers, kinds, low, high, pooled)
 
 
 def learn(flights: list[Observed]) -> dict[str, Any]:
@@ -38,45 +114,24 @@ def learn(flights: list[Observed]) -> dict[str, Any]:
     data = sequences(tables)
     if not len(data.sent):
         raise ConfigError("runs", ", ".join(flight.name for flight in flights), "a flight with one frame sent at least")
-    ratio, chance, ratio_of_all, chance_of_all = bursts(data)
-    enough = (data.lost >= LEAST_LOST) & (data.sent - data.lost >= LEAST_LOST)
-    own = np.flatnonzero(enough & (chance < LEAST_P))
-    chains = fit(data.some(own)) if len(own) else None
-    numbers, pooled = _shared(data, chance_of_all)
-    kinds = np.full(len(data.sent), POOLED if pooled else INDEPENDENT, dtype=object)
-    kinds[(data.lost == 0) | (data.lost == data.sent)] = INDEPENDENT
-    for link in np.flatnonzero(kinds == INDEPENDENT):
-        numbers[:, link] = _steady(float(data.rate[link]))
-    if chains is not None:
-        numbers[:, own], kinds[own] = chains.numbers, OWN
+    links = _learn(data)
+    receivers = _of_receivers(tables, links)
+    rows = links.rows()
+    for row, signal, metres in zip(rows, *_means(flights, data), strict=True):
+        row |= {name: _short(value) for name, value in (("rssi_dbm", signal), ("distance_m", metres))
+                if np.isfinite(value)}  # fmt: skip
     rate = float(data.lost.sum() / data.sent.sum())
-    spread = _spread(data, numbers)
-    low, high = wilson(data.lost / spread, data.sent / spread)
-    signal, metres = _means(flights, data)
-    links = []
-    for k, (sender, receiver) in enumerate(data.ids.tolist()):
-        link: dict[str, Any] = {
-            "sender": sender, "receiver": receiver,
-            "sent": int(data.sent[k]), "heard": int(data.sent[k] - data.lost[k]),
-            "loss": _short(data.rate[k]), "loss_interval": [_short(low[k]), _short(high[k])],
-            "likelihood_ratio": _short(ratio[k]), "p_value": _short(chance[k]), "chain": str(kinds[k]),
-            **_row(numbers[:, k]),
-        }  # fmt: skip
-        if kinds[k] == OWN and chains is not None:
-            place = int(np.flatnonzero(own == k)[0])
-            for name, lower, upper in zip(NUMBERS, chains.low[:, place], chains.high[:, place], strict=True):
-                link[f"{name}_interval"] = [_short(lower), _short(upper)]
-        link |= {name: _short(values[k]) for name, values in (("rssi_dbm", signal), ("distance_m", metres))
-                 if np.isfinite(values[k])}  # fmt: skip
-        links.append(link)
-    middle = float(np.average(spread, weights=data.sent))
-    ends = wilson(np.array([data.lost.sum() / middle]), np.array([data.sent.sum() / middle]))
+    best = links if receivers is None else receivers
+    spread = float(np.average(_spread(best.data, best.numbers), weights=best.data.sent))
+    ends = wilson(np.array([data.lost.sum() / spread]), np.array([data.sent.sum() / spread]))
     left_out: Counter[str] = sum((flight.left_out for flight in flights), Counter())
+    pooled = best.pooled
     others = of_rate(*(np.array([value]) for value in pooled[:3]), np.array([rate])) if pooled else None
     return {
         "format": FORMAT,
         "agents": agents,
         "slot_ns": slot_ns,
+        "scope": LINK if receivers is None else RECEIVER,
         "made": {
             "with": f"dtsa {__version__}",
             "on": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
@@ -85,29 +140,28 @@ def learn(flights: list[Observed]) -> dict[str, Any]:
         "frames": sum(len(table.slots) for table in tables),
         "left_out": {reason: count for reason, count in sorted(left_out.items()) if count},
         "all": {
-            "links": len(links), "sent": int(data.sent.sum()), "heard": int((data.sent - data.lost).sum()),
+            "links": len(rows), "sent": int(data.sent.sum()), "heard": int((data.sent - data.lost).sum()),
             "loss": _short(rate), "loss_interval": [_short(ends[0][0]), _short(ends[1][0])],
-            "likelihood_ratio": _short(ratio_of_all), "p_value": _short(chance_of_all),
+            "likelihood_ratio": _short(best.of_all[0]), "p_value": _short(best.of_all[1]),
             "pooled": None if pooled is None else {
                 "kept": _short(pooled[0]), "kept_interval": [_short(value) for value in pooled[4]],
                 "loss_good": _edge(pooled[1]), "loss_bad": _edge(pooled[2]),
             },
         },
         "others": _row(np.array(_steady(rate)) if others is None else np.array(others)[:, 0]),
-        "links": links,
-        "distance": by_distance(tables, middle),
+        **({} if receivers is None else {"receivers": receivers.rows()}),
+        "links": rows,
+        "distance": by_distance(tables, spread),
     }  # fmt: skip
 
 
-def _shared(
-    data: Sequences, chance: float
-) -> tuple[Floats, tuple[float, float, float, float, tuple[float, float]] | None]:
-    """(4, L) the chains with one memory for all links, each with its own rate; None: losses look independent."""
-    if chance >= LEAST_P:
-        return np.zeros((4, len(data.sent))), None
-    pooled = fit_pooled(data)
-    kept, good, bad = (np.full(len(data.sent), value) for value in pooled[:3])
-    return np.array(of_rate(kept, good, bad, data.rate)), pooled
+def _of_receivers(tables: Sequence[LossTable], links: _Learnt) -> _Learnt | None:
+    """Chains of receivers, where they say better what was lost than chains of links do."""
+    data = sequences(tables, of_receivers=True)
+    if len(data.sent) == len(links.data.sent) or bursts(data)[2] <= max(links.of_all[0], CHI2_95):
+        return None
+    found = _learn(data)
+    return found if found.criterion < links.criterion - _CLEARLY else None
 
 
 def _steady(rate: float) -> tuple[float, float, float, float]:

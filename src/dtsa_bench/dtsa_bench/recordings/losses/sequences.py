@@ -135,16 +135,17 @@ class Sequences:
         return np.asarray(1.0 + 2.0 * share * np.bincount(self.link, total, len(self.sent)) / self.sent)
 
 
-def sequences(tables: Sequence[LossTable]) -> Sequences:
+def sequences(tables: Sequence[LossTable], of_receivers: bool = False) -> Sequences:
     """The sequences of all links that were looked at once or more.
 
     :param tables: flights; a link's sequences of two flights do not go together.
+    :param of_receivers: take all links to a receiver as one, from sender 0: what disturbs a receiver disturbs them all.
     """
     pieces: list[tuple[int, NDArray[np.int64], NDArray[np.bool_]]] = []
     ids: dict[tuple[int, int], int] = {}
     for table in tables:
-        for sender in np.unique(table.senders).tolist():
-            rows = np.flatnonzero(table.senders == sender)
+        for sender in [0] if of_receivers else np.unique(table.senders).tolist():
+            rows = slice(None) if of_receivers else table.senders == sender
             slots, outcome = table.slots[rows], table.outcome[rows]
             known = outcome != UNKNOWN
             for receiver in np.flatnonzero(known.any(axis=0)).tolist():
