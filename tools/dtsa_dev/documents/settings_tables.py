@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
+from dtsa_agent.air.crazyradio.settings import CrazyradioSettings
 from dtsa_agent.air.serial.settings import SerialSettings
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp.settings import UdpSettings
@@ -154,6 +155,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "AgentSettings": partial(settings_table, AgentSettings),
     "VehicleSettings": _vehicle,
     "UdpSettings": partial(settings_table, UdpSettings),
+    "CrazyradioSettings": partial(settings_table, CrazyradioSettings),
     "SerialSettings": partial(settings_table, SerialSettings),
     "robots": partial(settings_table, RobotSettings, skip=("name", "id")),
     "battery": partial(settings_table, BatterySettings),

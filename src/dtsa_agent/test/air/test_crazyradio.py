@@ -18,7 +18,7 @@ from dtsa_agent.air.crazyradio import CrazyradioPort, CrazyradioSettings, port
 from dtsa_agent.air.crazyradio.dongle import Dongle, DongleError
 from dtsa_agent.air.crazyradio.packets import BROADCAST, PacketReader, broadcast, datagram_in
 from dtsa_agent.air.crazyradio.stamps import DongleClock
-from dtsa_agent.air.datagram import check_fits, flight_ns
+from dtsa_agent.air.datagram import check_fits, flight_ns, trust_ns
 from dtsa_agent.air.ports import make_settings
 from dtsa_agent.core import ConfigError, SwarmConfig
 
@@ -73,6 +73,7 @@ def test_a_sealed_frame_fills_the_packet_and_others_have_room_for_two_bytes() ->
     bits = 73 + 8 * (2 + SEALED.frame_length)
     assert flight_ns(SEALED, properties) == 1_100_000 + bits * 500
     assert flight_ns(SEALED, slow) == 1_100_000 + bits * 1000
+    assert trust_ns(SEALED, properties) == SEALED.slot_ns // 4, "a wrong send_time_ns is no other time"
     with pytest.raises(ConfigError, match="slot_ms"):
         check_fits(SwarmConfig(agents=5, policy="lease", slot_ms=9.9), properties)
 

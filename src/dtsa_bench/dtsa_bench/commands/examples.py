@@ -18,6 +18,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--id 3 --interface eth0 --auth-session 41", "the third of twelve; the key is in DTSA_AUTH_KEY"),
         ("--id 1 --agents 4 --interface lo --no-seal --duration-s 10 --out runs/cf1", "ten seconds, with a bag"),
         ("--swarm swarm.yaml --id 3 --auth-session 40 --check", "before a flight: do all hear all"),
+        ("--id 3 --air crazyradio --uri radio://0/80/2M --slot-ms 20 --auth-session 41", "by a Crazyradio 2.0"),
     ),
     "simulate": (
         ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),
@@ -42,7 +43,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("runs/a --rate 0.5 --start 2 --loop", "half as fast, from 2 s on, again and again"),
     ),
     "verify": (("runs/a", "one run"), ("runs/a runs/b --json", "several, as JSON")),
-    "sniff": (("--interface eth0 --auth-session 41 --out runs/sniffed", "twelve agents; until Ctrl-C"),),
+    "sniff": (
+        ("--interface eth0 --auth-session 41 --out runs/sniffed", "twelve agents; until Ctrl-C"),
+        ("--air crazyradio --uri radio://0/80/2M --slot-ms 20 --auth-session 41 --pcap air.pcap", "for Wireshark, too"),
+    ),
     "merge": (
         ("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"),
         ("runs/cf* --json", "all of them, as JSON"),

@@ -66,6 +66,7 @@ class CrazyradioSettings(Settings):
             longest=LONGEST_DATA,
             bare_sealed=True,
             shortest_slot_ns=_SHORTEST_SLOT_NS,
+            varies=True,
         )
 
     @property
