@@ -1,8 +1,8 @@
 """The tables of the shortest slots, and of ages in them, in the documentation, made from the model.
 
 A table stands between ``<!-- slots: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`TABLES`. The command
-``python -m dtsa_dev.documents.slot_lengths docs/*/*.md`` rewrites all tables of these files; for ``ages`` it flies the
-preset ``crazyflie-radio``, some minutes.
+``python -m dtsa_dev.documents.slot_lengths docs/*/*.md`` rewrites all tables of these files; for ``ages`` and
+``ring`` it flies, some minutes.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_bench.experiments.sweep import spec
 from dtsa_bench.experiments.sweep.aggregate import Group, Table, collected
 from dtsa_bench.experiments.sweep.work import fly_one
+from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import Airtime
 from dtsa_channel_sim.model.airtime import Line
 from dtsa_channel_sim.model.radio_table import RADIOS
@@ -29,6 +30,8 @@ from .markdown import table
 GUARD_NS = 70_000  # what clocks differ by that agents align at +-50 ppm and 20 % loss: docs/reference/protocol.md
 # Most instructions of a slot of dtsa at N = 18 on a Cortex-M4F at 168 MHz: docs/evidence/embedded.md.
 DECIDE_NS = {"dtsa": 780_000}
+_RINGS = ((4, 0.0), (4, 0.05), (12, 0.0), (12, 0.05), (12, 0.2), (20, 0.0), (20, 0.05))
+_RING_SEEDS = (1001, 1002, 1003)
 CONSTANT = Line(300_000, 0, 300_000, 0)
 _BLOCK = re.compile(r"(<!-- slots: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -65,7 +68,7 @@ SCHEMES = (
 )
 
 
-def rewritten(text: str, wanted: Sequence[str] = ("lengths", "ages")) -> str:
+def rewritten(text: str, wanted: Sequence[str] = ("lengths", "ages", "ring")) -> str:
     """A page with its tables made again.
 
     :param text: the page, Markdown.
@@ -147,7 +150,33 @@ def _ms(time_ns: int) -> str:
     return f"{time_ns / 1e6:.4f}".rstrip("0").rstrip(".") + " ms"
 
 
-TABLES: dict[str, Callable[[], str]] = {"lengths": lengths, "ages": ages}
+def ring(rows: Sequence[tuple[int, float]] = _RINGS) -> str:
+    """The token ring behind the lines of Crazyflies beside TDMA, flights of 10 ms slots.
+
+    :param rows: agents, and share of frames lost.
+    """
+    lines = []
+    for agents, loss in rows:
+        cells = [f"{agents}, {f'{100 * loss:g} %' if loss else 'none'}"]
+        for policy in ("dtr", "tdma"):
+            own = {"radio": "crazyflie", "options": {"dtr.react_ms": 0.0}} if policy == "dtr" else {}
+            settings = {"agents": agents, "loss": loss, "policy": policy, **own}
+            flown = [simulate(spec.run_config({**settings, "seed": seed})).summary() for seed in _RING_SEEDS]
+            age_ms, load, packets = (
+                sum(summary[name] for summary in flown) / len(flown)
+                for name in ("age_mean_ms", "channel_load", "frames_per_s")
+            )
+            cells += [f"{age_ms:.1f}" if age_ms < 9.95 else f"{age_ms:.0f}", f"{100 * load:.1f} %"]
+            if policy == "dtr":
+                crashed = sum(summary["collided"] for summary in flown)
+                cells += [f"{packets:.0f}", f"{crashed}/{len(flown)}"]
+        lines.append(cells)
+    heads = ("agents, frames lost", "`dtr`: mean age, ms", "time on the air", "packets/s", "crashes",
+             "`tdma`: mean age, ms", "time on the air")  # fmt: skip
+    return table(heads, lines)
+
+
+TABLES: dict[str, Callable[[], str]] = {"lengths": lengths, "ages": ages, "ring": ring}
 
 
 def main(paths: Sequence[str]) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.documents.slot_lengths import rewritten
+from dtsa_dev.documents.slot_lengths import rewritten, ring
 from dtsa_dev.protocol.experiment import Experiment
 from dtsa_dev.protocol.optimum import optimum
 
@@ -220,6 +220,12 @@ def test_beacons_behind_lines_wait_for_receptions_and_are_heard_all_the_same() -
     (sent, heard), (sent_behind, heard_behind) = flown
     assert sent == sent_behind
     assert 0 < heard_behind < heard
+
+
+def test_the_table_of_token_rings_is_what_the_flights_give() -> None:
+    """Its first row."""
+    (row,) = (line for line in ring([(4, 0.0)]).splitlines() if line.startswith("| 4, none"))
+    assert row in LEAGUE.read_text(encoding="utf-8").splitlines()
 
 
 def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
