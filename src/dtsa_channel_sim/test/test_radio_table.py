@@ -1,5 +1,10 @@
 """Radios by name: the times of their lines, and the shortest slots that follow."""
 
+from dtsa_agent.air.datagram import flight_ns
+from dtsa_agent.air.serial.lengths import HEADER, LONGEST
+from dtsa_agent.air.serial.modems import MODEMS
+from dtsa_agent.air.serial.settings import SerialSettings
+from dtsa_agent.core import SwarmConfig
 from dtsa_channel_sim.model.airtime import Airtime, Line
 from dtsa_channel_sim.model.radio_table import RADIOS, RadioRow, airtime_of
 
@@ -33,3 +38,18 @@ def test_settings_of_the_air_count_where_the_radio_has_them(monkeypatch):
     assert airtime_of("plain", 1_000_000, 5, 7).line == Line(7, 0, 7, 0)
     tuned = airtime_of("crazyflie", 1_000_000, 5, 7)
     assert (tuned.bitrate, tuned.ramp_up_ns, tuned.line) == (1_000_000, 5, RADIOS["crazyflie"].airtime.line)
+
+
+def test_modems_take_what_agents_over_serial_lines_expect_of_them():
+    for name, modem in MODEMS.items():
+        if name == "none":
+            assert name not in RADIOS
+            continue
+        airtime = RADIOS[name].airtime
+        config = SwarmConfig(agents=2, policy="lease", slot_ms=900.0, auth=True, auth_session=1)
+        port = SerialSettings(device="x", modem=name, baud=modem.baud).properties
+        assert port.header(config.auth).size == HEADER
+        length = config.frame_length
+        way_ns = airtime.to_radio_ns(length) + airtime.total_ns(length) + airtime.from_radio_ns(length) + modem.turn_ns
+        assert abs(flight_ns(config, port) - way_ns) < 1_500_000  # symbols of LoRa are whole ones
+        assert port.longest == min(LONGEST, airtime.longest + HEADER)

@@ -13,6 +13,8 @@ from functools import partial
 from pathlib import Path
 
 from dtsa_agent.air.crazyradio.settings import CrazyradioSettings
+from dtsa_agent.air.serial.lengths import FRAMING
+from dtsa_agent.air.serial.modems import MODEMS, NONE
 from dtsa_agent.air.serial.settings import SerialSettings
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp.settings import UdpSettings
@@ -28,6 +30,7 @@ from dtsa_channel_sim import ChannelConfig, ClockConfig
 
 from .markdown import table
 
+_LENGTH = 60 + FRAMING  # bytes of a sealed frame of `lease` on a modem's line
 NODES = ("agent", "agent, real time", "swarm_host", "crazyflie_agents", "channel", "recorded_channel")
 _BLOCK = re.compile(r"(<!-- settings: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 _HEAD = ("setting", "default", "unit", "allowed", "meaning")
@@ -143,6 +146,33 @@ def _radios() -> str:
     return radio_table()
 
 
+def _modems() -> str:
+    head = (
+        "`--modem`",
+        "what",
+        "73 bytes on the air",
+        "until it sends",
+        "an empty turn",
+        "longest packet, buffer",
+        "line",
+    )
+    rows = [
+        (
+            f"`{name}`",
+            modem.text,
+            f"{modem.on_air_ns(_LENGTH) / 1e6:.1f} ms",
+            f"{modem.turn_round_ns / 1e6:.1f} ms" if modem.turn_round_ns else "",
+            f"{modem.turn_ns / 1e6:.1f} ms" if modem.turn_ns else "",
+            f"{modem.packet}, {modem.buffer} bytes",
+            f"{modem.baud} baud",
+        )
+        for name, modem in MODEMS.items()
+        if name != NONE
+    ]
+    sources = dict.fromkeys((modem.source, modem.text) for name, modem in MODEMS.items() if name != NONE)
+    return table(head, rows) + "\nSources:\n\n" + "".join(f"- {text}: {source}.\n" for source, text in sources)
+
+
 #: What a page may ask for, and what makes it.
 TABLES: dict[str, Callable[[], str]] = {
     "SwarmConfig": partial(grouped_tables, SwarmConfig),
@@ -157,6 +187,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "UdpSettings": partial(settings_table, UdpSettings),
     "CrazyradioSettings": partial(settings_table, CrazyradioSettings),
     "SerialSettings": partial(settings_table, SerialSettings),
+    "modems": _modems,
     "robots": partial(settings_table, RobotSettings, skip=("name", "id")),
     "battery": partial(settings_table, BatterySettings),
     "station": partial(settings_table, StationSettings),

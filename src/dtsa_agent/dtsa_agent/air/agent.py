@@ -26,7 +26,7 @@ from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.stop import Stop
 
 from .contacts import Contact
-from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, check_fits, flight_ns
+from .datagram import EARLY, OTHER_TIME, OWN_ID, REPEATED, Wrapping, check_fits, flight_ns, late_in
 from .hearing import OF_OWN_NAME, REASONS, STATES, make_hearing
 from .outage import Outage
 from .port import DatagramPort
@@ -101,7 +101,8 @@ class AirAgent:
         self._new_slots = 2 * config.main_every * config.agents  # as long as an agent with policy lease is on probation
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
-        flight = flight_ns(config, port.properties)
+        self._flight_ns = flight = flight_ns(config, port.properties)
+        self._layout = port.properties.header(config.auth) if port.properties.varies else None
         self._latest_send_ns = latest_send_ns(self._slot_ns, flight)
         self._too_long_ns = too_long_ns(config)
         self._ordinary = ""  # why it has no real-time priority
@@ -242,6 +243,9 @@ class AirAgent:
             self._awaits = False
         if accepted:
             self.tally.hear(sender, slot, condition_in(frame)[0])
+            if self._layout is not None:
+                late_ns = late_in(datagram, self._layout)
+                self.tally.off(arrival - self.hearing.slot_start_ns(slot) - self._flight_ns - late_ns)
         if self.watcher is not None:
             heard = Heard(sender, slot, arrival, datagram, bool(accepted))
             (self._before if self._record is None else self._record.heard).append(heard)

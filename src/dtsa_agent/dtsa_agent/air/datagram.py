@@ -33,7 +33,7 @@ from dtsa_agent.core.settings.agreement import agreed_settings, settings_hash
 from dtsa_agent.core.settings.config import SwarmConfig
 
 from .delay import Peer
-from .port import PortProperties
+from .port import Header, PortProperties
 
 NETWORK = PortProperties("udp")  # with the longest header
 HEADER = NETWORK.header(sealed=True).size  # bytes before the frame
@@ -54,6 +54,15 @@ def flight_ns(config: SwarmConfig, port: PortProperties) -> int:
     """
     length = port.header(config.auth).size + config.frame_length
     return port.flight_time_ns + port.byte_time_ns * length + port.turn_ns * config.agents // 2  # half a round
+
+
+def late_in(datagram: bytes, layout: Header) -> int:
+    """How much later than its slot a datagram says to have left, ns; 0 where it does not say.
+
+    :param datagram: the datagram.
+    :param layout: what stands before its frame.
+    """
+    return int.from_bytes(datagram[layout.agreed : layout.agreed + layout.late], "little") * _UNIT_NS
 
 
 def trust_ns(config: SwarmConfig, port: PortProperties) -> int:

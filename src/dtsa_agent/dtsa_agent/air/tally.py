@@ -29,6 +29,7 @@ class Tally:
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
         self._oldest, self._oldest_of = 0, 0  # slots, and of whom
         self._late = Delays()  # frames sent, by how late they left
+        self._off: Delays | None = None  # frames heard, by how far off they arrived
         self._on_time = 0
 
     def begun(self, slot: int, now_ns: int) -> None:
@@ -78,6 +79,15 @@ class Tally:
         self._late.add(late_ns)
         self._on_time += late_ns <= _ON_TIME_NS
 
+    def off(self, off_ns: int) -> None:
+        """A frame was heard over a port whose arrivals vary.
+
+        :param off_ns: ns, how much earlier or later than expected it arrived.
+        """
+        if self._off is None:
+            self._off = Delays()
+        self._off.add(abs(off_ns))
+
     def summary(self, slot: int = -1) -> dict[str, Any]:
         """The counts as plain values.
 
@@ -97,12 +107,9 @@ class Tally:
             "unsent": self.unsent.total(),
             "unsent_because": dict(sorted(self.unsent.items())),
             "sends_on_time_share": self._on_time / sent if sent else None,
-            "send_late_ms": {
-                "p50": self._late.quantile_ms(0.5),
-                "p99": self._late.quantile_ms(0.99),
-                "max": self._late.largest_ms(),
-            },
+            "send_late_ms": _quantiles(self._late),
             "heard": self.heard,
+            **({} if self._off is None else {"arrivals_off_ms": _quantiles(self._off)}),
             "heard_share": self._hears / self._there if self._there else None,
             "oldest_heard_slots": self._oldest if self._there else None,
             "oldest_heard_of": self._oldest_of or None,
@@ -110,6 +117,10 @@ class Tally:
             "processor_us_per_slot": (used - self._joined_s) / self.slots * 1e6 if self.slots else None,
             "memory_mb": _memory_mb(),
         }
+
+
+def _quantiles(delays: Delays) -> dict[str, float | None]:
+    return {"p50": delays.quantile_ms(0.5), "p99": delays.quantile_ms(0.99), "max": delays.largest_ms()}
 
 
 def _processor_s() -> float:

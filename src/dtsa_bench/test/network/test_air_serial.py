@@ -17,7 +17,6 @@ from waiting import wait_for
 
 from dtsa_agent.air.serial import SerialSettings
 from dtsa_agent.air.serial.frames import to_line
-from dtsa_agent.air.serial.modems import MODEMS
 from dtsa_agent.air.serial.port import SerialPort
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
@@ -114,6 +113,7 @@ def test_groups_become_one_and_no_slot_has_two_senders(flight: Flight) -> None:
         found = one.agent.summary()
         assert found["state"] == "joined"
         assert found["dropped_by_computer"] == 0
+        assert found["arrivals_off_ms"].keys() == {"p50", "p99", "max"}
     assert flight.agents[1].agent.summary()["times_unplugged"] == 1
     assert flight.agents[1].agent.summary()["unsent_because"].keys() <= {"the device is not there", "too late"}
 
@@ -131,11 +131,6 @@ def test_the_bags_are_one_flight_whose_decisions_are_made_again(flight: Flight) 
     checked = verify_bag(flight.whole)
     assert checked.ok, checked.difference
     assert run_data(flight.whole)["slots"]["count"] > 100
-    kind = MODEMS["esp-now"]
-    length = 13 + CONFIG.frame_length
-    line_ns = (2 * length + kind.gap_bytes) * 10 * 1e9 / kind.baud
-    whole_ms = (line_ns + kind.turn_round_ns + kind.on_air_ns(length)) / 1e6
-    assert flight.merged["time_line"]["flight_time_us"] / 1e3 == pytest.approx(whole_ms, abs=5.0)
 
 
 def test_packets_that_overlap_are_lost_and_a_modem_that_sends_is_deaf(tmp_path: Path) -> None:

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from dtsa_agent.air.serial.lengths import FRAMING
+from dtsa_agent.air.serial.modems import MODEMS, NONE, Modem
+
 from .airtime import Airtime, Line
 
 
@@ -33,6 +36,28 @@ class RadioRow:
 _BYTE_NS = 10_000
 CRAZYFLIE_LINE = Line(7 * _BYTE_NS, _BYTE_NS, 8 * _BYTE_NS, _BYTE_NS, waits=True, queue=8)
 
+_SECOND = 1_000_000_000
+_BITS = 10  # of a byte on a modem's line
+
+
+def _modem(modem: Modem) -> RadioRow:
+    """Return a modem on a serial line; its frames carry a datagram's header and what marks them on the line.
+
+    :param modem: its row among those that agents know.
+    """
+    byte_ns = _BITS * _SECOND // modem.baud
+    line = Line((FRAMING + modem.gap_bytes) * byte_ns, byte_ns, FRAMING * byte_ns, byte_ns)
+    airtime = Airtime(
+        modem.bitrate,
+        modem.turn_round_ns,
+        0,
+        line,
+        modem.packet - FRAMING,
+        lambda length: modem.on_air_ns(FRAMING + length),
+    )
+    return RadioRow(airtime, f"{modem.text}, line of {modem.baud} baud, without turns of its own", modem.source)
+
+
 #: Radios by the name that the setting ``radio`` gives them.
 RADIOS: dict[str, RadioRow] = {
     "plain": RadioRow(
@@ -44,6 +69,7 @@ RADIOS: dict[str, RadioRow] = {
         "nRF51 reference manual; crazyflie2-nrf-firmware",
         tuned=True,
     ),
+    **{name: _modem(modem) for name, modem in MODEMS.items() if name != NONE},
 }
 
 

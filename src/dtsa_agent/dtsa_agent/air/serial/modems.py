@@ -53,7 +53,7 @@ def lora_ns(length: int, *, spreading: int, bandwidth_hz: int, coding: int = 1, 
     """
     few = spreading < 7
     preamble = preamble or (12 if few else 8)
-    symbol_ns = 2**spreading * _SECOND // bandwidth_hz
+    symbol_ns = (1 << spreading) * _SECOND // bandwidth_hz
     slow = symbol_ns > 16_380_000  # symbols so long are sent with two bits fewer each
     bits = 8 * length + 16 + 20 - 4 * spreading + (0 if few else 8)
     blocks = -(-max(bits, 0) // (4 * (spreading - 2 * slow)))
