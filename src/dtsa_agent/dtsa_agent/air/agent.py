@@ -410,6 +410,7 @@ class AirAgent:
             "alignments": alignments,
             "flight_time_error_us": error_ns / 1e3,
             "quorum": self.own.quorum,
+            "never_flew": self._hold.problem,
             "held_at_start_slots": self._hold.slots_at_start,
             "held_slots": self._hold.slots,
             "slots_too_short": self._short_slots.found,

@@ -19,6 +19,7 @@ from dtsa_agent.core.frame import condition_in
 from dtsa_agent.core.settings.config import SwarmConfig
 
 _CYCLES = 8  # of lists of one name each, after which an agent that was not named is not heard
+FOR_EVER = 1 << 40  # slots
 _NAMED = 3  # cycles of names within which an agent that somebody hears is named, whatever is lost
 
 
@@ -27,7 +28,7 @@ class Limits:
     """For how long an agent may not be heard, slots.
 
     :param moving: of one that moves.
-    :param resting: of one that rests or is on probation: it may speak in its main anchors only.
+    :param resting: of one that rests or is on probation: it may speak in its main anchors only, or not at all.
     :param named: how much longer it is there, and for how long it is there after somebody has named it.
     """
 
@@ -43,11 +44,12 @@ def limits_of(config: SwarmConfig, peers: int) -> Limits:
     :param peers: number of names in a datagram.
     """
     round_, row = config.agents, config.policy_row
-    resting = 6 * config.main_every * round_
-    in_turn = row.extended or "received" not in row.port  # an agent that moves speaks once in a round, or nearly so
-    moving = max(2 * config.anchor_every * round_, round(0.5 / config.slot_s)) if in_turn else resting
-    named = _NAMED * round_ * -(-(round_ - 1) // max(1, peers - 1)) if peers else resting
-    return Limits(moving, max(moving, resting), named)
+    turn = max(2 * config.anchor_every * round_, round(0.5 / config.slot_s))
+    long = max(turn, 6 * config.main_every * round_)
+    if not row.extended and "received" in row.port:  # agents send by chance, and those that have arrived need not
+        return Limits(long, FOR_EVER, long)
+    named = _NAMED * round_ * -(-(round_ - 1) // max(1, peers - 1)) if peers else long
+    return Limits(turn, long if row.extended else turn, named)
 
 
 class Contact(NamedTuple):

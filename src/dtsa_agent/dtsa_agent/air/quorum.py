@@ -61,24 +61,32 @@ class Hold:
     :param say: is told a line at once, and not again for 2 s; None: nobody is.
     """
 
-    __slots__ = ("_flew", "_next_ns", "_quorum", "_said", "_say", "held", "slots", "slots_at_start")
+    __slots__ = ("_next_ns", "_quorum", "_said", "_say", "flew", "held", "slots", "slots_at_start")
 
     def __init__(self, quorum: Quorum, say: Callable[[str], None] | None) -> None:
         self._quorum, self._say = quorum, say
         #: Whether it hovers.
         self.held = True
+        #: Whether it had a quorum when it was no longer new.
+        self.flew = False
         #: Slots in which it hovered that was no longer new: before it flew for the first time, and since then.
         self.slots_at_start = self.slots = 0
-        self._flew = False
         self._said = False
         self._next_ns: int | None = None  # None: it is new
 
     def hover(self) -> None:
         """It has hovered through a slot."""
-        if self._flew:
+        if self.flew:
             self.slots += 1
         else:
             self.slots_at_start += 1
+
+    @property
+    def problem(self) -> str:
+        """Why it has never flown, or an empty text."""
+        if self.flew or not self.slots_at_start:
+            return ""
+        return f"never had its quorum, and hovered for {self.slots_at_start} slots"
 
     def judge(self, contact: Contact, new: bool, now_ns: int) -> None:
         """Looks whether it may fly.
@@ -92,7 +100,7 @@ class Hold:
         if new:
             self._next_ns = None
             return
-        self._flew = self._flew or not held
+        self.flew = self.flew or not held
         if self._next_ns is None:
             self._next_ns = now_ns + _AT_START_NS
         if held == self._said or now_ns < self._next_ns or self._say is None:

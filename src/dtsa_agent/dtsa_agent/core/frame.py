@@ -114,12 +114,12 @@ def named_in(data: bytes) -> tuple[int, int] | None:
 
 
 def condition_in(data: bytes) -> tuple[bool, bool, bool]:
-    """Whether the sender of a frame leaves, rests, is on probation; frames of other profiles than the extended say no.
+    """Whether the sender of a frame leaves, rests, is on probation; extended frames alone say the first and the last.
 
     :param data: the bytes of a frame, at least those that :func:`named_in` reads.
     """
     if data[0] & 15 != PROFILE_EXTENDED:
-        return False, False, False
+        return False, not data[3], False
     return data[2] == LEAVING, not data[3] & 1, bool(data[3] & 2)
 
 

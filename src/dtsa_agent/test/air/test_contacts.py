@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_agent.air.contacts import Contact, Contacts, Limits, limits_of, said_of
+from dtsa_agent.air.contacts import FOR_EVER, Contact, Contacts, Limits, limits_of, said_of
 from dtsa_agent.air.delay import Delay
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
@@ -145,10 +145,17 @@ def test_with_one_name_a_datagram_only_long_silence_tells() -> None:
 def test_limits_follow_from_how_often_agents_speak(policy: str) -> None:
     config = SwarmConfig(agents=12, policy=policy)
     limits = limits_of(config, 4)
-    rests = 6 * config.main_every * 12
-    assert limits == Limits(rests if policy == "aloha" else 120, rests, 144)
-    assert limits_of(config, 1).named == 3 * 12 * 11
-    assert limits_of(config, 0).named == rests
+    long = 6 * config.main_every * 12
+    assert (
+        limits
+        == {
+            "lease": Limits(120, long, 144),
+            "tdma": Limits(120, 120, 144),
+            "aloha": Limits(long, FOR_EVER, long),
+        }[policy]
+    )
+    assert limits_of(config, 1).named == (long if policy == "aloha" else 3 * 12 * 11)
+    assert limits_of(config, 0).named == long
     slow = SwarmConfig(agents=2, policy=policy, slot_ms=150.0)
     assert limits_of(slow, 4).moving == (6 * slow.main_every * 2 if policy == "aloha" else 20)
     assert limits_of(dataclasses.replace(slow, slot_ms=1.0), 4).moving >= 180  # half a second at least

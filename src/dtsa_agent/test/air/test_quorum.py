@@ -68,7 +68,7 @@ def test_an_agent_says_at_once_that_it_hovers_and_that_it_flies_on() -> None:
     hold.hover()
     hold.judge(all_there, False, 51 * SECOND + 1)
     assert said == []  # a start takes a moment
-    assert (hold.slots, hold.slots_at_start) == (0, 2)
+    assert (hold.slots, hold.slots_at_start, hold.problem) == (0, 2, "")
     hold.judge(deaf, False, 60 * SECOND)
     hold.hover()
     assert (hold.held, hold.slots) == (True, 1)
@@ -88,4 +88,7 @@ def test_an_agent_that_never_gets_a_quorum_says_so_a_second_after_it_is_no_longe
         hold.judge(Contact(3, 3, 3, 3), tenth < 50, tenth * SECOND // 10)
         assert len(said) == (tenth >= 60)
     assert said == ["hovers: hears 3 of 3, is heard by 3 (quorum 5)"]
+    assert not hold.problem  # it has not hovered through a slot yet
+    hold.hover()
+    assert hold.problem == "never had its quorum, and hovered for 1 slots"
     Hold(Quorum("5"), None).judge(Contact(0, 0, 0, 0), False, 0)

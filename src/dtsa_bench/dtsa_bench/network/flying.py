@@ -125,6 +125,7 @@ def fly(order: Order) -> int:
         2, *(summary[key] for key in ("slots", "sent", "heard")), not_taken_in
     )  # this agent and the others
     problem = hearing.problem(not_taken_in) if hearing.delivered else ""  # who is alone hears nobody
+    problem = problem or summary["never_flew"]
     if problem:
         print(f"dtsa: cf{summary['id']}: {problem}", file=sys.stderr)
     if failure:

@@ -79,6 +79,8 @@ def test_an_agent_whose_frames_are_lost_one_way_hovers_in_flight_and_flies_on_wh
     assert summary["quorum"] == "all-but-one"
     assert [agent.agent.summary()["held_slots"] for agent in others] == [0, 0, 0]
     found = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in range(1, 5)]).judge()
+    assert found["held_slots"].keys() == {"cf4"}
+    assert found["never_flew"] == []
     assert verified(found), found["decisions_again"]
 
 
@@ -97,6 +99,7 @@ def test_an_agent_that_nobody_has_heard_does_not_begin_to_fly(groups: tuple[str,
     summary = far.agent.summary()
     assert summary["held_at_start_slots"] > 50
     assert summary["held_slots"] == 0
+    assert summary["never_flew"]
     assert not summary["arrived"]
 
 

@@ -3,7 +3,8 @@
 
 #include "frame.h"
 
-enum { LEAVES = 255, MOVES = 1, PROBATION = 2 }; /* of an extended frame, see frame_extended.c */
+/* Of an extended frame, see frame_extended.c; others have c_r at the same place. */
+enum { LEAVES = 255, MOVES = 1, PROBATION = 2 };
 
 static int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
 
@@ -70,7 +71,7 @@ void contacts_hear(contacts *c, int sender, int64_t slot, const uint8_t *frame, 
     one->seen = larger(one->seen, slot);
     one->left = extended && frame[2] == LEAVES;
     one->probation = extended && (frame[3] & PROBATION);
-    one->still = one->probation || (extended && !(frame[3] & MOVES));
+    one->still = one->probation || !(extended ? frame[3] & MOVES : frame[3]);
     for (int i = 0; i < count; i++) {
         const int k = names[i] - 1;
         if (k >= 0 && k < c->agents && k != c->self && !c->of[k].left)

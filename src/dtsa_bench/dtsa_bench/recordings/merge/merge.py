@@ -83,6 +83,8 @@ class Merge:
             "turns": judged(lives, self.sent, common_slot),
             "decisions_again": again(lives, replays),
             "not_taken_in": {named(life): dict(bag.refused) for life, bag in lives.items() if bag.refused},
+            "held_slots": {named(life): held for life, bag in lives.items() if (held := bag.summary.get("held_slots"))},
+            "never_flew": [named(life) for life, bag in lives.items() if bag.summary.get("never_flew")],
             "flight": flown,
         }
 
