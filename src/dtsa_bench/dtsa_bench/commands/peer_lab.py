@@ -42,14 +42,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--flag", action="append", default=[], metavar="F", help="a flag for the compiler: --flag=-O0")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=X", help="a parameter of the app")
     parser.add_argument("--out", metavar="DIR", help="directory for summary.json, packets.jsonl and truth.jsonl")
+    parser.add_argument(
+        "--simulated-radio", type=Path, metavar="SOCKET",
+        help="real time, with simulated Crazyradios for `bridge`, `sniff` and others with --simulated-radio SOCKET",
+    )  # fmt: skip
+    parser.add_argument("--dongles", type=int, default=2, metavar="X", help="number of these [2]")
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
 
 
 def run(args: argparse.Namespace) -> int:
     """Fly and print what came of it."""
     from dtsa_agent.core.errors import ConfigError
+    from dtsa_bench.crazyflies.peer_lab.live import stations
     from dtsa_bench.crazyflies.peer_lab.process import fly
     from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
+    from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
     from dtsa_bench.runs.options import new_directory
 
     if not 0.0 < args.seconds <= 1e6:
@@ -65,9 +72,15 @@ def run(args: argparse.Namespace) -> int:
     elif of_protocol:
         name, value = next(iter(of_protocol.items()))
         raise ConfigError(name, value, f"only with {PROTOCOL}")
+    live = None
+    if args.simulated_radio is not None:
+        live = RadioSettings(dongles=args.dongles, path=args.simulated_radio)
+        for station in stations(settings):
+            print(station.uri)
+        print(f"{settings.agents} simulated Crazyflies in real time; Ctrl-C ends", flush=True)
     summary = fly(
         place, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
-        flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm,
+        flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm, live=live,
     )  # fmt: skip
     console, warnings, logs = (summary.pop(key) for key in ("console", "warnings", "logs"))
     if out is not None:

@@ -142,6 +142,10 @@ class Engine:
         """Names of the app's parameters, or of its log variables, as group.name."""
         return list(self._variables.get((vehicle, int(parameters)), ()))
 
+    def type(self, vehicle: int, name: str, *, parameter: bool) -> int:
+        """Number of the type of a parameter or a log variable of the app, as the firmware has it."""
+        return int(self._library.lab_type(vehicle, int(parameter), self._variables[vehicle, int(parameter)][name]))
+
     def get(self, vehicle: int, name: str, *, parameter: bool) -> float:
         """Value of a parameter or a log variable of the app.
 

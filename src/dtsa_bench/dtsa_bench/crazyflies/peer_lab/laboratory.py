@@ -7,6 +7,7 @@ import struct
 import tempfile
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from dtsa_bench.crazyflies.simulated.planner import DISABLED, FLYING, IDLE, LAND
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
 from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
+from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
 from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
 from dtsa_bench.crazyflies.simulated.world import TICK_S, World
@@ -36,6 +38,7 @@ from .polling import Polling
 from .record import Observer, Record
 from .setpoints import setpoint_of
 from .settings import LabSettings
+from .variables import AppVariables
 
 TICK_NS = round(TICK_S * 1e9)
 ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the id
@@ -54,6 +57,7 @@ class Laboratory:
     :param settings: vehicles, air and ground.
     :param out: directory for files; None: none are written.
     :param observers: look on beside the record.
+    :param radio: dongles that are on the air, too; None: none.
     :raises CompileError: the app does not compile.
     """
 
@@ -63,6 +67,7 @@ class Laboratory:
         settings: LabSettings | None = None,
         out: Path | None = None,
         observers: Sequence[Observer] = (),
+        radio: RadioSide | None = None,
     ) -> None:
         self.settings = settings = settings or LabSettings()
         self.app = app
@@ -79,7 +84,7 @@ class Laboratory:
             round(settings.spin_ms * 1e6),
         )  # fmt: skip
         self.record = Record(count, app.state, out)
-        self._observers = (self.record, *observers)
+        self._observers: tuple[Observer, ...] = (self.record, *observers)
         config = FleetConfig(
             count=count, start=settings.start, seed=settings.seed, noise=settings.noise, arming=settings.arming
         )
@@ -87,17 +92,22 @@ class Laboratory:
         self._truth = TruthLog(out / "truth.jsonl" if out else None, header)
         self.world = World(config, self._report)
         self.peers = [Peer(*both) for both in zip(self.world.firmware, self.world.estimates, strict=True)]
-        self.agenda = Agenda()
+        self.agenda = Agenda() if radio is None else radio.agenda
+        self._dongle = None if radio is None else radio.dongles[0]
+        self._first = 1 if radio is None else radio.first  # id on the air of the first vehicle
         streams = np.random.SeedSequence(settings.seed).spawn(2)
-        self.air = RadioAir(count + 2, settings.loss, int(streams[0].generate_state(1)[0]))
+        own = RadioAir(count + 2, settings.loss, int(streams[0].generate_state(1)[0]))
+        self.air = own if radio is None else radio.air
         self._lines = Lines(airtime, count)
         self.overflows = [0] * count  # receptions that found a radio's queue full
         self._handed: list[deque[Packet]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
-        self.from_apps: list[tuple[float, int, bytes]] = []  # s, id, packet of the app channel to the ground
+        #: What an app sends to the ground: s, id, packet of the app channel.
+        self.from_apps: list[tuple[float, int, bytes]] = []
         self._on = [False] * count
         self._lives = [0] * count  # how often each was switched off
         self._parameters: list[dict[str, float]] = [dict(app.parameters) for _ in range(count)]
-        self.polling = Polling(self.air, self.agenda, settings, self._polled) if settings.polls else None
+        polls = settings.polls and radio is None  # else the dongles' hosts do that
+        self.polling = Polling(self.air, self.agenda, settings, self.polled) if polls else None
         generator = np.random.default_rng(streams[1])
         starts = (generator.random(count) * settings.boot_s * 1e9).astype(np.int64).tolist()
         drifts = np.rint(generator.uniform(-1.0, 1.0, count) * settings.drift_ppm * 1000).astype(np.int64)
@@ -180,13 +190,14 @@ class Laboratory:
         elif kind is Event.COMMAND:
             told.answer = self._command(k, Command(told.code), data)
             self._tell("on_command", k + 1, now, told.code, data)
-            self._show(k)
+            self.show(k)
         elif kind is Event.PRINT:
             self._tell("on_print", k + 1, now, data.decode("utf-8", "replace"))
         elif kind is Event.RECORD:
             self._tell("on_record", k + 1, now, data)
         elif kind is Event.APP_CHANNEL:
             self.from_apps.append((now / 1e9, k + 1, data))
+            self._tell("on_app_channel", k + 1, now, data)
         elif kind is not Event.ENDED:
             text = data.decode("utf-8", "replace")
             reason = {
@@ -194,6 +205,10 @@ class Laboratory:
                 Event.ASSERT: f"assertion failed in {text}",
             }.get(kind, f"it used {text}")
             raise AppError(f"app of agent {k + 1} at {now / 1e9:.6f} s: {reason}")
+
+    def observe(self, observer: Observer) -> None:
+        """From now on somebody else looks on, too."""
+        self._observers = (*self._observers, observer)
 
     def _tell(self, what: str, *values: Any) -> None:
         for observer in self._observers:
@@ -243,16 +258,19 @@ class Laboratory:
         self._truth.positions(self.time, position)
         for k, on in enumerate(self._on):
             if on:
-                self._show(k)
+                self.show(k)
         self.agenda.at(self.now_ns + TICK_NS, self._tick)
 
-    def _show(self, k: int) -> None:
-        """Tell a vehicle's app what its firmware knows."""
+    def show(self, k: int) -> None:
+        """Tell a vehicle's app what its firmware knows.
+
+        :param k: its index.
+        """
         firmware = self.world.firmware[k]
         values = log_values(self.world.estimates[k], firmware, self.time)
         own = firmware.priority, _PLANNER[firmware.planner.state]
         self._engine.world[k][:] = [*(values[name] for name in _NAMES), *own]
-        self._engine.known[k][:] = self.peers[k].values
+        self._engine.known[k][:] = self.peers[k].values[: len(_KNOWN)]
 
     def _report(self, index: int, name: str, **details: Any) -> None:
         self._tell("on_event", index + 1, self.now_ns, name)
@@ -264,14 +282,27 @@ class Laboratory:
         length = len(packet.data)
         start_ns = self._lines.start_ns(packet.sender, at_ns, length)
         settings = self.settings
-        frame = self.air.send(settings.channel, settings.rate, packet.sender, start_ns, HEADER_BYTES + length)
+        sender = self._first + packet.sender - 1
+        frame = self.air.send(settings.channel, settings.rate, sender, start_ns, HEADER_BYTES + length)
         self.agenda.at(frame.end_ns, lambda: self._left(packet, frame))
 
     def _left(self, packet: Packet, frame: OnAir) -> None:
         """A packet has left the air: who has it?"""
         self.record.on_air_ns += frame.end_ns - frame.air_ns
-        heard = self.air.heard(self.settings.channel, frame)
-        received = np.array([on and k in heard for k, on in enumerate(self._on, 1)])
+        channel, rate = self.settings.channel, self.settings.rate
+        heard = self.air.heard(channel, frame)
+        if self._dongle is not None:  # dongles in sniffer mode have it, too
+            payload = bytes((0xFF, esb.PEER_PORT | packet.raw[0])) + packet.data
+            self._dongle.overheard(heard, esb.BROADCAST, payload, channel, rate, frame)
+        self.hear(packet, heard, frame)
+
+    def hear(self, packet: Packet, heard: set[int], frame: OnAir) -> None:
+        """A packet has left the air.
+
+        :param heard: ids on the air of those that can have it.
+        :param frame: its transmission.
+        """
+        received = np.array([on and k in heard for k, on in enumerate(self._on, self._first)])
         for agent in self._take_in(frame.end_ns, len(packet.data), received):
             done_ns, life = self._lines.handed_ns(agent), self._lives[agent - 1]
             self.agenda.at(done_ns, lambda agent=agent, at=done_ns, life=life: self._deliver(agent, at, packet, life))  # type: ignore[misc]
@@ -283,11 +314,11 @@ class Laboratory:
             self.overflows[k] += 1
         return [int(k) + 1 for k in np.flatnonzero(taken)]
 
-    def _polled(self, agent: int, now_ns: int) -> None:
-        """A packet of the ground station's has come to a radio."""
+    def polled(self, agent: int, t: float) -> None:
+        """A packet of a ground station has come to a radio, at t (s)."""
         received = np.zeros(self.settings.agents, dtype=np.bool_)
         received[agent - 1] = self._on[agent - 1]
-        self._take_in(now_ns, 0, received)
+        self._take_in(round(t * 1e9), 0, received)
 
     def _deliver(self, agent: int, now_ns: int, packet: Packet, life: int) -> None:
         k = agent - 1
@@ -304,6 +335,10 @@ class Laboratory:
         distance = max(_NEAREST_M, float(np.linalg.norm(position[:, sender - 1] - position[:, k])))
         return round(_NEAR_RSSI + 20.0 * math.log10(distance))
 
+    def is_on(self, agent: int) -> bool:
+        """Whether a vehicle is switched on."""
+        return self._on[self._index(agent)]
+
     # -- the ground -------------------------------------------------------------------------------------------------
     def _index(self, agent: int) -> int:
         if not 1 <= agent <= self.settings.agents:
@@ -317,11 +352,13 @@ class Laboratory:
             return
         self._copies += 1
         copy = private_copy(self._library, Path(self._directory.name), f"agent_{agent}_{self._copies}")
-        self._show(k)
+        self.show(k)
         speed = esb.RATE_NAMES.index(self.settings.rate)
         self._engine.boot(k, copy, self.now_ns, self._drifts[k], ADDRESS + agent, self.settings.channel, speed)
         copy.unlink()
         self._on[k] = True
+        take = partial(self.send, agent)
+        self.peers[k].adopt(AppVariables(k, self._engine, lambda: self.now_ns, take))
         for name, value in self._parameters[k].items():
             self.set_parameter(agent, name, value)
 
@@ -394,7 +431,10 @@ class Laboratory:
         """A foreign radio on the channel sends a peer-to-peer packet now, whoever else does.
 
         :param data: at most 60 bytes.
+        :raises ConfigError: there are dongles, which do that.
         """
+        if self._dongle is not None:
+            raise ConfigError("transmit", data, "in a laboratory without dongles")
         packet, settings = Packet(0, bytes((port,)) + data, self.now_ns), self.settings
         radio = settings.agents + 2
         frame = self.air.send(settings.channel, settings.rate, radio, self.now_ns, HEADER_BYTES + len(data))
@@ -426,7 +466,7 @@ class Laboratory:
         self.world.firmware[self._index(agent)].supervisor.stop("emergency stop")
 
     def _then_show(self, agent: int, done: bool) -> bool:
-        self._show(agent - 1)
+        self.show(agent - 1)
         return done
 
     def _obey(self, order: Order) -> None:

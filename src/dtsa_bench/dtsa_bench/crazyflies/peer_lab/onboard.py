@@ -19,6 +19,7 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import policy_key
+from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
 from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 
 from .app import read_app
@@ -126,11 +127,18 @@ class OnBoard(Observer):
     :param out: directory for bags; None: none are made.
     :param key: 16 bytes, of sealed frames.
     :param enable_s: s, when the agents may steer.
+    :param radio: dongles that are on the air, too; None: none.
     :raises ConfigError: for a swarm that the app cannot be.
     """
 
     def __init__(
-        self, swarm: SwarmConfig, lab: LabSettings, out: Path | None = None, key: bytes = b"", enable_s: float = 8.0
+        self,
+        swarm: SwarmConfig,
+        lab: LabSettings,
+        out: Path | None = None,
+        key: bytes = b"",
+        enable_s: float = 8.0,
+        radio: RadioSide | None = None,
     ) -> None:
         check_on_board(swarm)
         if swarm.auth and len(key) != _KEY_BYTES:
@@ -139,7 +147,7 @@ class OnBoard(Observer):
         start = np.array(self.scenario.start)
         start[2] = 0.0  # on the floor
         settings = dataclasses.replace(lab, agents=swarm.agents, start=start)
-        self.lab = Laboratory(read_app(APP), settings, out, [self])
+        self.lab = Laboratory(read_app(APP), settings, out, [self], radio)
         self._flights = [
             None if out is None else _Flight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
         ]

@@ -17,35 +17,27 @@ from .settings import LabSettings
 _POLL = bytes((NULL | 0x0C,))  # an empty packet
 
 
-class _Polled(Receiver):
-    """The vehicle's end of the link: what comes goes over the line to the flight processor, too."""
-
-    def __init__(self, station: Station, taken: Callable[[int], None]) -> None:
-        super().__init__(station, lambda packet, t: None)
-        self._taken = taken
-
-    def hear(self, packet: bytes, t: float) -> bytes:
-        self._taken(round(t * 1e9))
-        return super().hear(packet, t)
-
-
 class Polling:
     """One dongle that polls all vehicles in turn.
 
     :param air: the air. :param agenda: what happens when. :param settings: how often.
-    :param taken: called with an id and the time (ns) when a vehicle's radio has a packet.
+    :param taken: called with an id and the time (s) when a vehicle's radio has a packet.
     """
 
-    def __init__(self, air: RadioAir, agenda: Agenda, settings: LabSettings, taken: Callable[[int, int], None]) -> None:
+    def __init__(
+        self, air: RadioAir, agenda: Agenda, settings: LabSettings, taken: Callable[[int, float], None]
+    ) -> None:
         count = settings.agents
         self.answered = self.unanswered = 0
         self._agenda = agenda
         self._stations = [
             Station("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1))) for k in range(count)
         ]
-        receivers: dict[int, Receiver] = {
-            agent: _Polled(station, partial(taken, agent)) for agent, station in enumerate(self._stations, 1)
+        receivers = {
+            agent: Receiver(station, lambda packet, t: None) for agent, station in enumerate(self._stations, 1)
         }
+        for agent, receiver in receivers.items():
+            receiver.taken = partial(taken, agent)
         radio = RadioSettings(seed=settings.seed, request_ms=0.0)
         self._dongle = Dongle(count + 1, radio, air, agenda, receivers, lambda agent, up: True, {})
         self._dongle.request(SET_CHANNEL, settings.channel, 0, b"", 0)

@@ -7,17 +7,19 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
 
 from .app import read_app
 from .compiling import CompileError, sanitizer_environment
 from .engine import AppError
 from .laboratory import Laboratory
+from .live import Live
 from .settings import LabSettings
 
 _CRASHED = 70  # native/crash.c
@@ -35,6 +37,7 @@ def fly(
     parameters: Mapping[str, float] | None = None,
     out: Path | None = None,
     swarm: Mapping[str, Any] | None = None,
+    live: RadioSettings | None = None,
 ) -> dict[str, Any]:
     """Fly an app; the summary, with `console` (what the apps printed), `warnings` (compiler, sanitizers), `logs`.
 
@@ -45,6 +48,7 @@ def fly(
     :param parameters: values of the app's parameters, beside those of app.yaml.
     :param out: directory for files.
     :param swarm: settings of the swarm that flies the protocol on board; None: the app is another one.
+    :param live: dongles for the ground's programs, and real time; None: virtual time.
     :raises ConfigError: a setting is not usable. :raises CompileError: the app does not compile.
     :raises AppError: an app crashed, or did what no app may do.
     """
@@ -55,12 +59,18 @@ def fly(
         "place": place, "seconds": seconds, "settings": values, "sources": sources, "include": include, "flags": flags,
         "parameters": dict(parameters or {}), "out": None if out is None else str(out),
         "swarm": None if swarm is None else dict(swarm),
+        "live": None if live is None else {"path": str(live.path), "dongles": live.dongles},
     }  # fmt: skip
     command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
     environment = {**os.environ, **sanitizer_environment(app)}
-    done = subprocess.run(
-        command, input=json.dumps(request), capture_output=True, text=True, check=False, env=environment
-    )
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if live is not None else None  # the flight ends by it
+    try:
+        done = subprocess.run(
+            command, input=json.dumps(request), capture_output=True, text=True, check=False, env=environment
+        )
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
     lines = done.stderr.splitlines()
     said = next((line.removeprefix(_HEAD) for line in reversed(lines) if line.startswith(_HEAD)), None)
     if done.returncode == _CRASHED and said is not None:
@@ -81,25 +91,39 @@ def _serve(request: dict[str, Any]) -> dict[str, Any]:
     paths = {key: tuple(request[key]) for key in ("sources", "include", "flags")}
     app = read_app(request["place"], **paths)
     out = None if request["out"] is None else Path(request["out"])
+    settings, seconds = LabSettings(**request["settings"]), request["seconds"]
+    live = _live(request["live"], settings) if request["live"] is not None else None
+    side = None if live is None else live.side
+    finish: Callable[[], dict[str, Any]]
     if request["swarm"] is not None:
-        return _serve_protocol(request, LabSettings(**request["settings"]), out)
-    with Laboratory(app, LabSettings(**request["settings"]), out) as lab:
+        from .onboard import OnBoard  # recordings: others do without
+
+        flight = OnBoard(SwarmConfig.from_dict(request["swarm"]), settings, out, radio=side)
+        lab, finish = flight.lab, flight.finish
+    else:
+        lab = Laboratory(app, settings, out, radio=side)
+        finish = lab.summary
+    try:
         for name, value in request["parameters"].items():
             for agent in range(1, lab.settings.agents + 1):
                 lab.set_parameter(agent, name, value)
-        lab.run(request["seconds"])
-        return {**lab.summary(), **_told(lab)}
+        if live is None:
+            lab.run(seconds)
+        else:
+            live.attach(lab)
+            live.run(seconds)
+        return {**finish(), **_told(lab)}
+    finally:
+        lab.close()
+        if live is not None:
+            live.close()
 
 
-def _serve_protocol(request: dict[str, Any], settings: LabSettings, out: Path | None) -> dict[str, Any]:
-    from .onboard import OnBoard  # recordings: others do without
-
-    with OnBoard(SwarmConfig.from_dict(request["swarm"]), settings, out) as flight:
-        for name, value in request["parameters"].items():
-            for agent in range(1, flight.swarm.agents + 1):
-                flight.lab.set_parameter(agent, name, value)
-        flight.lab.run(request["seconds"])
-        return {**flight.finish(), **_told(flight.lab)}
+def _live(request: dict[str, Any], settings: LabSettings) -> Live:
+    live = Live(settings, RadioSettings(dongles=request["dongles"], path=Path(request["path"])))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: live.stop())
+    return live
 
 
 def _told(lab: Laboratory) -> dict[str, Any]:

@@ -86,6 +86,9 @@ class Observer:
     def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
         """An app has handed something over (peerLabRecord)."""
 
+    def on_app_channel(self, agent: int, now_ns: int, data: bytes) -> None:
+        """An app has sent a packet of the app channel to the ground."""
+
     def on_event(self, agent: int, now_ns: int, name: str) -> None:
         """Something happened to a vehicle."""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import errno
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from . import crtp, toc
 from .estimate import Estimate, log_values
@@ -33,6 +34,25 @@ class Block:
         return b"".join(struct.pack("<" + form, toc.saturate(values[name], form)) for name, form in self.variables)
 
 
+class OnBoard(Protocol):
+    """An app on board: it adds parameters and log variables, and takes packets of its own."""
+
+    parameters: Sequence[toc.Entry]
+    logs: Sequence[toc.Entry]
+
+    def parameter(self, name: str) -> float:
+        """Value of one of its parameters."""
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set one."""
+
+    def log_values(self) -> Mapping[str, float]:
+        """Values of its log variables, by their full names."""
+
+    def receive(self, data: bytes) -> None:
+        """A packet of the app channel."""
+
+
 class Peer:
     """Protocol state of one simulated Crazyflie: log blocks and parameter values.
 
@@ -49,16 +69,20 @@ class Peer:
         self.number = number
         self.positions_received = 0
         self.blocks: dict[int, Block] = {}
-        self.values = [entry.value for entry in toc.PARAM_ENTRIES]
+        self._app: OnBoard | None = None
+        self._params, self._logs = toc.PARAM_ENTRIES, toc.LOG_ENTRIES
+        self._param_table, self._log_table = toc.PARAM_TABLE, toc.LOG_TABLE
+        self.values = [entry.value for entry in self._params]
         self._handlers: dict[tuple[int, int], Handler] = {
             (crtp.LINK, 0): lambda data, t: data,
             (crtp.LINK, 1): lambda data, t: b"Bitcraze Crazyflie".ljust(30, b"\0"),
             (crtp.LINK, 3): lambda data, t: data,
             (crtp.PLATFORM, 0): self._platform,
             (crtp.PLATFORM, 1): self._version,
-            (crtp.LOG, 0): lambda data, t: toc.LOG_TABLE.answer(data),
+            (crtp.PLATFORM, 2): self._app_channel,
+            (crtp.LOG, 0): lambda data, t: self._log_table.answer(data),
             (crtp.LOG, 1): self._log_settings,
-            (crtp.PARAM, 0): lambda data, t: toc.PARAM_TABLE.answer(data),
+            (crtp.PARAM, 0): lambda data, t: self._param_table.answer(data),
             (crtp.PARAM, 1): self._param_read,
             (crtp.PARAM, 2): self._param_write,
             (crtp.PARAM, 3): self._param_misc,
@@ -80,7 +104,15 @@ class Peer:
     def reset(self) -> None:
         """Power on: no log blocks, default parameters."""
         self.blocks.clear()
-        self.values = [entry.value for entry in toc.PARAM_ENTRIES]
+        self.values = [entry.value for entry in self._params]
+
+    def adopt(self, app: OnBoard) -> None:
+        """An app has started on board: its variables are in the tables of contents."""
+        self._app = app
+        self._params = (*toc.PARAM_ENTRIES, *app.parameters)
+        self._logs = (*toc.LOG_ENTRIES, *app.logs)
+        self._param_table, self._log_table = toc.Table(self._params, log=False), toc.Table(self._logs, log=True)
+        self.values[len(toc.PARAM_ENTRIES) :] = [entry.value for entry in app.parameters]
 
     def receive(self, datagram: bytes, t: float) -> bytes | None:
         """Handle one datagram at time t (s); the reply, or None."""
@@ -105,9 +137,15 @@ class Peer:
         due = [(i, b) for i, b in self.blocks.items() if b.period and (tick - b.phase) % b.period == 0]
         if due:
             values = log_values(self.estimate, self.firmware, t)
+            if self._app is not None:
+                values.update(self._app.log_values())
             stamp = (int(t * 1000) & 0xFFFFFF).to_bytes(3, "little")
             for number, block in due:
                 yield crtp.pack(crtp.LOG, 2, bytes((number,)) + stamp + block.data(values))
+
+    def _app_channel(self, data: bytes, t: float) -> None:
+        if self._app is not None:
+            self._app.receive(data)
 
     # -- handlers: request's data and time in, reply's data out -----------------------------------------------------
     def _version(self, data: bytes, t: float) -> bytes | None:
@@ -214,9 +252,9 @@ class Peer:
         variables = list(block.variables)
         for kind, index in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
             form = toc.LOG_FORMAT_BY_CODE.get(kind & 15)
-            if form is None or index >= len(toc.LOG_ENTRIES):
+            if form is None or index >= len(self._logs):
                 return errno.ENOENT
-            variables.append((toc.LOG_ENTRIES[index].full_name, form))
+            variables.append((self._logs[index].full_name, form))
         if Block(variables).size > MAX_BLOCK_BYTES:
             return errno.E2BIG
         block.variables = variables
@@ -224,7 +262,7 @@ class Peer:
         return 0
 
     def _param_format(self, index: int) -> str:
-        return "<" + toc.PARAM_TYPES[toc.PARAM_ENTRIES[index].type][1]
+        return "<" + toc.PARAM_TYPES[self._params[index].type][1]
 
     def _param_read(self, data: bytes, t: float) -> bytes:
         (index,) = struct.unpack_from("<H", data)
@@ -234,6 +272,8 @@ class Peer:
 
     def _packed(self, index: int) -> bytes:
         form = self._param_format(index)
+        if self._app is not None and index >= len(toc.PARAM_ENTRIES):
+            self.values[index] = self._app.parameter(self._params[index].full_name)
         return struct.pack(form, toc.saturate(self.values[index], form[1]))
 
     def _param_write(self, data: bytes, t: float) -> bytes:
@@ -249,14 +289,15 @@ class Peer:
             if index >= len(self.values):
                 return data[:3] + bytes((errno.ENOENT,))
             form = self._param_format(index)
-            default = struct.pack(form, toc.saturate(toc.PARAM_ENTRIES[index].value, form[1]))
+            default = struct.pack(form, toc.saturate(self._params[index].value, form[1]))
             return data[:3] + (b"\0" if data[:1] == b"\x08" else b"") + default
         if data[:1] != b"\0":
             return None
         parts = data[1:].split(b"\0", 2)  # set by name: group, name, type and value
         if len(parts) != 3:
             return None
-        index = toc.PARAM_ID.get(b".".join(parts[:2]).decode("ascii", "replace"), -1)
+        name = b".".join(parts[:2]).decode("ascii", "replace")
+        index = next((i for i, entry in enumerate(self._params) if entry.full_name == name), -1)
         head = b"\0" + parts[0] + b"\0" + parts[1] + b"\0"
         if index < 0:
             return head + bytes((errno.ENOENT,))
@@ -268,10 +309,12 @@ class Peer:
 
         :param index: in `toc.PARAM_ENTRIES`. :param value: what it is set to. :param t: s, the fleet's clock.
         """
-        entry = toc.PARAM_ENTRIES[index]
+        entry = self._params[index]
         if entry.read_only:
             return
         self.values[index] = value
+        if self._app is not None and index >= len(toc.PARAM_ENTRIES):
+            self._app.set_parameter(entry.full_name, value)
         if entry.full_name == "kalman.resetEstimation" and value:
             self.estimate.reset_time = t
             if self.estimate.filter is not None:

@@ -68,6 +68,8 @@ class Dongle:
         self.sniffer = SnifferMode(radio, air, agenda, round(settings.usb_ms * 0.5e6), settings.seed)
         self.sniffer.arrived = self._broadcast
         sniffers[radio] = self.sniffer
+        #: Takes a packet as between vehicles, ids of those that hear it, and how it was sent: for apps on board.
+        self.between: Callable[[bytes, set[int], Tuned, OnAir], None] = lambda *_: None
         self._sniffers = sniffers
         self.reset()
 
@@ -183,7 +185,7 @@ class Dongle:
     def _arrived(self, transfer: _Transfer, frame: OnAir, channel: int, rate: str, address: bytes) -> None:
         """The packet has left the air: who has it?"""
         heard = self._air.heard(channel, frame)
-        self._overheard(heard, address, transfer.packet, channel, rate, frame)
+        self.overheard(heard, address, transfer.packet, channel, rate, frame)
         seconds = frame.end_ns / 1e9
         replies = []
         for radio, receiver in self._reached(heard, channel, rate, address):
@@ -214,7 +216,7 @@ class Dongle:
                 found.append((radio, receiver))
         return found
 
-    def _overheard(self, heard: set[int], address: bytes, packet: bytes, channel: int, rate: str, frame: OnAir) -> None:
+    def overheard(self, heard: set[int], address: bytes, packet: bytes, channel: int, rate: str, frame: OnAir) -> None:
         """Dongles in sniffer mode have a packet."""
         for radio in sorted(heard & self._sniffers.keys()):
             tuned = self._sniffers[radio].tuned
@@ -224,8 +226,10 @@ class Dongle:
     def _broadcast(self, address: bytes, packet: bytes, tuned: Tuned, frame: OnAir) -> None:
         """A packet that this dongle has sent in sniffer mode has left the air."""
         heard = self._air.heard(tuned.channel, frame)
-        self._overheard(heard, address, packet, tuned.channel, tuned.rate, frame)
-        if not esb.between_crazyflies(packet):  # the vehicles have no app that takes these
+        self.overheard(heard, address, packet, tuned.channel, tuned.rate, frame)
+        if esb.between_crazyflies(packet):
+            self.between(packet, heard, tuned, frame)
+        else:
             for _, receiver in self._reached(heard, tuned.channel, tuned.rate, address):
                 receiver.hear_all(packet, frame.end_ns / 1e9)
 
@@ -235,7 +239,7 @@ class Dongle:
     def _answered(self, transfer: _Transfer, reply: OnAir, radio: int, payload: bytes, channel: int, over: int) -> None:
         """The acknowledgement has left the air."""
         heard = self._air.heard(channel, reply)
-        self._overheard(heard, self._receivers[radio].station.address, payload, channel, transfer.rate, reply)
+        self.overheard(heard, self._receivers[radio].station.address, payload, channel, transfer.rate, reply)
         if self._radio in heard and self._passes(radio, False):
             status = transfer.retries << 4 | POWER_DETECTED | ACKNOWLEDGED
             self._finish(transfer, reply.end_ns, bytes((status,)) + payload)

@@ -31,6 +31,8 @@ class Receiver:
         self.station = station
         self._deliver = deliver
         self.last_heard = float("-inf")  # s
+        #: Called with the time (s) of each packet: it goes over the line to the flight processor.
+        self.taken: Callable[[float], None] = lambda t: None
         self._queue: deque[bytes] = deque()
         self._reset_link()
 
@@ -68,6 +70,7 @@ class Receiver:
     def hear(self, packet: bytes, t: float) -> bytes:
         """A packet to its own address came at t (s); the payload of the acknowledgement."""
         header = packet[0]
+        self.taken(t)
         if len(packet) == 3 and header & MASK == NULL and packet[1] == 0x05:
             self._safelink = bool(packet[2])
             self._up = self._down = True
@@ -85,6 +88,7 @@ class Receiver:
 
     def hear_all(self, packet: bytes, t: float) -> None:
         """A packet to all came at t (s); nobody acknowledges it."""
+        self.taken(t)
         self._accept(packet, t)
 
     def _accept(self, packet: bytes, t: float) -> None:

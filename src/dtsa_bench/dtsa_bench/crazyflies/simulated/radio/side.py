@@ -70,7 +70,9 @@ class RadioSide:
             for index, station in enumerate(settings.stations)
         ]
         by_id = {first + index: receiver for index, receiver in enumerate(self.receivers)}
-        air = RadioAir(settings.dongles + len(by_id), settings.loss, settings.seed)
+        air = self.air = RadioAir(settings.dongles + len(by_id), settings.loss, settings.seed)
+        #: Id on the air of the first vehicle.
+        self.first = first
         sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
             Dongle(k, settings, air, self.agenda, by_id, lambda radio, up: passes(radio - first, up), sniffers)
@@ -78,6 +80,10 @@ class RadioSide:
         ]
         self._taken: set[int] = set()
         self.listener = _listen(settings.path)
+
+    def start_clock(self) -> None:
+        """The fleet's time begins now."""
+        self.origin_ns = time.monotonic_ns()
 
     def now_ns(self) -> int:
         """The fleet's time."""

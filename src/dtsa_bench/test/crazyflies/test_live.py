@@ -1,0 +1,148 @@
+"""The laboratory's dongles: the ground's programs talk to apps, and hear what they say to each other."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dtsa_bench.crazyflies.peer_lab import Laboratory, LabSettings, read_app
+from dtsa_bench.crazyflies.peer_lab.compiling import compiler
+from dtsa_bench.crazyflies.peer_lab.live import Live
+from dtsa_bench.crazyflies.simulated import crtp, toc
+from dtsa_bench.crazyflies.simulated.radio import dongle as requests
+from dtsa_bench.crazyflies.simulated.radio import esb
+from dtsa_bench.crazyflies.simulated.radio.dongle import Dongle
+from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
+
+pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
+
+APP = """
+#include "app.h"
+#include "app_channel.h"
+#include "configblock.h"
+#include "debug.h"
+#include "log.h"
+#include "param.h"
+#include "radiolink.h"
+#include "task.h"
+static uint8_t go = 1; static uint16_t heard;
+static void hear(P2PPacket *p) { if (p->port == 3) heard += p->size; }
+void appMain(void) {
+    static P2PPacket packet;
+    char text[30];
+    p2pRegisterCB(hear);
+    packet.port = 5; packet.size = 4; packet.data[0] = configblockGetRadioAddress() & 255;
+    for (;;) {
+        radiolinkSendP2PPacketBroadcast(&packet);
+        size_t length = appchannelReceiveDataPacket(text, sizeof text, 20);
+        if (length) appchannelSendDataPacket(text, length);
+    }
+}
+PARAM_GROUP_START(own)
+PARAM_ADD(PARAM_UINT8, go, &go)
+PARAM_GROUP_STOP(own)
+LOG_GROUP_START(own)
+LOG_ADD(LOG_UINT16, heard, &heard)
+LOG_GROUP_STOP(own)
+"""
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[Live]:
+    directory = tmp_path / "echo"
+    directory.mkdir()
+    (directory / "app.c").write_text(APP)
+    settings = LabSettings(agents=2, boot_s=0.05)
+    made = Live(settings, RadioSettings(path=tmp_path / "radio"))
+    with Laboratory(read_app(directory), settings, radio=made.side) as lab:
+        made.attach(lab)
+        yield made
+    made.close()
+
+
+def sniff(live: Live) -> list[bytes]:
+    """The first dongle in sniffer mode; what it hears."""
+    dongle, heard = live.side.dongles[0], []
+
+    def give(transfer: bytes) -> None:
+        heard.append(transfer[7:])
+        dongle.sniffer.read()
+
+    dongle.request(requests.SET_CHANNEL, 80, 0, b"", 0)
+    dongle.request(requests.SET_RATE, 2, 0, b"", 0)
+    dongle.request(requests.SET_SNIFFER_ADDRESS, 0, 0, esb.BROADCAST, 0)
+    dongle.request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
+    dongle.sniffer.give = give
+    dongle.sniffer.read()
+    return heard
+
+
+def exchange(live: Live, dongle: Dongle, packet: bytes) -> bytes:
+    """A packet to the vehicle; what came with its acknowledgement."""
+    answers: list[bytes] = []
+    while not answers or not answers[-1][0] & 1:  # what collides is sent again
+        start = len(answers)
+        dongle.transfer(packet, live.lab.now_ns, answers.append)
+        while len(answers) == start:
+            live.lab.run(live.lab.time + 0.001)
+    return answers[-1][1:]
+
+
+def test_a_dongle_in_sniffer_mode_hears_apps_and_they_hear_it(live: Live) -> None:
+    heard = sniff(live)
+    live.lab.run(0.5)
+    assert {packet[:3] for packet in heard} == {b"\xff\x85\x01", b"\xff\x85\x02"}
+    assert all(len(packet) == 6 for packet in heard)
+    live.side.dongles[0].transfer(esb.BROADCAST + b"\xff\x83hello", live.lab.now_ns, lambda data: None)
+    live.lab.run(0.6)
+    assert {live.lab.log(agent, "own.heard") for agent in (1, 2)} == {5.0}
+
+
+def test_ground_sets_parameters_and_reads_logs_of_an_app_and_talks_to_it(live: Live) -> None:
+    dongle = live.side.dongles[1]
+    dongle.request(requests.SET_CHANNEL, 80, 0, b"", 0)
+    dongle.request(requests.SET_RATE, 2, 0, b"", 0)
+    dongle.request(requests.SET_ADDRESS, 0, 0, b"\xe7\xe7\xe7\xe7\x02", 0)
+    live.lab.run(0.1)
+    index = len(toc.PARAM_ENTRIES)
+    number, log = index.to_bytes(2, "little"), len(toc.LOG_ENTRIES).to_bytes(2, "little")
+    packets = [
+        crtp.pack(crtp.PARAM, 0, b"\x02" + number),
+        crtp.pack(crtp.PARAM, 2, number + b"\x07"),
+        crtp.pack(crtp.PLATFORM, 2, b"echo"),
+        crtp.pack(crtp.LOG, 1, b"\x06\x01\x02" + log),  # a block of one 16-bit variable
+        crtp.pack(crtp.LOG, 1, b"\x03\x01\x05"),  # every 50 ms
+    ]
+    said = [exchange(live, dongle, packet) for packet in packets + 60 * [b"\xff"]]
+    assert [live.lab.parameter(agent, "own.go") for agent in (1, 2)] == [1.0, 7.0]
+    assert crtp.pack(crtp.PLATFORM, 2, b"echo") in said
+    assert any(packet.endswith(b"own\0go\0") for packet in said)
+    assert any(packet[:1] == crtp.pack(crtp.LOG, 2, b"") and len(packet) == 1 + 4 + 2 for packet in said)
+
+
+def test_a_live_flight_ends_by_ctrl_c_with_its_summary(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "dtsa_bench", "peer-lab", "beacons", "--agents", "2", "--simulated-radio"]
+    place = tmp_path / "radio"
+    process = subprocess.Popen(
+        [*command, str(place)], stdout=subprocess.PIPE, text=True, start_new_session=True, env={**os.environ}
+    )
+    try:
+        while not place.exists():
+            assert process.poll() is None
+            time.sleep(0.05)
+        time.sleep(2.0)  # the app is compiled, and flies for a while
+        os.killpg(process.pid, signal.SIGINT)
+        said, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert "radio://0/80/2M/E7E7E7E701" in said
+    assert "digest" in said
+    assert process.returncode == 0
