@@ -59,6 +59,26 @@ def test_an_own_frame_goes_before_the_next_reception_and_that_one_waits_for_noth
     assert verdicts["second"].arrival_ns == TOTAL + BACK + AIRTIME.from_radio_ns(20)
 
 
+def test_a_radio_sends_its_own_frames_one_after_the_other():
+    air = line()
+    for frame_id, at_ns in (("one", 0), ("two", 10), ("three", 20)):
+        air.begin(frame_id, 1, at_ns, 56)
+    verdicts = air.settle(10 * MS)
+    assert [(v.frame_id, v.start_ns, v.collided) for v in verdicts] == [
+        ("one", 0, 0), ("two", TOTAL, 0), ("three", 2 * TOTAL, 0),
+    ]  # fmt: skip
+
+
+def test_no_frame_takes_longer_than_the_latest_time():
+    """The own frame waits for the longest reception, and is the eighth that a receiver holds."""
+    assert AIRTIME.latest_ns(56) == BACK + TOTAL + 8 * BACK
+    air = line()
+    for k in range(200):
+        air.begin(k, k % 6 + 1, k * 300_000, 56)
+    for verdict in air.settle(1000 * MS):
+        assert verdict.arrival_ns - verdict.start_ns <= TOTAL + 8 * BACK
+
+
 def test_a_radio_holds_eight_receptions_and_loses_the_ninth():
     """Back to back a frame of 56 bytes comes every 0.27 ms, and takes 0.64 ms to be handed over.
 
