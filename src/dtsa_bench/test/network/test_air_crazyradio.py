@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,9 +19,15 @@ from waiting import wait_for
 pytest.importorskip("usb")
 
 from dtsa_agent.air.crazyradio import CrazyradioSettings
+from dtsa_agent.air.crazyradio.packets import broadcast, datagram_in
+from dtsa_agent.air.datagram import Wrapping
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.keys import authenticator
 from dtsa_bench.commands.cli import main
+from dtsa_bench.crazyflies.peer_lab.compiling import compiler
+from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
+from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.crazyflies.simulated.process import running_fleet
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge, verified
@@ -153,6 +160,29 @@ def test_another_program_reads_the_packets(flight: Flight) -> None:
     assert len(packets) == sum(flight.sniffed["heard"].values()) + sum(flight.sniffed["not_taken_in"].values())
     sent = {record.datagram for path in flight.bags for record in read(path).slots if record.datagram}
     assert {data[11:] for _, data in packets} <= sent
+
+
+@pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
+@pytest.mark.parametrize("auth", [True, False])
+def test_a_computer_reads_what_the_app_on_board_says(auth: bool, tmp_path: Path) -> None:
+    """On its port, with its header or its tag; and its own frames are such ones."""
+    swarm = SwarmConfig(agents=3, policy="lease", auth=auth, auth_session=3 if auth else 0)
+    with OnBoard(swarm, LabSettings(), tmp_path, key=bytes.fromhex(KEY) if auth else b"", enable_s=6.0) as flight:
+        flight.lab.run(5.0)
+        port = flight.lab.parameter(1, "dtsa.port")
+        flight.finish()
+    heard = CrazyradioSettings(uri="radio://0/80/2M")
+    assert port == heard.p2p_port
+    wrapping = Wrapping(swarm, authenticator(swarm), port=heard.properties)
+    said = [record for k in (1, 2, 3) for record in read(tmp_path / f"cf{k}.mcap").slots if record.datagram]
+    assert len(said) > 100
+    for record in said:
+        datagram = datagram_in(broadcast(record.datagram, heard.p2p_port)[5:], heard.p2p_port)
+        assert datagram is not None
+        told = wrapping.read(datagram)
+        assert (told.fault, told.slot, told.frame) == ("", record.slot, record.frame)
+    last = said[-1]
+    assert wrapping.wrap(last.frame, last.slot, told.late_ns) == last.datagram
 
 
 def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> None:

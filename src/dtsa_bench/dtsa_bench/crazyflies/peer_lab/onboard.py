@@ -38,7 +38,8 @@ _MARGIN_M = 0.8  # of the box around all places
 HEIGHT_M = 1.2  # of the frame map above the floor
 _UP = np.array([[0.0], [0.0], [HEIGHT_M]])
 FLIGHT_US = 1500
-_PORT = PortProperties("p2p", FLIGHT_US * 1000, 0, agreed_bytes=2, peers=0, longest=60, bare_sealed=True)
+# Named as that of a computer with a Crazyradio: they are on one air, and datagrams begin alike.
+_PORT = PortProperties("crazyradio", FLIGHT_US * 1000, 0, agreed_bytes=2, peers=0, longest=60, bare_sealed=True)
 
 
 class _P2P:
