@@ -44,7 +44,7 @@ static uint16_t headerWord = 0x5444, steps = 1;
 static uint32_t slotUs = 10000, flightUs = 1500, seed = 1;
 static float height = 1.0f, vMax = 1.5f, pairRadius = 0.336f, horizon = 1.0f;
 static safety_settings limits = {
-    .news_s = 3.0f, .unheard_s = 0.5f, .land_s = 5.0f, .well_s = 0.5f, .battery_v = 3.2f,
+    .news_s = 0.6f, .rests_s = 3.0f, .unheard_s = 0.5f, .land_s = 5.0f, .well_s = 0.5f, .battery_v = 3.2f,
     .sag_s = 2.0f, .low = {-2.0f, -2.0f, 0.2f}, .high = {2.0f, 2.0f, 2.0f},
 };
 
@@ -254,14 +254,17 @@ static void set_point(const double velocity[3])
 /* Of the others; their places and the own one are in the frame map. */
 static void look_around(safety_view *v, const double place[3], int64_t now)
 {
+    float rests = 0.0f;
     oldest = 0.0f;
     nearest = INFINITY;
     for (int k = 0; k < agent.config.agents; k++) {
         if (k == agent.settings.id - 1) continue;
         const int64_t age = board_age(&agent, k);
+        const float age_s = (float)age * (float)slotUs * 1e-6f;
         float distance = 0.0f;
         if (age < 0) oldest = -1.0f;
-        else if (oldest >= 0.0f) oldest = fmaxf(oldest, (float)age * (float)slotUs * 1e-6f);
+        else if (board_rests(&agent, k)) rests = fmaxf(rests, age_s);
+        else if (oldest >= 0.0f) oldest = fmaxf(oldest, age_s);
         if (age < 0) continue;
         for (int i = 0; i < 3; i++) {
             const float d = (float)(board_place(&agent, k, i) - place[i]);
@@ -270,6 +273,7 @@ static void look_around(safety_view *v, const double place[3], int64_t now)
         nearest = fminf(nearest, sqrtf(distance));
     }
     v->oldest_s = oldest;
+    v->rests_s = rests;
     v->unheard_s = heardLast == INT64_MIN ? -1.0f : (float)(now - heardLast) * 1e-9f;
     if (agent.config.agents == 1) v->unheard_s = v->oldest_s = 0.0f;
 }
@@ -388,6 +392,7 @@ PARAM_ADD(PARAM_FLOAT, vMax, &vMax)
 PARAM_ADD(PARAM_FLOAT, radius, &pairRadius)
 PARAM_ADD(PARAM_FLOAT, horizon, &horizon)
 PARAM_ADD(PARAM_FLOAT, newsS, &limits.news_s)
+PARAM_ADD(PARAM_FLOAT, restsS, &limits.rests_s)
 PARAM_ADD(PARAM_FLOAT, unheardS, &limits.unheard_s)
 PARAM_ADD(PARAM_FLOAT, landS, &limits.land_s)
 PARAM_ADD(PARAM_FLOAT, batteryV, &limits.battery_v)

@@ -224,6 +224,8 @@ int board_command(board *b, int64_t now, double command[3])
     return 1;
 }
 
+int board_rests(const board *b, int index) { return !b->agent->table->in_ap[index]; }
+
 double board_place(const board *b, int index, int direction)
 {
     return b->agent->table->sent_p[direction * b->config.agents + index];

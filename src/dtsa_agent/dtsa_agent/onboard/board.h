@@ -87,6 +87,8 @@ int board_command(board *b, int64_t now_ns, double command[3]);
 
 /* Slots since an agent's news was new, by index; -1: nothing is known of it. */
 int64_t board_age(const board *b, int index);
+/* Whether it rests, as far as is known. */
+int board_rests(const board *b, int index);
 /* Where it was heard to be, m, in direction 0 to 2. */
 double board_place(const board *b, int index, int direction);
 

@@ -30,6 +30,7 @@ static safety_reason doubt(const safety_settings *c, const safety_view *v)
 {
     if (!(v->unheard_s >= 0.0f && v->unheard_s <= c->unheard_s)) return SAFETY_UNHEARD;
     if (!(v->oldest_s >= 0.0f && v->oldest_s <= c->news_s)) return SAFETY_OLD_NEWS;
+    if (!(v->rests_s <= c->rests_s)) return SAFETY_OLD_NEWS;
     return v->newcomer ? SAFETY_NEWCOMER : SAFETY_WELL;
 }
 

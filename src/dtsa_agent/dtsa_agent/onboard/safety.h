@@ -29,7 +29,8 @@ typedef enum safety_reason {
 } safety_reason;
 
 typedef struct safety_settings {
-    float news_s;    /* oldest news of anybody with which it flies */
+    float news_s;    /* oldest news of one that moves with which it flies */
+    float rests_s;   /* ... of one that has said that it rests: it speaks seldom */
     float unheard_s; /* without any frame it hovers after this time */
     float land_s;    /* it has hovered for so long: it lands */
     float well_s;    /* all has to be well for so long before it flies again */
@@ -44,7 +45,8 @@ typedef struct safety_view {
     int can_fly, in_air;  /* says the supervisor */
     int newcomer;
     float battery_v, position[3];
-    float oldest_s;  /* age of the oldest news of anybody; negative: of somebody there is none */
+    float oldest_s;  /* age of the oldest news of those that move; negative: of somebody there is none */
+    float rests_s;   /* ... of those that rest */
     float unheard_s; /* since any frame was heard; negative: never */
 } safety_view;
 

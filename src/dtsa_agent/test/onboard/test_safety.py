@@ -19,7 +19,7 @@ ONBOARD = Path(dtsa_agent.__file__).parent / "onboard"
 OFF, FLY, HOVER, LAND = range(4)
 WELL, DISABLED, GROUND, CANNOT_FLY, ORDERED, BATTERY, OUTSIDE, UNHEARD, OLD_NEWS, NEWCOMER = range(10)
 STEP_S = 0.01
-LIMITS = {"news_s": 1.0, "unheard_s": 0.5, "land_s": 2.0, "well_s": 0.2, "battery_v": 3.2, "sag_s": 0.3}
+LIMITS = {"news_s": 1.0, "rests_s": 3.0, "unheard_s": 0.5, "land_s": 2.0, "well_s": 0.2, "battery_v": 3.2, "sag_s": 0.3}
 
 
 class Safety(ctypes.Structure):
@@ -43,13 +43,13 @@ class View(ctypes.Structure):
 
     _fields_ = [(name, ctypes.c_int) for name in ("enabled", "ordered", "ground", "can_fly", "in_air", "newcomer")] + [
         ("battery_v", ctypes.c_float), ("position", ctypes.c_float * 3),
-        ("oldest_s", ctypes.c_float), ("unheard_s", ctypes.c_float),
+        ("oldest_s", ctypes.c_float), ("rests_s", ctypes.c_float), ("unheard_s", ctypes.c_float),
     ]  # fmt: skip
 
 
 GOOD: dict[str, Any] = {
     "enabled": 1, "ordered": 0, "ground": 0, "can_fly": 1, "in_air": 1, "newcomer": 0, "battery_v": 3.8,
-    "position": (0.0, 0.0, 1.0), "oldest_s": 0.1, "unheard_s": 0.01,
+    "position": (0.0, 0.0, 1.0), "oldest_s": 0.1, "rests_s": 2.0, "unheard_s": 0.01,
 }  # fmt: skip
 
 
@@ -94,6 +94,8 @@ def test_it_flies_when_all_has_been_well_for_a_while(library: Any) -> None:
         ({"oldest_s": 1.1}, HOVER, OLD_NEWS),
         ({"oldest_s": -1.0}, HOVER, OLD_NEWS),
         ({"oldest_s": float("nan")}, HOVER, OLD_NEWS),
+        ({"rests_s": 3.1}, HOVER, OLD_NEWS),
+        ({"rests_s": float("nan")}, HOVER, OLD_NEWS),
         ({"unheard_s": 0.6}, HOVER, UNHEARD),
         ({"unheard_s": -1.0}, HOVER, UNHEARD),
         ({"newcomer": 1}, HOVER, NEWCOMER),
