@@ -170,14 +170,16 @@ def test_spread_and_lateness_come_from_the_right_agents() -> None:
     assert ClockStatistics(3).summary()["clock_spread_max_ms"] is None
 
 
-@given(st.integers(0, 2**31), st.floats(0.0, 0.5))
-@settings(max_examples=10, deadline=None)
-def test_late_frames_do_not_move_the_common_time(seed: int, late_share: float) -> None:
-    """Frames that a busy processor sends late are outliers for the median as long as they are fewer than half."""
+@given(st.integers(0, 2**31))
+@settings(max_examples=20, deadline=None)
+def test_late_frames_do_not_move_the_common_time(seed: int) -> None:
+    """Frames that a busy processor sends late are outliers for the median: four of nine change nothing, five may."""
     random = np.random.default_rng(seed)
-    shift = 0
-    aligner = ClockAligner()
-    for _ in range(9 * 50):
-        late = int(random.integers(0, 900_000)) if random.random() < late_share * 0.5 else 0
-        shift += aligner.hear(late - shift)
-    assert abs(shift) < 300_000
+    shift, aligner = 0, ClockAligner()
+    for most in (4, 9):
+        for _ in range(50):
+            late = np.zeros(9, dtype=np.int64)
+            late[: random.integers(0, most, endpoint=True)] = random.integers(1, 900_000)
+            for by in random.permutation(late).tolist():
+                shift += aligner.hear(by - shift)
+        assert (shift == 0) == (most == 4)
