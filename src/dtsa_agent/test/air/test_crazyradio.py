@@ -301,6 +301,23 @@ def test_what_a_dongle_hears_reaches_the_port_and_what_others_say_is_counted(plu
         assert (counts["other_packets"], counts["dropped_by_dongle"]) == (2, 3)
 
 
+def test_hostile_transfers_neither_end_the_port_nor_fill_its_memory(plugged: list[Any]) -> None:
+    draw, device = random.Random(1), FakeDevice()
+    for _ in range(2000):
+        data = draw.randbytes(draw.randrange(129))
+        if draw.random() < 0.5:
+            data = heard(broadcast(data[:61], draw.choice((7, 8)))[5:], draw.getrandbits(32), pipe=draw.randrange(256))
+        device.transfers.append(data)
+    device.transfers.append(heard(broadcast(b"the last", 7)[5:], 5))
+    plugged.append(device)
+    with CrazyradioPort(CrazyradioSettings(uri=URI)) as opened:
+        found: list[Any] = []
+        wait(lambda: found.extend(opened.receive(16)) or not device.transfers)
+        assert opened.send(b"mine") == ""
+        wait(lambda: opened.counts()["strange_stamps"] > 0)
+    assert all(len(one.data) <= 61 and one.arrival_ns <= time.monotonic_ns() for one in found)
+
+
 def test_a_dongle_that_is_unplugged_is_used_again_when_it_is_back(
     plugged: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -128,7 +128,7 @@ class CrazyradioPort:
     def _go(self, dongle: Dongle, why: str) -> None:
         with self._lock:
             self._dongle = None
-            dongle.close()
+        dongle.close()
         self._dropped_before, self._dropped = self._dropped_before + self._dropped, 0
         self._unplugged += 1
         self._tell(f"has gone ({why}): no frame leaves or arrives until it is back")
