@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -146,3 +147,28 @@ def test_a_live_flight_ends_by_ctrl_c_with_its_summary(tmp_path: Path) -> None:
     assert "radio://0/80/2M/E7E7E7E701" in said
     assert "digest" in said
     assert process.returncode == 0
+
+
+def test_sniff_judges_the_protocol_on_board_by_a_dongle(tmp_path: Path) -> None:
+    pytest.importorskip("usb")
+    dtsa = [sys.executable, "-m", "dtsa_bench"]
+    swarm = ["--agents", "2", "--slot-ms", "20", "--policy", "lease"]
+    place = str(tmp_path / "radio")
+    lab = subprocess.Popen(
+        [*dtsa, "peer-lab", "protocol", *swarm, "--seconds", "600", "--simulated-radio", place],
+        stdout=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    try:
+        while not Path(place).exists():
+            assert lab.poll() is None
+            time.sleep(0.05)
+        radio = ["--air", "crazyradio", "--uri", "radio://0/80/2M", "--simulated-radio", place]
+        sniff = [*dtsa, "sniff", *radio, *swarm, "--no-seal", "--duration-s", "10", "--json"]
+        said = subprocess.run(sniff, capture_output=True, text=True, check=False)
+    finally:
+        os.killpg(lab.pid, signal.SIGINT)
+        lab.wait(timeout=60)
+    assert said.returncode == 0, said.stderr
+    summary = json.loads(said.stdout)
+    assert all(summary["heard"][f"cf{agent}"] > 0 for agent in (1, 2))
+    assert summary["rules_broken"] == 0

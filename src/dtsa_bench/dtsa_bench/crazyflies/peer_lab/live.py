@@ -42,14 +42,13 @@ class Live(Observer):
 
     :param settings: vehicles and air.
     :param radio: the dongles, and their socket.
-    :raises ConfigError: the socket cannot be made.
     """
 
     lab: Laboratory
 
     def __init__(self, settings: LabSettings, radio: RadioSettings) -> None:
         radio = dataclasses.replace(radio, stations=stations(settings), loss=settings.loss, seed=settings.seed)
-        self.side = RadioSide(radio, self._hear, lambda index, up: self.lab.is_on(index + 1))
+        self.side = RadioSide(radio, self._hear, lambda index, up: self.lab.is_on(index + 1), listen=False)
         self._ticks = 0
         self._stopped = False
 
@@ -71,11 +70,11 @@ class Live(Observer):
         """Flies in real time.
 
         :param seconds: s, how long.
-        :raises AppError: an app did what no app may do.
+        :raises AppError: an app did what no app may do. :raises ConfigError: the socket cannot be made.
         """
+        self.side.listen()  # not before: the app has been compiled
         selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
         selector.register(self.side.listener, selectors.EVENT_READ, None)
-        self.side.start_clock()
         try:
             while not self._stopped and self.lab.time < seconds:
                 for key, _ in selector.select(_WAIT_S):

@@ -52,6 +52,7 @@ class RadioSide:
     :param settings: what they are made of.
     :param deliver: takes a vehicle's index, a packet for it and the time (s).
     :param passes: index and direction (True: up): whether a packet passes the faults of a vehicle's link.
+    :param listen: hosts may connect at once; else after `listen`.
     :raises ConfigError: the socket cannot be made.
     """
 
@@ -60,9 +61,12 @@ class RadioSide:
         settings: RadioSettings,
         deliver: Callable[[int, bytes, float], None],
         passes: Callable[[int, bool], bool],
+        *,
+        listen: bool = True,
     ) -> None:
         self.settings = settings
         self.origin_ns = time.monotonic_ns()
+        self.listener: socket.socket | None = None
         self.agenda = Agenda()
         first = settings.dongles + 1
         self.receivers = [
@@ -79,10 +83,15 @@ class RadioSide:
             for k in range(1, first)
         ]
         self._taken: set[int] = set()
-        self.listener = _listen(settings.path)
+        if listen:
+            self.listen()
 
-    def start_clock(self) -> None:
-        """The fleet's time begins now."""
+    def listen(self) -> None:
+        """Hosts may connect, and the fleet's time begins.
+
+        :raises ConfigError: the socket cannot be made.
+        """
+        self.listener = _listen(self.settings.path)
         self.origin_ns = time.monotonic_ns()
 
     def now_ns(self) -> int:
@@ -96,6 +105,7 @@ class RadioSide:
         :param selector: learns of hosts that come and go.
         """
         if host is None:
+            assert self.listener is not None
             with contextlib.suppress(OSError):
                 connection = self.listener.accept()[0]
                 connection.setblocking(False)
@@ -166,6 +176,8 @@ class RadioSide:
 
     def close(self) -> None:
         """The socket goes."""
+        if self.listener is None:
+            return
         self.listener.close()
         if self.settings.path is not None:
             self.settings.path.unlink(missing_ok=True)
