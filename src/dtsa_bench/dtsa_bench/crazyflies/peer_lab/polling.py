@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
+
 from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
 from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, Dongle
@@ -15,6 +17,7 @@ from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Statio
 from .settings import LabSettings
 
 _POLL = bytes((NULL | 0x0C,))  # an empty packet
+_STREAM = 0x706F6C6C  # of random numbers, besides those of losses and starts
 
 
 class Polling:
@@ -45,13 +48,15 @@ class Polling:
         self._gap_ns = round(1e9 / (settings.polls * count))
         self._next = 0
         self._busy = False
+        self._random = np.random.default_rng([settings.seed, _STREAM])
         self._due_ns = self._gap_ns
         agenda.at(self._due_ns, self._poll)
 
     def _poll(self) -> None:
         """The next vehicle's turn; one transfer at a time, so a dongle that is behind skips turns."""
         now = self._due_ns
-        self._due_ns += self._gap_ns
+        # A computer asks when its threads come to it: polls in step with slots would hit all frames, or none.
+        self._due_ns += round(self._gap_ns * self._random.uniform(0.5, 1.5))
         self._agenda.at(self._due_ns, self._poll)
         if self._busy:
             return
