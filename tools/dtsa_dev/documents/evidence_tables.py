@@ -156,6 +156,20 @@ def setup(record: Row) -> str:
     return "\n".join(said) + "\n"
 
 
+def losses(record: Row) -> str:
+    """How many intervals held what was flown.
+
+    :param record: of `dtsa soak losses`.
+    """
+    heads = ("channel", "chains", "rate", "p", "r", "loss in good phases", "in bad ones", "bursts found at 5 %", "at 1 %")
+    keys = ("rate", "enter", "leave", "loss_good", "loss_bad", "below 0.05", "below 0.01")
+    lines = [
+        [name, str(row["chains"]), *(f"{100 * row[key]:.1f} %" if key in row else "" for key in keys)]
+        for name, row in record["figures"].items()
+    ]
+    return f"{markdown(heads, lines)}\n"
+
+
 def _plain(rows: Iterable[Row]) -> Iterable[Row]:
     return [row for row in rows if "avoider" not in row and "loss" not in row]
 
@@ -192,7 +206,9 @@ def _targets(rows: Sequence[Row]) -> str:
     return f"{said}; not: {'; '.join(missed)}.\n" if missed else f"{said}.\n"
 
 
-QUOTED: dict[str, Callable[[Row], str]] = {"speed": speed, "fuzz": fuzz, "mutants": mutants, "setup": setup}
+QUOTED: dict[str, Callable[[Row], str]] = {
+    "speed": speed, "fuzz": fuzz, "losses": losses, "mutants": mutants, "setup": setup,
+}  # fmt: skip
 
 
 def main(paths: Sequence[str]) -> int:

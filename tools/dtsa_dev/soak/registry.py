@@ -16,6 +16,7 @@ SOAKS = {
     "crazyflie": "missions of twelve, gaps of the air, streams of commands: over UDP and simulated radios with losses",
     "air": "agents on hosts of their own over a switch that is the medium: cold starts, losses, drifts, faults",
     "serial": "agents over simulated modems: cold starts, losses, kills, partitions, modems unplugged, slow adapters",
+    "losses": "losses of simulated channels learnt again: how many intervals hold what was flown",
     "view": "what a live page costs a flight, 70 agents drawn, a page left open (needs Chromium)",
     "mutants": "small random changes of the source, each of which the tests should find",
     "setup": "set-ups ended by Ctrl-C and SIGKILL at random moments: the plain command again ends well",
