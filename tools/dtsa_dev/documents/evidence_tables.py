@@ -161,7 +161,7 @@ def losses(record: Row) -> str:
 
     :param record: of `dtsa soak losses`.
     """
-    heads = ("channel", "chains", "rate", "p", "r", "loss in good phases", "in bad ones", "bursts found at 5 %", "at 1 %")
+    heads = ("channel", "chains", "rate", "p", "r", "loss when good", "when bad", "bursts found at 5 %", "at 1 %")
     keys = ("rate", "enter", "leave", "loss_good", "loss_bad", "below 0.05", "below 0.01")
     lines = [
         [name, str(row["chains"]), *(f"{100 * row[key]:.1f} %" if key in row else "" for key in keys)]
