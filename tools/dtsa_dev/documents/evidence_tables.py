@@ -170,6 +170,32 @@ def losses(record: Row) -> str:
     return f"{markdown(heads, lines)}\n"
 
 
+def serial(record: Row) -> str:
+    """What came of flights over simulated modems.
+
+    :param record: as ``soak serial`` writes it.
+    """
+    head = (
+        "flight", "frames sent, not sent", "slots with two senders", "decisions made again, all equal",
+        "slots apart: mean / largest", "mean age, in the simulator", "closest pair",
+    )  # fmt: skip
+    rows = [
+        (
+            name,
+            f"{found['frames'][0]}, {found['frames'][1]}",
+            f"{found['slots_with_two_senders']} of {found['slots']['total']}",
+            f"{found['decisions_again']:,}",
+            f"{found['clock_spread_ms']['mean']:.1f} / {found['clock_spread_ms']['max']:.1f} ms",
+            "{:.2f}, {:.2f} slots".format(*found["age_mean_slots"]),
+            f"{found['min_distance_m'][0]:.2f} m",
+        )
+        for name, found in record["figures"].items()
+    ]
+    low, high = record["load_of_items"]
+    done = f"{record['finished'] - len(record['failures'])} of {record['items']} flights as they should be"
+    return f"{markdown(head, rows)}\n\n{done}, in {record['wall_s'] / 60:.0f} minutes, load {low:.0f} to {high:.0f}.\n"
+
+
 def _plain(rows: Iterable[Row]) -> Iterable[Row]:
     return [row for row in rows if "avoider" not in row and "loss" not in row]
 
@@ -207,7 +233,7 @@ def _targets(rows: Sequence[Row]) -> str:
 
 
 QUOTED: dict[str, Callable[[Row], str]] = {
-    "speed": speed, "fuzz": fuzz, "losses": losses, "mutants": mutants, "setup": setup,
+    "speed": speed, "fuzz": fuzz, "losses": losses, "mutants": mutants, "setup": setup, "serial": serial,
 }  # fmt: skip
 
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import errno
+import json
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -202,6 +206,32 @@ def test_echoes_garbage_and_late_bytes_lose_no_frame(tmp_path: Path) -> None:
         assert heard == [bytes([number]) * 30 for number in range(5)]
         wait_for(lambda: own.extend(d.data for d in one.receive(16) if d.own) or len(own) == 5)
         assert other.counts()["garbled_pieces"] >= 5
+
+
+def test_the_command_makes_modems_and_says_what_became_of_packets(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--modem=esp-now", "--count=2", f"--dir={tmp_path / 'modems'}"]
+    command = [sys.executable, "-m", "dtsa_bench", "fake-modem", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            devices = [process.stdout.readline().strip() for _ in range(2)]
+            ends = [SerialPort(SerialSettings(device=device, baud=115_200, modem="esp-now")) for device in devices]
+            ends[0].send(b"over the air")
+            heard: list[bytes] = []
+            wait_for(lambda: heard.extend(one.data for one in ends[1].receive(16)) or heard == [b"over the air"])
+            for end in ends:
+                end.close()
+            process.send_signal(signal.SIGINT)
+            counts = json.loads(process.stdout.read())
+        finally:
+            process.kill()
+        assert process.wait() == 0
+    assert (counts["packets"], counts["received"]) == (1, 1)
+    (tmp_path / "file").touch()
+    assert main(["fake-modem", "--count=1", f"--dir={tmp_path / 'file'}"]) == 2
+    assert "a directory in which links can be made" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

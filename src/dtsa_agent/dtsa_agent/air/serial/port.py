@@ -135,9 +135,9 @@ class SerialPort:
             )
 
     def _go(self, device: Device, why: str) -> None:
-        with self._lock:
+        with self._lock:  # nobody writes to it any more
             self._device = None
-            device.close()
+        device.close()  # this may take its time: no agent waits for it
         self._unplugged += 1
         self._tell(f"has gone ({why}): no frame leaves or arrives until it is back")
 
