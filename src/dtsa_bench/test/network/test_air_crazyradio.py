@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import threading
@@ -29,6 +30,8 @@ from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
 from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.crazyflies.simulated.process import running_fleet
+from dtsa_bench.pages.view.network_listener import NetworkListener
+from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge, verified
 from dtsa_bench.recordings.merge.merged_run import lay
@@ -72,6 +75,7 @@ class Flight:
     sniffed: dict[str, Any]
     heard: Path  # bag of the listener
     packets: Path  # its packets
+    told: list[dict[str, Any]]  # what a page gets of one who listens
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +85,11 @@ def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
     radio, heard, packets = (directory / name for name in ("radio", "sniffed.mcap", "packets.pcap"))
     paths = [directory / f"cf{agent}.mcap" for agent in AGENTS]
     flying: list[helpers.Flying] = []
-    with dongles(radio, "--radio-dongles", "5"):
+    with dongles(radio, "--radio-dongles", "6"):
+        track = Track("listener")
+        source = NetworkListener(track, CONFIG, settings(radio, 5))
+        listening = threading.Thread(target=source.run)
+        listening.start()
         sniffing = helpers.Sniffing(CONFIG, settings(radio, 4), heard, packets)
         sniffing.start()
         try:
@@ -95,13 +103,15 @@ def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
             for one in flying:
                 one.end()
             sniffed = sniffing.end()
+            source.stopped = True
+            listening.join()
     together = Merge([read(path) for path in reversed(paths)])
     merged, whole = together.judge(), directory / "whole"
     write(whole, lay(together, merged), merged)
     summaries = {one.agent.own.id: one.agent.summary() for one in flying}
-    return Flight(
-        paths, summaries, [line for one in flying for line in one.said], merged, whole, sniffed, heard, packets
-    )
+    said = [line for one in flying for line in one.said]
+    told = [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+    return Flight(paths, summaries, said, merged, whole, sniffed, heard, packets, told)
 
 
 def test_agents_become_one_group_and_hear_each_other(flight: Flight) -> None:
@@ -146,6 +156,11 @@ def test_who_only_listens_finds_that_all_keep_the_rules(flight: Flight) -> None:
     assert found["heard"].keys() == {f"cf{agent}" for agent in AGENTS}
     assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]
     assert found["dropped_by_dongle"] == 0
+
+
+def test_a_page_is_told_who_is_heard(flight: Flight) -> None:
+    words = "\n".join(event[2] for moment in flight.told for event in moment["events"])
+    assert all(f"cf{agent} is heard" in words for agent in AGENTS)
 
 
 def test_another_program_reads_the_packets(flight: Flight) -> None:

@@ -5,7 +5,9 @@ import {LiveRun} from "./run.js";
 import {Panels} from "./panels.js";
 import {Crazyflies} from "./crazyflies.js";
 
-const MODES = {realtime: "real time", lockstep: "lockstep", udp: "on a network"};
+const MODES = {
+  realtime: "real time", lockstep: "lockstep", udp: "on a network", serial: "by serial modems", crazyradio: "by Crazyradios",
+};
 const LISTENER = "As one who listens on the network knows it: positions are those of the last frames, flown on until the next; ages are the listener's. Not known here: who received a frame, what the agents believe, whether they agree, and where they truly are. A slot in which nothing was heard counts as idle.";
 const FRAME_MS = 30, SLOW_MS = 90, LAG_S = 0.12, CHARTS_MS = 1000;
 sharpness.ratio = Math.min(2, devicePixelRatio || 1);
