@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
 from dtsa_bench.crazyflies.peer_lab import Laboratory, LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.peer_lab.live import Live
@@ -172,3 +173,46 @@ def test_sniff_judges_the_protocol_on_board_by_a_dongle(tmp_path: Path) -> None:
     summary = json.loads(said.stdout)
     assert all(summary["heard"][f"cf{agent}"] > 0 for agent in (1, 2))
     assert summary["rules_broken"] == 0
+
+
+CFLIB = """
+import sys, time
+from dtsa_agent.crazyflie.links.link import require_cflib
+require_cflib()
+from cflib.crazyflie import Crazyflie
+from cflib.crazyflie.log import LogConfig
+from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+from cflib.crazyflie.syncLogger import SyncLogger
+with SyncCrazyflie("radio://0/80/2M/E7E7E7E702", cf=Crazyflie(rw_cache=sys.argv[1])) as link:
+    link.cf.param.set_value("beacons.period", 77)
+    link.cf.high_level_commander.takeoff(0.8, 1.0)
+    config = LogConfig("both", 100)
+    config.add_variable("beacons.heard")
+    config.add_variable("stateEstimate.z", "float")
+    with SyncLogger(link, config) as logger:
+        for _, values, _ in logger:
+            if values["stateEstimate.z"] > 0.7 and values["beacons.heard"] > 5:
+                break
+    print(link.cf.param.get_value("beacons.period"))
+"""
+
+
+def test_unmodified_cflib_finds_an_apps_variables_and_flies_its_vehicle(tmp_path: Path) -> None:
+    pytest.importorskip("cflib")
+    place = str(tmp_path / "radio")
+    lab = subprocess.Popen(
+        [sys.executable, "-m", "dtsa_bench", "peer-lab", "beacons", "--agents", "2", "--seconds", "600",
+         "--simulated-radio", place], stdout=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    try:
+        while not Path(place).exists():
+            assert lab.poll() is None
+            time.sleep(0.05)
+        time.sleep(1.5)  # both are switched on
+        command = [sys.executable, "-c", CFLIB, str(tmp_path / "cache")]
+        environment = {**os.environ, SIMULATED_RADIO: place}
+        said = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=120)
+    finally:
+        os.killpg(lab.pid, signal.SIGINT)
+        lab.wait(timeout=60)
+    assert said.stdout.split() == ["77"], said.stderr

@@ -172,6 +172,7 @@ class Laboratory:
             "seed": self.settings.seed,
             **self.record.summary(self.now_ns),
             "queue_overflows": sum(self.overflows),
+            "polls_answered": self.polling.answered if self.polling else None,
         }
 
     # -- what apps tell and ask -------------------------------------------------------------------------------------
