@@ -233,6 +233,19 @@ def test_hosts_have_clocks_of_their_own() -> None:
 
 
 @pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
+def test_agents_say_in_flight_that_slots_are_too_short_for_a_network(tmp_path: Path) -> None:
+    swarm = SwarmConfig(agents=3, policy="tdma", slot_ms=20.0)
+    with under_way(Trial(swarm, links=Links(jitter_ns=40_000_000), spread_s=0.0), tmp_path) as flight:
+
+        def said() -> bool:
+            return all("ms are too short for this network" in path.read_text() for path in tmp_path.glob("*.err"))
+
+        assert flight.switch.run(said, 60.0)
+        flight.end()
+    assert all(bag.summary["slots_too_short"] for bag in flight.bags())
+
+
+@pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
 def test_an_agent_that_does_not_begin_says_why(tmp_path: Path) -> None:
     wrong = dataclasses.replace(SWARM, agents=1, policy="dtsa", moving=None)
     with pytest.raises(NotFlown, match="policy: got 'dtsa'"), under_way(Trial(wrong, spread_s=0.0), tmp_path):

@@ -29,7 +29,8 @@ class Limits:
 
     :param moving: of one that moves.
     :param resting: of one that rests or is on probation: it may speak in its main anchors only, or not at all.
-    :param named: how much longer it is there, and for how long it is there after somebody has named it.
+    :param named: how much longer it is there, for how long it is there after somebody has named it, and for how long it
+        counts that it did not name this agent.
     """
 
     moving: int
@@ -77,6 +78,7 @@ class Contacts:
         self._still: dict[int, bool] = {}  # rests, or is on probation
         self._probation: dict[int, bool] = {}
         self._says: dict[int, bool] = {}  # whether it hears this agent, as far as it has said
+        self._denied: dict[int, int] = {}  # slot in which it said last that it does not
         self._unnamed: dict[int, int] = {}  # its datagrams since it named this agent
         self._left: set[int] = set()
         self._seen: dict[int, int] = {}  # largest slot in a frame of its own, of whatever time
@@ -88,7 +90,7 @@ class Contacts:
         :param slot: the present one, of the new time.
         """
         there = [agent for agent in self._heard.keys() | self._named.keys() if self._is_there(agent, False)]
-        for each in (self._heard, self._named, self._still, self._probation, self._says, self._unnamed):
+        for each in (self._heard, self._named, self._still, self._probation, self._says, self._denied, self._unnamed):
             each.clear()
         self._named.update(dict.fromkeys(there, slot))
         self._last = 0
@@ -131,6 +133,10 @@ class Contacts:
             self._says[sender] = says
         if says:
             self._unnamed[sender] = 0
+        elif says is not None:
+            self._denied[sender] = slot
+            if probation:  # it is new, and has not heard all yet
+                del self._says[sender]
 
     def _limit(self, agent: int) -> int:
         return self._limits.resting if self._still.get(agent) else self._limits.moving
@@ -153,6 +159,11 @@ class Contacts:
             agent in self._named and last - self._named[agent] <= by_name
         )
 
+    def _says_to_hear(self, agent: int, slot: int) -> bool | None:
+        """As far as it has said; what others denied long ago need not hold any more."""
+        says = self._says.get(agent)
+        return None if says is False and slot - self._denied[agent] > self._limits.named else says
+
     def count(self, slot: int, strict: bool) -> Contact:
         """How it stands with the others.
 
@@ -165,7 +176,9 @@ class Contacts:
             if not self._is_there(agent, strict) or (self._probation.get(agent) and not strict):
                 continue
             is_heard = self.hears(agent, slot)
-            hears_it = self._says.get(agent, not strict or not self._peers)
+            hears_it = self._says_to_hear(agent, slot)
+            if hears_it is None:
+                hears_it = not strict or not self._peers
             there += 1
             hears += is_heard
             heard_by += hears_it

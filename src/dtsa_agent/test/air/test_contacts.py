@@ -122,10 +122,21 @@ def test_one_that_rests_may_be_silent_for_longer_and_one_on_probation_counts_for
     contacts.hear(2, 0, extended(rests=True), [1])
     contacts.hear(3, 0, extended(probation=True), [1])
     contacts.hear(4, 0, extended(), [])
+    assert contacts.count(50, True) == Contact(3, 3, 2, 2)
+    assert contacts.count(50, False) == Contact(2, 2, 1, 1)
     assert contacts.count(101, True) == Contact(3, 2, 2, 2)
-    assert contacts.count(101, False) == Contact(2, 1, 1, 1)
     assert [contacts.hears(agent, 101) for agent in (2, 3, 4)] == [True, True, False]
     assert not contacts.hears(2, 501)
+
+
+def test_that_an_agent_is_not_heard_counts_for_a_while_and_not_from_one_that_is_new() -> None:
+    contacts = Contacts(9, 1, LIMITS, 4)
+    contacts.hear(2, 0, extended(rests=True), [])
+    contacts.hear(3, 0, extended(probation=True), [2])
+    contacts.hear(3, 1, extended(), [4, 5, 6, 7])
+    assert contacts.count(50, False).heard_by == contacts.count(50, False).there - 1
+    assert contacts.count(50, True).heard_by == 0
+    assert contacts.count(51, False).heard_by == contacts.count(51, False).there
 
 
 def test_with_one_name_a_datagram_only_long_silence_tells() -> None:

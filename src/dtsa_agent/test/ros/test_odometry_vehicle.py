@@ -18,7 +18,9 @@ pytest.importorskip("dtsa_msgs.msg")
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 
-from dtsa_agent.ros.odometry_vehicle import turned
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.ros.odometry_vehicle import OdometryVehicle, turned
 
 AGENT = "dtsa_agent.ros.agent_node"
 STEP_S = 0.02
@@ -122,3 +124,26 @@ def test_what_cannot_be_flown_ends_with_one_line(tmp_path: Path, values: dict[st
     assert code == 2
     assert said in line
     assert len(line.splitlines()) == 1
+
+
+def test_a_vehicle_that_has_to_hover_returns_to_where_that_began(monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle = OdometryVehicle.__new__(OdometryVehicle)
+    vehicle._every, vehicle._hold, sent = 1, None, []
+    monkeypatch.setattr(vehicle, "_fresh", lambda: (0.0, None, None))
+    monkeypatch.setattr(vehicle, "_command", lambda velocity: sent.append(velocity.tolist()))
+    swarm = make_swarm(SwarmConfig(agents=2, policy="lease"), None, local=[1])
+
+    def fly(x: float, active: int) -> None:
+        swarm.position[:, 0], swarm.active[0] = (x, 0.0, 0.0), active
+        vehicle.fly(swarm, 0)
+
+    fly(-1.0, 0)  # it begins, and nobody knows it yet
+    fly(-1.1, 0)
+    assert sent[-1] == pytest.approx([0.1, 0.0, 0.0])
+    fly(1.0, 1)
+    for x, command in ((2.0, 0.0), (2.1, -0.1), (3.0, -0.3), (1.9, 0.1)):
+        fly(x, 0)
+        assert sent[-1] == pytest.approx([command, 0.0, 0.0])
+    fly(2.0, 1)
+    fly(4.0, 0)
+    assert sent[-1] == [0.0, 0.0, 0.0]

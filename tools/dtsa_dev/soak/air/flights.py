@@ -126,7 +126,7 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
         "min_distance_m": [flown["min_distance_m"], again["min_distance_m"]],
         "age_mean_slots": [flown["age_mean_slots"], again["age_mean_slots"]],
         "estimate_error_mean_m": [flown["estimate_error_mean_m"], again["estimate_error_mean_m"]],
-        "not_taken_in": _refused(found),
+        "not_taken_in": _refused(found), "held_slots": found["held_slots"],
     }  # fmt: skip
     if fault:
         _check_fault(fault, figures)
@@ -145,6 +145,7 @@ def _check_bag(bag: Path, flown: dict[str, Any]) -> None:
 def _check_cold_start(figures: dict[str, Any], overlap: float) -> None:
     """No crash, no overlap, ages and errors as in the simulator."""
     met(not figures["collided"][0], "a crash")
+    met(not figures["held_slots"], f"agents hovered for want of a quorum: {figures['held_slots']}")
     share = figures["overlap_slots"] / figures["slots"]
     met(share <= overlap, f"frames overlapped in {share:.2%} of {figures['slots']} slots")
     for name, margin in (("age_mean_slots", AGE_MARGIN), ("estimate_error_mean_m", ERROR_MARGIN)):

@@ -82,6 +82,10 @@ void contacts_hear(contacts *c, int sender, int64_t slot, const uint8_t *frame, 
     if (!says && c->peers == 1 && one->unnamed > CYCLES * (c->agents - 1)) says = -1;
     if (says) one->says = (int8_t)says;
     if (says > 0) one->unnamed = 0;
+    if (says < 0) {
+        one->denied = slot;
+        if (one->probation) one->says = 0; /* it is new, and has not heard all yet */
+    }
 }
 
 int contacts_hears(const contacts *c, int index, int64_t slot)
@@ -96,8 +100,8 @@ contact_count contacts_count(const contacts *c, int64_t slot, int strict)
     for (int k = 0; k < c->agents; k++) {
         const contact *one = &c->of[k];
         if (!is_there(c, one, strict) || (one->probation && !strict)) continue;
-        const int hears = contacts_hears(c, k, slot),
-                  by = one->says ? one->says > 0 : !strict || !c->peers;
+        const int old = one->says < 0 && slot - one->denied > c->named, says = old ? 0 : one->says;
+        const int hears = contacts_hears(c, k, slot), by = says ? says > 0 : !strict || !c->peers;
         n.there++;
         n.hears += hears;
         n.heard_by += by;
