@@ -45,6 +45,7 @@ _PATIENCE_S = 0.05  # a signal is noticed after this time at the latest
 _LEAVING_NS = 900_000_000  # a signal is obeyed within a second
 _OWN_ID = 3  # frames in the own name after which an agent that is new gives way
 _JUDGED_S = 0.04  # from one look at the quorum to the next
+_TIMED = 25  # such looks from one look at the length of slots to the next
 _SAID = 64  # own frames that are remembered
 
 _Frame = tuple[int, int, bytes, bytes, int]  # sender, slot, frame, datagram, arrival by the own clock
@@ -98,6 +99,9 @@ class AirAgent:
             raise ConfigError("quorum", own.quorum, f"at most {config.agents - 1}, the number of the others")
         self._hold, self._short_slots = Hold(quorum, say), ShortSlots(config.slot_ms, say)
         self._judge_every = max(1, round(_JUDGED_S / config.slot_s))
+        self._timed_every = _TIMED * self._judge_every
+        self._contact: tuple[int, ...] = ()  # as it was judged last
+        self._says_leaving = config.policy_row.says_leaving
         self._new_slots = 2 * config.main_every * config.agents  # as long as an agent with policy lease is on probation
         self._slot_ns = config.slot_ns
         self._lead_ns, self._latest_lead_ns = (round(lead * self._slot_ns) for lead in (LEAD, BETWEEN))
@@ -242,7 +246,7 @@ class AirAgent:
         if self._awaits and slot >= self.slot:
             self._awaits = False
         if accepted:
-            self.tally.hear(sender, slot, condition_in(frame)[0])
+            self.tally.hear(sender, slot, self._says_leaving and condition_in(frame)[0])
             if self._layout is not None:
                 late_ns = late_in(datagram, self._layout)
                 self.tally.off(arrival - self.hearing.slot_start_ns(slot) - self._flight_ns - late_ns)
@@ -318,12 +322,14 @@ class AirAgent:
 
     def _judge(self, slot: int) -> None:
         """Looks whether it has a quorum, and whether slots are long enough."""
-        contact = Contact(*self.hearing.contact(slot, slot < self._first + self._new_slots))
+        contact = self.hearing.contact(slot, slot < self._first + self._new_slots)
         new = self._group.newcomers.some
-        self._hold.judge(contact, new, time.monotonic_ns())
+        if new or contact != self._contact or not self._hold.settled:
+            self._contact = contact
+            self._hold.judge(Contact(*contact), new, time.monotonic_ns())
         if not new:
-            self.tally.look(contact.there, contact.hears)
-        if not self._short_slots.found:
+            self.tally.look(contact[0], contact[1])
+        if slot % self._timed_every == 0 and not self._short_slots.found:
             self._short_slots.judge(*self.hearing.timing())
 
     def _recorded(self, slot: int, frame: bytes, present: int) -> SlotRecord:

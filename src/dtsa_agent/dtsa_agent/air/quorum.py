@@ -61,7 +61,7 @@ class Hold:
     :param say: is told a line at once, and not again for 2 s; None: nobody is.
     """
 
-    __slots__ = ("_next_ns", "_quorum", "_said", "_say", "flew", "held", "slots", "slots_at_start")
+    __slots__ = ("_next_ns", "_quorum", "_said", "_say", "flew", "held", "settled", "slots", "slots_at_start")
 
     def __init__(self, quorum: Quorum, say: Callable[[str], None] | None) -> None:
         self._quorum, self._say = quorum, say
@@ -71,6 +71,8 @@ class Hold:
         self.flew = False
         #: Slots in which it hovered that was no longer new: before it flew for the first time, and since then.
         self.slots_at_start = self.slots = 0
+        #: Whether it stays as it is, and has been said, until it stands otherwise with the others.
+        self.settled = False
         self._said = False
         self._next_ns: int | None = None  # None: it is new
 
@@ -98,14 +100,15 @@ class Hold:
         needed = self._quorum.needed(contact.there)
         held = self.held = contact.both < needed
         if new:
-            self._next_ns = None
+            self._next_ns, self.settled = None, False
             return
         self.flew = self.flew or not held
         if self._next_ns is None:
             self._next_ns = now_ns + _AT_START_NS
-        if held == self._said or now_ns < self._next_ns or self._say is None:
+        self.settled = held == self._said
+        if self.settled or now_ns < self._next_ns or self._say is None:
             return
-        self._said, self._next_ns = held, now_ns + _AGAIN_NS
+        self._said, self._next_ns, self.settled = held, now_ns + _AGAIN_NS, True
         there, hears, heard_by, _ = contact
         does = "hovers" if held else "flies on"
         self._say(f"{does}: hears {hears} of {there}, is heard by {heard_by} (quorum {needed})")

@@ -50,17 +50,12 @@ class Tally:
         :param leaves: it says that it leaves: its silence is no outage.
         """
         self.heard += 1
-        if sender in self._last:
-            self._grow(sender, slot)
-        if leaves:
-            self._last.pop(sender, None)
-        else:
-            self._last[sender] = slot
-
-    def _grow(self, sender: int, slot: int) -> None:
-        age = slot - self._last[sender]
+        age = slot - self._last.get(sender, slot)
         if age > self._oldest and self._there:
             self._oldest, self._oldest_of = age, sender
+        self._last[sender] = slot
+        if leaves:
+            del self._last[sender]
 
     def look(self, there: int, hears: int) -> None:
         """How it stands with the others while it flies, or could.
@@ -93,8 +88,9 @@ class Tally:
 
         :param slot: the present one.
         """
-        for sender in self._last:
-            self._grow(sender, slot)
+        for sender, last in self._last.items():
+            if slot - last > self._oldest and self._there:
+                self._oldest, self._oldest_of = slot - last, sender
         sent = self._late.count()
         used = _processor_s()
         ended = self.ended_ns or time.monotonic_ns()
