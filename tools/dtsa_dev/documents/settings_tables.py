@@ -169,8 +169,15 @@ def _modems() -> str:
         for name, modem in MODEMS.items()
         if name != NONE
     ]
-    sources = dict.fromkeys((modem.source, modem.text) for name, modem in MODEMS.items() if name != NONE)
-    return table(head, rows) + "\nSources:\n\n" + "".join(f"- {text}: {source}.\n" for source, text in sources)
+    sources: dict[str, list[str]] = {}
+    for name, modem in MODEMS.items():
+        sources.setdefault(modem.source, []).append(f"`{name}`")
+    del sources[MODEMS[NONE].source]
+    return (
+        table(head, rows)
+        + "\nSources:\n\n"
+        + "".join(f"- {', '.join(names)}: {source}.\n" for source, names in sources.items())
+    )
 
 
 #: What a page may ask for, and what makes it.

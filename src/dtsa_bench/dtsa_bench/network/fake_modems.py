@@ -1,8 +1,8 @@
 """Simulated modems on pseudo terminals: half duplex, on the one medium of the simulator, in wall-clock time.
 
-A program opens the pseudo terminal of a modem as it opens a real one. What it writes takes its time on the line, waits
-in the modem's buffer, is on the air as one packet or several, and comes out of all modems that have received it after
-its time on their lines. What overlaps, who is deaf and what is lost says the medium.
+A program opens the pseudo terminal of a modem as it opens a real one. Bytes that it writes take their time on the line,
+wait in the modem's buffer, are on the air as one packet or several, and come out of all modems that have received them
+after their time on those lines. The medium says what overlaps, who is deaf and what is lost.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Modems by name: how long a packet is on the air, and what a modem adds to that. None was ever measured here.
 
-A row is all that differs; the port, the simulated modem and the channel's table of radios are made from it. What makers
-do not publish is assumed, and the row says so.
+A row is all that differs; the port, the simulated modem and the channel's table of radios are made from it. Figures
+that makers do not publish are assumed, and the row says so.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _e22(spreading: int, rate: str, bitrate: int) -> Modem:
     return Modem(
         f"EBYTE E22 and the like, LoRa at {rate}",
         "Semtech SX1261/2 data sheet; EBYTE E22-400T30S manual (packet 240 bytes, buffer 1000 bytes). Assumed:"
-        f" spreading factor {spreading} and 500 kHz, which give the rate; {own} bytes of its own; 3 ms until it sends",
+        f" spreading factors 5, 6 and 7 at 500 kHz give these rates; {own} bytes of its own; 3 ms until it sends",
         lambda length: lora_ns(own + length, spreading=spreading, bandwidth_hz=500_000),
         bitrate,
         turn_round_ns=3 * _MS,
@@ -83,12 +83,13 @@ def _sik(rate: int) -> Modem:
     empty_ns = 13 * byte_ns + 208_000
     return Modem(
         f"SiK, RFD900 in multipoint mode at {rate // 1000} kbit/s",
-        "SiK tdm.c (13 bytes and 0.2 ms around a packet; turns); RFD900x multipoint manual (57600 baud, broadcast)."
-        " Assumed: in each round every modem without data sends one empty packet",
+        "SiK tdm.c (13 bytes and 0.2 ms around a packet, 248 bytes, turns; its trailer of 4 bytes, 0.5 ms at 64 kbit/s,"
+        " is not counted); RFD900x multipoint manual (57600 baud, broadcast). Assumed: in each round every modem"
+        " without data sends one empty packet; a frame goes as one packet; the buffer",
         _bits(rate, 13, 208_000),
         rate,
         turn_ns=empty_ns,
-        packet=250,
+        packet=248,
         buffer=2048,
     )
 

@@ -109,7 +109,7 @@ class SerialPort:
             own = datagram in self._said
             self._echoes += own
             self._datagrams += 1
-            # What follows it in the same piece has taken its time on the line.
+            # The bytes after it in the same piece have taken their time on the line.
             _queue.put(self.compiled, datagram, now_ns - after * self._byte_ns, own)
             if own:
                 self._tell_once("echoes", "gives back what it is given: own frames are left out")
