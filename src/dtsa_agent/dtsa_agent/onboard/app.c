@@ -41,7 +41,7 @@ static const float DOWN_M_S = 0.4f; /* how fast it lands */
 
 static uint8_t mute, enable, agents = 12, policy = DTSA_POLICY_LEASE, p2pPort = 7, started;
 static uint16_t headerWord = 0x5444, steps = 1;
-static uint32_t slotUs = 10000, flightUs = 1500, seed = 1;
+static uint32_t beginSlot, slotUs = 10000, flightUs = 1500, seed = 1;
 static float height = 1.0f, vMax = 1.5f, pairRadius = 0.336f, horizon = 1.0f;
 static safety_settings limits = {
     .news_s = 0.6f, .rests_s = 3.0f, .unheard_s = 0.5f, .land_s = 5.0f, .well_s = 0.5f, .battery_v = 3.2f,
@@ -131,6 +131,7 @@ static const char *start(void)
         .slot_ns = (int64_t)slotUs * 1000,
         .flight_ns = (int64_t)flightUs * 1000,
         .seed = seed,
+        .begin = beginSlot,
         .header = {(uint8_t)headerWord, (uint8_t)(headerWord >> 8)},
         .key = sealed ? key : NULL,
         .key_length = KEY_BYTES,
@@ -385,6 +386,7 @@ PARAM_ADD(PARAM_UINT8, port, &p2pPort)
 PARAM_ADD(PARAM_UINT16, header, &headerWord)
 PARAM_ADD(PARAM_UINT16, steps, &steps)
 PARAM_ADD(PARAM_UINT32, slotUs, &slotUs)
+PARAM_ADD(PARAM_UINT32, beginSlot, &beginSlot)
 PARAM_ADD(PARAM_UINT32, flightUs, &flightUs)
 PARAM_ADD(PARAM_UINT32, seed, &seed)
 PARAM_ADD(PARAM_FLOAT, height, &height)

@@ -12,6 +12,9 @@ static int64_t share(int64_t slot_ns, int thousandths) { return slot_ns * thousa
 
 static int64_t most(int64_t a, int64_t b) { return a > b ? a : b; }
 
+/* What comes before all begin together is of no bag: its slots are counted otherwise. */
+static int is_watched(const board *b) { return b->watch && b->policy < 0; }
+
 static dtsa_timebase *base_of(board *b) { return &b->hearing.base; }
 
 /* Rounds between two main anchors. */
@@ -35,6 +38,11 @@ const char *board_start(board *b, const board_settings *s, int64_t now)
     if (s->slot_ns < 1000000) return "slot";
     const char *fault = dtsa_config_fault(&b->config);
     if (fault) return fault;
+    b->policy = -1;
+    if (s->begin > 0) {
+        b->policy = b->config.policy;
+        b->config.policy = DTSA_POLICY_TDMA; /* of the same profile */
+    }
     b->agent = dtsa_agent_start(b->memory, sizeof b->memory, &b->config, s->id);
     if (!b->agent) return "memory";
     hearing *h = &b->hearing;
@@ -94,7 +102,7 @@ static void begin_anew(board *b, int64_t now)
     b->awaits = b->spoke = b->early_count = 0;
     b->newcomer = 1;
     dtsa_agent_restart(b->agent);
-    if (b->watch) b->watch->anew(b);
+    if (is_watched(b)) b->watch->anew(b);
     b->counts.restarts++;
 }
 
@@ -105,7 +113,7 @@ static void hear_frame(board *b, int sender, int64_t slot, const uint8_t *datagr
     const int accepted = dtsa_agent_hear(b->agent, slot, datagram + head, length - head - tag);
     b->counts.heard += (uint32_t)accepted;
     if (b->awaits && slot >= b->slot) b->awaits = 0;
-    if (b->watch) b->watch->heard(b, sender, slot, datagram, length, arrival, accepted);
+    if (is_watched(b)) b->watch->heard(b, sender, slot, datagram, length, arrival, accepted);
 }
 
 verdict board_hear(board *b, const uint8_t *data, long length, int64_t arrival)
@@ -117,7 +125,7 @@ verdict board_hear(board *b, const uint8_t *data, long length, int64_t arrival)
         b->counts.refused[v]++;
         return v;
     }
-    if (restarted || b->slot < 0) begin_anew(b, arrival);
+    if (restarted || b->first < 0) begin_anew(b, arrival);
     b->heard_ns[s.sender - 1] = arrival;
     if (s.slot > b->slot) {
         if (b->early_count == BOARD_EARLY) {
@@ -155,7 +163,7 @@ static void open_slot(board *b, int64_t slot, int64_t now, const double position
     b->slot = slot;
     b->running = 1;
     b->anew = slot == b->first;
-    if (b->watch) b->watch->opened(b, now);
+    if (is_watched(b)) b->watch->opened(b, now);
     const int chosen = dtsa_agent_decision(b->agent).chosen;
     b->awaits = chosen && chosen != b->settings.id;
     int kept = 0;
@@ -182,8 +190,26 @@ static int send(board *b, int64_t now, uint8_t *datagram)
     hearing_wrap(&b->hearing, b->frame, b->slot, late, datagram);
     b->counts.sent++;
     b->spoke = 1;
-    if (b->watch) b->watch->sent(b, datagram, (int)b->hearing.length, now);
+    if (is_watched(b)) b->watch->sent(b, datagram, (int)b->hearing.length, now);
     return (int)b->hearing.length;
+}
+
+/* All have a common time: from the next slot on, which is slot 0, they fly by the policy that nobody
+ * can join. Who comes later stays out: its slots are of another time. */
+static int64_t begin_together(board *b, int64_t now)
+{
+    close_slot(b);
+    b->config.policy = b->policy;
+    b->policy = -1;
+    b->agent = dtsa_agent_start(b->memory, sizeof b->memory, &b->config, b->settings.id);
+    base_of(b)->origin_ns += b->settings.begin * b->settings.slot_ns;
+    for (int k = 0; k < b->config.agents; k++) b->hearing.last[k] = -1;
+    contacts_clear(&b->hearing.contact);
+    b->slot = -1;
+    b->first = 0;
+    b->awaits = b->early_count = 0;
+    if (is_watched(b)) b->watch->anew(b);
+    return now;
 }
 
 int64_t board_step(board *b, int64_t now, const double position[3], const double velocity[3],
@@ -202,6 +228,9 @@ int64_t board_step(board *b, int64_t now, const double position[3], const double
         return now;
     }
     const int64_t next = dtsa_timebase_slot_start(base, b->slot + 1);
+    if (b->policy >= 0 && b->slot + 1 == b->settings.begin) { /* the last frame before has come */
+        return now < next - b->latest_lead_ns ? next - b->latest_lead_ns : begin_together(b, now);
+    }
     const int64_t due = next - (b->awaits ? b->latest_lead_ns : b->lead_ns);
     if (now < due) return due;
     if (now - next > b->too_long_ns)

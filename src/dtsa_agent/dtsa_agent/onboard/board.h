@@ -21,6 +21,8 @@ typedef struct board_settings {
     int id;
     int64_t slot_ns, flight_ns; /* length of a slot; from the order to send to the arrival */
     uint64_t seed;
+    int64_t begin; /* in this slot all begin anew together, with the configured policy and slot 0;
+                      until then they find a common time with tdma. 0: they need not */
     uint8_t header[2];  /* with which datagrams of the swarm begin that are not sealed */
     const uint8_t *key; /* NULL: frames are not sealed */
     int key_length;
@@ -52,6 +54,7 @@ typedef struct board {
     int64_t slot, first;   /* the present slot, the one with which it began; -1: none */
     int64_t lead_ns, latest_lead_ns, latest_send_ns, too_long_ns;
     int running, anew;     /* a slot is open; it is the first one */
+    int policy;            /* with which it begins, once all have a common time; else -1 */
     int awaits;            /* the slot's sender is another one, and has not been heard yet */
     int newcomer;          /* it hovers until the others know it */
     int spoke;             /* it has sent in a turn of its own since it began */

@@ -12,7 +12,7 @@ DESCRIPTION = """\
 Flies copies of a Crazyflie app (C, a function appMain) on this machine, in virtual time, on simulated Crazyflies over
 one medium with the radio's true times. The app is compiled against own declarations of the firmware's documented
 functions. The same seed gives the same bits: the digest says so. Apps that come with it: beacons, dtr, and `protocol`:
-policies tdma, aloha and lease on board, with a bag for each agent in --out, for `dtsa merge`."""
+policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in --out, for `dtsa merge`."""
 PROTOCOL = "protocol"
 _OF_PROTOCOL = ("policy", "slot_ms", "moving")
 

@@ -16,7 +16,6 @@ from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
-from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import policy_key
 from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
@@ -108,6 +107,11 @@ class _Flight:
         self._recorder.__exit__()
 
 
+def _begin(swarm: SwarmConfig) -> int:
+    """Slot in which all begin together with a policy that nobody can join; 0: they need not."""
+    return 0 if swarm.policy_row.may_join else 4 * swarm.anchor_every * swarm.agents
+
+
 def check_on_board(swarm: SwarmConfig) -> None:
     """Refuses a swarm that the app cannot be.
 
@@ -116,7 +120,8 @@ def check_on_board(swarm: SwarmConfig) -> None:
     """
     if swarm.agents > MOST:
         raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
-    check_joinable(swarm.policy)
+    if swarm.policy not in _POLICIES:
+        raise ConfigError("policy", swarm.policy, ", ".join(_POLICIES))
     check_fits(swarm, _PORT)
 
 
@@ -171,6 +176,7 @@ class OnBoard(Observer):
         header = int.from_bytes(header_of(swarm, _PORT) or b"\0\0", "little")
         values: dict[str, float] = {
             "agents": swarm.agents, "policy": _POLICIES.index(swarm.policy), "header": header, "steps": swarm.steps,
+            "beginSlot": _begin(swarm),
             "slotUs": swarm.slot_ns // 1000, "flightUs": FLIGHT_US, "seed": swarm.seed, "height": HEIGHT_M,
         }  # fmt: skip
         places = np.concatenate((scenario.start, scenario.target), axis=1) + _UP

@@ -157,7 +157,7 @@ def _moved(bag: AgentBag, shown: Callable[[int], int]) -> AgentBag:
             record,
             start_ns=shown(record.start_ns),
             opened_ns=shown(record.opened_ns),
-            sent_ns=shown(record.sent_ns) if record.datagram else -1,
+            sent_ns=max(0, shown(record.sent_ns)) if record.datagram else -1,  # of slot 0 it may be a little less
             before=arrived(record.before),
             heard=arrived(record.heard),
         )
