@@ -24,7 +24,7 @@ class Heard:
 
     def __init__(self) -> None:
         self._track = Track("listener")
-        self._run = HeardRun(self._track, CONFIG, FIRST, 0)
+        self._run = HeardRun(self._track, CONFIG, "udp", FIRST, 0)
         self._wrapping = Wrapping(CONFIG, None)
 
     def slots(self, first: int, end: int, senders: tuple[int, ...]) -> None:
