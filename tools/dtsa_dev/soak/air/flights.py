@@ -25,6 +25,7 @@ from dtsa_dev.soak.item import Item, NotMet
 AGENTS = 12
 OVERLAP = 0.001  # of slots
 AGE_MARGIN, ERROR_MARGIN = 0.05, 0.15  # mean age and mean error may differ from the simulator's by this share
+_HELD = 5 * AGENTS  # slots of each: those that begin later are there at once, and have not named it yet
 _SECONDS = 12.0
 _FAULT_S = 3.0
 _APART = f"1-{AGENTS // 2} | {AGENTS // 2 + 1}-{AGENTS}"
@@ -145,7 +146,8 @@ def _check_bag(bag: Path, flown: dict[str, Any]) -> None:
 def _check_cold_start(figures: dict[str, Any], overlap: float) -> None:
     """No crash, no overlap, ages and errors as in the simulator."""
     met(not figures["collided"][0], "a crash")
-    met(not figures["held_slots"], f"agents hovered for want of a quorum: {figures['held_slots']}")
+    held = figures["held_slots"]
+    met(max(held.values(), default=0) <= _HELD, f"agents hovered for want of a quorum: {held}")
     share = figures["overlap_slots"] / figures["slots"]
     met(share <= overlap, f"frames overlapped in {share:.2%} of {figures['slots']} slots")
     for name, margin in (("age_mean_slots", AGE_MARGIN), ("estimate_error_mean_m", ERROR_MARGIN)):
