@@ -16,6 +16,7 @@ from .packets import Packet, PacketReader, broadcast, datagram_in
 from .settings import CrazyradioSettings
 from .stamps import DongleClock
 
+_END_S = 2.0  # a dongle that hangs ends with the process
 _SECOND = 1_000_000_000
 _PRIORITY = 20
 _LOOK_S = 0.5  # between two looks whether a dongle that has gone is back
@@ -147,7 +148,7 @@ class CrazyradioPort:
     def close(self) -> None:
         """Ends the thread; the dongle is free for others."""
         self._stopped.set()
-        self._thread.join()
+        self._thread.join(_END_S)
         if self._dongle is not None:
             self._dongle.close()
             self._dongle = None

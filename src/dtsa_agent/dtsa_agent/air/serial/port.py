@@ -16,6 +16,7 @@ from .frames import LineReader, to_line
 from .settings import SerialSettings
 
 _PATIENCE_S = 0.1  # an end is noticed after this time at the latest
+_END_S = 2.0  # a device that hangs ends with the process
 _LOOK_S = 0.5  # between two looks whether a device that has gone is back
 _SAID = 8  # own datagrams that are remembered: a modem that echoes gives them back at once
 _GONE = "the device is not there"
@@ -162,7 +163,7 @@ class SerialPort:
     def close(self) -> None:
         """Ends the thread; the device is free for others."""
         self._stopped.set()
-        self._thread.join()
+        self._thread.join(_END_S)
         if self._device is not None:
             self._device.close()
             self._device = None
