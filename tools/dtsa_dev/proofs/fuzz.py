@@ -44,7 +44,7 @@ def build(target: str, directory: Path, library: Path = LIBRARY) -> Path:
         parts = [path for path in parts if path.name.startswith("frame")]
     files, flags = [HERE / f"fuzz_{target}.c", *parts], list(_FLAGS)
     if target == "hearing":
-        files += [_HEARING / "hearing.c", _SOCKET / "stamps.c"]
+        files += [_HEARING / "hearing.c", _HEARING / "contacts.c", _SOCKET / "stamps.c"]
         flags += ["-D_GNU_SOURCE", f"-I{_HEARING}", f"-I{_SOCKET}"]
     try:
         return compile_program(clang, directory / f"fuzz_{target}", files, flags, library)

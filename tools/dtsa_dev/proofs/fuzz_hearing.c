@@ -47,6 +47,10 @@ static hearing *opened(input *in)
     dtsa_timebase_init(&h->base, h->agents, 1 + (int)(next(in, 1) & 7),
                        300000 + next(in, 4) % 999700000, h->self + 1, 1);
     h->delay.limit = h->base.slot_ns / 4;
+    h->slot_ns = h->base.slot_ns;
+    h->contact.moving = next(in, 1);
+    h->contact.resting = next(in, 2);
+    h->contact.named = next(in, 2);
     check(hearing_open(h));
     return h;
 }
@@ -82,6 +86,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
                s.sender != h->self + 1 && s.frame + s.frame_length <= datagram + length &&
                h->base.state == DTSA_JOINED));
         check(h->delay.count <= h->agents);
+        const contact_count n = contacts_count(&h->contact, (int64_t)next(&in, 4), kind & 1);
+        check(n.both >= 0 && n.both <= n.hears && n.hears <= n.there && n.there < h->agents);
         stamps_looked(&stamps, next(&in, 6), now);
         check(stamps_arrival(&stamps, next(&in, 6)) <= now);
         free(datagram);
