@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.air.contacts import limits_of
+from dtsa_agent.air.datagram import NETWORK
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.recordings.bag.run import load_run
 from dtsa_bench.recordings.merge.merge import verified
@@ -25,7 +27,8 @@ from dtsa_dev.soak.item import Item, NotMet
 AGENTS = 12
 OVERLAP = 0.001  # of slots
 AGE_MARGIN, ERROR_MARGIN = 0.05, 0.15  # mean age and mean error may differ from the simulator's by this share
-_HELD = 5 * AGENTS  # slots of each: those that begin later are there at once, and have not named it yet
+# Slots of each: those that begin later are there at once, and name it within three cycles of their lists at the latest.
+_HELD = limits_of(SwarmConfig(agents=AGENTS, policy="lease"), NETWORK.peers).named
 _SECONDS = 12.0
 _FAULT_S = 3.0
 _APART = f"1-{AGENTS // 2} | {AGENTS // 2 + 1}-{AGENTS}"
