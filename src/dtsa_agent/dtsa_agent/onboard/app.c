@@ -31,7 +31,6 @@
 enum {
     QUEUE_LENGTH = 16,   /* datagrams between the radio's task and this one */
     CONTROL_US = 10000,  /* from one set-point to the next */
-    TICK_US = 1000,
     NEAR_US = 1500,      /* nearer than this to what is due it does not sleep */
     KEY_BYTES = 16
 };

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dtsa_agent.air import device_port
 from dtsa_agent.air.crazyradio import CrazyradioPort, CrazyradioSettings, port
 from dtsa_agent.air.crazyradio.dongle import Dongle, DongleError
 from dtsa_agent.air.crazyradio.packets import BROADCAST, PacketReader, broadcast, datagram_in
@@ -321,7 +322,7 @@ def test_hostile_transfers_neither_end_the_port_nor_fill_its_memory(plugged: lis
 def test_a_dongle_that_is_unplugged_is_used_again_when_it_is_back(
     plugged: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(port, "_LOOK_S", 0.01)
+    monkeypatch.setattr(device_port, "_LOOK_S", 0.01)
     monkeypatch.setattr(port, "_SECOND", 0)  # counts are asked for all the time
     device = FakeDevice()
     device.dropped = 2

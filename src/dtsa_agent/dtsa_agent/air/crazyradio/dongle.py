@@ -8,6 +8,7 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
+from dtsa_agent.air.device_port import DeviceError
 from dtsa_agent.core.errors import ConfigError
 
 from .packets import (
@@ -35,7 +36,7 @@ _RIGHTS = "one that this user may open: a udev rule gives the right (docs/how-to
 _HOW = "tools/dtsa setup --extra cflib, or pip install pyusb libusb-package"
 
 
-class DongleError(Exception):
+class DongleError(DeviceError):
     """The dongle does not do what it is told; the text says why."""
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import serial
 
+from dtsa_agent.air.device_port import DeviceError
 from dtsa_agent.core.errors import ConfigError
 
 _READ = 4096  # bytes at a time
@@ -25,10 +26,6 @@ _REASONS = {
     errno.ENOTTY: "a serial device",
     errno.EINVAL: "a speed that the device has",
 }
-
-
-class DeviceError(Exception):
-    """The device has gone, or does not take more now: why, for people."""
 
 
 class Device:
