@@ -24,7 +24,8 @@ from .timeline import Life
 
 _FOREVER_S = 86_400.0
 _GAP_SLOTS = 50  # an agent that says nothing for longer has fallen out
-_NOT_MEANT = ("end", "timed_out", "loss", "wall_time_s", "realtime_factor")  # of results of other flights
+# Of the results of other flights; the bags do not say how long frames of that port are on the air.
+_NOT_MEANT = ("end", "timed_out", "loss", "channel_load", "wall_time_s", "realtime_factor")
 
 Records = Mapping[int, Mapping[int, SlotRecord]]  # by agent and slot
 
@@ -194,7 +195,7 @@ def _results(metrics: FlightMetrics, first: int) -> dict[str, Any]:
     for name in ("min_distance_time_s", "completion_time_s"):
         if found[name] is not None:
             found[name] -= first * slot_s
-    for name in ("frames_per_s", "bytes_per_s", "channel_load"):
+    for name in ("frames_per_s", "bytes_per_s"):
         if found[name] is not None:
             found[name] *= metrics.slots / flown
     found["flight_time_s"] = flown * slot_s
