@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 REQUIREMENTS = Path(__file__).resolve().parent.parent / "requirements"
-SETS = ("ros", "build", "runtime", "test", "dev", "cflib", "benchmark", "cluster", "docs", "release")
+SETS = ("ros", "build", "runtime", "test", "dev", "cflib", "benchmark", "cluster", "learning", "docs", "release")
 
 # Runs in a fresh environment: names, versions and dependencies (by the markers of this interpreter) as JSON.
 RESOLVE = """

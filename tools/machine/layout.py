@@ -14,6 +14,7 @@ EXTRAS = {
     "cflib": "the bridge to Crazyflie quadcopters",
     "benchmark": "independent implementations to compare with",
     "cluster": "experiments on several machines",
+    "learning": "environments for learning",
     "test": "the test suite",
     "dev": "linting and type checks",
     "docs": "the documentation as a site",

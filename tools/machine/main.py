@@ -42,7 +42,7 @@ Removes what the build made for this kind of machine and this Python; what proce
 # When a worker dies, pytest-xdist would give its files to a new one, lose some of them, and wait for those for ever.
 SIDE_BY_SIDE = ("--dist", "loadfile", "--no-loadscope-reorder", "--max-worker-restart", "0")
 MOST_WORKERS = 4
-TEST_EXTRAS = {"test", "dev", "docs", "release", "cflib", "benchmark", "cluster"}
+TEST_EXTRAS = {"test", "dev", "docs", "release", "cflib", "benchmark", "cluster", "learning"}
 BENCH = layout.SOURCES / "dtsa_bench"
 
 

@@ -77,7 +77,8 @@ def test_names_and_notices_of_the_wheel(wheel: Path) -> None:
     assert said["License-Expression"] == "Apache-2.0 AND MIT"
     notices = {name.rpartition("/")[2] for name in names if name.startswith(f"{info}/licenses/")}
     assert notices == {"LICENSE", "NOTICE", "three.LICENSE"}
-    assert set(said.get_all("Provides-Extra", [])) == {"tables", "view", "cluster", "crazyflie", "serial", "all"}
+    extras = {"tables", "view", "cluster", "learning", "crazyflie", "serial", "all"}
+    assert set(said.get_all("Provides-Extra", [])) == extras
     compiled = {name.rpartition("/")[2] for name in names if name.endswith(".so")}
     assert "_kernel.abi3.so" in compiled
     assert all(name.endswith(".abi3.so") for name in compiled)

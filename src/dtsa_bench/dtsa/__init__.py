@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from dtsa_bench.runs.config import RunConfig, RunLimits
     from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig, Verdict
 
+    from . import env
     from ._flight import Flight, run_config, simulate
     from ._plots import plot_ages, plot_bars, plot_distances, plot_lines, plot_matrix, plot_trajectories
     from ._plugins import register
@@ -66,6 +67,7 @@ __all__ = [
     "Verification",
     "__version__",
     "agent_colour",
+    "env",
     "plot_ages",
     "plot_bars",
     "plot_distances",
@@ -105,6 +107,8 @@ if not TYPE_CHECKING:  # a type checker takes the names from above, and knows no
 
     def __getattr__(name: str) -> object:
         """Load what a name needs when it is first used."""
+        if name == "env":
+            return import_module("dtsa.env")
         if name not in _HOME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         value = getattr(import_module(_HOME[name]), _OTHER_NAMES.get(name, name))

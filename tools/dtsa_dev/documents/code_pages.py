@@ -83,7 +83,7 @@ def library() -> str:
     :raises ValueError: if a public name stands nowhere on the page.
     """
     grouped = {name for names in _GROUPS.values() for name in names}
-    if missing := set(dtsa.__all__) - grouped - {"REASONS", "__version__"}:
+    if missing := set(dtsa.__all__) - grouped - {"REASONS", "__version__", "env"}:
         raise ValueError(f"public names of dtsa that no group of the page has: {', '.join(sorted(missing))}")
     return "".join(_library())
 
@@ -102,6 +102,11 @@ def _library() -> Iterator[str]:
             yield "What a plug-in is, by kind ([plug-ins](plug-ins.md) says which methods do what):\n\n"
             for kind in _kinds():
                 yield _entry(f"{kinds.__name__}.{kind}", True)
+    yield "## An environment for learning\n\n"
+    yield "Each name is `dtsa.env.NAME`. What agents observe: [how-to](../how-to/learning.md).\n\n"
+    for name in dtsa.env.__all__:
+        if name != "Reward":  # a type without a text of its own: what takes SlotResults
+            yield _entry(f"{getattr(dtsa.env, name).__module__}.{name}", True)
 
 
 def _kinds() -> list[str]:

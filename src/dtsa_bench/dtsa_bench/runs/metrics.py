@@ -155,6 +155,11 @@ class FlightMetrics:
         self.awaited.discard(agent)
 
     @property
+    def woken(self) -> NDArray[np.int64]:
+        """(N,) slot in which each agent that flies got its goal; -1: it stands."""
+        return self._wakings.woken
+
+    @property
     def counted(self) -> NDArray[np.bool_]:
         """(N,) agents whose state is in the ages and errors: movers that have never been lost."""
         counted = np.asarray(self.scenario.moving, dtype=np.bool_).copy()

@@ -21,8 +21,8 @@ from dtsa_agent.plugin_watch import watched
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_channel_sim import Channel
-from dtsa_channel_sim.model.verdict import SUCCESS
 
+from .slotted import SlottedTraffic
 from .unslotted import UnslottedTraffic
 
 Array = NDArray[np.float64]
@@ -121,28 +121,17 @@ def simulate(
 
 def _fly(swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int) -> None:
     """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
-    advance, begin, fly, hear, end = swarm.scenario.advance, swarm.begin, swarm.fly, swarm.hear, swarm.end
-    frame, arbitrate, update = swarm.frame, channel.arbitrate, metrics.update
-    ids, track, position = swarm.ids, swarm.track, swarm.position
+    advance, begin, update = swarm.scenario.advance, swarm.begin, metrics.update
+    carry, track = SlottedTraffic(swarm, channel).slot, swarm.track
     table = 0 if swarm.shared else observer - 1
     compare = None if swarm.shared else metrics.compare_tables  # one table cannot differ from itself
     slot = 0
     while True:
         advance(slot, swarm)
-        heard = [(ids[index], frame(index)) for index in begin(slot)]
+        senders = begin(slot)
         if compare is not None:
             compare(slot, swarm.digest, swarm.chosen)
-        lengths = [len(data) for _, data in heard]
-        verdict = arbitrate(slot, [i for i, _ in heard], lengths, position)
-        fly(slot)
-        received = verdict.received
-        if received is not None:
-            for row, (_, data) in enumerate(heard):
-                hear(slot, data, received[row])
-        elif verdict.outcome == SUCCESS:
-            for _, data in heard:
-                hear(slot, data)
-        end(slot)
+        verdict, lengths = carry(slot, senders)
         over = update(slot, track, swarm, verdict.outcome, lengths)
         if kept is not None:
             _keep(kept, swarm, slot, verdict.senders, verdict.outcome, table)
