@@ -34,6 +34,8 @@ from .roster import Roster
 _REPEAT_S = 0.1
 _CALL_NS = 5_000_000
 _OTHER_CHANNEL_S = 0.3  # whoever calls or opens slots for so long is a channel
+_NAME_S = 1.0  # that the name of its node is waited for
+_UNNAMED = "a node whose name the graph does not know"
 _MOST_PROCESSES = 64  # messages of processes taken in at a time
 _HURRY_S = 0.2
 
@@ -190,8 +192,10 @@ class RosChannel:
                 with self.intake.guard():
                     check_slot(message, self.agents)
                     now = time.monotonic()
-                    if now - heard.setdefault(message.run, now) > _OTHER_CHANNEL_S:
-                        others = ", ".join(self._other_nodes(topic))
+                    waited = now - heard.setdefault(message.run, now)
+                    others = ", ".join(self._other_nodes(topic)) if waited > _OTHER_CHANNEL_S else ""
+                    # The graph may know of a publisher before it knows the name of its node.
+                    if others and (_UNNAMED not in others or waited > _OTHER_CHANNEL_S + _NAME_S):
                         raise ConfigError("run", str(self._identity), f"no other channel on {topic}; there is {others}")
 
         try:
@@ -203,7 +207,10 @@ class RosChannel:
     def _other_nodes(self, topic: str) -> list[str]:
         """Nodes that publish on a topic beside this one."""
         found = self.node.get_publishers_info_by_topic(topic)
-        nodes = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in found]
+        nodes = [
+            _UNNAMED if "UNKNOWN_" in info.node_name else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for info in found
+        ]
         if self.node.get_fully_qualified_name() in nodes:
             nodes.remove(self.node.get_fully_qualified_name())
         return nodes or ["one that has just gone"]
