@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import dtsa
 from dtsa.env import Observer, SlotResults, batch_env, fields, parallel_env
@@ -196,16 +195,16 @@ def test_what_cannot_be_used_is_named() -> None:
             env.step(actions)
     with pytest.raises(dtsa.ConfigError, match="actions"):
         dtsa.simulate(policy="actions", **SHORT)
-    with pytest.raises(dtsa.ConfigError, match="render_mode"):
-        parallel_env(render_mode="human")
 
 
 def test_pettingzoo_finds_nothing_wrong() -> None:
-    parallel_api_test(parallel_env(slots=40, **SHORT), num_cycles=100)
-    parallel_seed_test(lambda: parallel_env(slots=40, **SHORT), num_cycles=60)
+    checks = pytest.importorskip("pettingzoo.test")
+    checks.parallel_api_test(parallel_env(slots=40, **SHORT), num_cycles=100)
+    checks.parallel_seed_test(lambda: parallel_env(slots=40, **SHORT), num_cycles=60)
 
 
 def test_the_parallel_form_flies_the_same() -> None:
+    pytest.importorskip("pettingzoo")
     env = parallel_env(loss=0.1, render_mode="rgb_array", **SHORT)
     observations, _ = env.reset(seed=6)
     empty = env.render()
@@ -227,6 +226,7 @@ def test_the_parallel_form_flies_the_same() -> None:
 
 
 def test_a_missing_action_is_named_and_the_last_slot_can_be_read() -> None:
+    pytest.importorskip("pettingzoo")
     env = parallel_env(render_mode="ansi", **SHORT)
     env.reset()
     assert env.render() == "slot -"
@@ -234,17 +234,20 @@ def test_a_missing_action_is_named_and_the_last_slot_can_be_read() -> None:
         env.step({"agent_1": 1})
     env.step(dict.fromkeys(env.agents, 0) | {"agent_3": 1})
     assert env.render() == "slot 0: success, sent by 3"
+    with pytest.raises(dtsa.ConfigError, match="render_mode"):
+        parallel_env(render_mode="human")
 
 
 def test_without_pettingzoo_the_arrays_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
-    monkeypatch.delitem(sys.modules, "dtsa_bench.simulation.environment.parallel")
+    monkeypatch.delitem(sys.modules, "dtsa_bench.simulation.environment.parallel", raising=False)
     assert batch_env(flights=1, **SHORT).reset().shape == (1, 6, 64)
     with pytest.raises(dtsa.ConfigError, match=r"pettingzoo: .* an installed PettingZoo"):
         parallel_env(**SHORT)
 
 
 def test_the_example_flies_tdma(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pettingzoo")
     runpy.run_path(str(Path(__file__).parents[4] / "examples" / "environment.py"))
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith("completed after ")
