@@ -121,7 +121,6 @@ class BatchEnv:
         memory.sends[...] = sends
         # An agent that is silent says nothing of whom it takes for the sender.
         memory.chosen[...] = np.where(sends, self._ids, 0)
-        memory.digest[...] = memory.table_hash
         woken, begun = self._woken.copy(), self._slot.copy()
         over = self._fly(flew)
         results = self._results(begun, flew, sends, woken, over)
@@ -146,11 +145,13 @@ class BatchEnv:
         """Flies a slot of each flight that is not over; returns why those end that are over now."""
         over: dict[int, str] = {}
         self.terminated[flew] = self.truncated[flew] = False
-        slot, outcome, woken = self._slot, self._outcome, self._woken
+        slot, outcome, woken, memory = self._slot, self._outcome, self._woken, self._memory
+        torn = (memory.chosen != memory.chosen[:, :1]).any(axis=1).tolist()
+        split = (memory.table_hash != memory.table_hash[:, :1]).any(axis=1).tolist()
         for row, flight in enumerate(self._rows):
             if not flew[row]:
                 continue
-            end = flight.step()
+            end = flight.step(torn[row], split[row])
             slot[row], outcome[row], woken[row] = flight.slot, flight.outcome, flight.metrics.woken
             if end or flight.slot == self._limit:
                 over[row] = end

@@ -75,7 +75,7 @@ class Memory:
 
     NAMES = (
         "sent_position", "sent_velocity", "sent_slot", "last_turn", "in_ap", "table_hash",
-        "position", "velocity", "goal", "present", "chosen", "digest", "sends",
+        "position", "velocity", "goal", "present", "chosen", "sends",
     )  # fmt: skip
     sent_position: NDArray[np.float64]
     sent_velocity: NDArray[np.float64]
@@ -88,7 +88,6 @@ class Memory:
     goal: NDArray[np.float64]
     present: NDArray[np.uint8]
     chosen: NDArray[np.uint16]
-    digest: NDArray[np.uint32]
     sends: NDArray[np.uint8]
 
     def __init__(self, flights: int) -> None:
@@ -153,14 +152,16 @@ class ActedFlight:
         self._advance = self.scenario.advance
         self._advance(0, swarm)
 
-    def step(self) -> str:
-        """Flies a slot whose senders are those with ``sends`` set; what they take for its sender is in ``chosen``.
+    def step(self, torn: bool, split: bool) -> str:
+        """Flies a slot whose senders are those with ``sends`` set.
 
+        :param torn: whether two agents take different ones for its sender.
+        :param split: whether two of their tables differ.
         :returns: why the flight is over now, or "" if it goes on.
         """
         slot, swarm = self.slot, self.swarm
         senders = swarm.emit(slot)
-        self.metrics.compare_tables(slot, swarm.digest, swarm.chosen)
+        self.metrics.compared(slot, torn, split)
         verdict, lengths = self._carry(slot, senders)
         self.senders, self.outcome = verdict.senders, verdict.outcome
         over = self.metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)

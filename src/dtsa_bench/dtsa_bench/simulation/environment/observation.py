@@ -80,6 +80,12 @@ class Encoder:
         self._columns = table * agents + order  # (V, N) into (V N)
         axes = np.arange(3)[None, :, None] * agents
         self._planes = (table * 3 * agents + order)[:, None, :] + axes  # (V, 3, N) into (V 3 N)
+        # Arrays that NumPy would otherwise ask the system for in each slot.
+        shape = (flights, observers, agents)
+        self._sent, self._turn = (np.zeros(shape, dtype=np.int64) for _ in range(2))
+        self._in_ap = np.zeros(shape, dtype=np.uint8)
+        self._ago_s = np.zeros(shape)
+        self._place, self._velocity, self._moved = (np.zeros((flights, observers, 3, agents)) for _ in range(3))
 
     def fill(self, slots: NDArray[np.int64], tables: Tables) -> NDArray[np.float32]:
         """Fills the observations.
@@ -89,30 +95,37 @@ class Encoder:
         :returns: (B, V, F), the same array each time.
         """
         out, now = self._fields, slots[:, None, None]
-        sent, velocity = self._seen(tables.sent_slot), self._seen_planes(tables.sent_velocity)
-        ago = np.where(sent < 0, 0, now - sent)  # nobody that was never heard has moved
-        out["age"][...] = np.where(sent < 0, -1, ago - 1)
-        out["silence"][...] = now - 1 - self._seen(tables.last_turn)
-        out["moves"][...] = self._seen(tables.in_ap)
-        place = self._seen_planes(tables.sent_position) + velocity * (ago * self._slot_s)[:, :, None, :]
-        out["position"][...] = place - tables.position.swapaxes(1, 2)[..., None]
-        out["relative_velocity"][...] = velocity - tables.velocity.swapaxes(1, 2)[..., None]
+        sent, turn = self._sent, self._turn
+        _take(tables.sent_slot, self._columns, sent)
+        _take(tables.last_turn, self._columns, turn)
+        _take(tables.in_ap, self._columns, self._in_ap)
+        _take(tables.sent_position, self._planes, self._place)
+        _take(tables.sent_velocity, self._planes, self._velocity)
+        never = sent < 0
+        out["frame"][...] = (sent == now - 1).any(axis=2) & (slots > 0)[:, None]
+        np.subtract(now, sent, out=sent)
+        sent[never] = 0  # nobody that was never heard has moved
+        np.subtract(sent, 1, out=out["age"], casting="unsafe")
+        np.subtract(now - 1, turn, out=out["silence"], casting="unsafe")
+        out["moves"][...] = self._in_ap
+        np.multiply(sent, self._slot_s, out=self._ago_s)
+        np.multiply(self._velocity, self._ago_s[:, :, None, :], out=self._moved)
+        np.add(self._place, self._moved, out=self._place)
+        np.subtract(self._place, tables.position.swapaxes(1, 2)[..., None], out=out["position"], casting="same_kind")
+        own = tables.velocity.swapaxes(1, 2)
+        np.subtract(self._velocity, own[..., None], out=out["relative_velocity"], casting="same_kind")
         way = tables.goal - tables.position
         out["slot"][...] = slots[:, None]
         out["turn_in"][...] = (self._own - slots[:, None]) % self._agents
-        out["frame"][...] = (sent == now - 1).any(axis=2) & (slots > 0)[:, None]
         out["far"][...] = np.sqrt((way * way).sum(axis=1)) > self._r_min
         out["goal"][...] = way.swapaxes(1, 2)
-        out["velocity"][...] = tables.velocity.swapaxes(1, 2)
+        out["velocity"][...] = own
         return self.observations
 
-    def _seen(self, values: NDArray[Any]) -> NDArray[Any]:
-        """(B, V, N) by id, as each observer has them."""
-        return values.reshape(len(values), -1).take(self._columns, axis=1)
 
-    def _seen_planes(self, values: Floats) -> Floats:
-        """(B, V, 3, N) by id, as each observer has them."""
-        return values.reshape(len(values), -1).take(self._planes, axis=1)
+def _take(values: NDArray[Any], where: NDArray[np.intp], out: NDArray[Any]) -> None:
+    """Fills an array with values by id, as each observer has them."""
+    values.reshape(len(values), -1).take(where, axis=1, out=out, mode="clip")
 
 
 class _One:
