@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.benchmark import baselines, crazyflie, parts
+from dtsa_dev.benchmark import baselines, crazyflie, environments, parts
 from dtsa_dev.registry import main
 from metronome import flown_again_when_overloaded
 
@@ -67,6 +67,21 @@ def test_targets_are_met_or_not() -> None:
     rows += [node | {"slots_per_s": 1.0, "limit_per_s": None}, {"what": "nodes in lockstep", "left_out": "no rclpy"}]
     met = [target["met"] for target in parts.targets(rows)]
     assert met == [False, True, True, False, False, False, True, True, False, True, False, False, True]
+
+
+def test_environments_are_timed_in_both_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environments, "AGENTS", 3)
+    monkeypatch.setattr(environments, "FLIGHTS", 2)
+    rows = list(environments.environments(flights=1, repeats=1))
+    assert [(row["form"], row["loss"]) for row in rows] == [
+        ("dictionaries", 0.0), ("arrays", 0.0), ("dictionaries", 0.1), ("arrays", 0.1)
+    ]  # fmt: skip
+    if "left_out" not in rows[0]:
+        assert rows[1]["over_dictionaries"] == rows[1]["agent_steps_per_s"] / rows[0]["agent_steps_per_s"]
+    assert all(row["over_simulate"] > 0 for row in rows if "left_out" not in row)
+    one = {"what": "environment", "form": "arrays", "agents": 12, "loss": 0.1, "limit_per_s": 200_000}
+    found = parts.targets([one | {"agent_steps_per_s": 199_000.0}, one | {"left_out": "no PettingZoo"}])
+    assert [target["met"] for target in found] == [False]
 
 
 @pytest.mark.ros

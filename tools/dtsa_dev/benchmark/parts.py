@@ -1,6 +1,7 @@
 """What is measured:
 
-kernels, whole slots, whole flights, nodes in lockstep, the growth with the number of agents, the Crazyflie bridge.
+kernels, whole slots, whole flights, environments for learning, nodes in lockstep, the growth with the number of agents,
+the Crazyflie bridge.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from dtsa_bench.experiments.sweep.spec import run_config
 from dtsa_bench.simulation.simulate import simulate
 
 from . import crazyflie as bridge
+from . import environments as learning
 from .baselines import NotHere, baseline
 from .crazyflie import crazyflie as crazyflie
+from .environments import environments as environments
 
 Row = dict[str, Any]
 SIZES = (18, 70, 200)
@@ -238,6 +241,8 @@ def targets(rows: list[Row]) -> list[Row]:
                 found.append(_target(f"bare rounds over slots, {row['agents']} processes", row["ratio"], 2.5))
         elif row["what"] == bridge.WHAT and "left_out" not in row:
             found += [_target(*target) for target in bridge.targets(row)]
+        elif row["what"] == learning.WHAT:
+            found += [_target(*target) for target in learning.targets(row)]
     return found
 
 

@@ -60,7 +60,7 @@ def records(evidence: Path) -> str:
         lines.append(
             [
                 f"[{path.stem}](../evidence/{path.name})",
-                f"`tools/dtsa {'soak ' + record['soak'] if 'soak' in record else 'benchmark'}`",
+                f"`tools/dtsa {_command(record)}`",
                 record.get("promise", "Targets of speed.").rstrip(".") + ".",
                 f"{record['finished']} of {record['items']}{f', {failed} failed' * bool(failed)}"
                 if "items" in record
@@ -72,6 +72,12 @@ def records(evidence: Path) -> str:
         )
     heads = ("record", "command", "what should hold", "items done", "date", "commit", "machine")
     return f"{markdown(heads, lines)}\n"
+
+
+def _command(record: Row) -> str:
+    if "soak" in record:
+        return f"soak {record['soak']}"
+    return f"benchmark --parts {','.join(record['parts'])}" if "parts" in record else "benchmark"
 
 
 def speed(record: Row) -> str:
@@ -105,6 +111,36 @@ def speed(record: Row) -> str:
         f"On {machine['cores']} cores of a server processor, load {machine['load']:.1f} before it began, Python "
         f"{machine['python']} ([its record](../evidence/speed.json), {record['date'][:10]}):\n\n"
         f"{markdown(heads, lines)}\n\n{_nodes(record['nodes'])}\n{_targets(record['targets'])}"
+    )
+
+
+def environments(record: Row) -> str:
+    """How fast environments for learning are.
+
+    :param record: ``benchmark.json`` of `dtsa benchmark --parts environments`.
+    """
+    lines = [
+        [
+            row["form"],
+            str(row["flights"]),
+            f"{row['loss']:g}",
+            f"{row['agent_steps_per_s']:,.0f}",
+            f"{row['limit_per_s']:,}",
+            _us(row["slot_us"]),
+            f"{row['over_simulate']:.1f}",
+            f"{row['over_dictionaries']:.1f}" if "over_dictionaries" in row else "",
+        ]
+        for row in record["environments"]
+    ]
+    heads = (
+        "form", "flights", "loss", "agent-steps/s", "target", "a slot of a flight", "over that of `simulate`",
+        "agent-steps over those of dictionaries",
+    )  # fmt: skip
+    machine = record["machine"]
+    return (
+        f"{record['environments'][0]['agents']} agents, TDMA by actions, one core, load {machine['load']:.1f} of "
+        f"{machine['cores']} cores before it began ([its record](../evidence/environments.json), {record['date'][:10]}):"
+        f"\n\n{markdown(heads, lines)}\n\n{_targets(record['targets'])}"
     )
 
 
@@ -233,7 +269,8 @@ def _targets(rows: Sequence[Row]) -> str:
 
 
 QUOTED: dict[str, Callable[[Row], str]] = {
-    "speed": speed, "fuzz": fuzz, "losses": losses, "mutants": mutants, "setup": setup, "serial": serial,
+    "speed": speed, "environments": environments, "fuzz": fuzz, "losses": losses, "mutants": mutants, "setup": setup,
+    "serial": serial,
 }  # fmt: skip
 
 

@@ -177,6 +177,35 @@ def test_flights_follow_each_other_by_their_seeds() -> None:
     assert [env.flight(row).run.swarm.seed for row in range(2)] == [5, 6]
 
 
+@pytest.mark.parametrize(
+    "settings", [{"loss": 0.2, "scenario": "waypoints"}, {"estimator": "ahead"}, {"slot_ms": 25.0}]
+)
+def test_flights_that_follow_are_those_of_simulate(settings: dict[str, Any]) -> None:
+    class Ahead:
+        """The last state heard, a tenth of a second later."""
+
+        def __init__(self, config: dtsa.SwarmConfig, agent: int) -> None:
+            pass
+
+        def estimate(self, table: dtsa.Table, slot: int, step: int, position: Any, velocity: Any) -> None:
+            position[...] = table.sent_position + 0.1 * table.sent_velocity
+            velocity[...] = table.sent_velocity
+
+    dtsa.register("estimator", "ahead", Ahead)
+    settings = SHORT | {"timeout_s": 0.5, "moving": 4} | settings
+    env = batch_env(flights=2, **settings)
+    observations, ended = env.reset(seed=5), []
+    while len(ended) < 6:
+        observations, _, terminated, truncated = env.step(tdma(observations, 6))
+        ended += env.ended if (terminated | truncated).any() else []
+    for each in ended:
+        wanted = simulate(dtsa.run_config(policy="tdma", seed=each.seed, **settings), shared_table=False).summary()
+        assert {name: each.summary[name] for name in wanted if name not in OPEN} == {
+            name: wanted[name] for name in wanted if name not in OPEN
+        }
+    assert sorted(each.seed for each in ended) == [5, 6, 7, 8, 9, 10]
+
+
 def test_what_cannot_be_used_is_named() -> None:
     for settings, fault in (
         ({"policy": "tdma"}, "policy"), ({"flights": 0}, "flights"), ({"slots": True}, "slots"), ({"loss": 2}, "loss"),
@@ -186,7 +215,7 @@ def test_what_cannot_be_used_is_named() -> None:
     env = batch_env(flights=1, **SHORT)
     with pytest.raises(dtsa.ConfigError, match="reset"):
         env.step(np.zeros((1, 6), dtype=bool))
-    for seed in (-1, 1.5, [1, 2], []):
+    for seed in (-1, 1.5, [1, 2], [], 2**63, "7"):
         with pytest.raises(dtsa.ConfigError, match="seed"):
             env.reset(seed)  # type: ignore[arg-type]
     env.reset()

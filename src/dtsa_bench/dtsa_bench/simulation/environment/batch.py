@@ -19,6 +19,8 @@ from .flight import ActedFlight, Memory, acted, seeded
 from .observation import Encoder, size
 from .reward import MeanAge, Reward, SlotResults
 
+_MOST_SEED = 2**62  # those that follow it are seeds, too
+
 
 @dataclass(frozen=True, slots=True)
 class Ended:
@@ -95,10 +97,9 @@ class BatchEnv:
         """
         if seed is not None:
             self._seeds = self._numbers(seed)
-        self._rows = []
         self.ended = []
-        for row in range(self.flights):
-            self._rows.append(self._begin(row))
+        last = self._rows or [None] * self.flights
+        self._rows = [self._begin(row, last[row]) for row in range(self.flights)]
         self.terminated[:] = self.truncated[:] = False
         self.rewards[:] = 0.0
         return self._encoder.fill(self._slot, self._memory)
@@ -185,10 +186,10 @@ class BatchEnv:
             self.truncated[row] = not self.terminated[row]
             self.ended.append(Ended(row, flight.run.swarm.seed, flight.summary(), last[row].copy()))
             if self._autoreset:
-                self._rows[row] = self._begin(row)
+                self._rows[row] = self._begin(row, flight)
 
-    def _begin(self, row: int) -> ActedFlight:
-        flight = ActedFlight(seeded(self.config, next(self._seeds)), self._memory, row)
+    def _begin(self, row: int, last: ActedFlight | None) -> ActedFlight:
+        flight = ActedFlight(seeded(self.config, next(self._seeds)), self._memory, row, last)
         self._slot[row] = self._outcome[row] = 0
         self._moving[row], self._woken[row] = flight.scenario.moving, flight.metrics.woken
         return flight
@@ -198,8 +199,9 @@ class BatchEnv:
             given = [operator.index(seed)] if not isinstance(seed, Sequence) else [operator.index(one) for one in seed]
         except TypeError:
             given = []
-        if (isinstance(seed, Sequence) and len(given) != self.flights) or not given or min(given) < 0:
-            raise ConfigError("seed", seed, f"a whole number from 0 on, or {self.flights} of them")
+        count_fits = len(given) == (self.flights if isinstance(seed, Sequence) else 1)
+        if not count_fits or min(given) < 0 or max(given) > _MOST_SEED:
+            raise ConfigError("seed", seed, f"a whole number from 0 to 2^62, or {self.flights} of them")
         return iter(_seeds(given))
 
 

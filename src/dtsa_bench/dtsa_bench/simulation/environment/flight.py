@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -62,9 +63,14 @@ def seeded(run: RunConfig, seed: int) -> RunConfig:
     """The same run with another seed of swarm and channel.
 
     :param run: the run.
-    :param seed: the seed.
+    :param seed: the seed, which has been checked: to check all settings again takes as long as a hundred slots.
     """
-    return replace(run, swarm=replace(run.swarm, seed=seed), channel=replace(run.air, seed=seed))
+    swarm, channel, other = copy(run.swarm), copy(run.air), copy(run)
+    for settings, name, value in (
+        (swarm, "seed", seed), (channel, "seed", seed), (other, "swarm", swarm), (other, "channel", channel),
+    ):  # fmt: skip
+        object.__setattr__(settings, name, value)
+    return other
 
 
 class Memory:
@@ -128,6 +134,17 @@ class PlacedSwarm(Swarm):
         memory, row = self._place
         memory.place(self, row)
 
+    def fly_again(self, config: SwarmConfig, scenario: Scenario) -> None:
+        """Begins another flight, without the cost of a new swarm.
+
+        :param config: the same settings with another seed.
+        :param scenario: its starts and goals.
+        """
+        self.config, self.scenario = config, scenario
+        self._start[...], self._target[...] = scenario.start, scenario.target
+        self.course = scenario.course(self.local)
+        self.reset()
+
 
 class ActedFlight:
     """A flight in which each slot's senders are said from outside.
@@ -135,22 +152,23 @@ class ActedFlight:
     :param run: the run, as :func:`acted` gives it.
     :param memory: arrays of the batch.
     :param row: which row is this flight's.
+    :param last: the flight that was in this row, which is over; its swarm flies again where it can.
     """
 
-    def __init__(self, run: RunConfig, memory: Memory, row: int) -> None:
+    def __init__(self, run: RunConfig, memory: Memory, row: int, last: ActedFlight | None = None) -> None:
         self.run, self.scenario = run, make_scenario(run.swarm)
-        swarm: AbstractSwarm = PlacedSwarm(run.swarm, self.scenario, memory, row)
-        if run.swarm.estimator not in ESTIMATORS.rows or run.swarm.avoider not in AVOIDERS.rows:
-            swarm = PluginSwarm(swarm)
-        self.swarm = swarm = with_key(swarm)
-        swarm.reason[:] = _REASON
+        if last is not None and isinstance(last.swarm, PlacedSwarm):
+            self.swarm: AbstractSwarm = last.swarm
+            last.swarm.fly_again(run.swarm, self.scenario)
+        else:
+            self.swarm = _new_swarm(run.swarm, self.scenario, memory, row)
         self.metrics = FlightMetrics(run, self.scenario)
         self.slot = 0  # the one that begins
         self.senders: tuple[int, ...] = ()  # ids, of the last slot
         self.outcome = 0  # of the last slot
-        self._carry = SlottedTraffic(swarm, Channel(run.air)).slot
+        self._carry = SlottedTraffic(self.swarm, Channel(run.air)).slot
         self._advance = self.scenario.advance
-        self._advance(0, swarm)
+        self._advance(0, self.swarm)
 
     def step(self, torn: bool, split: bool) -> str:
         """Flies a slot whose senders are those with ``sends`` set.
@@ -178,3 +196,11 @@ class ActedFlight:
         result = self.metrics.summary(wall_time_s)
         result["malformed"], result["foreign"] = self.swarm.malformed, self.swarm.foreign
         return result
+
+
+def _new_swarm(config: SwarmConfig, scenario: Scenario, memory: Memory, row: int) -> AbstractSwarm:
+    swarm: AbstractSwarm = PlacedSwarm(config, scenario, memory, row)
+    if config.estimator not in ESTIMATORS.rows or config.avoider not in AVOIDERS.rows:
+        swarm = PluginSwarm(swarm)
+    swarm.reason[:] = _REASON
+    return with_key(swarm)
