@@ -136,10 +136,10 @@ def environments(record: Row) -> str:
         "form", "flights", "loss", "agent-steps/s", "target", "a slot of a flight", "over that of `simulate`",
         "agent-steps over those of dictionaries",
     )  # fmt: skip
-    machine = record["machine"]
+    machine, agents = record["machine"], record["environments"][0]["agents"]
     return (
-        f"{record['environments'][0]['agents']} agents, TDMA by actions, one core, load {machine['load']:.1f} of "
-        f"{machine['cores']} cores before it began ([its record](../evidence/environments.json), {record['date'][:10]}):"
+        f"{agents} agents, TDMA by actions, one core of {machine['cores']}, load {machine['load']:.1f} before it began "
+        f"([its record](../evidence/environments.json), {record['date'][:10]}):"
         f"\n\n{markdown(heads, lines)}\n\n{_targets(record['targets'])}"
     )
 
