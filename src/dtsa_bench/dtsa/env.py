@@ -31,7 +31,7 @@ def parallel_env(
     :param config: what is flown, without its policy; None: made from the settings.
     :param reward: what a slot was worth, (B, N) or (B, 1) of :class:`SlotResults` with B = 1; None: :class:`MeanAge`.
     :param slots: a flight that is not over after so many slots is truncated; None: at its `timeout_s`.
-    :param render_mode: "rgb_array", "ansi" or None.
+    :param render_mode: "rgb_array", "ansi", "human" or None.
     :param settings: as for :func:`dtsa.run_config`, if there is no config.
     :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
     """

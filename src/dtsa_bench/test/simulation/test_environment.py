@@ -228,8 +228,12 @@ def test_what_cannot_be_used_is_named() -> None:
 
 def test_pettingzoo_finds_nothing_wrong() -> None:
     checks = pytest.importorskip("pettingzoo.test")
+    from pettingzoo.test.render_test import render_test
+    from pettingzoo.utils.conversions import parallel_to_aec
+
     checks.parallel_api_test(parallel_env(slots=40, **SHORT), num_cycles=100)
     checks.parallel_seed_test(lambda: parallel_env(slots=40, **SHORT), num_cycles=60)
+    render_test(lambda render_mode: parallel_to_aec(parallel_env(agents=2, slots=3, render_mode=render_mode)))
 
 
 def test_the_parallel_form_flies_the_same() -> None:
@@ -238,6 +242,7 @@ def test_the_parallel_form_flies_the_same() -> None:
     observations, _ = env.reset(seed=6)
     empty = env.render()
     while env.agents:
+        assert all(env.observation_space(agent).contains(seen) for agent, seen in observations.items())
         actions = {agent: int(fields(seen, 6)["turn_in"] == 0) for agent, seen in observations.items()}
         observations, rewards, terminated, truncated, infos = env.step(actions)
     wanted = dtsa.simulate(policy="tdma", loss=0.1, seed=6, **SHORT).summary  # with loss each has a table of its own
@@ -258,13 +263,13 @@ def test_a_missing_action_is_named_and_the_last_slot_can_be_read() -> None:
     pytest.importorskip("pettingzoo")
     env = parallel_env(render_mode="ansi", **SHORT)
     env.reset()
-    assert env.render() == "slot -"
+    assert env.render() == "slot 0 begins"
     with pytest.raises(dtsa.ConfigError, match="agent_2"):
         env.step({"agent_1": 1})
     env.step(dict.fromkeys(env.agents, 0) | {"agent_3": 1})
     assert env.render() == "slot 0: success, sent by 3"
     with pytest.raises(dtsa.ConfigError, match="render_mode"):
-        parallel_env(render_mode="human")
+        parallel_env(render_mode="window")
 
 
 def test_without_pettingzoo_the_arrays_are_there(monkeypatch: pytest.MonkeyPatch) -> None:

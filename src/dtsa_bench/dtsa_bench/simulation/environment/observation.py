@@ -47,6 +47,20 @@ def fields(observations: NDArray[np.float32], agents: int) -> dict[str, NDArray[
     }
 
 
+def bounds(agents: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Least and greatest values, (F,) each; infinite where there is no limit.
+
+    :param agents: number of agents N.
+    """
+    low, high = (np.full(size(agents), limit, dtype=np.float32) for limit in (-np.inf, np.inf))
+    for name, least, most in (
+        ("slot", 0, np.inf), ("turn_in", 0, agents - 1), ("frame", 0, 1), ("far", 0, 1), ("age", -1, np.inf),
+        ("silence", 0, np.inf), ("moves", 0, 1),
+    ):  # fmt: skip
+        fields(low, agents)[name][...], fields(high, agents)[name][...] = least, most
+    return low, high
+
+
 class Tables(Protocol):
     """Tables and own states of V observers in B flights."""
 

@@ -16,10 +16,11 @@ from dtsa_channel_sim import OUTCOMES
 
 from .batch import BatchEnv
 from .flight import ActedFlight
+from .observation import bounds
 from .reward import Reward
 
 Observations = dict[str, NDArray[np.float32]]
-RENDER_MODES = ("rgb_array", "ansi")
+RENDER_MODES = ("rgb_array", "ansi", "human")
 
 
 class SwarmEnv(ParallelEnv):  # type: ignore[misc]
@@ -28,7 +29,8 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
     :param run: what is flown; its policy does not count, its seed is that of the first flight.
     :param reward: what a slot was worth; None: minus the mean age from waking on, and a penalty for a crash.
     :param slots: a flight that is not over after so many slots is truncated; None: at its ``timeout_s``.
-    :param render_mode: ``rgb_array``: the flight so far, seen from above; ``ansi``: a line on the last slot.
+    :param render_mode: ``rgb_array``: the flight so far, seen from above; ``ansi``: a line on the last slot;
+        ``human``: `render` prints that line.
     :raises ConfigError: for a value that is not usable.
     """
 
@@ -50,8 +52,8 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         self._batch = BatchEnv(run, 1, reward=reward, slots=slots, autoreset=False)
         self.possible_agents = [f"agent_{agent}" for agent in range(1, self._batch.agents + 1)]
         self.agents: list[str] = []
-        shape = (self._batch.observation_size,)
-        self.observation_spaces = {name: Box(-np.inf, np.inf, shape, np.float32) for name in self.possible_agents}
+        low, high = bounds(self._batch.agents)
+        self.observation_spaces = {name: Box(low, high, dtype=np.float32) for name in self.possible_agents}
         self.action_spaces = {name: Discrete(2) for name in self.possible_agents}
         self._track: list[NDArray[np.float64]] = []
 
@@ -129,10 +131,17 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
             pair = self.flight.metrics.collided_pair
             return from_above(self.flight.scenario, np.concatenate(self._track), pair)
         if self.render_mode == "ansi":
-            flight = self.flight
-            senders = ", ".join(map(str, flight.senders)) or "nobody"
-            return f"slot {flight.slot - 1}: {OUTCOMES[flight.outcome]}, sent by {senders}" if flight.slot else "slot -"
+            return self._line()
+        if self.render_mode == "human":
+            print(self._line())
         return None
+
+    def _line(self) -> str:
+        flight = self.flight
+        if not flight.slot:
+            return "slot 0 begins"
+        senders = ", ".join(map(str, flight.senders)) or "nobody"
+        return f"slot {flight.slot - 1}: {OUTCOMES[flight.outcome]}, sent by {senders}"
 
     def close(self) -> None:
         """There is nothing to close."""

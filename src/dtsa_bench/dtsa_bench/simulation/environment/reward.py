@@ -29,7 +29,8 @@ Reward = Callable[[SlotResults], NDArray[np.float64]]
 class MeanAge:
     """The default: minus the mean age from waking on, over pairs, in slots; a crash costs a penalty on top.
 
-    The sum over a flight is minus what `waking_age_mean_slots` takes the mean of, weighted slot by slot.
+    In slots in which nobody flies it is 0. `waking_age_mean_slots` is the mean of the same ages over all pairs of all
+    slots.
 
     :param crash: penalty. It has to exceed what the rest of a flight may cost: a crash ends the flight.
     """
