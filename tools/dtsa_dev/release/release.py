@@ -20,7 +20,7 @@ from .running import Runner, clean_environment
 from .smoke import Installed, Trial
 
 MAX_IMPORT_S = 0.5
-EXTRAS = "tables,view,cluster"
+EXTRAS = "tables,view,cluster,learning"
 RECORD, LOG = "release.json", "release.log"
 
 

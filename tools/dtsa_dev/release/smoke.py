@@ -209,5 +209,7 @@ class Trial:
         self.dtsa("view", code=2, says=NEEDS_ROS)
         done = self.python("-c", "import dtsa; print(len(dtsa.simulate(agents=4, timeout_s=3).slots))")
         self.note(done.code == 0, f"tables of a flight: {done.reason()}")
+        done = self.python("-c", "import dtsa; print(len(dtsa.env.parallel_env(agents=4).reset(seed=1)[0]))")
+        self.note(done.code == 0, f"an environment for learning: {done.reason()}")
         done = self.python("-c", "import distributed")
         self.note(done.code == 0, f"import distributed: {done.reason()}")
