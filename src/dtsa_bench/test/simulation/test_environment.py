@@ -165,8 +165,8 @@ def test_flights_follow_each_other_by_their_seeds() -> None:
     observations, first = env.reset(seed=[11, 4]), env.observations.copy()
     ended = []
     for _ in range(60):
-        observations, _, terminated, truncated = env.step(tdma(observations, 6))
-        ended += env.ended if (terminated | truncated).any() else []
+        observations, _, _, truncated = env.step(tdma(observations, 6))
+        ended += env.ended
     assert [(each.flight, each.seed) for each in ended] == [(0, 11), (1, 4), (0, 5), (1, 6)]
     assert [each.summary["slots"]["total"] for each in ended] == [30] * 4
     assert ended[0].observation.shape == (6, env.observation_size)
@@ -196,8 +196,8 @@ def test_flights_that_follow_are_those_of_simulate(settings: dict[str, Any]) -> 
     env = batch_env(flights=2, **settings)
     observations, ended = env.reset(seed=5), []
     while len(ended) < 6:
-        observations, _, terminated, truncated = env.step(tdma(observations, 6))
-        ended += env.ended if (terminated | truncated).any() else []
+        observations, *_ = env.step(tdma(observations, 6))
+        ended += env.ended
     for each in ended:
         wanted = simulate(dtsa.run_config(policy="tdma", seed=each.seed, **settings), shared_table=False).summary()
         assert {name: each.summary[name] for name in wanted if name not in OPEN} == {
@@ -224,6 +224,10 @@ def test_what_cannot_be_used_is_named() -> None:
             env.step(actions)
     with pytest.raises(dtsa.ConfigError, match="actions"):
         dtsa.simulate(policy="actions", **SHORT)
+    env = batch_env(flights=6, reward=lambda results: results.ages.sum(axis=(1, 2)), **SHORT)
+    env.reset()
+    with pytest.raises(dtsa.ConfigError, match="reward"):
+        env.step(np.zeros((6, 6), dtype=bool))
 
 
 def test_pettingzoo_finds_nothing_wrong() -> None:

@@ -112,9 +112,10 @@ class BatchEnv:
         :param actions: (B, N), 1: the agent sends in this slot, 0: it is silent.
         :returns: observations (B, N, F), rewards (B, N), terminated (B,): crashed or complete, truncated (B,): not over
             within the limit. Where a flight is over the observation is the first one of the next.
-        :raises ConfigError: for actions of another shape or other values.
+        :raises ConfigError: for actions of another shape or other values, or a reward of another shape.
         """
         sends = self._sends(actions)
+        self.ended = []
         memory, flew = self._memory, ~(self.terminated | self.truncated)
         if self._autoreset:
             flew[:] = True
@@ -125,7 +126,12 @@ class BatchEnv:
         woken, begun = self._woken.copy(), self._slot.copy()
         over = self._fly(flew)
         results = self._results(begun, flew, sends, woken, over)
-        self.rewards[...] = np.where(flew[:, None], self._reward(results), 0.0)
+        worth = np.asarray(self._reward(results))
+        if worth.shape not in (self.rewards.shape, (self.flights, 1)):
+            raise ConfigError(
+                "reward", f"an array of shape {worth.shape}", f"{self.rewards.shape} or {(self.flights, 1)}"
+            )
+        self.rewards[...] = np.where(flew[:, None], worth, 0.0)
         if over:
             self._end(over)
         return self._encoder.fill(self._slot, memory), self.rewards, self.terminated, self.truncated
@@ -179,7 +185,6 @@ class BatchEnv:
 
     def _end(self, over: dict[int, str]) -> None:
         last = self._encoder.fill(self._slot, self._memory)
-        self.ended = []
         for row, end in over.items():
             flight = self._rows[row]
             self.terminated[row] = end in (CRASHED, COMPLETED)
