@@ -32,6 +32,13 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("--file own.yaml --json", "a sweep of your own, its groups as JSON"),
         ("--preset loss --paper pdf", "with figures and tables for a paper"),
     ),
+    "league": (
+        ("cells", "what is flown, and the schemes that come with the package"),
+        ("enter lease --sample 2", "two practice seeds of each cell, to try it out"),
+        ("enter examples/dtsa_plugins --jobs 2", "the policy of a folder, all cells"),
+        ("check runs/league-1/lease", "flies a sample of its flights again"),
+        ("table runs/league-1/lease runs/league-1/tdma --out runs/table", "a page, figures, CSV and LaTeX"),
+    ),
     "peer-lab": (
         ("beacons --agents 12 --seconds 20", "twelve vehicles that broadcast their states"),
         ("dtr --loss 0.1 --polls 10", "a token ring with lost frames, beside a ground station that polls"),

@@ -10,6 +10,7 @@ COMMANDS = {
     "agent": "one agent on a real network: frames over UDP, no channel node, no ROS",
     "simulate": "one or many flights without ROS, as fast as the machine allows",
     "sweep": "many simulated flights over a grid of settings; can be interrupted and resumed",
+    "league": "cells that any policy flies, entries that anybody can check, and their table",
     "new-plugin": "a package to begin with: a policy of your own, its test and a sweep",
     "replay": "play a bag back into the ROS graph",
     "verify": "check a bag: was every decision what the protocol says?",

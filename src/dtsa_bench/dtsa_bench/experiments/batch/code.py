@@ -47,6 +47,24 @@ def code_digest(plug_ins: frozenset[PlugIn] = frozenset(), own: tuple[Path, ...]
     return digest.hexdigest()[:16]
 
 
+def package_digest(kind: str, name: str) -> str:
+    """A digest of the packages that a part comes from; of one that is built in, of this project's package with it.
+
+    :param kind: of the part, as a setting names it.
+    :param name: its name.
+    """
+    registry = _REGISTRIES[kind]
+    built_in = "dtsa_agent" if name in registry.rows else registry.factory(name).__module__.partition(".")[0]
+    digest = hashlib.sha256()
+    if built_in in PROJECT:
+        digest.update(_content_of(built_in, _SOURCES))
+    else:
+        for package in sorted(set(_packages_of(kind, name))):
+            digest.update(_content_of(package, None))
+        digest.update(_written_here(registry.factory(name)))
+    return digest.hexdigest()
+
+
 def _packages_of(kind: str, name: str) -> Iterator[str]:
     """Top-level modules and packages of a plug-in: all that its distribution announces; none of this project's."""
     registry = _REGISTRIES[kind]
