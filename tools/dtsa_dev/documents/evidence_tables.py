@@ -1,7 +1,8 @@
 """What the documentation quotes of measurements, made from their records.
 
 A quotation stands between ``<!-- evidence: NAME -->`` and ``<!-- end -->``; NAME is one of :data:`QUOTED`, and its
-record ``docs/evidence/NAME.json``; ``records`` is the list of all records. The command
+record ``docs/evidence/NAME.json``; ``records`` is the list of all records. A league's records are the entries in the
+directory ``docs/evidence/NAME``. The command
 ``python -m dtsa_dev.documents.evidence_tables docs/*/*.md`` rewrites all quotations of these files.
 """
 
@@ -16,11 +17,15 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.experiments.batch.table import markdown
+from dtsa_bench.experiments.league.cells import league
+from dtsa_bench.experiments.league.entry import read_entry
+from dtsa_bench.experiments.league.table import HEADS, LeagueTable
 
 Row = dict[str, Any]
 
 _BLOCK = re.compile(r"(<!-- evidence: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 LIST = "records"  # what a page asks for that lists them all
+LEAGUES = ("league-1",)
 _SIZES = (18, 70, 200)
 _PARTS = ("kernels", "avoidance", "slots", "flights", "nodes")  # of a benchmark, that are quoted
 
@@ -37,8 +42,10 @@ def rewritten(text: str, evidence: Path) -> str:
         name = found["name"]
         if name == LIST:
             return f"{found[1]}{records(evidence)}{found[3]}"
+        if name in LEAGUES:
+            return f"{found[1]}{standings(evidence / name)}{found[3]}" if (evidence / name).is_dir() else found[0]
         if name not in QUOTED:
-            raise ConfigError("evidence", name, ", ".join((*QUOTED, LIST)))
+            raise ConfigError("evidence", name, ", ".join((*QUOTED, *LEAGUES, LIST)))
         record = evidence / f"{name}.json"
         if not record.exists():
             return found[0]
@@ -230,6 +237,38 @@ def serial(record: Row) -> str:
     low, high = record["load_of_items"]
     done = f"{record['finished'] - len(record['failures'])} of {record['items']} flights as they should be"
     return f"{markdown(head, rows)}\n\n{done}, in {record['wall_s'] / 60:.0f} minutes, load {low:.0f} to {high:.0f}.\n"
+
+
+def standings(directory: Path) -> str:
+    """The tables of a league: all scores, ages by cell, and who flew what.
+
+    :param directory: of its entries.
+    """
+    entries = [read_entry(path) for path in sorted(directory.glob("*.json"))]
+    table = LeagueTable(league(entries[0]["league"]), entries)
+    cells = [[cell.name, cell.text] for cell in table.league.cells]
+    flown = [
+        [
+            f"[{entry['name']}](league-1/{entry['name']}.json)",
+            ", ".join(f"`{key}: {value}`" for key, value in entry["scheme"].items()),
+            " ".join(str(entry["package"][key] or "") for key in ("distribution", "version")),
+            str(entry["package"]["license"] or "not given"),
+            str(entry["package"]["author"] or "not given"),
+            f"`{entry['made_with']['commit'][:9]}`, {entry['made_with']['date'][:10]}",
+        ]
+        for entry in table.entries
+    ]
+    flights = sum(entry["summary"]["flights"] for entry in entries)
+    return "\n\n".join(
+        [
+            f"{len(entries)} entries, {flights:,} flights, {entries[0]['seeds']} seeds. 95 % intervals in brackets.",
+            markdown(HEADS, table.lines()),
+            "Age in each cell, ms; in brackets the lost flights, if any:",
+            markdown(("scheme", *table.cells), table.cell_lines()),
+            markdown(("cell", "what it is"), cells),
+            markdown(("entry", "sets", "package", "licence", "author", "flown by"), flown) + "\n",
+        ]
+    )
 
 
 def _plain(rows: Iterable[Row]) -> Iterable[Row]:

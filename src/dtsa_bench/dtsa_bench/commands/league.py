@@ -24,7 +24,7 @@ lists what is flown, and the schemes that come with this program. What an entry 
 
 SAMPLE = 24  # flights that `check` flies again
 _OPTIONS = {
-    "enter": ("name", "policy", "set", "cells", "sample", "secret", "out", "jobs", "cluster", "json"),
+    "enter": ("name", "policy", "set", "cells", "sample", "secret", "judged", "out", "jobs", "cluster", "json"),
     "check": ("sample", "all", "seed", "secret", "package", "jobs"),
     "table": ("out", "json"),
     "cells": (),
@@ -46,6 +46,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--set", metavar="NAME=VALUE", action="append", help="a setting of the policy, or frame=extended"
     )
     enter.add_argument("--cells", metavar="NAME[,NAME...]", help="these alone; the entry is incomplete")
+    enter.add_argument(
+        "--judged", action="store_true", default=None, help="the judged seeds, after their word is published"
+    )
     enter.add_argument("--cluster", metavar="tcp://HOST:PORT", help="fly on a Dask cluster with this scheduler")
     both = parser.add_argument_group("enter and check")
     both.add_argument("--secret", metavar="FILE", help="the word of the judged seeds [practice; check: as published]")
@@ -82,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _enter(args: argparse.Namespace, there: League) -> int:
+    from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.experiments.batch.progress import run_batch
     from dtsa_bench.experiments.league.cells import JUDGED, PRACTICE
     from dtsa_bench.experiments.league.entrant import entrant_of
@@ -91,6 +95,10 @@ def _enter(args: argparse.Namespace, there: League) -> int:
     from dtsa_bench.runs.options import whole_number
 
     word = _word(args, there)
+    if args.judged:
+        word = there.published()
+        if word is None:
+            raise ConfigError("judged", True, "after the secret has been published")
     chosen = [cell.name for cell in there.cells]
     if args.cells is not None:
         named = [there.cell(name.strip()).name for name in args.cells.split(",")]

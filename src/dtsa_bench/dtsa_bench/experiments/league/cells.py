@@ -36,7 +36,7 @@ class LeagueCell:
     lost_age_ms: float  # counts as the age of a lost flight, and is the largest that counts of any other
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class League:
     """A league as its file says it."""
 

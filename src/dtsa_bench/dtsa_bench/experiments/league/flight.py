@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,7 @@ def digest_of(trace: Trace) -> str:
     return digest.hexdigest()[:16]
 
 
+@cache
 def golden_digest(there: League) -> str:
     """A digest of some flights with practice seeds: another one where the simulator computes something else.
 
