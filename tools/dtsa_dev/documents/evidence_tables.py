@@ -199,6 +199,20 @@ def setup(record: Row) -> str:
     return "\n".join(said) + "\n"
 
 
+def flown_again(record: Row) -> str:
+    """How many flights of entries were flown a second time.
+
+    :param record: of `dtsa soak league`.
+    """
+    figures, failures = record["figures"], record["failures"]
+    failed = f"; {len(failures)} entries failed: {', '.join(row['item'] for row in failures)}" if failures else ""
+    return (
+        f"All {figures['flights']:,} flights of {figures['entries']} entries were flown a second time, and had the "
+        f"same rows and digests. {figures['forged']} entries with one number of one row changed, sums and "
+        f"digest made anew, were found ([its record](../evidence/league.json)){failed}.\n"
+    )
+
+
 def losses(record: Row) -> str:
     """How many intervals held what was flown.
 
@@ -308,7 +322,8 @@ def _targets(rows: Sequence[Row]) -> str:
 
 
 QUOTED: dict[str, Callable[[Row], str]] = {
-    "speed": speed, "environments": environments, "fuzz": fuzz, "losses": losses, "mutants": mutants, "setup": setup,
+    "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again, "losses": losses,
+    "mutants": mutants, "setup": setup,
     "serial": serial,
 }  # fmt: skip
 

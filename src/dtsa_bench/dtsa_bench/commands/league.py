@@ -182,11 +182,16 @@ def _check(args: argparse.Namespace, there: League) -> int:
 def _table(args: argparse.Namespace, there: League) -> int:
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.experiments.batch.table import aligned
+    from dtsa_bench.experiments.league.check import sums
     from dtsa_bench.experiments.league.entry import read_entry
     from dtsa_bench.experiments.league.table import HEADS, LeagueTable
     from dtsa_bench.pages.report.league import write_league
 
-    table = LeagueTable(there, [read_entry(path) for path in args.what])
+    entries = [read_entry(path) for path in args.what]
+    for path, entry in zip(args.what, entries, strict=True):
+        if wrong := sums(there, entry):
+            raise ConfigError("ENTRY", path, f"an entry whose numbers follow from its flights ({wrong[0]})")
+    table = LeagueTable(there, entries)
     directory = Path(args.out) if args.out else Path("runs") / there.name / "table"
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -260,6 +260,11 @@ def test_the_table_is_a_page_figures_csv_and_latex(
     names = sorted(path.name for path in (tmp_path / "figures").iterdir())
     assert names == ["cells.png", "cells.svg", "scores.png", "scores.svg"]
     other = read_entry(flown / "lease")
+    other["summary"]["lost"] = 0.5
+    (tmp_path / "forged.json").write_text(json.dumps(other))
+    capsys.readouterr()
+    assert cli.main(["league", "table", str(tmp_path / "forged.json"), "--out", str(tmp_path)]) == 2
+    assert "follow from its flights" in capsys.readouterr().err
     other["flights"]["few"][0][1] += 1
     with pytest.raises(ConfigError, match="same cells and seeds"):
         LeagueTable(LEAGUE, [read_entry(flown / "tdma"), other])

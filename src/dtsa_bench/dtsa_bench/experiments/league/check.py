@@ -43,7 +43,7 @@ def check_entry(
     :param jobs: number of processes.
     :raises ConfigError: if its policy is not here.
     """
-    differences = [*_sums(there, entry), *_seeds(there, entry, word)]
+    differences = [*sums(there, entry), *_seeds(there, entry, word)]
     check_scheme(entry["scheme"])
     work = work_of(entry["scheme"]["policy"])
     notes = _notes(entry, work.code(), word)
@@ -65,8 +65,12 @@ def _sample(entry: Mapping[str, Any], sample: int | None, seed: int) -> list[Wan
     return random.Random(seed).sample(flights, sample)
 
 
-def _sums(there: League, entry: Mapping[str, Any]) -> list[str]:
-    """Numbers of an entry that do not follow from its rows."""
+def sums(there: League, entry: Mapping[str, Any]) -> list[str]:
+    """Numbers of an entry that do not follow from its rows.
+
+    :param there: its league.
+    :param entry: the entry.
+    """
     found = []
     if digest_of(entry) != entry["digest"]:
         found.append("digest: not that of what the entry says: something in it was changed")

@@ -39,6 +39,7 @@ def scores(table: LeagueTable) -> Figure:
         axes[2].set_title("time on the air")
         ranks = [(place.rank, place.first, place.last) if place.rank else (math.nan,) * 3 for place in table.places]
         _dots(axes[3], ranks, bounds)
+        axes[3].xaxis.set_major_locator(MaxNLocator(6, integer=True))
         axes[3].set_title("rank")
         for axis in axes:
             axis.set_ylim(len(names) - 0.4, -0.6)

@@ -94,4 +94,6 @@ _NOTES = """<ul>
 So schemes that lose their hardest flights gain nothing by it.</li>
 <li>Rank: by lost flights, then by age. In brackets: the ranks that are left open by all pairs of entries on the same
 seeds, all tests corrected together (Holm, 5 %).</li>
+<li>Sums were made again from the flights of the entries. Whether the flights are right, <code>league check</code>
+says.</li>
 <li>A bound looks into all agents. Nobody can fly it.</li></ul>"""
