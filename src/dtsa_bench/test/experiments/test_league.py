@@ -226,6 +226,12 @@ def test_wrong_input_is_refused_in_one_line(words: list[str], said: str, capsys:
     assert said in text
 
 
+def test_an_entry_of_a_policy_that_is_not_here_cannot_be_checked(entry: Entry) -> None:
+    entry["scheme"] = {"policy": "moon"}
+    with pytest.raises(ConfigError, match="--package"):
+        checked(entry)
+
+
 @pytest.mark.parametrize(
     "broken",
     [
@@ -293,11 +299,13 @@ def test_ranks_are_what_pairs_of_flights_leave_open() -> None:
         made_up("all-knowing", [age / 9 for age in base], kind="bound"),
     ]
     found = standings(LEAGUE, entries)
-    assert [place.name for place in found] == ["all-knowing", "good", "middle", "same", "worst"]
+    assert [place.name for place in found] == ["good", "middle", "same", "worst", "all-knowing"]
     assert [(place.rank, place.first, place.last) for place in found] == [
-        (None, None, None), (1, 1, 1), (2, 2, 3), (3, 2, 3), (4, 4, 4),
+        (1, 1, 1), (2, 2, 3), (3, 2, 3), (4, 4, 4), (None, None, None),
     ]  # fmt: skip
     assert standings(LEAGUE, entries[::-1]) == found
+    entries[2] = made_up("good", [age * 0.5 for age in base], crashed=1)  # one flight more decides nothing
+    assert standings(LEAGUE, entries)[0].name == "good"
 
 
 def test_a_lost_flight_counts_with_the_cells_age() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.experiments.batch.pool import run_all
 
@@ -44,6 +45,11 @@ def check_entry(
     :raises ConfigError: if its policy is not here.
     """
     differences = [*sums(there, entry), *_seeds(there, entry, word)]
+    policy = entry["scheme"].get("policy")
+    if policy not in POLICIES.rows and policy not in POLICIES.plug_in_names():
+        raise ConfigError(
+            "ENTRY", policy, "an entry whose policy is installed; --package flies that of a folder or wheel"
+        )
     check_scheme(entry["scheme"])
     work = work_of(entry["scheme"]["policy"])
     notes = _notes(entry, work.code(), word)

@@ -115,31 +115,33 @@ class Standing:
     """The place of an entry among others."""
 
     name: str
-    rank: int | None  # by lost flights, of equal ones by age; None: a bound
+    rank: int | None  # None: a bound
     first: int | None  # best and worst rank that the pairs of flights leave open
     last: int | None
 
 
 def standings(there: League, entries: Sequence[Mapping[str, Any]]) -> list[Standing]:
-    """Places of entries, the best first; bounds stand where they would be and have none.
+    """Places of entries, the best first, bounds at the end.
 
     An entry is ahead of another if it lost fewer flights of the same seeds (exact test of McNemar). Where that is not
     decided, it is if it has less age on the same seeds (normal test of the mean difference of logarithms, cells apart).
     All tests of all pairs are corrected together (Holm), so that all intervals of ranks hold together with 95 %.
+    The order is by how many entries are ahead, of equal ones by lost flights, then by age.
 
     :param there: the league.
     :param entries: with the same flights.
     """
     ordered = sorted(entries, key=lambda entry: (entry["summary"]["lost"], entry["summary"]["age_ms"], entry["name"]))
     ranked = [entry for entry in ordered if entry["kind"] != "bound"]
+    bounds = [Standing(entry["name"], None, None, None) for entry in ordered if entry["kind"] == "bound"]
     ahead = _ahead(there, ranked)
-    places = {}
-    for number, entry in enumerate(ranked):
-        better, worse = int(ahead[:, number].sum()), int(ahead[number].sum())
-        # A pair that is ahead by the tests may stand the other way round in the order of counts.
-        first, last = 1 + better, len(ranked) - worse
-        places[entry["name"]] = Standing(entry["name"], number + 1, min(first, number + 1), max(last, number + 1))
-    return [places.get(entry["name"]) or Standing(entry["name"], None, None, None) for entry in ordered]
+    better, worse = ahead.sum(axis=0), ahead.sum(axis=1)
+    places = []
+    for rank, number in enumerate(sorted(range(len(ranked)), key=lambda n: (better[n], n)), 1):
+        # Who is ahead of whom need not be transitive: the interval has the rank in it even so.
+        first, last = min(rank, 1 + int(better[number])), max(rank, len(ranked) - int(worse[number]))
+        places.append(Standing(ranked[number]["name"], rank, first, last))
+    return [*places, *bounds]
 
 
 def _ahead(there: League, entries: Sequence[Mapping[str, Any]]) -> NDArray[np.bool_]:

@@ -92,8 +92,9 @@ _NOTES = """<ul>
 (Wilson).</li>
 <li>Age: age from waking on, geometric mean over all flights, lost ones included with the cell's age of a lost flight.
 So schemes that lose their hardest flights gain nothing by it.</li>
-<li>Rank: by lost flights, then by age. In brackets: the ranks that are left open by all pairs of entries on the same
-seeds, all tests corrected together (Holm, 5 %).</li>
+<li>Rank: an entry is ahead of another if it lost fewer flights of the same seeds; where that is not decided, if it has
+less age on them. All tests are corrected together (Holm, 5 %). The order is by how many entries are ahead, then by lost
+flights and age. In brackets: the ranks that the tests leave open.</li>
 <li>Sums were made again from the flights of the entries. Whether the flights are right, <code>league check</code>
 says.</li>
 <li>A bound looks into all agents. Nobody can fly it.</li></ul>"""
