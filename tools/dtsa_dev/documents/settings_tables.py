@@ -25,6 +25,7 @@ from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, KINDS, Avoider
 from dtsa_agent.crazyflie.positions.motion_capture import PositionSettings
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
 from dtsa_agent.crazyflie.settings.config import BatterySettings, RobotSettings, StationSettings
+from dtsa_agent.crazyflie.settings.on_board import OnBoardSettings
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
@@ -199,6 +200,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "battery": partial(settings_table, BatterySettings),
     "station": partial(settings_table, StationSettings),
     "positions": partial(settings_table, PositionSettings),
+    "on_board": partial(settings_table, OnBoardSettings),
     "safety": partial(settings_table, SafetySettings),
     "radios": _radios,
     **{f"node {name}": partial(_node, name) for name in NODES},

@@ -191,20 +191,21 @@ static bool place(double *planes, const uint8_t *data, size_t length)
 /* What the ground says; it hears the order's letter and 1, or 0 and why not. */
 static void obey(const uint8_t *data, size_t length)
 {
+    const bool flies = guard.mode != SAFETY_OFF; /* what is said on the ground counts from the next start on */
     const char *fault = strchr("FTKDSL", data[0]) ? "length" : "order";
-    if (data[0] == ORDER_FROM && !started && place(starts, data, length)) fault = NULL;
+    if (data[0] == ORDER_FROM && !flies && place(starts, data, length)) fault = NULL;
     else if (data[0] == ORDER_TO && place(targets, data, length)) fault = NULL;
     else if (data[0] == ORDER_LAND && length == 1) ordered = 1, fault = NULL;
-    else if (data[0] == ORDER_KEY && !started && length == 1 + KEY_BYTES + sizeof session) {
+    else if (data[0] == ORDER_KEY && !flies && length == 1 + KEY_BYTES + sizeof session) {
         memcpy(key, data + 1, KEY_BYTES);
         memcpy(&session, data + 1 + KEY_BYTES, sizeof session);
         sealed = 1;
         fault = NULL;
-    } else if (data[0] == ORDER_LOTS && !started && length == 1 + sizeof lots) {
+    } else if (data[0] == ORDER_LOTS && !flies && length == 1 + sizeof lots) {
         memcpy(&lots, data + 1, sizeof lots);
         fault = NULL;
     } else if (data[0] == ORDER_START && length == 1) {
-        fault = guard.mode == SAFETY_OFF ? start() : "in flight";
+        fault = flies ? "in flight" : start();
         started = !fault;
     }
     uint8_t answer[2 + 16] = {data[0], !fault};
@@ -319,7 +320,7 @@ static void steer(const double position[3], const double place[3], int64_t now, 
     } else if (next == SAFETY_LAND && before != SAFETY_LAND) {
         land(position);
     } else if (next == SAFETY_OFF && (before == SAFETY_FLY || before == SAFETY_HOVER) &&
-               guard.reason == SAFETY_DISABLED) { /* the ground takes it back, hovering */
+               guard.reason == SAFETY_DISABLED && !view.ground) { /* the ground takes it back, hovering */
         crtpCommanderHighLevelGoTo((float)position[0], (float)position[1], (float)position[2],
                                    0.0f, 1.0f, false);
     }

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
 from dtsa_agent.crazyflie.links.ownership import Ownership
@@ -21,6 +22,20 @@ CONFIG = Path(__file__).parents[2] / "config"
 
 def swarm(**top: Any) -> dict[str, Any]:
     return {"robots": {"cf1": {"uri": "udp://127.0.0.1:19850"}}} | top
+
+
+def on_board(
+    rate: float = 5, ids: tuple[int, ...] = (1, 2), where: list[float] | None = None, **station: Any
+) -> dict[str, Any]:
+    """Two that steer themselves; other keys are those of `on_board` or of the station."""
+    given = {"swarm": {"policy": "lease", "jitter_m": 0.0, "permute": False}, "polls_hz": 10}
+    given |= {key: station.pop(key) for key in tuple(station) if key in given}
+    places = [list(make_scenario(SwarmConfig(agents=2)).start[:, k]) for k in range(2)]
+    robots = {
+        f"cf{k}": {"uri": f"udp://h:{k}", "log_rate_hz": rate, "initial_position": where or places[i]}
+        for i, k in enumerate(ids)
+    }
+    return swarm(robots=robots, station={"on_board": given, **station})
 
 
 def test_robot_beats_type_beats_all() -> None:
@@ -75,6 +90,15 @@ def test_robot_beats_type_beats_all() -> None:
         (swarm(station={"safety": {"geofence_min": [2, 0, 0]}}), "station.safety.geofence_min"),
         (swarm(station={"safety": {"command_age_s": 0.6}}), "station.safety.command_age_s"),
         (swarm(station={"safety": {"geofenze": True}}), "station.safety.geofenze"),
+        (on_board(swarm={"policy": "lease", "agents": 3}), "station.on_board.swarm.agents"),
+        (on_board(swarm={"policy": "lease", "slots": 3}), "station.on_board.swarm.slots"),
+        (on_board(swarm={"policy": "sotdma"}), "station.on_board.swarm.policy"),
+        (on_board(polls_hz=5), "station.on_board.polls_hz"),
+        (on_board(rate=8), "robots.cf1.log_rate_hz"),
+        (on_board(ids=(1, 3)), "robots.cf3"),
+        (on_board(where=[0.5, 0.0, 0.0]), "robots.cf1.initial_position"),
+        (on_board(positions={"source": "pose"}), "station.positions.source"),
+        (on_board(room_origin_in_world=[1, 0, 1]), "station.room_origin_in_world"),
     ],
 )
 def test_bad_configuration_names_the_field(data: object, field: str) -> None:

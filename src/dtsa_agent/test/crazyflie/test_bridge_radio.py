@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import queue
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,6 +21,7 @@ from metronome import flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+from dtsa_agent.crazyflie.links.radio_link import RadioPort
 from dtsa_agent.crazyflie.motion.trajectories import Piece, Trajectory
 from dtsa_agent.crazyflie.state.state_machine import State
 
@@ -106,3 +110,18 @@ def test_gaps_of_the_air(tmp_path: Path) -> None:
         assert pilot.logged("cf4: .*-> lost", began)
         pilot.bridge.land_all("test over")
         assert pilot.bridge.wait_landed(lambda: False) == []
+
+
+def test_whoever_looks_for_room_wakes_those_that_wait_for_it() -> None:
+    """cflib's own threads wait in `put`; one that slept on would hold the lock of all senders for two seconds."""
+    waiting: queue.Queue[int] = queue.Queue(1)
+    waiting.put(1)
+    port = RadioPort(SimpleNamespace(link=SimpleNamespace(out_queue=waiting)))
+    looks = threading.Thread(target=port.wait_for_room, args=(60.0,), daemon=True)
+    puts = threading.Thread(target=waiting.put, args=(2, True, 60.0), daemon=True)
+    for number, thread in enumerate((looks, puts), 1):
+        thread.start()
+        wait_for(lambda number=number: len(waiting.not_full._waiters) == number)  # type: ignore[attr-defined, misc]
+    waiting.get()
+    puts.join(30.0)
+    assert not puts.is_alive()

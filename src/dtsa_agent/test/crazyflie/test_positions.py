@@ -161,10 +161,12 @@ def test_an_estimate_that_wanders_has_not_settled() -> None:
     assert "its place moves by" in settling.problem
 
 
-def flown(positions: Any, velocity: Any = (0.0, 0.0, 0.0), seen: Any = None, flying: bool = True) -> EstimateWatch:
+def flown(
+    positions: Any, velocity: Any = (0.0, 0.0, 0.0), seen: Any = None, flying: bool = True, period: float = 0.02
+) -> EstimateWatch:
     watch = EstimateWatch(0.5, 0.5, 0.4)
     for k, place in enumerate(positions):
-        watch.update(VehicleState(place, velocity, LEVEL, 4.0, 0), 0.02 * k, seen, flying=flying)
+        watch.update(VehicleState(place, velocity, LEVEL, 4.0, 0), period * k, seen, flying=flying)
     return watch
 
 
@@ -175,6 +177,8 @@ def test_jumps_standstill_and_errors_in_flight_are_noticed() -> None:
     assert "though it moved by 0.1" in flown(still[:20], (1.0, 0.0, 0.0)).wrong
     moving = [(0.02 * k, 0.0, 1.0) for k in range(50)]
     assert flown(moving, (1.0, 0.0, 0.0)).wrong == ""
+    seldom = [(0.25 * k, 0.0, 1.0) for k in range(10)]  # as with the lowest log_rate_hz
+    assert flown(seldom, (1.0, 0.0, 0.0), period=0.25).wrong == ""
     assert "m from where motion capture sees it" in flown(moving, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)).wrong
     assert flown(still, flying=False).wrong == ""
     assert flown([(0.0, 0.0, 0.03)] * 50).wrong == ""  # it may be about to stand

@@ -46,6 +46,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--simulated-radio", type=Path, metavar="SOCKET",
         help="real time, with simulated Crazyradios for `bridge`, `sniff` and others with --simulated-radio SOCKET",
     )  # fmt: skip
+    parser.add_argument(
+        "--no-ground", action="store_true",
+        help=f"with {PROTOCOL} and --simulated-radio: `bridge` or another program prepares, takes off and enables",
+    )  # fmt: skip
     parser.add_argument("--dongles", type=int, default=2, metavar="X", help="number of these [2]")
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
 
@@ -73,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
         name, value = next(iter(of_protocol.items()))
         raise ConfigError(name, value, f"only with {PROTOCOL}")
     live = None
+    if args.no_ground and (swarm is None or args.simulated_radio is None):
+        raise ConfigError("no_ground", True, f"only with {PROTOCOL} and --simulated-radio")
     if args.simulated_radio is not None:
         live = RadioSettings(dongles=args.dongles, path=args.simulated_radio)
         for station in stations(settings):
@@ -81,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
     summary = fly(
         place, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
         flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm, live=live,
+        ground=not args.no_ground,
     )  # fmt: skip
     console, warnings, logs = (summary.pop(key) for key in ("console", "warnings", "logs"))
     if out is not None:

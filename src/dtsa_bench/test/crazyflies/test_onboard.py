@@ -120,6 +120,17 @@ def test_the_ground_takes_a_vehicle_back_in_three_ways() -> None:
         assert lab.record.crashed == {}
 
 
+def test_a_landing_that_the_ground_orders_is_not_undone_by_the_end_of_enable() -> None:
+    with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
+        in_flight(flight)
+        lab = flight.lab
+        lab.land(1, 0.0, 2.0)
+        lab.set_parameter(1, "dtsa.enable", 0)  # before the app looks again
+        lab.run(12.5)
+        assert lab.world.vehicles.position[2, 0] < 0.05
+        assert lab.record.crashed == {}
+
+
 def test_who_hears_nobody_hovers_and_then_lands() -> None:
     with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
         in_flight(flight)

@@ -26,10 +26,11 @@ from dtsa_agent.crazyflie.positions.estimates import Settling
 from dtsa_agent.crazyflie.settings.config import RobotSettings
 from dtsa_agent.crazyflie.state.conversions import LOG_VARIABLES, Setpoint, Vector, VehicleState, decode_log
 
+from .board_orders import BoardOrders
 from .errors import LinkError
 from .estimator_reset import settle
 from .outbox import Order, Outbox, Position
-from .radio_link import ROOM_S, Heard, RadioPort, keep_links_open, packets_of
+from .radio_link import Heard, RadioPort, keep_links_open, packets_of
 
 SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only
 FIRST_ANSWER_S = 2.0  # over the air nothing else tells that nobody is there: the link stays open
@@ -138,7 +139,9 @@ class Link:
         self._heard = Heard()
         self._log_block: Any = None
         self._log_ordered = 0.0  # s, monotonic
+        self._log_order_s = LOG_ORDER_S
         self._reopen = False
+        self.board: BoardOrders | None = None  # what the app on board is told; None: there is none
         self.guarded = False  # the firmware's emergency watchdog wants to be fed as soon as it can be
         self.reopened = 0  # times that a link which had ended by itself was opened again
         self._thread = threading.Thread(target=self._work, name=f"{robot.name}-worker", daemon=True)
@@ -167,7 +170,7 @@ class Link:
         radio = self._radio
         if radio is None or not self.connected:
             return False
-        return self._heard.age(time.monotonic()) > STUCK_S or not radio.wait_for_room(ROOM_S)
+        return self._heard.age(time.monotonic()) > STUCK_S or not radio.has_room
 
     def _send_past(self) -> None:
         """Nothing can be sent as usual: the next order goes past what waits, blindly. Streamed commands wait."""
@@ -288,6 +291,8 @@ class Link:
                 cf.param.set_value(name, value)
             except (KeyError, AttributeError) as error:  # noqa: PERF203
                 raise LinkError(f"firmware parameter {name}: {error}") from error
+        if self.board is not None and not again:
+            self.board.prepare(cf)
         if self.robot.reset_estimator and not again:
             settle(cf, self._settling, self._seen, self.outbox.take_position, self.robot.estimator_timeout_s)
         self.firmware = _firmware(cf)
@@ -295,7 +300,33 @@ class Link:
         if radio is not None:
             cf.link_statistics.latency.stop()  # its pings would wait behind a stuck packet, and have the link closed
         self._radio = radio
+        if again and self.board is not None:
+            self._spare_air()
         self.connected = True
+
+    def start_agent(self, done: Callable[[str], None]) -> None:
+        """Start the agent on board; `done` is called with an empty text, or with why it does not start.
+
+        From then on the bridge asks seldom: its packets take air from the agents.
+        """
+
+        def start(cf: Any) -> None:
+            assert self.board is not None
+            try:
+                self.board.start(cf)
+            except LinkError as error:
+                done(str(error))
+            else:
+                self._spare_air()
+                done("")
+
+        self.order(start, background=True)
+
+    def _spare_air(self) -> None:
+        if self._radio is not None and self.board is not None:
+            self._radio.limit(self.board.polls_hz)
+            # An order takes some packets of each way, and the log comes seldom.
+            self._log_order_s = LOG_ORDER_S + 1.0 / self.robot.log_rate_hz + 5.0 / self.board.polls_hz
 
     def _watch(self, cf: Any, again: bool) -> _Opening:
         """Takes note of all that cflib says about a connection, from its threads.
@@ -382,7 +413,7 @@ class Link:
     def order_log(self, now: float) -> None:
         """Order the log anew, if it can be heard now (s, monotonic): the firmware ends it in a gap of a second."""
         heard = self._heard
-        if heard.age(now) > STUCK_S or now - max(heard.logged, heard.since, self._log_ordered) < LOG_ORDER_S:
+        if heard.age(now) > STUCK_S or now - max(heard.logged, heard.since, self._log_ordered) < self._log_order_s:
             return
         self._log_ordered = now
 

@@ -86,6 +86,7 @@ class RadioPort:
     def __init__(self, cf: Any) -> None:
         self._driver = cf.link
         self._instance: Any = None
+        self._room_s = ROOM_S
 
     @classmethod
     def of(cls, cf: Any) -> RadioPort | None:
@@ -94,11 +95,29 @@ class RadioPort:
 
         return cls(cf) if isinstance(cf.link, RadioDriver) else None
 
+    def limit(self, polls_hz: float) -> None:
+        """From now on at most so many packets a second go to the Crazyflie.
+
+        :param polls_hz: Hz.
+        """
+        thread = self._driver._thread
+        if thread is not None:
+            thread.rate_limit = polls_hz  # it sleeps for that long after each acknowledgement
+        self._room_s = ROOM_S + 2.0 / polls_hz
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the driver can take a packet; waits for a while."""
+        return self.wait_for_room(self._room_s)
+
     def wait_for_room(self, seconds: float) -> bool:
         """Wait until the driver can take a packet; False when it still cannot after so many seconds."""
         waiting: queue.Queue[Any] = self._driver.out_queue
         with waiting.not_full:
-            return waiting.not_full.wait_for(lambda: waiting._qsize() < waiting.maxsize, seconds)
+            there = waiting.not_full.wait_for(lambda: waiting._qsize() < waiting.maxsize, seconds)
+            if there:  # the room is not taken here: a thread of cflib's that waits for it would sleep on, for 2 s
+                waiting.not_full.notify()
+            return there
 
     def send(self, cf: Any, packets: Sequence[bytes]) -> bool:
         """Send packets one after the other; False when there was no room for one: the rest was sent past it.
@@ -108,7 +127,7 @@ class RadioPort:
         from cflib.crtp.crtpstack import CRTPPacket
 
         for number, packet in enumerate(packets):
-            if not self.wait_for_room(ROOM_S):
+            if not self.has_room:
                 self.send_past(packets[number:])
                 return False
             cf.send_packet(CRTPPacket(packet[0], packet[1:]))

@@ -6,8 +6,13 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.scenario import make_scenario
+from dtsa_agent.crazyflie.links.board_orders import BoardOrders
 from dtsa_agent.crazyflie.links.emergency_radio import EmergencyRadio
 from dtsa_agent.crazyflie.links.link import require_cflib
 from dtsa_agent.crazyflie.links.ownership import Ownership
@@ -15,12 +20,14 @@ from dtsa_agent.crazyflie.motion.limits import room_of
 from dtsa_agent.crazyflie.safety.landing_places import SINK, Descent, LandingPlaces, Other
 from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
 from dtsa_agent.crazyflie.settings.config import SwarmSettings
+from dtsa_agent.crazyflie.settings.on_board import KEY_BYTES, orders, parameters
 from dtsa_agent.crazyflie.settings.radio_budget import WATCHDOG_HZ, check_budget, radio_loads
 from dtsa_agent.crazyflie.state.conversions import VehicleState
 from dtsa_agent.crazyflie.state.state_machine import IN_AIR, State
 from dtsa_agent.crazyflie.vehicle.reports import snapshot, watched
 from dtsa_agent.crazyflie.vehicle.snapshot import Snapshot
 from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
+from dtsa_agent.keys import VARIABLE, authenticator, check_session
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
@@ -64,6 +71,7 @@ class Bridge:
         cache.mkdir(parents=True, exist_ok=True)
         self._landing_places = LandingPlaces(*room_of(station))
         self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state, self._descent) for r in settings.robots}
+        self._prepare_boards()
         self.emergency = EmergencyRadio([r.uri for r in settings.robots], log)
         self.monitor = SafetyMonitor(station.safety)
         self._heartbeat: float | None = None
@@ -89,6 +97,33 @@ class Bridge:
                 pass
         return [v.name for v in vehicles if v.state in (State.DISCONNECTED, State.CONNECTING)]
 
+    def _prepare_boards(self) -> None:
+        """What agents on board are told, where they steer."""
+        if (swarm := self.settings.swarm) is None:
+            return
+        check_session(swarm)
+        found = authenticator(swarm)
+        scenario, station = make_scenario(swarm), self.settings.station
+        key = b"" if found is None else found.key_and_session[0]
+        if found is not None and len(key) != KEY_BYTES:
+            raise ConfigError(VARIABLE, f"{len(key)} bytes", f"{KEY_BYTES} bytes on board")
+        values = parameters(swarm, scenario, station.room_origin_in_world[2])
+        for vehicle in self.vehicles.values():
+            own = {name: vehicle.robot.firmware_params.get(name, value) for name, value in values.items()}
+            vehicle.link.board = BoardOrders(own, orders(swarm, scenario, key), station.on_board.polls_hz)
+
+    def start_agents(self, names: Iterable[str] | None = None) -> str:
+        """Start the agents on board of those that are connected, all at once; why some do not start, or an empty text.
+
+        :param names: whose; None: those of all.
+        """
+        vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
+        vehicles = [v for v in vehicles if v.link.connected and v.link.board is not None]
+        problems: SimpleQueue[str] = SimpleQueue()
+        for vehicle in vehicles:
+            vehicle.link.start_agent(lambda text, name=vehicle.name: problems.put(text and f"{name}: {text}"))  # type: ignore[misc]
+        return "; ".join(filter(None, (problems.get() for _ in vehicles)))
+
     @property
     def connected(self) -> int:
         """Number of connected Crazyflies."""
@@ -105,8 +140,14 @@ class Bridge:
                 )
             if state not in (State.LOST, State.DISCONNECTED, State.EMERGENCY):
                 return f"{name} is {state.name.lower()}"
-            vehicle.connect(lambda: None)
+            vehicle.connect(partial(self._rejoin, name))
         return ""
+
+    def _rejoin(self, name: str) -> None:
+        """It is connected again, or not: its agent on board starts anew, in the link's worker."""
+        vehicle = self.vehicles[name]
+        if vehicle.link.connected and vehicle.link.board is not None:
+            vehicle.link.start_agent(lambda text: self._log("error", f"{name}: {text}") if text else None)
 
     # -- orders to several ------------------------------------------------------------------------------------------
     def each(self, names: Iterable[str], order: Callable[[Vehicle], str | None]) -> tuple[bool, str]:

@@ -123,6 +123,8 @@ class BridgeNode(Node):
         teleop = str(self.declare_parameter("teleop", "", TELEOP_DESCRIPTOR).value)
         if teleop not in ("", *(robot.name for robot in settings.robots)):
             raise ConfigError("teleop", teleop, "one of " + ", ".join(robot.name for robot in settings.robots))
+        if teleop and settings.station.on_board.on:
+            raise ConfigError("teleop", teleop, "nobody with on_board: the agents on board steer")
         safety = safety_parameters(self, settings.station.safety)
         positions = position_parameters(self, settings.station.positions)
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
@@ -177,6 +179,11 @@ class BridgeNode(Node):
             self.say("warn", f"not connected: {', '.join(missing)} (service reconnect)")
         if self.bridge.connected < self.settings.station.min_connected:
             return f"{self.bridge.connected} connected, min_connected is {self.settings.station.min_connected}"
+        if self.settings.station.on_board.on:
+            if problem := self.bridge.start_agents():
+                return problem
+            rate = self.settings.station.on_board.polls_hz
+            self.say("info", f"agents started on board; from now on {rate:g} packets a second to each")
         self._inputs.offer()
         self.create_timer(1.0 / STATUS_HZ, lambda: self.outputs.publish_status(self.bridge.snapshots()))
         self.create_timer(1.0, lambda: self.outputs.publish_diagnostics(self.bridge.snapshots()))

@@ -40,8 +40,9 @@ class CommandThread:
         self._subscriptions.append((subscription.handle, kind, callback))
 
     def start(self) -> None:
-        """Begin."""
-        self._thread.start()
+        """Begin, if there is something to take."""
+        if self._subscriptions:
+            self._thread.start()
 
     def close(self) -> None:
         """End of the thread."""

@@ -16,7 +16,7 @@ from geometry_msgs.msg import Point, TwistStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Empty as EmptyMsg
-from std_srvs.srv import Empty, Trigger
+from std_srvs.srv import Empty, SetBool, Trigger
 
 from dtsa_agent.crazyflie.motion.limits import check_stream
 from dtsa_agent.crazyflie.motion.steering import steered
@@ -92,18 +92,20 @@ class Inputs:
         self._say = say
         self._node, self._bridge, self._commands = node, bridge, commands
         self._origin = bridge.settings.station.room_origin_in_world
+        self._on_board = bridge.settings.station.on_board.on
         self.teleop = ""  # name of the vehicle that a person steers; empty: of none
 
     def offer(self) -> None:
         """Create everything; `/all/emergency` is last: whoever waits for it knows that everything else is there."""
+        streams = (
+            (self.types.full_state, "cmd_full_state", self._full_state),
+            (self.types.position, "cmd_position", self._position),
+            (self.types.velocity_world, "cmd_velocity_world", self._velocity_world),
+            (self.types.hover, "cmd_hover", self._hover),
+        )
         for vehicle in self._bridge.vehicles.values():
             name = vehicle.name
-            for kind, topic, callback in (
-                (self.types.full_state, "cmd_full_state", self._full_state),
-                (self.types.position, "cmd_position", self._position),
-                (self.types.velocity_world, "cmd_velocity_world", self._velocity_world),
-                (self.types.hover, "cmd_hover", self._hover),
-            ):
+            for kind, topic, callback in () if self._on_board else streams:  # agents on board steer themselves
                 self._commands.subscribe(
                     kind, f"{name}/{topic}", partial(self._command, vehicle, callback), LATEST_ONLY
                 )
@@ -128,7 +130,9 @@ class Inputs:
 
     def _services(self) -> list[tuple[Any, str, Callable[[list[str], Any, Any], Any]]]:
         """Type, name and callback of each service that takes an order to one or all; `emergency` is the last."""
+        enable = [(SetBool, "enable", self._enable)] if self._on_board else []
         return [
+            *enable,
             (self.types.takeoff, "takeoff", self._takeoff),
             (self.types.land, "land", self._land),
             (self.types.go_to, "go_to", self._go_to),
@@ -251,6 +255,9 @@ class Inputs:
 
     def _arm(self, names: list[str], request: Any, response: Any) -> Any:
         return self._each(names, lambda v: v.arm(request.arm), response)
+
+    def _enable(self, names: list[str], request: Any, response: Any) -> Any:
+        return self._each(names, lambda v: v.enable(request.data), response)
 
     def _notify(self, names: list[str], request: Any, response: Any) -> Any:
         valid_ms = request.remain_valid_millisecs

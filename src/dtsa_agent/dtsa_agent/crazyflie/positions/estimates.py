@@ -111,9 +111,10 @@ class EstimateWatch:
         before = last[0]
         if state.position != before.position or state.position[2] < STANDING_M:
             self._moved, self._unmoved_m = now, 0.0
-        elif state.velocity != before.velocity or state.orientation != before.orientation:
-            self._moved = now  # the place alone may stay the same, to the millimetre, unless its velocity is large
-        self._unmoved_m += math.hypot(*state.velocity) * (now - last[1])
+        else:
+            self._unmoved_m += math.hypot(*state.velocity) * (now - last[1])
+            if state.velocity != before.velocity or state.orientation != before.orientation:
+                self._moved = now  # the place alone may stay the same, to the millimetre, unless its velocity is large
         if seen is None or math.dist(seen, state.position) <= self.error_m:
             self._agreed = now
         if self.wrong:

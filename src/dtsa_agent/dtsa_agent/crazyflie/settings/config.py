@@ -21,11 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting, settings_of
-from dtsa_agent.crazyflie.positions.motion_capture import PositionSettings
+from dtsa_agent.core.settings.scenario import make_scenario
+from dtsa_agent.crazyflie.positions.motion_capture import NONE, PositionSettings
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
 from dtsa_agent.crazyflie.state.conversions import Vector
 
+from .on_board import OnBoardSettings, check_on_board
 from .radio_budget import radio_of
 
 NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*?(\d+)$")
@@ -33,6 +36,7 @@ CHANNEL = re.compile(r"radio://[^/]+/(\d+)")
 PORT = re.compile(r"udp://.*:(\d+)$")
 VARIABLE = re.compile(r"^\w+\.\w+$")
 LAST_CHANNEL, LAST_PORT = 125, 65535
+PLACE_M = 0.25  # m: an agent on board may stand this far beside its place
 SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
 # Keys that Crazyswarm2's files have and that mean nothing here: its files can be used as they are.
 IGNORED = frozenset({"motion_capture", "big_quad", "reference_frame", "broadcasts", "marker"})
@@ -183,6 +187,7 @@ class StationSettings(Settings):
         20, "real-time priority of bridge, agents and ground station, where allowed; 0: none", minimum=0, maximum=90
     )
     positions: PositionSettings = nested(PositionSettings, "positions from motion capture")
+    on_board: OnBoardSettings = nested(OnBoardSettings, "Crazyflies that steer themselves by the app on board")
     safety: SafetySettings = nested(SafetySettings, "the safety rules")
 
 
@@ -192,6 +197,20 @@ class SwarmSettings:
 
     robots: tuple[RobotSettings, ...]  # the enabled ones, by id
     station: StationSettings
+
+    @property
+    def swarm(self) -> SwarmConfig | None:
+        """What the agents on board share; None: the bridge steers.
+
+        :raises ConfigError: it is not usable.
+        """
+        given = self.station.on_board
+        if not given.on:
+            return None
+        with named("station.on_board.swarm"):
+            swarm = SwarmConfig.from_dict({**given.swarm, "agents": len(self.robots)})
+            check_on_board(swarm)
+            return swarm
 
     def radio_rates(self) -> list[tuple[str, str, float, float]]:
         """Name, URI, packets/s to and log packets/s from each robot: what `radio_loads` counts."""
@@ -248,7 +267,36 @@ def parse_swarm(data: object) -> SwarmSettings:
         station = StationSettings.from_dict(_used(_mapping("station", top.get("station"))))
     if station.min_connected > len(robots):
         raise ConfigError("station.min_connected", station.min_connected, f"1 to {len(robots)}, the enabled robots")
-    return SwarmSettings(tuple(robots), station)
+    settings = SwarmSettings(tuple(robots), station)
+    if (swarm := settings.swarm) is not None:
+        _check_swarm(settings, swarm)
+    return settings
+
+
+def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
+    """Whether robots and station fit to agents on board.
+
+    :raises ConfigError: they do not.
+    """
+    station, (x, y, _) = settings.station, settings.station.room_origin_in_world
+    rate = station.on_board.polls_hz
+    if station.positions.on:
+        allowed = f"{NONE} with on_board: poses to the Crazyflies would take their air"
+        raise ConfigError("station.positions.source", station.positions.source, allowed)
+    if x or y:
+        allowed = "0, 0, z with on_board: the app knows a height alone"
+        raise ConfigError("station.room_origin_in_world", list(station.room_origin_in_world), allowed)
+    start = make_scenario(swarm).start
+    for index, robot in enumerate(settings.robots):
+        if robot.id != index + 1:
+            raise ConfigError(f"robots.{robot.name}", robot.id, f"the ids 1 to {swarm.agents} with on_board")
+        if robot.log_rate_hz > rate / 2:
+            allowed = f"at most {rate / 2:g} Hz with on_board.polls_hz {rate:g}: a packet comes with every second poll"
+            raise ConfigError(f"robots.{robot.name}.log_rate_hz", robot.log_rate_hz, allowed)
+        place = robot.initial_position
+        if math.dist(place[:2], start[:2, index]) > PLACE_M:
+            allowed = f"within {PLACE_M} m of ({start[0, index]:.2f}, {start[1, index]:.2f}), where the swarm begins"
+            raise ConfigError(f"robots.{robot.name}.initial_position", list(place), allowed)
 
 
 def _check_numbers(uri: str) -> None:

@@ -35,6 +35,7 @@ from dtsa_agent.crazyflie.motion.limits import outside_fence
 from dtsa_agent.crazyflie.motion.paths import too_short
 from dtsa_agent.crazyflie.safety.landing_places import SINK, Descent
 from dtsa_agent.crazyflie.settings.config import RobotSettings, StationSettings
+from dtsa_agent.crazyflie.settings.on_board import ENABLE
 from dtsa_agent.crazyflie.state.conversions import Quaternion, Setpoint, Vector, VehicleState, yaw_of
 from dtsa_agent.crazyflie.state.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 
@@ -278,6 +279,8 @@ class Vehicle:
             if problem := too_short(duration, height - z, self.station.max_speed_mps):
                 return f"{self.name}: {problem}"
             self._overruled, self._moved = False, True
+            if self.station.on_board.on:  # the app had been overruled by the last landing: it has to be enabled anew
+                self.onboard.set_parameter(ENABLE, 0)
             self.controls.see_again()
             on_ground = self.state == State.ARMED
             self.machine.takeoff(f"take-off to {height:.2f} m")
@@ -289,6 +292,17 @@ class Vehicle:
                 x, y, _ = self.last.position
                 yaw = yaw_of(self.last.orientation)
                 self.fly(GO_TO, lambda cf: cf.high_level_commander.go_to(x, y, height, yaw, duration), duration)
+            return ""
+
+    def enable(self, on: bool) -> str:
+        """Let the agent on board steer, or take the controls back: it then hovers; why not, or an empty text."""
+        with self.lock:
+            if on and (problem := self.not_led()):
+                return problem
+            if on and (left := self.controls.guard_until - time.monotonic()) > 0.0:
+                return f"{self.name} still flies its take-off or go_to, for {left:.1f} s"
+            self._log("info", f"{self.name}: the agent on board {'may steer' if on else 'may not steer any more'}")
+            self.onboard.set_parameter(ENABLE, int(on))
             return ""
 
     def go_to(self, place: tuple[float, float, float], yaw: float, duration: float, relative: bool) -> str:

@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 import dtsa_agent
-from dtsa_agent.air.datagram import check_fits, header_of
-from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings.scenario import policy_key
+from dtsa_agent.crazyflie.settings.on_board import KEY_BYTES, PORT, START, check_on_board, orders, parameters
 from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
 from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 
@@ -27,24 +25,17 @@ from .record import Observer
 from .settings import LabSettings
 
 APP = Path(dtsa_agent.__file__).parent / "onboard"
-MOST = 20  # agents: BOARD_AGENTS of board.h
-_POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
 _OPENED, _HEARD = struct.Struct("<4B3q2HI13d60s"), struct.Struct("<4B2q60s")  # onboard/watch.c
 _ORDER_S = 0.02  # from one packet of the app channel to the next
 _CLIMB_S = 3.0
-_KEY_BYTES = 16
-_MARGIN_M = 0.8  # of the box around all places
 HEIGHT_M = 1.2  # of the frame map above the floor
 _UP = np.array([[0.0], [0.0], [HEIGHT_M]])
-FLIGHT_US = 1500
-# Named as that of a computer with a Crazyradio: they are on one air, and datagrams begin alike.
-_PORT = PortProperties("crazyradio", FLIGHT_US * 1000, 0, agreed_bytes=2, peers=0, longest=60, bare_sealed=True)
 
 
 class _P2P:
     """The port of a Crazyflie, for the bag."""
 
-    properties, where = _PORT, "peer to peer"
+    properties, where = PORT, "peer to peer"
 
     def to_dict(self) -> dict[str, Any]:
         """No settings."""
@@ -107,24 +98,6 @@ class _Flight:
         self._recorder.__exit__()
 
 
-def _begin(swarm: SwarmConfig) -> int:
-    """Slot in which all begin together with a policy that nobody can join; 0: they need not."""
-    return 0 if swarm.policy_row.may_join else 4 * swarm.anchor_every * swarm.agents
-
-
-def check_on_board(swarm: SwarmConfig) -> None:
-    """Refuses a swarm that the app cannot be.
-
-    :param swarm: what all agents share.
-    :raises ConfigError: if it cannot.
-    """
-    if swarm.agents > MOST:
-        raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
-    if swarm.policy not in _POLICIES:
-        raise ConfigError("policy", swarm.policy, ", ".join(_POLICIES))
-    check_fits(swarm, _PORT)
-
-
 class OnBoard(Observer):
     """A swarm that flies the protocol on board, and its ground.
 
@@ -134,6 +107,7 @@ class OnBoard(Observer):
     :param key: 16 bytes, of sealed frames.
     :param enable_s: s, when the agents may steer.
     :param radio: dongles that are on the air, too; None: none.
+    :param ground: it is played here; else a program on the air tells the apps what to do.
     :raises ConfigError: for a swarm that the app cannot be.
     """
 
@@ -145,10 +119,11 @@ class OnBoard(Observer):
         key: bytes = b"",
         enable_s: float = 8.0,
         radio: RadioSide | None = None,
+        ground: bool = True,
     ) -> None:
         check_on_board(swarm)
-        if swarm.auth and len(key) != _KEY_BYTES:
-            raise ConfigError("key", len(key) or "none", f"{_KEY_BYTES} bytes on board")
+        if swarm.auth and len(key) != KEY_BYTES:
+            raise ConfigError("key", len(key) or "none", f"{KEY_BYTES} bytes on board")
         self.swarm, self.scenario = swarm, make_scenario(swarm)
         start = np.array(self.scenario.start)
         start[2] = 0.0  # on the floor
@@ -158,7 +133,7 @@ class OnBoard(Observer):
             None if out is None else _Flight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
         ]
         self._key = key
-        for agent in range(1, swarm.agents + 1):
+        for agent in range(1, swarm.agents + 1) if ground else ():
             self.lab.at(settings.boot_s + 0.1, lambda agent=agent: self.prepare(agent))  # type: ignore[misc]
             height = HEIGHT_M + float(self.scenario.start[2, agent - 1])
             self._at(enable_s - _CLIMB_S - 0.5, self.lab.take_off, agent, height, _CLIMB_S)
@@ -172,28 +147,10 @@ class OnBoard(Observer):
 
         :param agent: id of one that has just been switched on.
         """
-        lab, swarm, scenario, now = self.lab, self.swarm, self.scenario, self.lab.time
-        header = int.from_bytes(header_of(swarm, _PORT) or b"\0\0", "little")
-        values: dict[str, float] = {
-            "agents": swarm.agents, "policy": _POLICIES.index(swarm.policy), "header": header, "steps": swarm.steps,
-            "beginSlot": _begin(swarm),
-            "slotUs": swarm.slot_ns // 1000, "flightUs": FLIGHT_US, "seed": swarm.seed, "height": HEIGHT_M,
-        }  # fmt: skip
-        places = np.concatenate((scenario.start, scenario.target), axis=1) + _UP
-        for axis, least, most in zip(
-            "XYZ", places.min(axis=1) - _MARGIN_M, places.max(axis=1) + _MARGIN_M, strict=True
-        ):
-            values |= {f"low{axis}": float(least), f"high{axis}": float(most)}
-        for name, value in values.items():
-            lab.set_parameter(agent, f"dtsa.{name}", value)
-        orders = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]
-        for letter, places in ((b"F", scenario.start), (b"T", scenario.target)):
-            for k in range(swarm.agents):
-                orders.append(letter + struct.pack("<B3d", k + 1, *(float(places[i, k]) for i in range(3))))
-        if swarm.auth:
-            orders.append(b"K" + self._key + struct.pack("<Q", swarm.auth_session))
-        orders.append(b"S")
-        for i, order in enumerate(orders):
+        lab, now = self.lab, self.lab.time
+        for name, value in parameters(self.swarm, self.scenario, HEIGHT_M).items():
+            lab.set_parameter(agent, name, value)
+        for i, order in enumerate([*orders(self.swarm, self.scenario, self._key), START]):
             self._at(now + 0.1 + i * _ORDER_S, lab.send, agent, order)
 
     def mute(self, agent: int) -> None:

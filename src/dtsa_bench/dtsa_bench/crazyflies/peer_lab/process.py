@@ -38,6 +38,7 @@ def fly(
     out: Path | None = None,
     swarm: Mapping[str, Any] | None = None,
     live: RadioSettings | None = None,
+    ground: bool = True,
 ) -> dict[str, Any]:
     """Fly an app; the summary, with `console` (what the apps printed), `warnings` (compiler, sanitizers), `logs`.
 
@@ -49,6 +50,7 @@ def fly(
     :param out: directory for files.
     :param swarm: settings of the swarm that flies the protocol on board; None: the app is another one.
     :param live: dongles for the ground's programs, and real time; None: virtual time.
+    :param ground: with a swarm: it is played here; else one of those programs does that.
     :raises ConfigError: a setting is not usable. :raises CompileError: the app does not compile.
     :raises AppError: an app crashed, or did what no app may do.
     """
@@ -60,6 +62,7 @@ def fly(
         "parameters": dict(parameters or {}), "out": None if out is None else str(out),
         "swarm": None if swarm is None else dict(swarm),
         "live": None if live is None else {"path": str(live.path), "dongles": live.dongles},
+        "ground": ground,
     }  # fmt: skip
     command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
     environment = {**os.environ, **sanitizer_environment(app)}
@@ -98,7 +101,8 @@ def _serve(request: dict[str, Any]) -> dict[str, Any]:
     if request["swarm"] is not None:
         from .onboard import OnBoard  # recordings: others do without
 
-        flight = OnBoard(SwarmConfig.from_dict(request["swarm"]), settings, out, radio=side)
+        swarm = SwarmConfig.from_dict(request["swarm"])
+        flight = OnBoard(swarm, settings, out, radio=side, ground=request["ground"])
         lab, finish = flight.lab, flight.finish
     else:
         lab = Laboratory(app, settings, out, radio=side)

@@ -1,0 +1,109 @@
+"""The protocol on board of Crazyflies: its settings, and what the ground tells each one's app before it starts.
+
+The app is in `dtsa_agent/onboard`; what its parameters and orders mean stands in docs/how-to/on-board.md.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dtsa_agent.air.datagram import check_fits, header_of
+from dtsa_agent.air.port import PortProperties
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.settings.declaration import Settings, check, setting
+from dtsa_agent.core.settings.scenario import Scenario, policy_key
+
+MOST = 20  # agents: BOARD_AGENTS of board.h
+POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
+KEY_BYTES = 16
+FLIGHT_US = 1500
+ENABLE = "dtsa.enable"
+START = b"S"
+#: Named as that of a computer with a Crazyradio: they are on one air, and datagrams begin alike.
+PORT = PortProperties("crazyradio", FLIGHT_US * 1000, 0, agreed_bytes=2, peers=0, longest=60, bare_sealed=True)
+_MARGIN_M = 0.8  # of the box around all places
+
+
+@dataclass(frozen=True, slots=True)
+class OnBoardSettings(Settings):
+    """Crazyflies that steer themselves.
+
+    :raises ConfigError: a value is out of range.
+    """
+
+    swarm: Mapping[str, Any] = setting(
+        {}, "settings of the swarm, as for `dtsa simulate`, without `agents`; empty: nobody steers itself",
+        kind="structure",
+    )  # fmt: skip
+    polls_hz: float = setting(
+        10.0, "packets a second to each Crazyflie from the start of its agent on: they take air from the agents",
+        unit="Hz", minimum=10, maximum=100,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check(self)
+        if not isinstance(self.swarm, Mapping):
+            raise ConfigError("swarm", self.swarm, "names with values")
+        if "agents" in self.swarm:
+            raise ConfigError("swarm.agents", self.swarm["agents"], "nothing: the robots of the file are the agents")
+
+    @property
+    def on(self) -> bool:
+        """Whether the Crazyflies steer themselves."""
+        return bool(self.swarm)
+
+
+def check_on_board(swarm: SwarmConfig) -> None:
+    """Refuses a swarm that the app cannot be.
+
+    :param swarm: what all agents share.
+    :raises ConfigError: if it cannot.
+    """
+    if swarm.agents > MOST:
+        raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
+    if swarm.policy not in POLICIES:
+        raise ConfigError("policy", swarm.policy, ", ".join(POLICIES))
+    check_fits(swarm, PORT)
+
+
+def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[str, float]:
+    """The app's parameters of a swarm, by their full names; it may not steer yet.
+
+    :param swarm: what all agents share.
+    :param scenario: starts and goals; the app lands outside of the box around them.
+    :param height: m, of the frame map's origin above the floor.
+    """
+    values: dict[str, float] = {
+        "enable": 0, "agents": swarm.agents, "policy": POLICIES.index(swarm.policy),
+        "header": int.from_bytes(header_of(swarm, PORT) or b"\0\0", "little"), "steps": swarm.steps,
+        # In this slot all begin together with a policy that nobody can join.
+        "beginSlot": 0 if swarm.policy_row.may_join else 4 * swarm.anchor_every * swarm.agents,
+        "slotUs": swarm.slot_ns // 1000, "flightUs": FLIGHT_US, "seed": swarm.seed, "height": height,
+    }  # fmt: skip
+    places = np.concatenate((scenario.start, scenario.target), axis=1) + np.array([[0.0], [0.0], [height]])
+    low, high = places.min(axis=1) - _MARGIN_M, places.max(axis=1) + _MARGIN_M
+    for axis, least, most in zip("XYZ", low.tolist(), high.tolist(), strict=True):
+        values |= {f"low{axis}": least, f"high{axis}": most}
+    return {f"dtsa.{name}": value for name, value in values.items()}
+
+
+def orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[bytes]:
+    """Packets of the app channel before the start: draw of lots, everybody's places, key.
+
+    :param swarm: what all agents share.
+    :param scenario: starts and goals.
+    :param key: 16 bytes, where frames are sealed.
+    """
+    found = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]
+    for letter, places in ((b"F", scenario.start), (b"T", scenario.target)):
+        for k in range(swarm.agents):
+            found.append(letter + struct.pack("<B3d", k + 1, *(float(places[i, k]) for i in range(3))))
+    if swarm.auth:
+        found.append(b"K" + key + struct.pack("<Q", swarm.auth_session))
+    return found

@@ -1,0 +1,185 @@
+"""Integration: agents on board and the bridge on one air: take-off, enabling, emergency and landing by CRTP."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("cflib")
+pytest.importorskip("rclpy")
+pytest.importorskip("dtsa_msgs.srv")
+
+from builtin_interfaces.msg import Duration
+from dtsa_msgs.msg import Status
+from dtsa_msgs.srv import Arm, Takeoff
+from node_helpers import Graph, ros_graph
+from std_srvs.srv import Empty, SetBool
+from waiting import wait_for
+
+from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+from dtsa_bench.crazyflies.peer_lab.compiling import compiler
+from dtsa_bench.recordings.merge.agent_bag import read
+from dtsa_bench.recordings.merge.merge import Merge, verified
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.ros,
+    pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler"),
+]
+
+NAMES = ("cf1", "cf2", "cf3")
+SWARM = {"policy": "lease", "slot_ms": 20.0, "axis_x_m": 0.8, "axis_y_m": 0.8, "jitter_m": 0.0, "permute": False}
+CONFIG = SwarmConfig.from_dict({**SWARM, "agents": len(NAMES)})
+FLOOR_M = 0.6  # below the frame map
+URI = "radio://{}/80/2M"
+
+
+def swarm_yaml(folder: Path) -> Path:
+    start = make_scenario(CONFIG).start
+    robots = {
+        name: {
+            "uri": f"{URI.format(0)}/E7E7E7E70{k + 1}",
+            "initial_position": [float(start[0, k]), float(start[1, k]), 0.0],
+        }
+        for k, name in enumerate(NAMES)
+    }
+    station = {
+        "on_board": {"swarm": SWARM, "polls_hz": 10},
+        "room_origin_in_world": [0.0, 0.0, FLOOR_M],
+        "toc_cache": str(folder / "cache"),
+        "land_speed_mps": 1.0,
+        "safety": {"link_age_s": 3.0, "emergency_watchdog": False},  # on a machine that is busy with other tests
+    }
+    path = folder / "swarm.yaml"
+    path.write_text(yaml.safe_dump({"robots": robots, "all": {"log_rate_hz": 4}, "station": station}))
+    return path
+
+
+@contextmanager
+def laboratory(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """Three vehicles on the floor, each with the app, and dongles; nobody plays the ground."""
+    place = folder / "radio"
+    request = {
+        "place": "beacons", "sources": [], "include": [], "flags": [], "parameters": {}, "out": str(folder),
+        "seconds": 600.0, "settings": {"agents": len(NAMES), "boot_s": 0.1}, "swarm": CONFIG.to_dict(),
+        "live": {"path": str(place), "dongles": 3}, "ground": False,
+    }  # fmt: skip
+    command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None
+    try:
+        process.stdin.write(json.dumps(request))
+        process.stdin.close()
+        process.stdin = None
+        wait_for(lambda: place.exists() or process.poll() is not None)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+class Operator:
+    """Calls services, and knows the states."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.states: dict[str, str] = {}
+        for name in NAMES:
+            graph.node.create_subscription(Status, f"/{name}/status", lambda m, name=name: self._keep(name, m), 10)  # type: ignore[misc]
+
+    def _keep(self, name: str, message: Status) -> None:
+        self.states[name] = message.state_name
+
+    def until(self, *states: str) -> None:
+        self.graph.until(lambda: tuple(map(self.states.get, NAMES)) == states)
+
+    def call(self, kind: Any, name: str, **fields: Any) -> None:
+        client = self.graph.node.create_client(kind, name)
+        self.graph.until(client.service_is_ready)
+        answer = self.graph.ask(client, kind.Request(**fields))
+        assert getattr(answer, "success", True), answer
+
+    def enable(self) -> None:
+        """As soon as the take-off is over; before that the bridge refuses."""
+        client = self.graph.node.create_client(SetBool, "/all/enable")
+        self.graph.until(client.service_is_ready)
+        assert "still flies its take-off" in self.graph.ask(client, SetBool.Request(data=True)).message
+        self.graph.until(lambda: self.graph.ask(client, SetBool.Request(data=True)).success)
+
+
+def events(folder: Path) -> list[dict[str, Any]]:
+    """What happened to vehicles, in truth."""
+    lines = map(json.loads, (folder / "truth.jsonl").read_text().splitlines())
+    return [line for line in lines if "event" in line]
+
+
+def arrived(folder: Path) -> bool:
+    """Whether all are where they wanted to be."""
+    lines = (folder / "truth.jsonl").read_text().splitlines()[:-1]
+    places = next((json.loads(line)["p"] for line in reversed(lines) if '"p"' in line), None)
+    goal = np.array(make_scenario(CONFIG).target) + np.array([[0.0], [0.0], [FLOOR_M]])
+    return places is not None and bool((np.abs(np.array(places) - goal) < 0.15).all())
+
+
+def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens(tmp_path: Path) -> None:
+    config, place = swarm_yaml(tmp_path), tmp_path / "radio"
+    dtsa = [sys.executable, "-m", "dtsa_bench"]
+    options = [f"--{key.replace('_', '-')}={value}" for key, value in SWARM.items() if not isinstance(value, bool)]
+    radio = [
+        "--air",
+        "crazyradio",
+        "--uri",
+        URI.format(2),
+        "--simulated-radio",
+        str(place),
+        "--no-seal",
+        "--json",
+    ]
+    sniff = [*dtsa, "sniff", *radio, "--agents", str(len(NAMES)), "--no-permute", *options]
+    with laboratory(tmp_path) as lab, ros_graph(tmp_path) as graph:
+        environment = {**graph.environment, SIMULATED_RADIO: str(place)}
+        listener = subprocess.Popen(sniff, stdout=subprocess.PIPE, text=True, env=os.environ | environment)
+        bridge = subprocess.Popen([*dtsa, "bridge", "--config", str(config)], env=environment)
+        graph.processes.append(bridge)
+        operator = Operator(graph)
+        try:
+            operator.until("ready", "ready", "ready")
+            assert not [name for name, _ in graph.node.get_topic_names_and_types() if "/cmd_" in name]
+            operator.call(Arm, "/all/arm", arm=True)
+            operator.until("armed", "armed", "armed")
+            operator.call(Takeoff, "/all/takeoff", height=FLOOR_M, duration=Duration(sec=1, nanosec=200_000_000))
+            operator.until("flying", "flying", "flying")
+            operator.enable()
+            wait_for(lambda: arrived(tmp_path))
+            operator.call(Empty, "/cf3/emergency")
+            operator.until("flying", "flying", "emergency")
+            bridge.send_signal(signal.SIGINT)
+            assert bridge.wait(60) == 0
+            listener.send_signal(signal.SIGINT)
+            heard = json.loads(listener.communicate(timeout=60)[0])
+            lab.send_signal(signal.SIGINT)
+            summary = json.loads(lab.communicate(timeout=60)[0])
+        finally:
+            for process in (bridge, listener):
+                process.kill()
+                process.wait()
+    assert summary["crashed"] == [3]
+    assert [e["cf"] for e in events(tmp_path) if e.get("state") == "landed"] in ([1, 2], [2, 1])
+    assert summary["min_distance_m"] > 0.2
+    assert all(heard["heard"][name] > 50 for name in NAMES)
+    found = Merge([read(tmp_path / f"{name}.mcap") for name in NAMES]).judge()
+    assert verified(found)
+    assert found["decisions_again"]["differences"] == []
