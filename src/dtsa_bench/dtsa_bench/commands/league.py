@@ -122,7 +122,7 @@ def _enter(args: argparse.Namespace, there: League) -> int:
 def _say(args: argparse.Namespace, there: League, entry: dict[str, Any], entrant: Entrant, path: Path) -> int:
     """Prints what has come of an entry."""
     from dtsa_bench.experiments.batch.table import aligned
-    from dtsa_bench.experiments.league.table import figure
+    from dtsa_bench.experiments.league.table import figure, percent_text
 
     summary = entry["summary"]
     if args.json:
@@ -130,12 +130,12 @@ def _say(args: argparse.Namespace, there: League, entry: dict[str, Any], entrant
     else:
         lines = [["cell", "lost", "age ms", "on the air", "what it is"]]
         for name, cell in summary["cells"].items():
-            air = "-" if cell["air"] is None else f"{100 * cell['air']:.2f} %"
+            air = percent_text(cell["air"])
             lines.append(
                 [name, f"{cell['lost']}/{cell['flights']}", figure(cell["age_ms"]), air, there.cell(name).text]
             )
         total = f"{summary['lost']}/{summary['flights']}"
-        lines.append(["all", total, figure(summary["age_ms"]), f"{100 * summary['air']:.2f} %", ""])
+        lines.append(["all", total, figure(summary["age_ms"]), percent_text(summary["air"]), ""])
         print(aligned(lines))
         part = "complete" if entry["complete"] else "incomplete: for trying out"
         print(f"{entrant.name}: {part}, {entry['seeds']} seeds: {path}")

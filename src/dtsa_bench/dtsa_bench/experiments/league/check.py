@@ -128,7 +128,7 @@ def _notes(entry: Mapping[str, Any], code: str, word: str | None) -> list[str]:
     if policy in POLICIES.rows or policy in POLICIES.plug_in_names():
         digest = package_of(policy)["digest"]
         if digest != entry["package"].get("digest"):
-            notes.append(f"the policy's package is another one here ({digest[:16]})")
+            notes.append(f"the policy's package, or its build, is another one here ({digest[:16]})")
     return notes
 
 

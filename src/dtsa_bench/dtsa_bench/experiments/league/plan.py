@@ -47,10 +47,10 @@ class EntryPlan:
         self.source = {"league": there.name, "frozen": there.digest, "scheme": dict(scheme)}
         self.flights = list(flights)
         numbers = {cell.name: number for number, cell in enumerate(there.cells)}
-        self._tasks = [
-            self._task(there, scheme, wanted, numbers[wanted.cell])
+        self._tasks = {
+            wanted: self._task(there, scheme, wanted, numbers[wanted.cell])
             for wanted in sorted(flights, key=lambda w: (numbers[w.cell], w.k))
-        ]
+        }
 
     @staticmethod
     def _task(there: League, scheme: Mapping[str, Any], wanted: Wanted, number: int) -> Task:
@@ -60,15 +60,14 @@ class EntryPlan:
 
     def tasks(self) -> Iterator[Task]:
         """All flights, cell by cell."""
-        return iter(self._tasks)
+        return iter(self._tasks.values())
 
     def key(self, wanted: Wanted) -> str:
         """Key of the row of a flight.
 
         :param wanted: the flight.
         """
-        cell = next(number for number, label in enumerate(self.cells) if label.labels["cell"] == wanted.cell)
-        return next(task.key for task in self._tasks if (task.cell, task.seed) == (cell, wanted.seed))
+        return self._tasks[wanted].key
 
 
 def work_of(policy: str) -> Work:

@@ -62,7 +62,7 @@ def summary_of(there: League, table: Lines) -> dict[str, Any]:
         "lost_high": found.high,
         **{name: sum(line[_STATUS] == status for line in lines) for name, status in _ENDS.items()},
         **dict(zip(("age_ms", "age_low_ms", "age_high_ms"), age, strict=True)),
-        **dict(zip(("air", "air_low", "air_high"), _stratified([part for part in loads if len(part)]), strict=True)),
+        **dict(zip(("air", "air_low", "air_high"), _air([part for part in loads if len(part)]), strict=True)),
         "worst_cell": worst,
         "cells": cells,
     }
@@ -92,13 +92,16 @@ def _cell(lines: Sequence[Sequence[Any]], most: float) -> dict[str, Any]:
     }
 
 
+def _air(loads: Sequence[Array]) -> Sequence[float | None]:
+    """Time on the air with its interval; None if nothing could be flown."""
+    return _stratified(loads) if loads else (None, None, None)
+
+
 def _stratified(parts: Sequence[Array]) -> tuple[float, float, float]:
     """Mean over parts that weigh the same, and its interval from the variances within them.
 
     :param parts: values of each part; with one value alone a part has no variance.
     """
-    if not parts:
-        return 0.0, 0.0, 0.0
     mean, error = _mean_and_error(parts)
     half = NormalDist().inv_cdf(0.5 + LEVEL / 2) * error
     return mean, mean - half, mean + half

@@ -67,7 +67,7 @@ class LeagueTable:
             str(summary["crashed"]),
             f"{summary['timed_out']}" + (f" + {summary['failed']} not flown" if summary["failed"] else ""),
             f"{figure(summary['age_ms'])} ({figure(summary['age_low_ms'])}{dash}{figure(summary['age_high_ms'])})",
-            f"{100 * summary['air']:.2f} %",
+            percent_text(summary["air"]),
             f"{summary['worst_cell']}: {cell['lost']}/{cell['flights']}, {figure(cell['age_ms'])} ms",
         ]
 
@@ -121,6 +121,14 @@ def rank_text(place: Standing, dash: str = "–") -> str:
     if place.rank is None:
         return "bound"
     return f"{place.rank}" + (f" ({place.first}{dash}{place.last})" if place.first != place.last else "")
+
+
+def percent_text(share: float | None) -> str:
+    """A share in percent; a dash: there is none.
+
+    :param share: 0 to 1.
+    """
+    return "–" if share is None else f"{100 * share:.2f} %"
 
 
 def figure(value: float) -> str:
