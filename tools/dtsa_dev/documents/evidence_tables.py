@@ -285,6 +285,31 @@ def standings(directory: Path) -> str:
     )
 
 
+def board(record: Row) -> str:
+    """What came of the protocol on board with faults.
+
+    :param record: as ``soak board`` writes it.
+    """
+    head = (
+        "fault", "flown", "fell", "closest pair", "frames heard", "mean age", "slots with two senders",
+        "decisions made again, all equal",
+    )  # fmt: skip
+    rows = [
+        (
+            name,
+            f"{found['seconds']:.0f} s",
+            str(found["crashed"]),
+            f"{found['min_distance_m']:.2f} m",
+            f"{100 * found['heard_share']:.0f} %",
+            f"{found['mean_age_ms']:.0f} ms",
+            str(found["slots_with_two_senders"]),
+            f"{found['decisions_again']:,}",
+        )
+        for name, found in record["figures"].items()
+    ]
+    return f"{markdown(head, rows)}\n"
+
+
 def _plain(rows: Iterable[Row]) -> Iterable[Row]:
     return [row for row in rows if "avoider" not in row and "loss" not in row]
 
@@ -324,7 +349,7 @@ def _targets(rows: Sequence[Row]) -> str:
 QUOTED: dict[str, Callable[[Row], str]] = {
     "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again, "losses": losses,
     "mutants": mutants, "setup": setup,
-    "serial": serial,
+    "serial": serial, "board": board,
 }  # fmt: skip
 
 

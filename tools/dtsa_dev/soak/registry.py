@@ -16,6 +16,7 @@ SOAKS = {
     "crazyflie": "missions of twelve, gaps of the air, streams of commands: over UDP and simulated radios with losses",
     "air": "agents on hosts of their own over a switch that is the medium: cold starts, losses, drifts, faults",
     "serial": "agents over simulated modems: cold starts, losses, kills, partitions, modems unplugged, slow adapters",
+    "board": "twelve apps on board in the laboratory, an hour of virtual time with faults",
     "league": "every entry of league-1 flown again, whole; entries with one number changed are found",
     "losses": "losses of simulated channels learnt again: how many intervals hold what was flown",
     "view": "what a live page costs a flight, 70 agents drawn, a page left open (needs Chromium)",

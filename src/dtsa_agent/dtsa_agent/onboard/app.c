@@ -38,7 +38,7 @@ static const float DOWN_M_S = 0.4f; /* how fast it lands */
 
 /* ---- what the ground sets and sees ---- */
 
-static uint8_t mute, enable, agents = 12, policy = DTSA_POLICY_LEASE, p2pPort = 7, started;
+static uint8_t mute, enable, goalsKnown = 1, agents = 12, policy = DTSA_POLICY_LEASE, p2pPort = 7, started;
 static uint16_t headerWord = 0x5444, steps = 1;
 static uint32_t beginSlot, slotUs = 10000, flightUs = 1500, seed = 1;
 static float height = 1.0f, vMax = 1.5f, pairRadius = 0.336f, horizon = 1.0f;
@@ -106,7 +106,7 @@ static void configure(dtsa_config *c)
         .return_every = 20,
         .r_min = 0.3,
         .c_r = 1,
-        .targets_known = 1,
+        .targets_known = goalsKnown,
         .gossip = 1,
         .position_step = 0.002,
         .key = lots,
@@ -121,6 +121,13 @@ static void configure(dtsa_config *c)
         .start = places,
         .target = places + 3 * n,
     };
+}
+
+/* To where the ground has said. Where goals change in flight none is known to be the last. */
+static void fly_to(int k)
+{
+    const double goal[3] = {targets[k], targets[BOARD_AGENTS + k], targets[2 * BOARD_AGENTS + k]};
+    dtsa_agent_set_goal(agent.agent, goal, goalsKnown);
 }
 
 static const char *start(void)
@@ -142,7 +149,9 @@ static const char *start(void)
     safety_reset(&guard);
     heardLast = INT64_MIN;
     ordered = 0;
-    return board_start(&agent, &settings, now_ns());
+    const char *fault = board_start(&agent, &settings, now_ns());
+    if (!fault) fly_to(settings.id - 1);
+    return fault;
 }
 
 static void see(void)
@@ -182,9 +191,6 @@ static bool place(double *planes, const uint8_t *data, size_t length)
         if (!isfinite(at[i])) return false;
         planes[i * BOARD_AGENTS + k] = at[i];
     }
-    if (planes == targets && started && k == agent.settings.id - 1) {
-        dtsa_agent_set_goal(agent.agent, at, 1);
-    }
     return true;
 }
 
@@ -193,9 +199,13 @@ static void obey(const uint8_t *data, size_t length)
 {
     const bool flies = guard.mode != SAFETY_OFF; /* what is said on the ground counts from the next start on */
     const char *fault = strchr("FTKDSL", data[0]) ? "length" : "order";
+    const bool changes = !goalsKnown && data[0] == ORDER_TO && data[1] == agent.settings.id;
     if (data[0] == ORDER_FROM && !flies && place(starts, data, length)) fault = NULL;
-    else if (data[0] == ORDER_TO && place(targets, data, length)) fault = NULL;
-    else if (data[0] == ORDER_LAND && length == 1) ordered = 1, fault = NULL;
+    else if (data[0] == ORDER_TO && flies && !changes) fault = "goals known";
+    else if (data[0] == ORDER_TO && place(targets, data, length)) {
+        if (started && changes) fly_to(data[1] - 1);
+        fault = NULL;
+    } else if (data[0] == ORDER_LAND && length == 1) ordered = 1, fault = NULL;
     else if (data[0] == ORDER_KEY && !flies && length == 1 + KEY_BYTES + sizeof session) {
         memcpy(key, data + 1, KEY_BYTES);
         memcpy(&session, data + 1 + KEY_BYTES, sizeof session);
@@ -382,6 +392,7 @@ PARAM_ADD(PARAM_UINT8, enable, &enable)
 PARAM_ADD(PARAM_UINT8, agents, &agents)
 PARAM_ADD(PARAM_UINT8, policy, &policy)
 PARAM_ADD(PARAM_UINT8, mute, &mute) /* for trials: it sends nothing */
+PARAM_ADD(PARAM_UINT8, goalsKnown, &goalsKnown)
 PARAM_ADD(PARAM_UINT8, port, &p2pPort)
 PARAM_ADD(PARAM_UINT16, header, &headerWord)
 PARAM_ADD(PARAM_UINT16, steps, &steps)

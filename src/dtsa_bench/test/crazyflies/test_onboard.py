@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,24 @@ def test_one_is_switched_off_and_on_again_and_the_others_fly_on(tmp_path: Path) 
         assert lab.log(4, "dtsa.heard") > 50  # from the floor, it takes part
         assert [lab.log(k, "dtsa.mode") for k in (1, 2, 3, 5)] == [FLY] * 4
         flight.finish()
+    assert merged(tmp_path)["decisions_again"]["differences"] == []
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_an_agent_with_a_new_goal_is_soon_heard(known: bool, tmp_path: Path) -> None:
+    """Agents whose goal is their last give nearly all of their turns away, for good: such an agent may get no other."""
+    with OnBoard(replace(LEASE, targets_known=known), LabSettings(), tmp_path, enable_s=6.0) as flight:
+        lab = flight.lab
+        lab.run(13.0)
+        before = [lab.log(k, "dtsa.sent") for k in range(1, 6)]
+        for agent in range(1, 6):
+            flight.send_goal(agent, flight.scenario.start[:, agent - 1])
+        lab.run(13.3)
+        new = [lab.log(k, "dtsa.sent") - old for k, old in enumerate(before, 1)]
+        lab.run(13.3 if known else 15.0)
+        flight.finish()
+    assert all((data == b"T\0goals known") == known for _, _, data in lab.from_apps[-5:])
+    assert known or min(new) >= 3  # of 30 slots each has six
     assert merged(tmp_path)["decisions_again"]["differences"] == []
 
 

@@ -46,7 +46,7 @@ class _Flight:
     """What one agent has noted, and its bag."""
 
     def __init__(self, agent: int, config: SwarmConfig, path: Path) -> None:
-        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _P2P())
+        self._recorder = AgentRecorder(path, AgentSettings(id=agent), config, _P2P(), not config.targets_known)
         self._record: SlotRecord | None = None
         self._before: list[Heard] = []
         self._slots = config.steps
@@ -152,6 +152,26 @@ class OnBoard(Observer):
             lab.set_parameter(agent, name, value)
         for i, order in enumerate([*orders(self.swarm, self.scenario, self._key), START]):
             self._at(now + 0.1 + i * _ORDER_S, lab.send, agent, order)
+
+    def come_back(self, agent: int, after_s: float) -> None:
+        """One that was switched off is switched on, told all, and takes off.
+
+        :param agent: id.
+        :param after_s: s from now, when it may steer.
+        """
+        now = self.lab.time
+        self.lab.switch_on(agent)
+        self._at(now + 0.5, self.prepare, agent)
+        self._at(now + after_s - _CLIMB_S - 0.5, self.lab.take_off, agent, HEIGHT_M, _CLIMB_S)
+        self._at(now + after_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
+
+    def send_goal(self, agent: int, goal: Any) -> None:
+        """An agent's new goal, of which the others hear nothing.
+
+        :param agent: id.
+        :param goal: (3,) m, frame map.
+        """
+        self.lab.send(agent, b"T" + struct.pack("<B3d", agent, *map(float, goal)))
 
     def mute(self, agent: int) -> None:
         """No frame of an agent gets on the air any more.

@@ -43,6 +43,7 @@ class AgentBag:
     summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
     broken_off: bool = False  # the file was not finished
     unsent_kept: bool = True  # frames that were too late to be sent are in it
+    goals_told: bool = False  # it was told goals in flight: none was known to be its last
 
     @property
     def flight_ns(self) -> int:
@@ -135,7 +136,8 @@ def _metadata(file: Path, record: Metadata, bag: AgentBag | None) -> AgentBag | 
     if record.name == METADATA:
         try:
             swarm = SwarmConfig.from_dict(json.loads(values["swarm"]))
-            return AgentBag(file, int(values["id"]), swarm, _port(values), int(values["started_ns"]))
+            told = values.get("goals_told") == "yes"
+            return AgentBag(file, int(values["id"]), swarm, _port(values), int(values["started_ns"]), goals_told=told)
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise UnusableBag(file, f"its settings cannot be read ({error})") from None
     if record.name == SUMMARY and bag is not None:

@@ -89,14 +89,18 @@ class AgentRecorder(JsonBag):
     :param own: the agent.
     :param config: the settings that all agents share.
     :param port: what carries the frames.
+    :param goals_told: the agent is told goals in flight, beside those of the scenario: none is known to be its last.
     :raises BagError: if the file cannot be made.
     """
 
-    def __init__(self, path: Path, own: AgentSettings, config: SwarmConfig, port: PortSettings) -> None:
+    def __init__(
+        self, path: Path, own: AgentSettings, config: SwarmConfig, port: PortSettings, goals_told: bool = False
+    ) -> None:
         started = monotonic_ns() + own.clock_offset_ns  # own clock
         sections = {"own": own, "swarm": config}
         about = {name: json.dumps(section.to_dict(), sort_keys=True) for name, section in sections.items()}
         about |= {"id": str(own.id), "started_ns": str(started), **about_port(port)}
+        about |= {"goals_told": "yes"} if goals_told else {}
         super().__init__(path, {SLOT: SLOT_SCHEMA, REFUSED: REFUSED_SCHEMA}, METADATA, about)
         self._refused = 0  # since the last flush
         self._slots: list[SlotRecord] = []  # not written yet

@@ -177,6 +177,7 @@ def _process(life: Life, bag: AgentBag) -> dict[str, Any]:
         "last": bag.slots[-1].slot,
         "anew": [record.slot for record in bag.slots if record.anew],
         "present": present,
+        "goals_told": bag.goals_told,
         "ended_in_order": bool(bag.summary),
         "broken_off": bag.broken_off,
     }
@@ -224,6 +225,7 @@ class _Reader:
                 summary=summary,
                 broken_off=bool(said["broken_off"]),
                 unsent_kept=False,
+                goals_told=bool(said.get("goals_told")),
             )
 
     def run(self) -> MergedRun:

@@ -29,6 +29,8 @@ class Replay:
         self.agent = bag.agent
         self._unsent_kept = bag.unsent_kept
         self.swarm = make_swarm(config, make_scenario(config), local=[bag.agent])
+        if bag.goals_told:
+            self.swarm.final[:] = 0
         self._group = AgentGroup(self.swarm)
         self.equal = 0  # slots
         self.differences: list[dict[str, Any]] = []
@@ -45,6 +47,7 @@ class Replay:
         swarm.track[:, :, 0] = record.track
         swarm.position[:, 0] = record.track[-1]
         swarm.velocity[:, 0], swarm.command[:, 0] = record.velocity, record.command
+        swarm.goal[:, 0] = record.goal  # one that flies where it is told to has others than the scenario's
         if record.present != 1:
             swarm.present[0] = record.present
         self._group.on_slot(slot)
