@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +108,7 @@ class OnBoard(Observer):
     :param enable_s: s, when the agents may steer.
     :param radio: dongles that are on the air, too; None: none.
     :param ground: it is played here; else a program on the air tells the apps what to do.
+    :param flags: more of the compiler's, for the app.
     :raises ConfigError: for a swarm that the app cannot be.
     """
 
@@ -120,6 +121,7 @@ class OnBoard(Observer):
         enable_s: float = 8.0,
         radio: RadioSide | None = None,
         ground: bool = True,
+        flags: Sequence[str] = (),
     ) -> None:
         check_on_board(swarm)
         if swarm.auth and len(key) != KEY_BYTES:
@@ -128,7 +130,9 @@ class OnBoard(Observer):
         start = np.array(self.scenario.start)
         start[2] = 0.0  # on the floor
         settings = dataclasses.replace(lab, agents=swarm.agents, start=start)
-        self.lab = Laboratory(read_app(APP), settings, out, [self], radio)
+        app = read_app(APP)
+        app = dataclasses.replace(app, flags=(*app.flags, *flags))
+        self.lab = Laboratory(app, settings, out, [self], radio)
         self._flights = [
             None if out is None else _Flight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
         ]
