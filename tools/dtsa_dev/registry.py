@@ -24,7 +24,10 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "benchmark": (("--json", "all parts, as JSON"),),
     "docs": (("", "into runs/site"), ("--serve", "on http://127.0.0.1:8000, built again after each change")),
     "prove": (("", "all worlds, then the broken rules"), ("--mutants", "the broken rules only")),
-    "embedded": (("", "needs a cross compiler and QEMU, see docs/evidence/embedded.md"),),
+    "embedded": (
+        ("", "needs a cross compiler and QEMU, see docs/evidence/embedded.md"),
+        ("--board", "what a slot costs the app of Crazyflies"),
+    ),
     "protocol": (("", "all tables, into runs/protocol"), ("--seeds 3 --slots 6000", "fewer and shorter runs")),
 }
 

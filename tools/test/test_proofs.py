@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from dtsa_dev.proofs.board_cost import STACK_BYTES, fly_app_on_cortex
 from dtsa_dev.proofs.embedded import FUSING, fly_here, fly_on_cortex, fused
 from dtsa_dev.proofs.fuzz import Found, build, fuzz
 from dtsa_dev.proofs.library import LIBRARY, NotHere
@@ -53,6 +54,17 @@ def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
     assert [flight.digest for flight in cortex] == [flight.digest for flight in here]
     assert len({flight.digest for flight in here}) == 6
     assert all(flight.memory < 8192 for flight in cortex)
+
+
+def test_a_slot_of_the_app_on_board_fits_its_stack_and_its_time(tmp_path: Path) -> None:
+    try:
+        (cost,) = fly_app_on_cortex(tmp_path, slots=5, sample=True)
+    except NotHere as error:
+        pytest.skip(str(error))
+    assert (cost.policy, cost.agents, cost.slots) == ("lease", 20, 5)  # it steers
+    assert 1000 < cost.stack < STACK_BYTES
+    assert all(mean <= most for mean, most in cost.instructions.values())
+    assert 10_000 < cost.instructions["slot"][1] < 840_000  # half a slot of 1.68 million cycles
 
 
 def test_a_firmware_that_fuses_operations_flies_the_same_bits(tmp_path: Path) -> None:

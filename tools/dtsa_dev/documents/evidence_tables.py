@@ -82,6 +82,8 @@ def records(evidence: Path) -> str:
 
 
 def _command(record: Row) -> str:
+    if "command" in record:
+        return str(record["command"])
     if "soak" in record:
         return f"soak {record['soak']}"
     return f"benchmark --parts {','.join(record['parts'])}" if "parts" in record else "benchmark"
@@ -161,6 +163,40 @@ def fuzz(record: Row) -> str:
         f"{record['wall_s'] / 60:.0f} minutes of it ([its record](../evidence/fuzz.json)): "
         f"{found['frames: inputs']:,} inputs of decoders and {found['agents: inputs']:,} streams of events, "
         f"{failures or 'no'} findings.\n"
+    )
+
+
+def board(record: Row) -> str:
+    """What a slot costs the app on board.
+
+    :param record: of `dtsa embedded --board`.
+    """
+    cycles, clock = record["cycles_an_instruction"], record["clock_mhz"]
+
+    def us(instructions: int) -> str:
+        return f"{instructions * cycles / clock:,.0f}"
+
+    lines = []
+    for cost in record["costs"]:
+        count = cost["instructions"]
+        mean, most = count["slot"]
+        lines.append(
+            [
+                cost["policy"], str(cost["agents"]),
+                *(f"{count[kind][0]:,} / {count[kind][1]:,}" for kind in ("hear", "decide", "send", "steer", "slot")),
+                f"{us(mean)} / {us(most)} us", f"{most * cycles / clock / record['slot_ms'] / 10:.0f} %",
+                f"{cost['stack']:,} B", f"{cost['datagram']} B", f"{100 * cost['frames_of_air']:.1f} %",
+                f"{100 * cost['polls_of_air']:.1f} %",
+            ]
+        )  # fmt: skip
+    heads = (
+        "policy", "N", "hear, mean / most", "decide", "send", "steer", "a slot", f"at {clock:g} MHz", "most, of a slot",
+        "stack", "datagram", "frames, of the air", "polls",
+    )  # fmt: skip
+    sizes = record["memory"]
+    return (
+        f"{markdown(heads, lines)}\n\nCode and constants {sizes['code']:,} B, RAM {sizes['ram']:,} B, beside the stack "
+        f"of {record['stack_of_task']:,} B ([its record](../evidence/board.json)).\n"
     )
 
 
@@ -347,6 +383,7 @@ def _targets(rows: Sequence[Row]) -> str:
 
 
 QUOTED: dict[str, Callable[[Row], str]] = {
+    "board": board,
     "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again, "losses": losses,
     "mutants": mutants, "setup": setup,
     "serial": serial, "board": board,

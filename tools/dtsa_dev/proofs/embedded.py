@@ -13,10 +13,11 @@ from dtsa_agent.core.errors import DtsaError
 from .library import HERE, LIBRARY, compile_program, sources, tool
 
 CALLS = ("slot", "command", "hear", "end")  # in the order of meter.h
-_CORTEX = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-O2")
+#: Flags for the processor of a Crazyflie.
+CORTEX = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")
 #: Flags of a firmware that fuses multiplications and additions where it may.
 FUSING = ("-std=gnu11", "-O3", "-ffp-contract=fast", "-fno-math-errno")
-_IN_PARTS = ("-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections")
+IN_PARTS = ("-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections")
 _LIMIT_S = 120.0
 
 
@@ -50,7 +51,7 @@ def fly_here(directory: Path, slots: int = 200, compiler: str = "gcc", soft: boo
     """
     flags = ["-O2", f"-I{HERE}", f"-DSLOTS={slots}", *(["-DDTSA_SOFT_DOUBLES"] if soft else [])]
     program = compile_program(tool(compiler, compiler), directory / "flight", _files(), flags)
-    return _read(_run([str(program)]))
+    return _read(run_program([str(program)]))
 
 
 def fly_on_cortex(directory: Path, slots: int = 200, metered: bool = True, more: Sequence[str] = ()) -> list[Flight]:
@@ -62,8 +63,8 @@ def fly_on_cortex(directory: Path, slots: int = 200, metered: bool = True, more:
     :param more: flags of the compiler.
     :raises NotHere: where compiler or QEMU are missing.
     """
-    qemu = [*_qemu(), *(["-icount", "shift=5"] if metered else [])]  # 32 ns an instruction, see mps2.c
-    return _read(_run([*qemu, "-kernel", str(build_for_cortex(directory, slots, metered, more))]))
+    board = [*qemu(), *(["-icount", "shift=5"] if metered else [])]  # 32 ns an instruction, see mps2.c
+    return _read(run_program([*board, "-kernel", str(build_for_cortex(directory, slots, metered, more))]))
 
 
 def build_for_cortex(directory: Path, slots: int = 200, metered: bool = True, more: Sequence[str] = ()) -> Path:
@@ -78,7 +79,7 @@ def build_for_cortex(directory: Path, slots: int = 200, metered: bool = True, mo
     board = ["-nostartfiles", "--specs=rdimon.specs", f"-T{HERE / 'mps2.ld'}", f"-I{HERE}", f"-DSLOTS={slots}"]
     board += ["-DMETERED"] if metered else []
     files = [*_files(), HERE / "mps2.c"]
-    return compile_program(compiler, directory / "flight.elf", files, [*_CORTEX, *_IN_PARTS, *board, *more])
+    return compile_program(compiler, directory / "flight.elf", files, [*CORTEX, "-O2", *IN_PARTS, *board, *more])
 
 
 def code_size(directory: Path) -> dict[str, int]:
@@ -91,8 +92,8 @@ def code_size(directory: Path) -> dict[str, int]:
     sums: dict[str, int] = {}
     for path in sources():
         out = directory / f"{path.parent.name}-{path.stem}.o"
-        compile_program(compiler, out, [path], [*_CORTEX, "-c"], links=())
-        text = _run([size, str(out)]).splitlines()[1].split()[0]
+        compile_program(compiler, out, [path], [*CORTEX, "-O2", "-c"], links=())
+        text = run_program([size, str(out)]).splitlines()[1].split()[0]
         part = (
             "avoiders" if path.parent.name == "avoider" else "policy lease" if path.parent.name == "lease" else "rest"
         )
@@ -110,7 +111,7 @@ def fused(directory: Path, library: Path = LIBRARY) -> dict[str, int]:
     counts = {}
     for path in sources(library):
         out = directory / f"{path.parent.name}-{path.stem}.s"
-        compile_program(compiler, out, [path], [*_CORTEX, *FUSING, "-S"], library, links=())
+        compile_program(compiler, out, [path], [*CORTEX, "-O2", *FUSING, "-S"], library, links=())
         count = len(re.findall(r"^\s+vfn?m[as]", out.read_text(), re.MULTILINE))
         if count:
             counts[path.name] = count
@@ -121,14 +122,23 @@ def _files() -> list[Path]:
     return [HERE / "flight.c", *sources(LIBRARY)]
 
 
-def _qemu() -> list[str]:
-    qemu = tool("qemu-system-arm", "qemu-system-arm")
+def qemu() -> list[str]:
+    """The command that starts the board, without a program.
+
+    :raises NotHere: if there is no QEMU.
+    """
+    program = tool("qemu-system-arm", "qemu-system-arm")
     board = ["-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "none"]
-    return [qemu, *board, "-semihosting-config", "enable=on,target=native"]
+    return [program, *board, "-semihosting-config", "enable=on,target=native"]
 
 
-def _run(command: list[str]) -> str:
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_LIMIT_S)
+def run_program(command: list[str], limit_s: float = _LIMIT_S) -> str:
+    """What a program prints.
+
+    :param command: it, and its arguments. :param limit_s: s, for which it may run.
+    :raises DtsaError: if it fails.
+    """
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit_s)
     if done.returncode:
         raise DtsaError(f"{Path(command[0]).name}: exit code {done.returncode}: {done.stderr.strip()[-500:]}")
     return done.stdout or done.stderr  # QEMU's semihosting writes to the terminal's error output
