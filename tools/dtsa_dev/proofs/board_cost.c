@@ -1,6 +1,6 @@
 /* What the app on board costs: onboard/app.c runs as it is, on board mps2-an386 (see mps2.c), among
- * others that run board.c. The firmware's functions are here: they hand over what the air carries, let
- * time pass, and count instructions and stack of each turn of the app's loop.
+ * others that run board.c. The firmware's functions are here: they hand over what the air carries,
+ * let time pass, and count instructions and stack of each turn of the app's loop.
  *
  * Times are us. A turn begins where the app looks for a packet of the ground. */
 #include <setjmp.h>
@@ -121,7 +121,8 @@ static void end_turn(void)
     uint32_t *word = stack_top - WORDS;
     while (word < stack_top && *word == PAINT) word++;
     if ((uint32_t)(stack_top - word) * 4 > deepest) deepest = (uint32_t)(stack_top - word) * 4;
-    if (guard.mode != SAFETY_FLY || agent.policy >= 0) return; /* it counts once it steers, by this policy */
+    /* It counts once the app steers, by this policy. */
+    if (guard.mode != SAFETY_FLY || agent.policy >= 0) return;
     if (!what) {
         add(&idle, instructions);
         return;
@@ -173,7 +174,7 @@ size_t appchannelReceiveDataPacket(void *data, size_t length, int timeout)
 BaseType_t xQueueReceive(QueueHandle_t q, void *item, TickType_t ticks)
 {
     (void)q;
-    if (ticks > 0 && !waiting) pass(1000, 1); /* it sleeps until something arrives, or a tick is over */
+    if (ticks > 0 && !waiting) pass(1000, 1); /* it sleeps: a tick at most */
     if (!waiting) return pdFALSE;
     memcpy(item, &received[--waiting], sizeof received[0]);
     what |= DID_HEAR;
@@ -213,7 +214,10 @@ void p2pRegisterCB(P2PCallback callback) { (void)callback; }
 int appchannelSendDataPacket(void *data, size_t length) { return (void)data, (int)length; }
 uint64_t configblockGetRadioAddress(void) { return 0xe7e7e7e701; }
 int commanderGetActivePriority(void) { return COMMANDER_PRIORITY_LOWEST; }
-enum trajectory_state crtpCommanderHighLevelGetPlannerState(void) { return TRAJECTORY_STATE_DISABLED; }
+enum trajectory_state crtpCommanderHighLevelGetPlannerState(void)
+{
+    return TRAJECTORY_STATE_DISABLED;
+}
 int crtpCommanderHighLevelDisable(void) { return 0; }
 int crtpCommanderHighLevelLand(float z, float s) { return (void)z, (void)s, 0; }
 int crtpCommanderHighLevelGoTo(float x, float y, float z, float yaw, float s, bool relative)
@@ -227,7 +231,8 @@ BaseType_t xQueueSend(QueueHandle_t q, const void *item, TickType_t ticks)
 {
     return (void)q, (void)item, (void)ticks, pdTRUE;
 }
-QueueHandle_t xQueueCreateStatic(UBaseType_t n, UBaseType_t size, uint8_t *storage, StaticQueue_t *memory)
+QueueHandle_t xQueueCreateStatic(UBaseType_t n, UBaseType_t size, uint8_t *storage,
+                                 StaticQueue_t *memory)
 {
     return (void)n, (void)size, (void)storage, (void)memory, (QueueHandle_t)1;
 }
@@ -299,8 +304,10 @@ int main(void)
             stack_top = here();
             begin_turn();
             if (!setjmp(over)) appMain();
-            printf("%s %d %d %lu", dtsa_names(0)->names[POLICIES[i]], SIZES[j], counted - 1, (unsigned long)deepest);
-            show(&turns[DID_HEAR]), show(&turns[DID_DECIDE]), show(&turns[DID_SEND]), show(&turns[DID_STEER]);
+            printf("%s %d %d %lu", dtsa_names(0)->names[POLICIES[i]], SIZES[j], counted - 1,
+                   (unsigned long)deepest);
+            show(&turns[DID_HEAR]), show(&turns[DID_DECIDE]);
+            show(&turns[DID_SEND]), show(&turns[DID_STEER]);
             show(&slots), show(&idle);
             printf(" %d\n", (int)agent.hearing.length);
         }

@@ -197,7 +197,8 @@ static bool place(double *planes, const uint8_t *data, size_t length)
 /* What the ground says; it hears the order's letter and 1, or 0 and why not. */
 static void obey(const uint8_t *data, size_t length)
 {
-    const bool flies = guard.mode != SAFETY_OFF; /* what is said on the ground counts from the next start on */
+    /* What is said on the ground counts from the next start on. */
+    const bool flies = guard.mode != SAFETY_OFF;
     const char *fault = strchr("FTKDSL", data[0]) ? "length" : "order";
     const bool changes = !goalsKnown && data[0] == ORDER_TO && data[1] == agent.settings.id;
     if (data[0] == ORDER_FROM && !flies && place(starts, data, length)) fault = NULL;
@@ -330,7 +331,8 @@ static void steer(const double position[3], const double place[3], int64_t now, 
     } else if (next == SAFETY_LAND && before != SAFETY_LAND) {
         land(position);
     } else if (next == SAFETY_OFF && (before == SAFETY_FLY || before == SAFETY_HOVER) &&
-               guard.reason == SAFETY_DISABLED && !view.ground) { /* the ground takes it back, hovering */
+               guard.reason == SAFETY_DISABLED && !view.ground) {
+        /* The ground takes it back, hovering; unless it has commanded something else already. */
         crtpCommanderHighLevelGoTo((float)position[0], (float)position[1], (float)position[2],
                                    0.0f, 1.0f, false);
     }
