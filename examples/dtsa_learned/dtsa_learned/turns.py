@@ -12,6 +12,7 @@ from .rules import ARRIVED, MOVER, STEPS, WAITING, Rules
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 DELAY = 3  # slots until news counts: until then it has reached nearly all
+_FAILED = 3  # turns in a row without a frame, after which an agent is taken to rest
 _KEPT = DELAY + 2  # slots of which is kept who sent
 
 
@@ -32,6 +33,7 @@ class Turns:
     def __init__(self, rules: Sequence[Rules], agents: int, ids: Sequence[int], quiet_until: int = 0) -> None:
         shape = len(rules), len(ids), agents
         self._agents, self._ids, self._quiet_until = agents, np.array(ids), quiet_until
+        self._rounds = np.array([1, 4, 16]) * agents
         # Rates by flight, kind, time, share and calm, one after the other.
         self._rates = np.concatenate([one.rates.ravel() for one in rules])
         self._first = (np.arange(len(rules)) * rules[0].rates.size)[:, None]
@@ -50,6 +52,7 @@ class Turns:
         self._sender = np.full((*shape[:2], _KEPT), -1, dtype=np.int64)  # index of who sent in the last slots; -1: none
         self._sent = np.full(shape, -1, dtype=np.int64)  # as before the last slot
         self._missed = np.zeros(shape, dtype=np.bool_)  # another one sent in its last turn
+        self._failed = np.zeros(shape, dtype=np.int64)  # turns in a row without a frame of its own
         self._next = np.full(shape[:2], -1, dtype=np.int64)  # index of whose turn it was in the next slot that counts
         self.plan = np.zeros(shape[:2], dtype=np.int64)  # (B, V) id of the agent whose turn an observer takes it for
 
@@ -81,6 +84,7 @@ class Turns:
         self._sender[:, :, (slot - 1) % _KEPT] = -1
         flight, observer, agent = np.nonzero((sent != self._sent) & (sent >= slot - 1 - DELAY))
         self._sender[flight, observer, sent[flight, observer, agent] % _KEPT] = agent
+        self._failed[flight, observer, agent] = 0
         self._sent = sent.copy()
 
     def _count_turn(self, slot: int) -> None:
@@ -92,6 +96,7 @@ class Turns:
             return
         planned, sender = self._next, self._sender[:, :, slot % _KEPT]
         at, turn, missed = self._row + planned, self._turn.reshape(-1), self._missed.reshape(-1)
+        self._failed.reshape(-1)[at] += sender != planned
         keeps = (sender >= 0) & (sender != planned) & ~missed[at]
         turn[at] = np.where(keeps, turn[at], slot)
         missed[at] = keeps
@@ -118,20 +123,22 @@ class Turns:
         if slot < n:
             return np.full(turn.shape[:2], slot)
         claimed = (rates * (slot - turn)).argmax(axis=2)
-        return np.asarray(np.where(self._is_owners(slot), slot // self._every % n, claimed))
+        owners = self._is_owners(slot)
+        return np.where(owners, slot // self._every % n, claimed) if owners.any() else claimed
 
     def _is_owners(self, slot: int) -> Bools:
         return np.asarray(slot < self._agents or (slot + 1) % self._every == 0)
 
     def _rates_now(self, slot: int) -> Ints:
         """(B, V, N) how fast claims grow, whole numbers."""
-        n, count = self._agents, self._moves.sum(axis=2)
+        silent = self._failed >= _FAILED
+        n, count = self._agents, (self._moves & ~silent).sum(axis=2)
+        kind = np.where(silent & self._moves, ARRIVED, self._kind)
         share = (6 * count > n).astype(np.int64) + (3 * count > n) + (3 * count > 2 * n)
         of_all = self._first + STEPS * share + self._steps(slot - self._woken)
-        at = STEPS**3 * self._kind + STEPS**2 * self._steps(slot - self._since) + of_all[:, :, None]
+        at = STEPS**3 * kind + STEPS**2 * self._steps(slot - self._since) + of_all[:, :, None]
         return np.asarray(self._rates[at])
 
     def _steps(self, slots: Ints) -> Ints:
         """How long ago, in rounds of TDMA: up to 1, 4, 16, more."""
-        n = self._agents
-        return (slots > n).astype(np.int64) + (slots > 4 * n) + (slots > 16 * n)
+        return self._rounds.searchsorted(slots)
