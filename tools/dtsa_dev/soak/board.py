@@ -121,7 +121,7 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
         "fault": fault, "seconds": seconds, "crashed": [int(agent) for agent in summary["crashed"]],
         "min_distance_m": summary["min_distance_m"], "decisions_again": again["equal"],
         "differences": len(again["differences"]), "slots_with_two_senders": turns["slots_with_two_senders"],
-        "sent": summary["sent"], "heard_share": summary["heard"] / summary["sent"] / (_AGENTS - 1),
+        "sent": found["frames_sent"], "heard_share": found["frames_heard"] / found["frames_sent"] / (_AGENTS - 1),
         "mean_age_ms": summary["mean_age_ms"],
     }  # fmt: skip
     expected = [_ONE] if fault == "a brown-out in flight" else []
