@@ -12,7 +12,7 @@ from .rules import ARRIVED, MOVER, STEPS, WAITING, Rules
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 DELAY = 3  # slots until news counts: until then it has reached nearly all
-_FAILED = 3  # turns in a row without a frame, after which an agent is taken to rest
+_FAILED = 5  # turns in a row without a frame, after which an agent is taken to rest
 _KEPT = DELAY + 2  # slots of which is kept who sent
 
 
@@ -96,7 +96,8 @@ class Turns:
             return
         planned, sender = self._next, self._sender[:, :, slot % _KEPT]
         at, turn, missed = self._row + planned, self._turn.reshape(-1), self._missed.reshape(-1)
-        self._failed.reshape(-1)[at] += sender != planned
+        hears = ((self._sender >= 0) & (self._sender != self._ids[None, :, None] - 1)).any(axis=2)  # else it is deaf
+        self._failed.reshape(-1)[at] += (sender != planned) & hears
         keeps = (sender >= 0) & (sender != planned) & ~missed[at]
         turn[at] = np.where(keeps, turn[at], slot)
         missed[at] = keeps
