@@ -15,6 +15,7 @@ SOAKS = {
     "fuzz": "an hour of coverage-guided fuzzing of decoders and event streams of libdtsa (needs clang)",
     "crazyflie": "missions of twelve, gaps of the air, streams of commands: over UDP and simulated radios with losses",
     "air": "agents on hosts of their own over a switch that is the medium: cold starts, losses, drifts, faults",
+    "twelve": "the paper's experiment from twelve apps on board, beside the simulator and agents over UDP",
     "serial": "agents over simulated modems: cold starts, losses, kills, partitions, modems unplugged, slow adapters",
     "board": "twelve apps on board in the laboratory, an hour of virtual time with faults",
     "league": "every entry of league-1 flown again, whole; entries with one number changed are found",

@@ -39,6 +39,7 @@ static const float DOWN_M_S = 0.4f; /* how fast it lands */
 /* ---- what the ground sets and sees ---- */
 
 static uint8_t mute, enable, goalsKnown = 1, agents = 12, policy = DTSA_POLICY_LEASE, p2pPort = 7, started;
+static uint8_t estimator = DTSA_ESTIMATE_LINEAR;
 static uint16_t headerWord = 0x5444, steps = 1;
 static uint32_t beginSlot, slotUs = 10000, flightUs = 1500, seed = 1;
 static float height = 1.0f, vMax = 1.5f, pairRadius = 0.336f, horizon = 1.0f;
@@ -97,7 +98,7 @@ static void configure(dtsa_config *c)
         .slot_s = (double)slotUs * 1e-6,
         .steps = steps,
         .policy = policy,
-        .estimator = DTSA_ESTIMATE_LINEAR,
+        .estimator = estimator,
         .avoider = DTSA_AVOID_ORCA,
         .profile = policy == DTSA_POLICY_LEASE ? DTSA_PROFILE_EXTENDED : DTSA_PROFILE_PAPER,
         .epsilon = 0.5,
@@ -144,6 +145,7 @@ static const char *start(void)
         .session = session,
     };
     if (agents < 1 || agents > BOARD_AGENTS) return "agents";
+    if (estimator > DTSA_ESTIMATE_LINEAR) return "estimator";
     configure(&agent.config);
     agent.watch = WATCH;
     safety_reset(&guard);
@@ -393,6 +395,7 @@ PARAM_GROUP_START(dtsa)
 PARAM_ADD(PARAM_UINT8, enable, &enable)
 PARAM_ADD(PARAM_UINT8, agents, &agents)
 PARAM_ADD(PARAM_UINT8, policy, &policy)
+PARAM_ADD(PARAM_UINT8, estimator, &estimator)
 PARAM_ADD(PARAM_UINT8, mute, &mute) /* for trials: it sends nothing */
 PARAM_ADD(PARAM_UINT8, goalsKnown, &goalsKnown)
 PARAM_ADD(PARAM_UINT8, port, &p2pPort)

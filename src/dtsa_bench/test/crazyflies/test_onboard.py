@@ -37,7 +37,7 @@ def merged(folder: Path) -> dict[str, Any]:
     [
         (LEASE, LabSettings(drift_ppm=50.0)),
         (LEASE, LabSettings(loss=0.1, seed=2)),
-        (SwarmConfig(agents=5, policy="tdma", slot_ms=5.0), LabSettings(loss=0.1)),
+        (SwarmConfig(agents=5, policy="tdma", slot_ms=5.0, estimator="hold"), LabSettings(loss=0.1)),
         (SwarmConfig(agents=5, policy="lease", auth=True, auth_session=3), LabSettings()),
     ],
 )
@@ -174,6 +174,7 @@ def test_who_hears_nobody_hovers_and_then_lands() -> None:
     [
         (SwarmConfig(agents=21, policy="lease"), "agents: got 21; allowed: 1 to 20"),
         (SwarmConfig(agents=4, policy="lease", auth=True, auth_session=1), "key: got 'none'"),
+        (SwarmConfig(agents=4, policy="tdma", estimator="intent"), "estimator: got 'intent'; allowed: hold, linear"),
     ],
 )
 def test_a_swarm_that_cannot_fly_on_board_is_refused(swarm: SwarmConfig, said: str) -> None:

@@ -21,6 +21,7 @@ from dtsa_agent.core.settings.scenario import Scenario, policy_key
 
 MOST = 20  # agents: BOARD_AGENTS of board.h
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
+ESTIMATORS = ("hold", "linear")
 KEY_BYTES = 16
 FLIGHT_US = 1500
 ENABLE = "dtsa.enable"
@@ -69,6 +70,8 @@ def check_on_board(swarm: SwarmConfig) -> None:
         raise ConfigError("agents", swarm.agents, f"1 to {MOST} on board")
     if swarm.policy not in POLICIES:
         raise ConfigError("policy", swarm.policy, ", ".join(POLICIES))
+    if swarm.estimator not in ESTIMATORS:
+        raise ConfigError("estimator", swarm.estimator, f"{', '.join(ESTIMATORS)} on board")
     check_fits(swarm, PORT)
 
 
@@ -81,6 +84,7 @@ def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[st
     """
     values: dict[str, float] = {
         "enable": 0, "agents": swarm.agents, "policy": POLICIES.index(swarm.policy),
+        "estimator": ESTIMATORS.index(swarm.estimator),
         "header": int.from_bytes(header_of(swarm, PORT) or b"\0\0", "little"), "steps": swarm.steps,
         # In this slot all begin together with a policy that nobody can join.
         "beginSlot": 0 if swarm.policy_row.may_join else 4 * swarm.anchor_every * swarm.agents,
