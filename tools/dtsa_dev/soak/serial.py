@@ -39,7 +39,7 @@ _MODEMS: dict[str, dict[str, Any]] = {
 
 def _items() -> Iterator[Item]:
     seed = 0
-    for modem, agents, slot_ms in (("sik-64k", 12, 100.0), ("sik-64k", 12, 80.0), ("e22-19k", 6, 150.0)):
+    for modem, agents, slot_ms in (("sik-64k", 12, 100.0), ("sik-64k", 12, 90.0), ("e22-19k", 6, 150.0)):
         for loss in (0.0, 0.1):
             seed += 1
             settings = {"modem": modem, "agents": agents, "slot_ms": slot_ms, "loss": loss}

@@ -119,7 +119,7 @@ def test_slots_that_are_too_short_are_refused_with_the_shortest() -> None:
     assert said.startswith(f"slot_ms: got 50.0; allowed: at least {shortest_ms:g} over serial with frames of 56 bytes")
     assert "with 19 (policy tdma, frame paper)" in said
     check_fits(SwarmConfig(agents=12, policy="lease", slot_ms=shortest_ms), port)
-    paper = SwarmConfig(agents=12, policy="dtsa", slot_ms=51.0)
+    paper = SwarmConfig(agents=12, policy="dtsa", slot_ms=57.0)
     check_fits(paper, port)
     with pytest.raises(ConfigError, match=r"at least 18\.4 over serial with frames of 19 bytes$"):
         check_fits(

@@ -79,16 +79,15 @@ def _e22(spreading: int, rate: str, bitrate: int) -> Modem:
 
 def _sik(rate: int) -> Modem:
     """A SiK radio in multipoint mode by its air speed."""
-    byte_ns = 8 * _SECOND // rate
-    empty_ns = 13 * byte_ns + 208_000
+    on_air_ns = _bits(rate, 13 + 4, 208_000)  # every packet has a trailer, an empty one too
     return Modem(
         f"SiK, RFD900 in multipoint mode at {rate // 1000} kbit/s",
-        "SiK tdm.c (13 bytes and 0.2 ms around a packet, 248 bytes, turns; its trailer of 4 bytes, 0.5 ms at 64 kbit/s,"
-        " is not counted); RFD900x multipoint manual (57600 baud, broadcast). Assumed: in each round every modem"
-        " without data sends one empty packet; a frame goes as one packet; the buffer",
-        _bits(rate, 13, 208_000),
+        "SiK tdm.c (13 bytes, a trailer of 4 and 0.2 ms around a packet, 248 bytes, turns); RFD900x multipoint manual"
+        " (57600 baud, broadcast). Assumed: in each round every modem without data sends one empty packet; a frame goes"
+        " as one packet; the buffer",
+        on_air_ns,
         rate,
-        turn_ns=empty_ns,
+        turn_ns=on_air_ns(0),
         packet=248,
         buffer=2048,
     )
