@@ -40,7 +40,9 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("name", args.name or "", ", ".join(SOAKS))
     name = f"{args.name}-sample" if args.sample else args.name
     directory = Path(args.out) if args.out else Path("runs") / "soak" / name
-    record = run_soak(soak_named(args.name), directory, _minutes(args.minutes), args.sample)
+    soak = soak_named(args.name)
+    soak.check()
+    record = run_soak(soak, directory, _minutes(args.minutes), args.sample)
     if args.evidence or not args.sample:
         path = Path(args.evidence) if args.evidence else Path("docs") / "evidence" / f"{name}.json"
         write_record(path, record)

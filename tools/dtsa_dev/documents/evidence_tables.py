@@ -20,6 +20,7 @@ from dtsa_bench.experiments.batch.table import markdown
 from dtsa_bench.experiments.league.cells import league
 from dtsa_bench.experiments.league.entry import read_entry
 from dtsa_bench.experiments.league.table import HEADS, LeagueTable
+from dtsa_bench.experiments.statistics import wilson
 
 Row = dict[str, Any]
 
@@ -346,6 +347,70 @@ def board(record: Row) -> str:
     return f"{markdown(head, rows)}\n"
 
 
+def ns3(record: Row) -> str:
+    """Who received what on the simulated channel and in ns-3.
+
+    :param record: of `dtsa soak ns3`.
+    """
+    figures = record["figures"]
+    same = (
+        "scheme", "load", "frames", "receptions here, in ns-3", "pairs that differ", "arrivals apart by",
+        "throughput here, in ns-3", "formula", "mean age here, in ns-3",
+    )  # fmt: skip
+    rows = [
+        [
+            row["scheme"],
+            f"{row['load']:g}",
+            f"{row['frames']:,}",
+            "{:,}, {:,}".format(*row["received"]),
+            f"{row['differ']} of {row['pairs']:,}",
+            f"{row['arrivals_apart_ns']} ns",
+            "{:.4f}, {:.4f} ± {:.4f}".format(row["throughput"][0][0], *row["throughput"][1]),
+            f"{row['formula']:.4f}" if "formula" in row else "",
+            "{:.1f}, {:.1f} ms".format(*row["age_ms"]),
+        ]
+        for row in figures["carried"]
+    ]
+    own = ("scheme", "load", "side", "sent", "given up", "received", "throughput", "formula", "mean wait", "95 % wait")
+    cells: dict[tuple[str, float], list[Row]] = {}
+    for row in figures["contended"]:
+        cells.setdefault((row["scheme"], row["load"]), []).append(row)
+    others = [
+        [scheme, f"{load:g}", side, *_contended([run[key] for run in runs])]
+        for (scheme, load), runs in cells.items()
+        for side, key in (("here", "ours"), ("ns-3", "theirs"))
+    ]
+    failed = len(record["failures"])
+    done = f"{record['finished'] - failed} of {record['items']} comparisons as they should be"
+    parts = (
+        f"ns-3 {' and '.join(figures['ns3'])}, {done} ([its record](../evidence/ns3.json)).",
+        "The same instants on both channels:",
+        markdown(same, rows),
+        "Each side contends for itself. Means of its runs, smallest to largest; share received with its 95 % interval:",
+        markdown(own, others),
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def _contended(runs: Sequence[Row]) -> list[str]:
+    sent, received, given_up = (sum(run[key] for run in runs) for key in ("sent", "received", "given_up"))
+    share = wilson(received, sent)
+    return [
+        f"{sent:,}",
+        f"{given_up:,}",
+        f"{100 * received / sent:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})",
+        _mean([run["throughput"] for run in runs], 3),
+        _mean([run["formula"] for run in runs], 3) if "formula" in runs[0] else "",
+        f"{_mean([run['wait_ms']['mean'] for run in runs], 2)} ms",
+        f"{_mean([run['wait_ms']['p95'] for run in runs], 1)} ms",
+    ]
+
+
+def _mean(values: Sequence[float], digits: int) -> str:
+    mean = sum(values) / len(values)
+    return f"{mean:.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
 def _plain(rows: Iterable[Row]) -> Iterable[Row]:
     return [row for row in rows if "avoider" not in row and "loss" not in row]
 
@@ -385,8 +450,7 @@ def _targets(rows: Sequence[Row]) -> str:
 QUOTED: dict[str, Callable[[Row], str]] = {
     "board": board,
     "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again, "losses": losses,
-    "mutants": mutants, "setup": setup,
-    "serial": serial, "board": board,
+    "mutants": mutants, "setup": setup, "serial": serial, "ns3": ns3,
 }  # fmt: skip
 
 

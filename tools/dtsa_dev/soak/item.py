@@ -35,6 +35,7 @@ class Soak:
     :param items: all items.
     :param run: does one in an empty directory and returns its figures; raises :class:`NotMet` where the promise fails.
     :param figures: sums up the figures of all finished items.
+    :param check: raises a ConfigError where the machine lacks what it needs.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Soak:
     items: tuple[Item, ...]
     run: Callable[[Item, Path], dict[str, Any]]
     figures: Callable[[Sequence[Row]], dict[str, Any]]
+    check: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True)
