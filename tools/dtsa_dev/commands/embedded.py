@@ -17,7 +17,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     text = "the protocol on a simulated microcontroller"
     parser = subparsers.add_parser("embedded", help=text, description=DESCRIPTION)
     parser.add_argument("--board", action="store_true", help="the app of Crazyflies, instead of libdtsa alone")
-    parser.add_argument("--out", metavar="FILE", help="with --board: its record, as docs/evidence/board.json")
+    parser.add_argument("--out", metavar="FILE", help="with --board: its record, as docs/evidence/board-cost.json")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,12 +42,12 @@ def _board(args: argparse.Namespace) -> int:
     import tempfile
     from pathlib import Path
 
-    from dtsa_dev.documents.evidence_tables import board
+    from dtsa_dev.documents.evidence_tables import board_cost
     from dtsa_dev.proofs.board_cost import fly_app_on_cortex, memory, record
 
     with tempfile.TemporaryDirectory() as directory:
         found = record(fly_app_on_cortex(Path(directory)), memory(Path(directory)))
-    print(board(found))
+    print(board_cost(found))
     if args.out:
         Path(args.out).write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return 0

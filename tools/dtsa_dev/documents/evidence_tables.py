@@ -167,7 +167,7 @@ def fuzz(record: Row) -> str:
     )
 
 
-def board(record: Row) -> str:
+def board_cost(record: Row) -> str:
     """What a slot costs the app on board.
 
     :param record: of `dtsa embedded --board`.
@@ -197,7 +197,7 @@ def board(record: Row) -> str:
     sizes = record["memory"]
     return (
         f"{markdown(heads, lines)}\n\nCode and constants {sizes['code']:,} B, RAM {sizes['ram']:,} B, beside the stack "
-        f"of {record['stack_of_task']:,} B ([its record](../evidence/board.json)).\n"
+        f"of {record['stack_of_task']:,} B ([its record](../evidence/board-cost.json)).\n"
     )
 
 
@@ -448,7 +448,7 @@ def _targets(rows: Sequence[Row]) -> str:
 
 
 QUOTED: dict[str, Callable[[Row], str]] = {
-    "board": board,
+    "board": board, "board-cost": board_cost,
     "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again, "losses": losses,
     "mutants": mutants, "setup": setup, "serial": serial, "ns3": ns3,
 }  # fmt: skip

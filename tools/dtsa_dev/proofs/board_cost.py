@@ -90,7 +90,7 @@ def memory(directory: Path) -> dict[str, int]:
 
 
 def record(costs: Sequence[BoardCost], sizes: dict[str, int]) -> dict[str, Any]:
-    """``docs/evidence/board.json``.
+    """``docs/evidence/board-cost.json``.
 
     :param costs: of :func:`fly_app_on_cortex`. :param sizes: of :func:`memory`.
     """
