@@ -35,7 +35,7 @@ def on_board(
         f"cf{k}": {"uri": f"udp://h:{k}", "log_rate_hz": rate, "initial_position": where or places[i]}
         for i, k in enumerate(ids)
     }
-    return swarm(robots=robots, station={"on_board": given, **station})
+    return swarm(robots=robots, station={"on_board": given, "safety": {"min_distance_m": 0}} | station)
 
 
 def test_robot_beats_type_beats_all() -> None:
@@ -97,6 +97,7 @@ def test_robot_beats_type_beats_all() -> None:
         (on_board(rate=8), "robots.cf1.log_rate_hz"),
         (on_board(ids=(1, 3)), "robots.cf3"),
         (on_board(where=[0.5, 0.0, 0.0]), "robots.cf1.initial_position"),
+        (on_board(safety={}), "station.safety.min_distance_m"),
         (on_board(positions={"source": "pose"}), "station.positions.source"),
         (on_board(room_origin_in_world=[1, 0, 1]), "station.room_origin_in_world"),
     ],

@@ -148,4 +148,7 @@ def _lines(summary: dict[str, Any], printed: int) -> str:
         ("printed", f"{printed} lines"),
         ("digest", summary["digest"]),
     )  # fmt: skip
-    return "\n".join(f"{name:<9}{text}" for name, text in rows)
+    if "lost_s" in summary:
+        late = f"{summary['lost_s']:.3f} s were lost: the machine was too busy" if summary["lost_s"] else "kept"
+        rows = (*rows, ("real time", late))
+    return "\n".join(f"{name:<9} {text}" for name, text in rows)

@@ -61,7 +61,11 @@ def swarm_yaml(folder: Path) -> Path:
         "room_origin_in_world": [0.0, 0.0, FLOOR_M],
         "toc_cache": str(folder / "cache"),
         "land_speed_mps": 1.0,
-        "safety": {"link_age_s": 3.0, "emergency_watchdog": False},  # on a machine that is busy with other tests
+        "safety": {
+            "link_age_s": 3.0,
+            "emergency_watchdog": False,
+            "min_distance_m": 0,
+        },  # on a machine that is busy with other tests
     }
     path = folder / "swarm.yaml"
     path.write_text(yaml.safe_dump({"robots": robots, "all": {"log_rate_hz": 4}, "station": station}))

@@ -286,6 +286,9 @@ def _check_swarm(settings: SwarmSettings, swarm: SwarmConfig) -> None:
     if x or y:
         allowed = "0, 0, z with on_board: the app knows a height alone"
         raise ConfigError("station.room_origin_in_world", list(station.room_origin_in_world), allowed)
+    if station.safety.min_distance_m:
+        allowed = "0 with on_board: places that come so seldom are too old for it; the agents keep apart themselves"
+        raise ConfigError("station.safety.min_distance_m", station.safety.min_distance_m, allowed)
     start = make_scenario(swarm).start
     for index, robot in enumerate(settings.robots):
         if robot.id != index + 1:

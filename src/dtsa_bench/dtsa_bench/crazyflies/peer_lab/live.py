@@ -2,7 +2,8 @@
 
 The bridge and every other program with cflib talks to the vehicles by CRTP, with the app's parameters, log variables
 and app channel. Dongles in sniffer mode hear what the apps say to each other, and take part. Times on the air are as
-exact as in virtual time; only the programs see them as late as this machine is.
+exact as in virtual time; only the programs see them as late as this machine is. On a machine that is too busy the
+laboratory is slower than real time: caught up at once, the lost time would be a gap of all links.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from .record import Observer
 from .settings import LabSettings
 
 _WAIT_S = 0.001
+_BEHIND_NS = 20_000_000  # caught up at once; what is more is lost
 _APP_CHANNEL = 2  # of CRTP's platform port
 
 
@@ -49,6 +51,7 @@ class Live(Observer):
     def __init__(self, settings: LabSettings, radio: RadioSettings) -> None:
         radio = dataclasses.replace(radio, stations=stations(settings), loss=settings.loss, seed=settings.seed)
         self.side = RadioSide(radio, self._hear, lambda index, up: self.lab.is_on(index + 1), listen=False)
+        self.lost_s = 0.0  # s, by which its time has fallen behind
         self._ticks = 0
         self._stopped = False
 
@@ -79,12 +82,19 @@ class Live(Observer):
             while not self._stopped and self.lab.time < seconds:
                 for key, _ in selector.select(_WAIT_S):
                     self.side.take(key.data, selector)
+                self._keep_up()
                 self.lab.run(min(seconds, self.side.now_ns() / 1e9))
         finally:
             for key in list(selector.get_map().values()):
                 if key.data is not None:
                     self.side.leave(key.data)
             selector.close()
+
+    def _keep_up(self) -> None:
+        behind = self.side.now_ns() - self.lab.now_ns - _BEHIND_NS
+        if behind > 0:
+            self.side.origin_ns += behind
+            self.lost_s += behind / 1e9
 
     def close(self) -> None:
         """The socket goes."""

@@ -116,7 +116,8 @@ def _serve(request: dict[str, Any]) -> dict[str, Any]:
         else:
             live.attach(lab)
             live.run(seconds)
-        return {**finish(), **_told(lab)}
+        late = {} if live is None else {"lost_s": round(live.lost_s, 3)}
+        return {**finish(), **late, **_told(lab)}
     finally:
         lab.close()
         if live is not None:
