@@ -313,3 +313,13 @@ def test_a_lost_flight_counts_with_the_cells_age() -> None:
     assert summary["lost"] == 1
     assert summary["age_ms"] == pytest.approx((1200 * 1200 * 200) ** (1 / 3))  # a larger age counts no more than that
     assert summary["worst_cell"] == "few"
+
+
+def test_the_published_word_is_the_one_of_the_commitment_and_of_the_judged_entries() -> None:
+    word = LEAGUE.published()
+    assert word is not None
+    paths = sorted((PLUGINS.parents[1] / "docs" / "evidence" / "league-1").glob("*.json"))
+    assert len(paths) >= 18
+    for path in paths:
+        found = check_entry(LEAGUE, read_entry(path), word=word, sample=0, seed=1, jobs=1)
+        assert not found.differences, path.name
