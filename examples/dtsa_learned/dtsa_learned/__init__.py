@@ -1,4 +1,4 @@
-"""A policy whose rules were learned: ``learned``. See README.md; it needs NumPy alone."""
+"""A policy whose rules can be learned: ``learned``. See README.md; it needs NumPy alone."""
 
 from __future__ import annotations
 
