@@ -26,8 +26,7 @@ Row = dict[str, Any]
 
 _BLOCK = re.compile(r"(<!-- evidence: (?P<name>[^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
 LIST = "records"  # what a page asks for that lists them all
-LEAGUES = ("league-1", "league-1-practice")
-_SHORT = ("league-1-practice",)  # beside a league that says what its cells are
+LEAGUES = ("league-1",)
 _SIZES = (18, 70, 200)
 _PARTS = ("kernels", "avoidance", "slots", "flights", "nodes")  # of a benchmark, that are quoted
 
@@ -301,7 +300,7 @@ def standings(directory: Path) -> str:
     cells = [[cell.name, cell.text] for cell in table.league.cells]
     flown = [
         [
-            f"[{entry['name']}]({directory.name}/{entry['name']}.json)",
+            f"[{entry['name']}](league-1/{entry['name']}.json)",
             ", ".join(f"`{key}: {value}`" for key, value in entry["scheme"].items()),
             " ".join(str(entry["package"][key] or "") for key in ("distribution", "version")),
             str(entry["package"]["license"] or "not given"),
@@ -317,7 +316,7 @@ def standings(directory: Path) -> str:
             markdown(HEADS, table.lines()),
             "Age in each cell, ms; in brackets the lost flights, if any:",
             markdown(("scheme", *table.cells), table.cell_lines()),
-            *([] if directory.name in _SHORT else [markdown(("cell", "what it is"), cells)]),
+            markdown(("cell", "what it is"), cells),
             markdown(("entry", "sets", "package", "licence", "author", "flown by"), flown) + "\n",
         ]
     )
