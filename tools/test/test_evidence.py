@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from dtsa_dev.documents import twelve_picture
 from dtsa_dev.documents.evidence_tables import LEAGUES, LIST, QUOTED, main, rewritten, speed
 
 from dtsa_agent.core.errors import ConfigError
@@ -85,3 +86,11 @@ def test_speeds_and_missed_targets_are_quoted() -> None:
         "1 of 2 targets are met; not: one: 1.23, not 1.",
     ):
         assert line in said.split("\n")
+
+
+def test_the_picture_of_twelve_on_board_is_drawn_from_its_record(tmp_path: Path) -> None:
+    record = Path(__file__).parents[2] / "docs/evidence/twelve.json"
+    assert twelve_picture.main(str(record), str(tmp_path / "twelve.svg")) == 0
+    drawn = (tmp_path / "twelve.svg").read_text(encoding="utf-8")
+    assert "on board, laboratory" in drawn
+    assert json.loads(record.read_text(encoding="utf-8"))["commit"] in drawn

@@ -447,10 +447,31 @@ def _targets(rows: Sequence[Row]) -> str:
     return f"{said}; not: {'; '.join(missed)}.\n" if missed else f"{said}.\n"
 
 
+def twelve(record: Row) -> str:
+    """The paper's experiment on board, beside the simulator and UDP.
+
+    :param record: of `dtsa soak twelve`.
+    """
+    head = ("scheme", "lost", "age, slots: on board", "simulator", "UDP", "nearest pair, m: on board", "simulator",
+            "UDP", "crashed: on board", "simulator", "UDP")  # fmt: skip
+    forms = ("board", "simulator", "udp")
+    rows = [
+        (
+            cell["scheme"],
+            f"{cell['loss']:.0%}",
+            *(f"{cell[form]['age_slots']:.2f}" if form in cell else "" for form in forms),
+            *(f"{cell[form]['min_distance_m']:.2f}" if form in cell else "" for form in forms),
+            *(cell[form]["crashed"] if form in cell else "" for form in forms),
+        )
+        for cell in record["figures"]["cells"]
+    ]
+    return f"{markdown(head, rows)}\n"
+
+
 QUOTED: dict[str, Callable[[Row], str]] = {
     "board": board, "board-cost": board_cost,
     "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again, "losses": losses,
-    "mutants": mutants, "setup": setup, "serial": serial, "ns3": ns3,
+    "mutants": mutants, "setup": setup, "serial": serial, "twelve": twelve, "ns3": ns3,
 }  # fmt: skip
 
 

@@ -141,6 +141,7 @@ def _over_udp(swarm: SwarmConfig, loss: float, directory: Path) -> dict[str, Any
         raise NotMet(str(error)) from error
     met(verified(found), f"the bags do not verify: {found['decisions_again']}, {found['turns']['which']}")
     met(found["flight"] is not None, "they never counted alike")
+    met(not found["flight"]["collided"], f"a crash; nearest pair {found['flight']['min_distance_m']:.3f} m")
     sent = found["frames_sent"] + found["frames_unsent"]
     return {
         "decisions_again": found["decisions_again"]["equal"],
