@@ -36,7 +36,11 @@ def picture(record: dict[str, Any]) -> Figure:
                     points = [(100 * c["loss"], c[form][name]) for c in cells if c["scheme"] == scheme and form in c]
                     if not points:
                         continue
-                    look = {"linestyle": line or "none", "marker": marker or None, "color": colour(scheme, index)}
+                    look: dict[str, Any] = {
+                        "linestyle": line or "none",
+                        "marker": marker or None,
+                        "color": colour(scheme, index),
+                    }
                     drawn = axis.plot(*zip(*points, strict=True), markersize=6, **look)
                     if form == "simulator":
                         handles.setdefault(scheme, drawn[0])
