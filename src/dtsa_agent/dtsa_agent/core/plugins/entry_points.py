@@ -135,6 +135,7 @@ class PluginSwarm(SwarmWrapper):
         if self._wakes is not None:
             self._act(self._wakes, slot)
             return
+        self.estimate(slot)  # the control instants and the metrics leave others, which depend on what flies it
         for index, agent in enumerate(self.ids):
             policy = self._policies[index]
             chosen = policy.chosen(policy.choose(self._tables[index], slot), slot, self.config.agents)
