@@ -55,6 +55,8 @@ setup(
             "beacons = dtsa_bench.simulation.schemes:Beacons",
             "csma = dtsa_bench.simulation.schemes:Csma",
             "dtr = dtsa_bench.simulation.schemes:Dtr",
+            "mixer = dtsa_bench.simulation.schemes:Mixer",
+            "threshold-aoii = dtsa_bench.simulation.schemes:ThresholdAoii",
             "whittle = dtsa_bench.simulation.schemes:Whittle",
         ],
     },

@@ -167,6 +167,28 @@ class UnslottedTraffic:
         self._begin(packet, now_ns + self._to_radio_ns(len(packet.note) + len(packet.frame)), now_ns)
         return True
 
+    def frame(self, index: int) -> bytes:
+        """An agent's frame of this slot, which its policy sends in packets of its own.
+
+        :param index: its position in ``ids``.
+        """
+        if self._frames[index]:
+            self._began.add(index)
+        return self._frames[index]
+
+    def take_in(self, index: int, frame: bytes) -> None:
+        """An agent hears a frame that its policy has put together from packets.
+
+        :param index: its position in ``ids``.
+        :param frame: the frame.
+        """
+        if not isinstance(frame, bytes) or not frame:
+            policy = self._parts.policies[index].name
+            raise PluginError(f"{policy}, wake", f"took in {frame!r}; allowed: bytes of a frame")
+        mask = np.zeros(len(self._frames), np.bool_)
+        mask[index] = True
+        self._carried.heard.append((frame, mask))
+
     def _to_radio_ns(self, length: int) -> int:
         """How long after the order a radio has a packet, ns; a constant delay moves arrivals alone."""
         return self._airtime.to_radio_ns(length) if self._airtime.line.serial else 0
@@ -232,3 +254,9 @@ class _Radio:
 
     def say(self, note: bytes) -> bool:
         return self._traffic.transmit(_Packet(self._index + 1, b"", note), self._now_ns)
+
+    def frame(self) -> bytes:
+        return self._traffic.frame(self._index)
+
+    def take_in(self, frame: bytes) -> None:
+        self._traffic.take_in(self._index, frame)

@@ -26,6 +26,7 @@ from dtsa_bench.experiments.sweep.spec import run_config
 from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.schemes.knowledge import whittle_index
+from dtsa_bench.simulation.schemes.mixer import Decoder
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
@@ -118,6 +119,55 @@ def test_threshold_aloha_has_the_age_of_its_source() -> None:
     """1.4169 n for many agents, ages counted from 1."""
     ages = steady("threshold-aloha", 200, 200, slots=4000, warmup=1200).outcome
     assert (ages.age + 1) / 200 == pytest.approx(1.4169, rel=0.05)
+
+
+def delivered(share: float, loss: float) -> float:
+    """Share of the frames of each round of Mixer that an agent has before the next one, by the slots they are from."""
+    run = run_config({
+        "policy": "mixer", "agents": 12, "avoider": "none", "loss": loss, "seed": 3, "timeout_s": 8, "tail_s": 9,
+        "stop_on_crash": False, "options": {"mixer.slots_per_agent": share},
+    })  # fmt: skip
+    trace = simulate(run, trace=True).trace
+    assert trace is not None
+    period = round(share * 12)
+    ends = np.array(trace.heard_slot)[2 * period - 2 :: period, 1:]
+    return float((ends == period * np.arange(1, len(ends) + 1)[:, None]).mean())
+
+
+def test_a_round_of_mixer_brings_all_states_to_all_also_where_frames_are_lost() -> None:
+    """Each packet helps whatever an agent lacks: a fifth lost costs next to nothing."""
+    assert delivered(2.0, 0.0) == 1.0
+    assert delivered(2.0, 0.05) > 0.99
+    assert delivered(3.0, 0.2) > 0.99
+    assert delivered(1.5, 0.2) < 0.95  # fewer packets than it takes
+
+
+def test_what_mixer_combines_is_solved_for_as_soon_as_there_are_enough() -> None:
+    draw, frames = np.random.default_rng(1), {k: int(v) for k, v in enumerate(range(100, 110), 1)}
+    heard, count = Decoder(), 0
+    while len(heard.rows) < len(frames):
+        vector = int(draw.integers(1, 1 << len(frames)))
+        mixed = 0
+        for k, frame in frames.items():
+            mixed ^= frame if vector >> (k - 1) & 1 else 0
+        heard.add(vector, mixed)
+        count += 1
+    assert heard.solved() == frames
+    assert count <= len(frames) + 8  # random sums: the chance of needing so many is 1 in 250
+
+
+def test_who_is_known_as_it_is_does_not_send_by_the_age_of_incorrect_information() -> None:
+    """Larger errors that are borne cost fewer frames, and are there: in the mean a third of the bound."""
+    loose = {"threshold-aoii.error_m": 0.5, "threshold-aoii.rate": 1.0}
+    settings = {"policy": "threshold-aoii", "agents": 12, "moving": 2, "seed": 2, "timeout_s": 20}
+    few, many = (
+        simulate(run_config({**settings, "options": options})).summary()
+        for options in (loose, {"threshold-aoii.error_m": 0.02})
+    )
+    assert few["frames_per_s"] < 0.8 * many["frames_per_s"]
+    assert 0.05 < few["estimate_error_mean_m"] < 0.5
+    with pytest.raises(ConfigError, match=r"threshold-aoii\.rate: got 0"):
+        simulate(run_config({**settings, "options": {"threshold-aoii.rate": 0.0}}))
 
 
 def traffic(policy: str, slots: int, **settings: object) -> tuple[UnslottedTraffic, list[object], SwarmConfig]:

@@ -133,6 +133,18 @@ class PacketRadio(Radio, Protocol):
         :param note: its bytes.
         """
 
+    def frame(self) -> bytes:
+        """The agent's frame, with its state at the start of the slot, for packets of the policy's own.
+
+        The agent counts as having sent it. Empty: it has none.
+        """
+
+    def take_in(self, frame: bytes) -> None:
+        """The agent hears a frame that its policy has put together from packets.
+
+        :param frame: the whole frame, as its sender's :meth:`frame` gave it.
+        """
+
 
 class Reacts(Unslotted, Protocol):
     """An unslotted policy that acts on each packet as it arrives, for example a token ring. In the simulator only."""

@@ -10,11 +10,13 @@ from .contention import Dominance, ThresholdAloha
 from .dtr import Dtr
 from .event_tdma import EventTdma
 from .genie import GenieAge, GenieError, Whittle
+from .mixer import Mixer
 from .sense import Sense
 from .sotdma import Sotdma
+from .threshold_aoii import ThresholdAoii
 from .unslotted import Beacons, Csma, PureAloha
 
 __all__ = [
-    "Beacons", "Csma", "Dominance", "Dtr", "EventTdma", "GenieAge", "GenieError", "PureAloha", "Sense",
-    "Sotdma", "ThresholdAloha", "Whittle",
+    "Beacons", "Csma", "Dominance", "Dtr", "EventTdma", "GenieAge", "GenieError", "Mixer", "PureAloha",
+    "Sense", "Sotdma", "ThresholdAloha", "ThresholdAoii", "Whittle",
 ]  # fmt: skip
