@@ -153,6 +153,8 @@ def _fly_unslotted(
         swarm.fly(slot)
         for frame, mask in carried.heard:
             swarm.hear(slot, frame, mask)
+        for sampled, frame, mask in carried.combined:
+            swarm.hear(sampled, frame, mask)
         swarm.end(slot)
         over = metrics.update(slot, swarm.track, swarm, carried.outcome, carried.lengths)
         if kept is not None:

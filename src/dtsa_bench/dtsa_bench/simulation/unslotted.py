@@ -30,6 +30,8 @@ class Carried:
     senders: tuple[int, ...] = ()  # ids that began to send a frame in it, each once
     lengths: list[int] = field(default_factory=list)  # bytes of the packets that began in it
     heard: list[tuple[bytes, NDArray[np.bool_]]] = field(default_factory=list)  # frames that arrived, and (N,) by whom
+    # Frames that policies have put together from packets: the slot of their state, the frame, and (N,) by whom.
+    combined: list[tuple[int, bytes, NDArray[np.bool_]]] = field(default_factory=list)
     outcome: int = IDLE  # SUCCESS: packets ended in it and none was disturbed; COLLISION: one was
 
 
@@ -176,18 +178,19 @@ class UnslottedTraffic:
             self._began.add(index)
         return self._frames[index]
 
-    def take_in(self, index: int, frame: bytes) -> None:
+    def take_in(self, index: int, frame: bytes, slot: int) -> None:
         """An agent hears a frame that its policy has put together from packets.
 
         :param index: its position in ``ids``.
         :param frame: the frame.
+        :param slot: the slot at whose start its state was.
         """
         if not isinstance(frame, bytes) or not frame:
             policy = self._parts.policies[index].name
             raise PluginError(f"{policy}, wake", f"took in {frame!r}; allowed: bytes of a frame")
         mask = np.zeros(len(self._frames), np.bool_)
         mask[index] = True
-        self._carried.heard.append((frame, mask))
+        self._carried.combined.append((slot, frame, mask))
 
     def _to_radio_ns(self, length: int) -> int:
         """How long after the order a radio has a packet, ns; a constant delay moves arrivals alone."""
@@ -258,5 +261,5 @@ class _Radio:
     def frame(self) -> bytes:
         return self._traffic.frame(self._index)
 
-    def take_in(self, frame: bytes) -> None:
-        self._traffic.take_in(self._index, frame)
+    def take_in(self, frame: bytes, slot: int) -> None:
+        self._traffic.take_in(self._index, frame, slot)

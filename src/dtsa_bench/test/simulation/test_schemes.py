@@ -121,15 +121,15 @@ def test_threshold_aloha_has_the_age_of_its_source() -> None:
     assert (ages.age + 1) / 200 == pytest.approx(1.4169, rel=0.05)
 
 
-def delivered(share: float, loss: float) -> float:
+def delivered(share: float, loss: float, agents: int = 12) -> float:
     """Share of the frames of each round of Mixer that an agent has before the next one, by the slots they are from."""
     run = run_config({
-        "policy": "mixer", "agents": 12, "avoider": "none", "loss": loss, "seed": 3, "timeout_s": 8, "tail_s": 9,
+        "policy": "mixer", "agents": agents, "avoider": "none", "loss": loss, "seed": 3, "timeout_s": 8, "tail_s": 9,
         "stop_on_crash": False, "options": {"mixer.slots_per_agent": share},
     })  # fmt: skip
     trace = simulate(run, trace=True).trace
     assert trace is not None
-    period = round(share * 12)
+    period = round(share * agents)
     ends = np.array(trace.heard_slot)[2 * period - 2 :: period, 1:]
     return float((ends == period * np.arange(1, len(ends) + 1)[:, None]).mean())
 
@@ -140,6 +140,7 @@ def test_a_round_of_mixer_brings_all_states_to_all_also_where_frames_are_lost() 
     assert delivered(2.0, 0.05) > 0.99
     assert delivered(3.0, 0.2) > 0.99
     assert delivered(1.5, 0.2) < 0.95  # fewer packets than it takes
+    assert delivered(2.0, 0.05, agents=40) > 0.99  # rounds of three slots
 
 
 def test_what_mixer_combines_is_solved_for_as_soon_as_there_are_enough() -> None:

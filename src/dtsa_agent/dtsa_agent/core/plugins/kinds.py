@@ -139,10 +139,11 @@ class PacketRadio(Radio, Protocol):
         The agent counts as having sent it. Empty: it has none.
         """
 
-    def take_in(self, frame: bytes) -> None:
+    def take_in(self, frame: bytes, slot: int) -> None:
         """The agent hears a frame that its policy has put together from packets.
 
         :param frame: the whole frame, as its sender's :meth:`frame` gave it.
+        :param slot: the slot in which it did. It may be over for long: a round may take many slots.
         """
 
 

@@ -77,6 +77,7 @@ class Mixer:
         if not 1.0 <= share <= 100.0:
             raise ConfigError("mixer.slots_per_agent", share, "1 to 100")
         self._agent, self._count, self._length = agent, config.agents, config.frame_length
+        self._slot_ns = config.slot_ns
         self._width = -(-config.agents // 8)  # bytes of a vector
         self.packet = HEADER + 2 * self._width + self._length
         nrf_us = Airtime().total_ns(self.packet) / 1e3 + GUARD_US
@@ -99,7 +100,8 @@ class Mixer:
             self._news = False
             for agent, frame in sorted(self._heard.solved().items()):
                 if agent != self._agent:
-                    radio.take_in(frame.to_bytes(self._length, "little"))
+                    slot = self._round * self.period_ns // self._slot_ns
+                    radio.take_in(frame.to_bytes(self._length, "little"), slot)
         if now_ns >= self._due_ns:
             self._act(radio)
         return max(now_ns + 1, self._due_ns)
