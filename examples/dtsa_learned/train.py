@@ -44,7 +44,7 @@ SWARMS: tuple[dict[str, Any], ...] = (
 COMMON = {"estimator": "linear", "avoider": "orca", "slot_ms": 10, "frame": "extended"}
 FIRST_SEED = 50_000_000  # of training; those of the validation come before it
 SLOTS = 600  # most of a flight
-STEP = 0.08  # first step size of the evolution: larger ones lose what the start knows
+STEP = 0.12  # first step size of the evolution
 MOST = 10.0  # rounds, the largest age that counts
 # What a crash costs on top. The league's price, an age of ten rounds, is four times that: luck would hide the rest.
 LOST = 1.0

@@ -253,6 +253,16 @@ int board_command(board *b, int64_t now, double command[3])
     return 1;
 }
 
+int board_stay(board *b, int64_t now, const double place[3], double command[3])
+{
+    double *goal = b->agent->goal, there[3];
+    memcpy(there, goal, sizeof there);
+    memcpy(goal, place, sizeof there);
+    const int flies = board_command(b, now, command);
+    memcpy(goal, there, sizeof there);
+    return flies;
+}
+
 int board_rests(const board *b, int index) { return !b->agent->table->in_ap[index]; }
 
 double board_place(const board *b, int index, int direction)

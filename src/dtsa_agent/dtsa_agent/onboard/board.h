@@ -88,6 +88,9 @@ int64_t board_step(board *b, int64_t now_ns, const double position[3], const dou
 /* Where to fly, m/s, in the present slot; 0: nowhere, it hovers, command is zero. */
 int board_command(board *b, int64_t now_ns, double command[3]);
 
+/* The same for one that stays at a place (m, frame map) and gives way to those it has heard of. */
+int board_stay(board *b, int64_t now_ns, const double place[3], double command[3]);
+
 /* Slots since an agent's news was new, by index; -1: nothing is known of it. */
 int64_t board_age(const board *b, int index);
 /* Whether it rests, as far as is known. */
