@@ -36,7 +36,7 @@ class Rules:
 
 
 def start() -> NDArray[np.float64]:
-    """(SIZE,) what training begins with: all claims grow alike, a round robin. The hidden units tell the inputs apart."""
+    """(SIZE,) what training begins with: all claims grow alike, a round robin. Hidden units tell inputs apart."""
     theta = np.zeros(SIZE)
     inputs = ((2, 0, 0, 0, 0), (0, 2, 0, 0, 0), (0, 0, 2, 0, 0), (0, 0, 0, 2, 0), (2, 0, 2, 0, -2), (0, 2, 2, 0, -2))
     theta[:_HEADS] = np.array(inputs, dtype=np.float64).ravel()

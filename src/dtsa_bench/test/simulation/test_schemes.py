@@ -171,6 +171,24 @@ def test_who_is_known_as_it_is_does_not_send_by_the_age_of_incorrect_information
         simulate(run_config({**settings, "options": {"threshold-aoii.rate": 0.0}}))
 
 
+def test_first_reports_of_sotdma_that_enter_by_random_access_collide_as_often_as_slots_are_equal() -> None:
+    """All are switched on at once and each begins in any of L slots: 1 - (1 - 1 / L)^(N - 1), 0.38 for 20 in 40."""
+    collided, first = 0, 0
+    for seed in range(15):
+        settings = {"policy": "sotdma", "agents": 20, "seed": seed, "timeout_s": 2, "options": {"sotdma.entry": 1}}
+        trace = simulate(run_config(settings), trace=True).trace
+        assert trace is not None
+        seen: set[int] = set()
+        for senders in trace.senders:
+            new = set(senders) - seen
+            collided += len(new) if len(senders) > 1 else 0
+            first += len(new)
+            seen |= new
+        assert len(seen) == 20
+    assert first == 300
+    assert collided / first == pytest.approx(1 - (1 - 1 / 40) ** 19, abs=0.1)  # more than three standard deviations
+
+
 def traffic(policy: str, slots: int, **settings: object) -> tuple[UnslottedTraffic, list[object], SwarmConfig]:
     """The air alone: nobody flies."""
     config = SwarmConfig(agents=20, policy=policy, seed=5, slot_ms=2, **settings)

@@ -56,14 +56,14 @@ class Mixer:
     packet contains its own frame for certain. Frames are taken in at the end of the round, as far as what was heard can
     be solved for them. Every packet goes over the medium like any other one: it may be lost, or collide.
 
-    Sources: Mixer (arXiv 1804.08986), whose code says who sends when: the owner of a slot, and in slots of others
-    nobody while their owner is in reach; DMPC-Swarm (arXiv 2508.20553), with slots of 0.53 ms. Not here: synchronous
-    transmissions, by which Mixer spans several hops (its helpers send at the same time, and the capture effect lets one
-    of them be received); requests for missing frames; the end of a round as soon as all have everything.
+    Sources: Mixer (arXiv 1804.08986), a derivative of whose code says who sends when: the owner of a slot, and in slots
+    of others nobody while their owner is in reach; DMPC-Swarm (arXiv 2508.20553), with slots of 0.53 ms. Not here:
+    synchronous transmissions, by which Mixer spans several hops (its helpers send at the same time, and the capture
+    effect lets one of them be received); requests for missing frames; the early end of a round.
 
     Options: ``mixer.slots_per_agent`` (2; DMPC-Swarm has 5.2 for several hops), ``mixer.slot_us`` (default: what a
-    packet takes an nRF, and 31 us) and ``mixer.period_ms`` (from round to
-    round, whole slots, at least a round; default: as many packets as TDMA has frames).
+    packet takes an nRF, and 31 us) and ``mixer.period_ms`` (from round to round, whole slots, at least a round;
+    default: as many packets as TDMA has frames).
 
     :raises ConfigError: for less than one slot an agent.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import islice
 
 import numpy as np
 
@@ -23,10 +24,14 @@ class Sotdma:
     in it announces another one, drawn within 0.2 L around it from at least four that are free. Three own bytes: reports
     left, and offset to the next one. Collisions are not noticed; they end with the slot's time-out.
 
-    Option: ``sotdma.load`` (0.5), N / L: with more, less is free to choose from; with less, reports are rare.
+    Options: ``sotdma.load`` (0.5), N / L: with more, less is free to choose from; with less, reports are rare.
+    ``sotdma.entry`` (0), 1: the first report has no slot of its own near the nominal one. It begins at a random slot of
+    the second frame, by random access (RATDMA): in each of at least four free slots it is sent with a probability that
+    starts at one in their number and grows to 1. It announces the slot of the next report, as in the network entry of
+    the source, of which a summary was read and not the text.
     """
 
-    options = ("load",)
+    options = ("entry", "load")
     own_bytes = 3
     may_join = True
 
@@ -39,15 +44,36 @@ class Sotdma:
         self._next = -1  # own next slot; -1: not entered yet
         self._left = 0  # reports left in it
         self._offset = 0  # announced in the present frame: slots to the next report
+        self._by_random_access = config.options.get("sotdma.entry", 0.0) > 0.0
+        self._chances: list[int] = []  # slots in which the first report may be sent
+        self._chance = 0.0  # of the next of them
 
     def choose(self, table: Table, slot: int) -> int:
         """Itself in its own slots; else who has announced this one."""
         if self._agent and self._next < 0 and slot >= self._frame:
-            self._next = self._draw(slot + (self._agent * self._frame) // table.config.agents, slot)
-            self._left = int(self._random.integers(*_TIMEOUTS))
+            if self._by_random_access:
+                self._enter(slot)
+            else:
+                self._next = self._draw(slot + (self._agent * self._frame) // table.config.agents, slot)
+                self._left = int(self._random.integers(*_TIMEOUTS))
         if slot == self._next and self._agent:
             return self._agent
         return self._taken.get(slot, 0)
+
+    def _enter(self, slot: int) -> None:
+        """Sends the first report by random access, as soon as a draw says so."""
+        if not self._chances:
+            begin = slot + int(self._random.integers(self._frame))
+            free = (one for one in range(begin, begin + 2 * self._frame) if one not in self._taken)
+            self._chances = list(islice(free, _LEAST)) or [begin]
+            self._chance = 1.0 / len(self._chances)
+        if slot != self._chances[0]:
+            return
+        if self._random.random() < self._chance or len(self._chances) == 1:
+            self._next = slot
+        else:
+            self._chances.pop(0)
+            self._chance += (1.0 - self._chance) / len(self._chances)
 
     def _draw(self, nominal: int, now: int) -> int:
         """A slot around a nominal one, free if there are free ones."""
