@@ -73,7 +73,7 @@ def test_names_and_notices_of_the_wheel(wheel: Path) -> None:
         points = configparser.ConfigParser()
         points.read_string(file.read(f"{info}/entry_points.txt").decode())
     assert list(points["console_scripts"]) == ["dtsa"]
-    assert len(points["dtsa.policies"]) == 12
+    assert len(points["dtsa.policies"]) == 14
     assert said["License-Expression"] == "Apache-2.0 AND MIT"
     notices = {name.rpartition("/")[2] for name in names if name.startswith(f"{info}/licenses/")}
     assert notices == {"LICENSE", "NOTICE", "three.LICENSE"}
