@@ -92,7 +92,7 @@ def _enter(args: argparse.Namespace, there: League) -> int:
     from dtsa_bench.experiments.league.entry import make_entry, write_entry
     from dtsa_bench.experiments.league.flight import check_golden
     from dtsa_bench.experiments.league.plan import EntryPlan, flights_of, work_of
-    from dtsa_bench.runs.options import whole_number
+    from dtsa_bench.runs.options import named_values, processes, whole_number
 
     word = _word(args, there)
     if args.judged:
@@ -104,9 +104,9 @@ def _enter(args: argparse.Namespace, there: League) -> int:
         named = [there.cell(name.strip()).name for name in args.cells.split(",")]
         chosen = [name for name in chosen if name in named]
     count = there.count if args.sample is None else whole_number(args.sample, "sample", 1, there.count)
-    jobs = _jobs(args)
+    jobs = processes(args.jobs)
     room = Path(args.out or Path("runs") / there.name) / "package"
-    entrant = entrant_of(args.what[0], args.name, args.policy, _changes(args.set or []), room)
+    entrant = entrant_of(args.what[0], args.name, args.policy, named_values(args.set or []), room)
     check_golden(there)
     flights = flights_of(there, word or there.practice, chosen, count)
     plan, work = EntryPlan(there, entrant.name, entrant.scheme, flights), work_of(entrant.scheme["policy"])
@@ -151,7 +151,7 @@ def _check(args: argparse.Namespace, there: League) -> int:
     from dtsa_bench.experiments.league.check import SHOWN, check_entry, found_share
     from dtsa_bench.experiments.league.entrant import install
     from dtsa_bench.experiments.league.entry import read_entry
-    from dtsa_bench.runs.options import whole_number
+    from dtsa_bench.runs.options import processes, whole_number
 
     if args.all and args.sample is not None:
         raise ConfigError("sample", args.sample, "without --all")
@@ -159,7 +159,7 @@ def _check(args: argparse.Namespace, there: League) -> int:
     word = _word(args, there) or there.published() if entry["seeds"] == "judged" else there.practice
     sample = None if args.all else whole_number(args.sample or str(SAMPLE), "sample", 0, 1_000_000)
     seed = secrets.randbits(31) if args.seed is None else whole_number(args.seed, "seed", 0, 2**62)
-    jobs = _jobs(args)
+    jobs = processes(args.jobs)
     if args.package is not None:
         install(Path(args.package), Path("runs") / there.name / "package")
     found = check_entry(there, entry, word=word, sample=sample, seed=seed, jobs=jobs)
@@ -227,28 +227,3 @@ def _word(args: argparse.Namespace, there: League) -> str | None:
     word = read_secret(args.secret)
     there.check_secret(word)
     return word
-
-
-def _changes(words: list[str]) -> dict[str, Any]:
-    import yaml
-
-    from dtsa_agent.core.errors import ConfigError
-
-    changes = {}
-    for word in words:
-        name, sign, value = word.partition("=")
-        if not sign:
-            raise ConfigError("set", word, "NAME=VALUE")
-        try:
-            changes[name.replace("-", "_")] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ConfigError("set", word, "NAME=VALUE with a plain value") from None
-    return changes
-
-
-def _jobs(args: argparse.Namespace) -> int:
-    import os
-
-    from dtsa_bench.runs.options import whole_number
-
-    return len(os.sched_getaffinity(0)) if args.jobs is None else whole_number(args.jobs, "jobs", 1, 1024)

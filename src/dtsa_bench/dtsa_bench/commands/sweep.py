@@ -79,12 +79,12 @@ def run(args: argparse.Namespace) -> int:
 def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.experiments.sweep import spec
-    from dtsa_bench.runs.options import whole_number
+    from dtsa_bench.runs.options import named_values, whole_number
 
     changes = {
         "seeds": None if args.seeds is None else whole_number(args.seeds, "seeds", 1, 1_000_000),
         "first_seed": None if args.first_seed is None else whole_number(args.first_seed, "first-seed", 0, 2**62),
-        "base": _base(args.set) | ({"losses": args.losses} if args.losses else {}),
+        "base": named_values(args.set) | ({"losses": args.losses} if args.losses else {}),
     }
     if args.file:
         return [spec.load_file(args.file, **changes)]
@@ -95,31 +95,15 @@ def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     return [spec.load_preset(name, **changes) for name in names]
 
 
-def _base(words: list[str]) -> dict[str, object]:
-    import yaml
-
-    from dtsa_agent.core.errors import ConfigError
-
-    base = {}
-    for word in words:
-        name, sign, value = word.partition("=")
-        if not sign:
-            raise ConfigError("set", word, "NAME=VALUE")
-        try:
-            base[name.replace("-", "_")] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ConfigError("set", word, "NAME=VALUE with a plain value") from None
-    return base
-
-
 def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
     from dtsa_bench.experiments.batch.progress import run_batch
     from dtsa_bench.experiments.sweep.aggregate import Table, collected, write_table
     from dtsa_bench.experiments.sweep.text import claims_text, table_text
     from dtsa_bench.experiments.sweep.work import work_of
+    from dtsa_bench.runs.options import processes
 
     begun, work = time.monotonic(), work_of(sweep)
-    rows = collected(sweep, run_batch(sweep, work, directory, jobs=_jobs(args), cluster=args.cluster))
+    rows = collected(sweep, run_batch(sweep, work, directory, jobs=processes(args.jobs), cluster=args.cluster))
     table = Table(sweep, rows)
     write_table(directory, table, work.code())
     flown = time.monotonic() - begun
@@ -151,9 +135,3 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     return 1 if failed else 0
-
-
-def _jobs(args: argparse.Namespace) -> int | None:
-    from dtsa_bench.runs.options import whole_number
-
-    return None if args.jobs is None else whole_number(args.jobs, "jobs", 1, 1024)

@@ -138,6 +138,35 @@ def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:
     return int(Setting(name, "int", None, name, minimum=minimum, maximum=maximum).read(text))
 
 
+def processes(text: str | None) -> int | None:
+    """The number of processes that an option says; None: one a core.
+
+    :param text: what was given to the option; None: nothing.
+    :raises ConfigError: if it is no such number.
+    """
+    return None if text is None else whole_number(text, "jobs", 1, 1024)
+
+
+def named_values(words: Iterable[str]) -> dict[str, Any]:
+    """What `--set NAME=VALUE` says, by name, with underscores; values are YAML.
+
+    :param words: all that were given.
+    :raises ConfigError: for one that is none.
+    """
+    import yaml
+
+    values = {}
+    for word in words:
+        name, sign, value = word.partition("=")
+        if not sign:
+            raise ConfigError("set", word, "NAME=VALUE")
+        try:
+            values[name.replace("-", "_")] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError("set", word, "NAME=VALUE with a plain value") from None
+    return values
+
+
 def new_directory(path: str | Path) -> Path:
     """The directory for results: it does not exist yet, or is empty.
 

@@ -27,7 +27,7 @@ def run_all(
     work: Work,
     journal: Journal | None = None,
     *,
-    jobs: int = 1,
+    jobs: int | None = 1,
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Row]:
@@ -36,7 +36,7 @@ def run_all(
     :param plan: all runs.
     :param work: how a run is done.
     :param journal: of the plan; gets every row as soon as it is there. None: rows are kept in memory alone.
-    :param jobs: number of processes on this machine.
+    :param jobs: number of processes on this machine; None: one a core.
     :param cluster: address of a Dask scheduler (``tcp://HOST:PORT``) instead.
     :param progress: called after every chunk.
     :returns: all rows by key.
@@ -49,7 +49,8 @@ def run_all(
     # All settings with few seeds before few settings with all seeds; the longest runs of a seed first.
     tasks.sort(key=lambda task: (task.seed, -task.cost))
     costs = {task.key: task.cost for task in tasks}
-    with contextlib.closing(_results(tasks, work, jobs, cluster)) as results:
+    workers = len(os.sched_getaffinity(0)) if jobs is None else jobs
+    with contextlib.closing(_results(tasks, work, workers, cluster)) as results:
         for code, chunk in results:
             if code != known:
                 where = "on the cluster" if cluster else "on this machine while the batch ran"

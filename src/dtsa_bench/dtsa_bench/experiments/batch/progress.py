@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import time
@@ -33,8 +32,7 @@ def run_batch(
     """
     journal = Journal(directory, plan, work.code())
     with ending_on_signals(journal), Progress(journal) as progress:
-        cores = len(os.sched_getaffinity(0)) if jobs is None else jobs
-        return run_all(plan, work, journal, jobs=cores, cluster=cluster, progress=progress.advance)
+        return run_all(plan, work, journal, jobs=jobs, cluster=cluster, progress=progress.advance)
 
 
 @contextmanager

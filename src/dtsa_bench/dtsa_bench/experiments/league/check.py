@@ -32,7 +32,7 @@ class Checked:
 
 
 def check_entry(
-    there: League, entry: Mapping[str, Any], *, word: str | None, sample: int | None, seed: int, jobs: int
+    there: League, entry: Mapping[str, Any], *, word: str | None, sample: int | None, seed: int, jobs: int | None
 ) -> Checked:
     """Checks an entry.
 
@@ -41,7 +41,7 @@ def check_entry(
     :param word: the practice word or the secret, from which its seeds must follow; None: it is not known yet.
     :param sample: flights that are flown again; None: all.
     :param seed: decides which.
-    :param jobs: number of processes.
+    :param jobs: number of processes; None: one a core.
     :raises ConfigError: if its policy is not here.
     """
     differences = [*sums(there, entry), *_seeds(there, entry, word)]
