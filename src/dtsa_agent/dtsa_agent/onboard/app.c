@@ -80,8 +80,7 @@ static double starts[3 * BOARD_AGENTS], targets[3 * BOARD_AGENTS];
 static uint8_t key[KEY_BYTES], sealed, ordered;
 static uint64_t session, lots;
 static int64_t heardLast; /* ns */
-static float hold[3];    /* m, where it hovers */
-static double staying[3]; /* the same in the frame map */
+static float hold[3]; /* m, where it hovers */
 
 static int64_t now_ns(void) { return (int64_t)usecTimestamp() * 1000; }
 
@@ -328,10 +327,11 @@ static void steer(const double position[3], const double place[3], int64_t now, 
     if (next == SAFETY_FLY || next == SAFETY_HOVER) {
         if (before == SAFETY_OFF) crtpCommanderHighLevelDisable(); /* it takes over */
         if (next != before)
-            for (int i = 0; i < 3; i++) hold[i] = (float)position[i], staying[i] = place[i];
+            for (int i = 0; i < 3; i++) hold[i] = (float)position[i];
         /* The others count on it to give way as they do: one whose news of somebody is old still does. */
         const int gives_way = next == SAFETY_HOVER && guard.reason == SAFETY_OLD_NEWS;
-        const int flies = gives_way ? board_stay(&agent, now, staying, command)
+        const double there[3] = {(double)hold[0], (double)hold[1], (double)hold[2] - (double)height}; /* frame map */
+        const int flies = gives_way ? board_stay(&agent, now, there, command)
                                     : next == SAFETY_FLY && board_command(&agent, now, command);
         set_point(flies ? command : NULL);
     } else if (next == SAFETY_LAND && before != SAFETY_LAND) {

@@ -77,7 +77,6 @@ class Mixer:
         if not 1.0 <= share <= 100.0:
             raise ConfigError("mixer.slots_per_agent", share, "1 to 100")
         self._agent, self._count, self._length = agent, config.agents, config.frame_length
-        self._slot_ns = config.slot_ns
         self._width = -(-config.agents // 8)  # bytes of a vector
         self.packet = HEADER + 2 * self._width + self._length
         nrf_us = Airtime().total_ns(self.packet) / 1e3 + GUARD_US
@@ -85,7 +84,8 @@ class Mixer:
         slots = round(share * config.agents)
         self.round_ns = slots * self.slot_ns
         period_ns = round(config.options.get("mixer.period_ms", slots * config.slot_ms) * 1e6)
-        self.period_ns = -(-max(period_ns, self.round_ns) // config.slot_ns) * config.slot_ns
+        self._period_slots = -(-max(period_ns, self.round_ns) // config.slot_ns)  # of the flight
+        self.period_ns = self._period_slots * config.slot_ns
         self._random = np.random.default_rng([config.seed, 18040, agent])
         self._due_ns = 0  # when there is something to do: a round begins or ends, or it owns a slot
         self._round = -1  # that it takes part in
@@ -100,8 +100,7 @@ class Mixer:
             self._news = False
             for agent, frame in sorted(self._heard.solved().items()):
                 if agent != self._agent:
-                    slot = self._round * self.period_ns // self._slot_ns
-                    radio.take_in(frame.to_bytes(self._length, "little"), slot)
+                    radio.take_in(frame.to_bytes(self._length, "little"), self._round * self._period_slots)
         if now_ns >= self._due_ns:
             self._act(radio)
         return max(now_ns + 1, self._due_ns)
