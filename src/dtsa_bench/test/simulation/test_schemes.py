@@ -16,6 +16,7 @@ import dtsa
 from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
 from dtsa_agent.core.errors import PluginError
 from dtsa_agent.core.plugins.entry_points import make_swarm, plug_ins_of
+from dtsa_agent.core.plugins.table import Table
 from dtsa_agent.core.plugins.unslotted import check_slotted
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings.config import StationSettings, SwarmSettings
@@ -27,6 +28,7 @@ from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.schemes.knowledge import whittle_index
 from dtsa_bench.simulation.schemes.mixer import Decoder
+from dtsa_bench.simulation.schemes.sotdma import Sotdma
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
@@ -187,6 +189,20 @@ def test_first_reports_of_sotdma_that_enter_by_random_access_collide_as_often_as
         assert len(seen) == 20
     assert first == 300
     assert collided / first == pytest.approx(1 - (1 - 1 / 40) ** 19, abs=0.1)  # more than three standard deviations
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_first_report_of_sotdma_keeps_out_of_slots_that_others_have_announced_meanwhile(seed: int) -> None:
+    """Frames have 12 slots. Another agent announces each slot just before it, but for four of them."""
+    config = SwarmConfig(agents=6, policy="sotdma", seed=seed, options={"sotdma.entry": 1})
+    agent, table, free = Sotdma(config, 1), Table(make_swarm(config), 0), range(30, 34)
+    sent = -1
+    for slot in range(12, 36):
+        if slot not in free:
+            agent.heard(table, slot - 1, 2, bytes((0, 1, 0)))
+        if sent < 0 and agent.choose(table, slot) == 1:
+            sent = slot
+    assert sent in free
 
 
 def traffic(policy: str, slots: int, **settings: object) -> tuple[UnslottedTraffic, list[object], SwarmConfig]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import islice
 
 import numpy as np
 
@@ -26,9 +25,10 @@ class Sotdma:
 
     Options: ``sotdma.load`` (0.5), N / L: with more, less is free to choose from; with less, reports are rare.
     ``sotdma.entry`` (0), 1: the first report has no slot of its own near the nominal one. It begins at a random slot of
-    the second frame, by random access (RATDMA): in each of at least four free slots it is sent with a probability that
-    starts at one in their number and grows to 1. It announces the slot of the next report, as in the network entry of
-    the source, of which a summary was read and not the text.
+    the second frame, by random access (RATDMA): in each of four free slots it is sent with a probability that grows:
+    1/4, 1/2, 3/4, 1. Slots that others have announced meanwhile are not free. It announces the slot of the next report,
+    as in the network entry of the source. A summary of that was read and not the text; how the probability grows is
+    assumed.
     """
 
     options = ("entry", "load")
@@ -45,8 +45,8 @@ class Sotdma:
         self._left = 0  # reports left in it
         self._offset = 0  # announced in the present frame: slots to the next report
         self._by_random_access = config.options.get("sotdma.entry", 0.0) > 0.0
-        self._chances: list[int] = []  # slots in which the first report may be sent
-        self._chance = 0.0  # of the next of them
+        self._begin = -1  # from this slot on the first report may be sent; -1: not drawn yet
+        self._passed = 0  # free slots since then
 
     def choose(self, table: Table, slot: int) -> int:
         """Itself in its own slots; else who has announced this one."""
@@ -62,18 +62,14 @@ class Sotdma:
 
     def _enter(self, slot: int) -> None:
         """Sends the first report by random access, as soon as a draw says so."""
-        if not self._chances:
-            begin = slot + int(self._random.integers(self._frame))
-            free = (one for one in range(begin, begin + 2 * self._frame) if one not in self._taken)
-            self._chances = list(islice(free, _LEAST)) or [begin]
-            self._chance = 1.0 / len(self._chances)
-        if slot != self._chances[0]:
+        if self._begin < 0:
+            self._begin = slot + int(self._random.integers(self._frame))
+        late = slot >= self._begin + 2 * self._frame  # there may be no free slot at all
+        if slot < self._begin or (slot in self._taken and not late):
             return
-        if self._random.random() < self._chance or len(self._chances) == 1:
+        self._passed += 1
+        if late or self._random.random() < self._passed / _LEAST:
             self._next = slot
-        else:
-            self._chances.pop(0)
-            self._chance += (1.0 - self._chance) / len(self._chances)
 
     def _draw(self, nominal: int, now: int) -> int:
         """A slot around a nominal one, free if there are free ones."""
