@@ -50,17 +50,18 @@ def test_an_interrupted_soak_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert record["failures"] == []
 
 
-def test_a_failed_item_is_in_the_record_and_is_tried_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("figures", [False, True])
+def test_a_failed_item_is_in_the_record_and_is_tried_again(figures: bool, tmp_path: Path) -> None:
     broken = [3]
 
     def run(item: Item, directory: Path) -> Row:
         if item.seed in broken:
-            raise NotMet("it fell\n over")
+            raise NotMet("it fell\n over", {"k": -1} if figures else None)
         return {"k": item.seed}
 
     record = run_soak(soak_of(run), tmp_path / "journal", 1.0)
     assert record["failures"] == [{"item": "item 3", "reason": "NotMet: it fell over"}]
-    assert record["figures"] == {"k": [0, 1, 2]}
+    assert record["figures"] == {"k": [0, 1, 2, -1] if figures else [0, 1, 2]}
     assert "failed_before_they_passed" not in record
     unfinished = run_soak(soak_of(run), tmp_path / "journal", 1e-9)
     assert (unfinished["failures"], unfinished["finished"]) == (record["failures"], record["finished"])

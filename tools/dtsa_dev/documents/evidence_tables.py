@@ -328,7 +328,7 @@ def board(record: Row) -> str:
     :param record: as ``soak board`` writes it.
     """
     head = (
-        "fault", "flown", "fell", "closest pair", "frames heard", "mean age", "slots with two senders",
+        "fault", "flown", "fell", "closest pair", "frames heard", "mean age", "time hovered", "slots with two senders",
         "decisions made again, all equal",
     )  # fmt: skip
     rows = [
@@ -339,6 +339,7 @@ def board(record: Row) -> str:
             f"{found['min_distance_m']:.2f} m",
             f"{100 * found['heard_share']:.0f} %",
             f"{found['mean_age_ms']:.0f} ms",
+            f"{100 * found['hover_share']:.1f} %",
             str(found["slots_with_two_senders"]),
             f"{found['decisions_again']:,}",
         )

@@ -27,6 +27,7 @@ from .item import Item, NotMet, Soak
 _AGENTS, _SECONDS, _SANITIZED_S, _ENABLED_S = 12, 300.0, 100.0, 8.0
 _EACH_S = 12.0  # from one change of goals to the next
 _NEAREST_M = 0.2
+_LOOK_S, _HOVER = 0.2, 2  # how often an app is asked for its mode; one of these
 _ONE = 5  # agent of the faults that befall one
 _RESET_S, _BACK_S = 60.0, 15.0
 _LAST_S = 30.0  # before the end: where one is without power the others land
@@ -37,6 +38,7 @@ _ALL = "all but a brown-out, with sanitizers"
 _FAULTS: dict[str, dict[str, float]] = {
     "clocks off by 50 ppm": {},
     "30 % lost": {"loss": 0.3},
+    "polls, 10 a second each": {"polls": 10.0},
     "polls, 50 a second each": {"polls": 50.0},
     "an app that is reset": {},
     "a brown-out in flight": {},
@@ -93,8 +95,16 @@ def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[
     with OnBoard(swarm, settings, directory, enable_s=_ENABLED_S, flags=flags) as flight:
         _fly_to_and_fro(flight, seconds)
         _befall(flight, fault, seconds, seed)
+        modes: list[int] = []
+        for at in np.arange(_ENABLED_S + 2.0, seconds, _LOOK_S).tolist():
+            flight.lab.at(at, lambda: modes.extend(_modes(flight)))
         flight.lab.run(seconds)
-        return flight.finish()
+        return {**flight.finish(), "hover_share": modes.count(_HOVER) / len(modes)}
+
+
+def _modes(flight: OnBoard) -> list[int]:
+    lab = flight.lab
+    return [round(lab.log(agent, "dtsa.mode")) for agent in range(1, _AGENTS + 1) if lab.is_on(agent)]
 
 
 def _fly_with_sanitizers(fault: str, seconds: float, seed: int, directory: Path) -> dict[str, Any]:
@@ -122,15 +132,15 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
         "min_distance_m": summary["min_distance_m"], "decisions_again": again["equal"],
         "differences": len(again["differences"]), "slots_with_two_senders": turns["slots_with_two_senders"],
         "sent": found["frames_sent"], "heard_share": found["frames_heard"] / found["frames_sent"] / (_AGENTS - 1),
-        "mean_age_ms": summary["mean_age_ms"],
+        "mean_age_ms": summary["mean_age_ms"], "hover_share": summary["hover_share"],
     }  # fmt: skip
     expected = [_ONE] if fault == "a brown-out in flight" else []
     if figures["crashed"] != expected:
-        raise NotMet(f"{item.name}: crashed {figures['crashed']}, expected {expected}")
+        raise NotMet(f"{item.name}: crashed {figures['crashed']}, expected {expected}", figures)
     if figures["differences"]:
-        raise NotMet(f"{item.name}: {again['differences'][0]}")
+        raise NotMet(f"{item.name}: {again['differences'][0]}", figures)
     if figures["min_distance_m"] < _NEAREST_M:
-        raise NotMet(f"{item.name}: two came as near as {figures['min_distance_m']:.3f} m")
+        raise NotMet(f"{item.name}: two came as near as {figures['min_distance_m']:.3f} m", figures)
     return figures
 
 
@@ -139,14 +149,16 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     for fault in _FAULTS:
         parts = [row["summary"] for row in rows if row["summary"].get("fault") == fault]
         if parts:
+            seconds = sum(part["seconds"] for part in parts)
             found[fault] = {
-                "seconds": sum(part["seconds"] for part in parts),
+                "seconds": seconds,
                 "crashed": sum(len(part["crashed"]) for part in parts),
                 "min_distance_m": min(part["min_distance_m"] for part in parts),
                 "decisions_again": sum(part["decisions_again"] for part in parts),
                 "slots_with_two_senders": sum(part["slots_with_two_senders"] for part in parts),
                 "heard_share": sum(part["heard_share"] for part in parts) / len(parts),
                 "mean_age_ms": sum(part["mean_age_ms"] for part in parts) / len(parts),
+                "hover_share": sum(part["hover_share"] * part["seconds"] for part in parts) / seconds,
             }
     return found
 

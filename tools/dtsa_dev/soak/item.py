@@ -12,7 +12,14 @@ from dtsa_bench.experiments.batch.task import Row, Task, key_of
 
 
 class NotMet(DtsaError):
-    """What a soak promises did not hold in one of its items; the message says what."""
+    """What a soak promises did not hold in one of its items; the message says what.
+
+    :param figures: of that item, where it gave them all the same: they are summed up with those of the others.
+    """
+
+    def __init__(self, message: str, figures: dict[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.figures = figures
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +41,7 @@ class Soak:
     :param promise: what holds if it finds nothing, in a sentence.
     :param items: all items.
     :param run: does one in an empty directory and returns its figures; raises :class:`NotMet` where the promise fails.
-    :param figures: sums up the figures of all finished items.
+    :param figures: sums up the figures of all finished items that have them.
     :param check: raises a ConfigError where the machine lacks what it needs.
     """
 

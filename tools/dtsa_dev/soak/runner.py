@@ -16,7 +16,7 @@ from dtsa_bench.experiments.batch.table import write_whole
 from dtsa_bench.experiments.batch.task import FAILED, Row, Task, attempt
 from dtsa_dev.code import developers_digest
 
-from .item import Item, Soak, SoakPlan
+from .item import Item, NotMet, Soak, SoakPlan
 
 PASSED = "passed"
 
@@ -54,12 +54,20 @@ def run_soak(soak: Soak, directory: Path, minutes: float, sample: bool = False) 
 
 def _one(soak: Soak, item: Item, task: Task) -> Row:
     begin, load = time.monotonic(), _load()
+    failed: Row | None = None  # figures of an item that failed
 
     def run(_: Task) -> tuple[str, Row]:
+        nonlocal failed
         with tempfile.TemporaryDirectory(prefix="dtsa-soak-") as directory:
-            return PASSED, soak.run(item, Path(directory))
+            try:
+                return PASSED, soak.run(item, Path(directory))
+            except NotMet as error:
+                failed = error.figures
+                raise
 
     row = attempt(task, run)
+    if failed is not None:
+        row["summary"] = failed
     return {**row, "item": item.name, "wall_s": round(time.monotonic() - begin, 1), "load": load[0]}
 
 
@@ -87,7 +95,7 @@ def record_of(
         "finished": len(done),
         "wall_s": round(sum(row["wall_s"] for row in done), 1),
         "load_of_items": [min((r["load"] for r in done), default=0.0), max((r["load"] for r in done), default=0.0)],
-        "figures": plan.soak.figures([row for row in done if row["status"] != FAILED]),
+        "figures": plan.soak.figures([row for row in done if row["summary"] is not None]),
         "failures": failures,
         **({"failed_before_they_passed": repeated} if repeated else {}),
     }

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from dtsa_agent.core import SwarmConfig
@@ -23,7 +24,7 @@ from dtsa_bench.recordings.merge.merge import Merge, verified
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 
 OFF, FLY, HOVER, LAND = range(4)
-DISABLED, GROUND, ORDERED, UNHEARD = 1, 2, 4, 7
+DISABLED, GROUND, ORDERED, UNHEARD, OLD_NEWS = 1, 2, 4, 7, 8
 LEASE = SwarmConfig(agents=5, policy="lease")
 
 
@@ -167,6 +168,23 @@ def test_who_hears_nobody_hovers_and_then_lands() -> None:
         assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) in [(LAND, UNHEARD), (OFF, UNHEARD)]
         assert lab.world.vehicles.position[2, 0] < 0.05
         assert lab.record.crashed == {}
+
+
+def test_an_agent_that_stays_for_old_news_gives_way_to_those_that_it_hears() -> None:
+    """To agent 1 all news is too old, where six meet; one that hovers like a post is passed at 0.22 m."""
+    swarm = SwarmConfig(agents=6, policy="lease", axis_x_m=0.8, axis_y_m=0.8, jitter_m=0.0, targets_known=False)
+    nearest = []
+    with OnBoard(swarm, LabSettings(), enable_s=6.0) as flight:
+        lab, place = flight.lab, flight.lab.world.vehicles.position
+        lab.run(6.9)
+        for name in ("dtsa.newsS", "dtsa.restsS"):
+            lab.set_parameter(1, name, -1.0)
+        for at in np.arange(7.0, 10.5, 0.05).tolist():
+            lab.at(at, lambda: nearest.append(np.linalg.norm(place[:, 1:] - place[:, :1], axis=0).min()))
+        lab.run(10.5)
+        assert (lab.log(1, "dtsa.mode"), lab.log(1, "dtsa.why")) == (HOVER, OLD_NEWS)
+        assert all(lab.log(k, "dtsa.mode") == FLY for k in range(2, 7))
+    assert min(nearest) > 0.3
 
 
 @pytest.mark.parametrize(
