@@ -205,6 +205,23 @@ def test_a_first_report_of_sotdma_keeps_out_of_slots_that_others_have_announced_
     assert sent in free
 
 
+@pytest.mark.parametrize(("free", "taken"), [(None, 22), (23, 23)])
+def test_an_agent_of_sotdma_that_finds_no_free_slot_may_take_that_of_the_agent_farthest_away(
+    free: int | None, taken: int
+) -> None:
+    """Frames have 12 slots: the first report of agent 5 comes in slot 21, 22 or 23."""
+    config = SwarmConfig(agents=6, policy="sotdma", options={"sotdma.reuse": 1})
+    swarm = make_swarm(config)
+    agent, table = Sotdma(config, 5), Table(swarm, 0)
+    for owner, away_m in ((1, 3.0), (2, 9.0), (3, 2.0), (5, 0.0)):
+        swarm.sent_position[0][:, owner - 1] = (away_m, 0.0, 0.0)
+    for owner, slot in ((1, 21), (2, 22), (3, 23)):
+        if slot != free:
+            agent.heard(table, 11, owner, bytes((0, slot - 11, 0)))
+    sent = [slot for slot in range(12, 24) if agent.choose(table, slot) == 5]
+    assert sent == [taken]
+
+
 def traffic(policy: str, slots: int, **settings: object) -> tuple[UnslottedTraffic, list[object], SwarmConfig]:
     """The air alone: nobody flies."""
     config = SwarmConfig(agents=20, policy=policy, seed=5, slot_ms=2, **settings)

@@ -29,9 +29,11 @@ class Sotdma:
     1/4, 1/2, 3/4, 1. Slots that others have announced meanwhile are not free. It announces the slot of the next report,
     as in the network entry of the source. A summary of that was read and not the text; how the probability grows is
     assumed.
+    ``sotdma.reuse`` (0), 1: an agent that finds no free slot near the nominal one takes that of the agent farthest away
+    instead of looking farther afield, as STDMA of vehicles does.
     """
 
-    options = ("entry", "load")
+    options = ("entry", "load", "reuse")
     own_bytes = 3
     may_join = True
 
@@ -45,6 +47,7 @@ class Sotdma:
         self._left = 0  # reports left in it
         self._offset = 0  # announced in the present frame: slots to the next report
         self._by_random_access = config.options.get("sotdma.entry", 0.0) > 0.0
+        self._reuses = config.options.get("sotdma.reuse", 0.0) > 0.0
         self._begin = -1  # from this slot on the first report may be sent; -1: not drawn yet
         self._passed = 0  # free slots since then
 
@@ -54,7 +57,7 @@ class Sotdma:
             if self._by_random_access:
                 self._enter(slot)
             else:
-                self._next = self._draw(slot + (self._agent * self._frame) // table.config.agents, slot)
+                self._next = self._draw(table, slot + (self._agent * self._frame) // table.config.agents, slot)
                 self._left = int(self._random.integers(*_TIMEOUTS))
         if slot == self._next and self._agent:
             return self._agent
@@ -71,22 +74,31 @@ class Sotdma:
         if late or self._random.random() < self._passed / _LEAST:
             self._next = slot
 
-    def _draw(self, nominal: int, now: int) -> int:
-        """A slot around a nominal one, free if there are free ones."""
+    def _draw(self, table: Table, nominal: int, now: int) -> int:
+        """A slot around a nominal one, free if there are free ones near it, or if slots are not reused."""
         reach = max(1, round(_SELECTION * self._frame / 2))
         while True:
             around = list(range(max(now + 1, nominal - reach), nominal + reach + 1))
             free = [slot for slot in around if slot not in self._taken]
             if len(free) >= _LEAST or 2 * reach >= self._frame:
                 return int(self._random.choice(free or around))
+            if self._reuses and around:
+                return int(self._random.choice(free)) if free else self._farthest(table, around)
             reach += 1
+
+    def _farthest(self, table: Table, slots: list[int]) -> int:
+        """The slot whose owner was farthest away when it was heard last; the first of equal ones."""
+        own = table.sent_position[:, [self._agent - 1]]
+        owners = [self._taken[slot] - 1 for slot in slots]
+        away = ((table.sent_position[:, owners] - own) ** 2).sum(axis=0)
+        return slots[int(away.argmax())]
 
     def say(self, table: Table, slot: int) -> bytes:
         """Frames left, and the offset to the next report."""
         if self._left:
             self._offset = self._frame
         else:
-            self._offset = self._draw(slot + self._frame, slot) - slot
+            self._offset = self._draw(table, slot + self._frame, slot) - slot
         return bytes((self._left, *self._offset.to_bytes(2, "little")))
 
     def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
