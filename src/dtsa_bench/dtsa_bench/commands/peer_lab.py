@@ -14,7 +14,7 @@ one medium with the radio's true times. The app is compiled against own declarat
 functions. The same seed gives the same bits: the digest says so. Apps that come with it: beacons, dtr, and `protocol`:
 policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in --out, for `dtsa merge`."""
 PROTOCOL = "protocol"
-_OF_PROTOCOL = ("policy", "slot_ms", "moving")
+_OF_PROTOCOL = ("policy", "slot_ms", "moving", "auth_session")
 
 _SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
 
@@ -28,7 +28,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("peer-lab", help=text, description=DESCRIPTION)
     parser.add_argument("app", metavar="APP", help="directory of the app, or the name of one that comes with it")
     for name in _OF_PROTOCOL:
-        parser.add_argument(f"--{name.replace('_', '-')}", metavar="X", help=f"with {PROTOCOL}: as for `dtsa simulate`")
+        text = "frames are sealed, the key is in DTSA_AUTH_KEY" if name == "auth_session" else "as for `dtsa simulate`"
+        parser.add_argument(f"--{name.replace('_', '-')}", metavar="X", help=f"with {PROTOCOL}: {text}")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="virtual time [60]")
     specs = {spec.name: spec for spec in settings_of(LabSettings)}
     for name in _SETTINGS:
@@ -102,12 +103,14 @@ def _swarm(given: dict[str, str], settings: Any) -> dict[str, Any]:
     """Settings of the swarm that flies the protocol."""
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.core.settings.declaration import settings_of
-    from dtsa_bench.crazyflies.peer_lab.onboard import check_on_board
+    from dtsa_agent.crazyflie.settings.on_board import check_on_board, key_of
 
     specs = {spec.name: spec for spec in settings_of(SwarmConfig)}
     values = {"policy": "lease", **{name: specs[name].parse(text) for name, text in given.items()}}
-    swarm = SwarmConfig.from_dict({**values, "agents": settings.agents, "seed": settings.seed})
+    values |= {"agents": settings.agents, "seed": settings.seed, "auth": "auth_session" in given}
+    swarm = SwarmConfig.from_dict(values)
     check_on_board(swarm)
+    key_of(swarm)
     return swarm.to_dict()
 
 

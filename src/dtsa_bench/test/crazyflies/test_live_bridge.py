@@ -30,6 +30,7 @@ from waiting import wait_for
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
+from dtsa_agent.keys import VARIABLE
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge, verified
@@ -42,7 +43,9 @@ pytestmark = [
 
 NAMES = ("cf1", "cf2", "cf3")
 SWARM = {"policy": "lease", "slot_ms": 20.0, "axis_x_m": 0.8, "axis_y_m": 0.8, "jitter_m": 0.0, "permute": False}
-CONFIG = SwarmConfig.from_dict({**SWARM, "agents": len(NAMES)})
+SEALED = {**SWARM, "auth": True, "auth_session": 41}
+KEY = {VARIABLE: "9f86d081884c7d659a2feaa0c55ad015"}
+CONFIG = SwarmConfig.from_dict({**SEALED, "agents": len(NAMES)})
 FLOOR_M = 0.6  # below the frame map
 URI = "radio://{}/80/2M"
 
@@ -57,7 +60,7 @@ def swarm_yaml(folder: Path) -> Path:
         for k, name in enumerate(NAMES)
     }
     station = {
-        "on_board": {"swarm": SWARM, "polls_hz": 10},
+        "on_board": {"swarm": SEALED, "polls_hz": 10},
         "room_origin_in_world": [0.0, 0.0, FLOOR_M],
         "toc_cache": str(folder / "cache"),
         "land_speed_mps": 1.0,
@@ -82,7 +85,7 @@ def laboratory(folder: Path) -> Iterator[subprocess.Popen[str]]:
         "live": {"path": str(place), "dongles": 3}, "ground": False,
     }  # fmt: skip
     command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | KEY)
     assert process.stdin is not None
     try:
         process.stdin.write(json.dumps(request))
@@ -138,7 +141,7 @@ def arrived(folder: Path) -> bool:
     return places is not None and bool((np.abs(np.array(places) - goal) < 0.15).all())
 
 
-def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens(tmp_path: Path) -> None:
+def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to_sealed_frames(tmp_path: Path) -> None:
     config, place = swarm_yaml(tmp_path), tmp_path / "radio"
     dtsa = [sys.executable, "-m", "dtsa_bench"]
     options = [f"--{key.replace('_', '-')}={value}" for key, value in SWARM.items() if not isinstance(value, bool)]
@@ -149,12 +152,13 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens(tm
         URI.format(2),
         "--simulated-radio",
         str(place),
-        "--no-seal",
+        "--auth-session",
+        str(CONFIG.auth_session),
         "--json",
     ]
     sniff = [*dtsa, "sniff", *radio, "--agents", str(len(NAMES)), "--no-permute", *options]
     with laboratory(tmp_path) as lab, ros_graph(tmp_path) as graph:
-        environment = {**graph.environment, SIMULATED_RADIO: str(place)}
+        environment = {**graph.environment, SIMULATED_RADIO: str(place), **KEY}
         listener = subprocess.Popen(sniff, stdout=subprocess.PIPE, text=True, env=os.environ | environment)
         bridge = subprocess.Popen([*dtsa, "bridge", "--config", str(config)], env=environment)
         graph.processes.append(bridge)

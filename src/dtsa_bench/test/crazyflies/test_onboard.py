@@ -229,6 +229,8 @@ def test_the_command_flies_the_protocol_and_says_what_cannot_be(
         (["protocol", "--policy", "csma"], "policy: got 'csma'"),
         (["protocol", "--agents", "21"], "agents: got 21"),
         (["beacons", "--slot-ms", "5"], "slot_ms: got '5'; allowed: only with protocol"),
+        (["protocol", "--auth-session", "7"], "DTSA_AUTH_KEY: got ''"),
+        (["protocol", "--auth-session", "0"], "auth_session: got 0"),
     ):
         assert main(["peer-lab", *words]) == 2
         assert said in capsys.readouterr().err

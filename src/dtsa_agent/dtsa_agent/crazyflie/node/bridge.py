@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 
-from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_agent.crazyflie.links.board_orders import BoardOrders
 from dtsa_agent.crazyflie.links.emergency_radio import EmergencyRadio
@@ -20,14 +19,13 @@ from dtsa_agent.crazyflie.motion.limits import room_of
 from dtsa_agent.crazyflie.safety.landing_places import SINK, Descent, LandingPlaces, Other
 from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
 from dtsa_agent.crazyflie.settings.config import SwarmSettings
-from dtsa_agent.crazyflie.settings.on_board import KEY_BYTES, orders, parameters
+from dtsa_agent.crazyflie.settings.on_board import key_of, orders, parameters
 from dtsa_agent.crazyflie.settings.radio_budget import WATCHDOG_HZ, check_budget, radio_loads
 from dtsa_agent.crazyflie.state.conversions import VehicleState
 from dtsa_agent.crazyflie.state.state_machine import IN_AIR, State
 from dtsa_agent.crazyflie.vehicle.reports import snapshot, watched
 from dtsa_agent.crazyflie.vehicle.snapshot import Snapshot
 from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
-from dtsa_agent.keys import VARIABLE, authenticator, check_session
 
 TICK_S = 0.02
 GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: the firmware has seen to that
@@ -101,12 +99,7 @@ class Bridge:
         """What agents on board are told, where they steer."""
         if (swarm := self.settings.swarm) is None:
             return
-        check_session(swarm)
-        found = authenticator(swarm)
-        scenario, station = make_scenario(swarm), self.settings.station
-        key = b"" if found is None else found.key_and_session[0]
-        if found is not None and len(key) != KEY_BYTES:
-            raise ConfigError(VARIABLE, f"{len(key)} bytes", f"{KEY_BYTES} bytes on board")
+        key, scenario, station = key_of(swarm), make_scenario(swarm), self.settings.station
         values = parameters(swarm, scenario, station.room_origin_in_world[2])
         for vehicle in self.vehicles.values():
             own = {name: vehicle.robot.firmware_params.get(name, value) for name, value in values.items()}

@@ -18,6 +18,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_agent.core.settings.scenario import Scenario, policy_key
+from dtsa_agent.keys import VARIABLE, authenticator, check_session
 
 MOST = 20  # agents: BOARD_AGENTS of board.h
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease")  # numbers of libdtsa
@@ -96,6 +97,20 @@ def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[st
     for axis, least, most in zip("XYZ", low.tolist(), high.tolist(), strict=True):
         values |= {f"low{axis}": least, f"high{axis}": most}
     return {f"dtsa.{name}": value for name, value in values.items()}
+
+
+def key_of(swarm: SwarmConfig) -> bytes:
+    """The key of frames that are sealed on board, from the environment; none if they are not sealed.
+
+    :param swarm: what all agents share.
+    :raises ConfigError: there is no key of 16 bytes, or no session.
+    """
+    check_session(swarm)
+    found = authenticator(swarm)
+    key = b"" if found is None else found.key_and_session[0]
+    if found is not None and len(key) != KEY_BYTES:
+        raise ConfigError(VARIABLE, f"{len(key)} bytes", f"{KEY_BYTES} bytes on board")
+    return key
 
 
 def orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[bytes]:

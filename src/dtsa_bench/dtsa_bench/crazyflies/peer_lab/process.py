@@ -13,6 +13,7 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.crazyflie.settings.on_board import key_of
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
 
 from .app import read_app
@@ -102,7 +103,7 @@ def _serve(request: dict[str, Any]) -> dict[str, Any]:
         from .onboard import OnBoard  # recordings: others do without
 
         swarm = SwarmConfig.from_dict(request["swarm"])
-        flight = OnBoard(swarm, settings, out, radio=side, ground=request["ground"])
+        flight = OnBoard(swarm, settings, out, key_of(swarm), radio=side, ground=request["ground"])
         lab, finish = flight.lab, flight.finish
     else:
         lab = Laboratory(app, settings, out, radio=side)
