@@ -49,13 +49,12 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
 
 
 def _forged(there: League, entry: Mapping[str, Any], draw: random.Random) -> tuple[dict[str, Any], str]:
-    """One cell of an entry with one number of a row changed, sums and digest made anew; and what was changed."""
+    """One flight of an entry with one number changed, sums and digest made anew; and what was changed."""
     cell = draw.choice(list(entry["flights"]))
-    lines = copy.deepcopy(entry["flights"][cell])
-    line = draw.choice(lines)
+    line = copy.deepcopy(draw.choice(entry["flights"][cell]))
     place = draw.choice([n for n, value in enumerate(line) if isinstance(value, (int, float)) and FIELDS[n] != "k"])
     line[place] = line[place] + 1 if isinstance(line[place], int) else line[place] * (1 - 1e-6)
-    forged = {**entry, "flights": {cell: lines}, "complete": False, "summary": summary_of(there, {cell: lines})}
+    forged = {**entry, "flights": {cell: [line]}, "complete": False, "summary": summary_of(there, {cell: [line]})}
     return {**forged, "digest": digest_of(forged)}, f"{cell}/{line[0]} {FIELDS[place]}"
 
 
