@@ -48,6 +48,7 @@ KEY = {VARIABLE: "9f86d081884c7d659a2feaa0c55ad015"}
 CONFIG = SwarmConfig.from_dict({**SEALED, "agents": len(NAMES)})
 FLOOR_M = 0.6  # below the frame map
 URI = "radio://{}/80/2M"
+DTSA = [sys.executable, "-m", "dtsa_bench"]
 
 
 def swarm_yaml(folder: Path) -> Path:
@@ -119,6 +120,14 @@ class Operator:
         answer = self.graph.ask(client, kind.Request(**fields))
         assert getattr(answer, "success", True), answer
 
+    def take_off(self) -> None:
+        """All, until their agents steer."""
+        self.call(Arm, "/all/arm", arm=True)
+        self.until("armed", "armed", "armed")
+        self.call(Takeoff, "/all/takeoff", height=FLOOR_M, duration=Duration(sec=1, nanosec=200_000_000))
+        self.until("flying", "flying", "flying")
+        self.enable()
+
     def enable(self) -> None:
         """As soon as the take-off is over; before that the bridge refuses."""
         client = self.graph.node.create_client(SetBool, "/all/enable")
@@ -141,36 +150,39 @@ def arrived(folder: Path) -> bool:
     return places is not None and bool((np.abs(np.array(places) - goal) < 0.15).all())
 
 
-def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to_sealed_frames(tmp_path: Path) -> None:
-    config, place = swarm_yaml(tmp_path), tmp_path / "radio"
-    dtsa = [sys.executable, "-m", "dtsa_bench"]
-    options = [f"--{key.replace('_', '-')}={value}" for key, value in SWARM.items() if not isinstance(value, bool)]
-    radio = [
-        "--air",
-        "crazyradio",
-        "--uri",
-        URI.format(2),
-        "--simulated-radio",
-        str(place),
-        "--auth-session",
-        str(CONFIG.auth_session),
-        "--json",
-    ]
-    sniff = [*dtsa, "sniff", *radio, "--agents", str(len(NAMES)), "--no-permute", *options]
-    with laboratory(tmp_path) as lab, ros_graph(tmp_path) as graph:
-        environment = {**graph.environment, SIMULATED_RADIO: str(place), **KEY}
-        listener = subprocess.Popen(sniff, stdout=subprocess.PIPE, text=True, env=os.environ | environment)
-        bridge = subprocess.Popen([*dtsa, "bridge", "--config", str(config)], env=environment)
+@contextmanager
+def bridged(folder: Path) -> Iterator[tuple[Operator, subprocess.Popen[str], subprocess.Popen[str], dict[str, str]]]:
+    """An operator, the bridge, the laboratory, and the environment of other programs on its air."""
+    config = swarm_yaml(folder)
+    with laboratory(folder) as lab, ros_graph(folder) as graph:
+        environment = {**graph.environment, SIMULATED_RADIO: str(folder / "radio"), **KEY}
+        bridge = subprocess.Popen([*DTSA, "bridge", "--config", str(config)], env=environment, text=True)
         graph.processes.append(bridge)
-        operator = Operator(graph)
+        try:
+            yield Operator(graph), bridge, lab, environment
+        finally:
+            bridge.kill()
+            bridge.wait()
+
+
+def told(lab: subprocess.Popen[str]) -> dict[str, Any]:
+    """What the laboratory says when it is ended."""
+    lab.send_signal(signal.SIGINT)
+    return json.loads(lab.communicate(timeout=60)[0])  # type: ignore[no-any-return]
+
+
+def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to_sealed_frames(tmp_path: Path) -> None:
+    options = [f"--{key.replace('_', '-')}={value}" for key, value in SWARM.items() if not isinstance(value, bool)]
+    radio = ["--air", "crazyradio", "--uri", URI.format(2), "--simulated-radio", str(tmp_path / "radio"), "--json"]
+    sealed = ["--auth-session", str(CONFIG.auth_session)]
+    sniff = [*DTSA, "sniff", *radio, *sealed, "--agents", str(len(NAMES)), "--no-permute", *options]
+    with bridged(tmp_path) as (operator, bridge, lab, environment):
+        listener = subprocess.Popen(sniff, stdout=subprocess.PIPE, text=True, env=os.environ | environment)
         try:
             operator.until("ready", "ready", "ready")
-            assert not [name for name, _ in graph.node.get_topic_names_and_types() if "/cmd_" in name]
-            operator.call(Arm, "/all/arm", arm=True)
-            operator.until("armed", "armed", "armed")
-            operator.call(Takeoff, "/all/takeoff", height=FLOOR_M, duration=Duration(sec=1, nanosec=200_000_000))
-            operator.until("flying", "flying", "flying")
-            operator.enable()
+            topics = operator.graph.node.get_topic_names_and_types()
+            assert not [name for name, _ in topics if "/cmd_" in name]
+            operator.take_off()
             wait_for(lambda: arrived(tmp_path))
             operator.call(Empty, "/cf3/emergency")
             operator.until("flying", "flying", "emergency")
@@ -178,12 +190,10 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
             assert bridge.wait(60) == 0
             listener.send_signal(signal.SIGINT)
             heard = json.loads(listener.communicate(timeout=60)[0])
-            lab.send_signal(signal.SIGINT)
-            summary = json.loads(lab.communicate(timeout=60)[0])
+            summary = told(lab)
         finally:
-            for process in (bridge, listener):
-                process.kill()
-                process.wait()
+            listener.kill()
+            listener.wait()
     assert summary["crashed"] == [3]
     assert [e["cf"] for e in events(tmp_path) if e.get("state") == "landed"] in ([1, 2], [2, 1])
     assert summary["min_distance_m"] > 0.2
@@ -191,3 +201,16 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
     found = Merge([read(tmp_path / f"{name}.mcap") for name in NAMES]).judge()
     assert verified(found)
     assert found["decisions_again"]["differences"] == []
+
+
+def test_a_second_ctrl_c_stops_the_motors_of_agents_that_steer_on_board(tmp_path: Path) -> None:
+    with bridged(tmp_path) as (operator, bridge, lab, _):
+        operator.until("ready", "ready", "ready")
+        operator.take_off()
+        bridge.send_signal(signal.SIGINT)
+        operator.until("landing", "landing", "landing")
+        bridge.send_signal(signal.SIGINT)
+        assert bridge.wait(60) != 0
+        wait_for(lambda: sum(e["event"] == "hard landing" for e in events(tmp_path)) == len(NAMES))
+        summary = told(lab)
+    assert summary["crashed"] == [1, 2, 3]
