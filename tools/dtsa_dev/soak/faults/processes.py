@@ -159,7 +159,19 @@ def _agent_stopped_in_real_time(flight: Running) -> None:
 
 
 def _signalled(number: int, words: tuple[str, ...]) -> Callable[[Path], None]:
-    return _during(*words)(lambda flight: met(interrupted_well(flight, number)["end"] == "stopped", "no end"))
+    run = _during(*words)(lambda flight: met(interrupted_well(flight, number)["end"] == "stopped", "no end"))
+
+    def heeded(directory: Path) -> None:
+        ignored = signal.getsignal(number) == signal.SIG_IGN  # as under nohup: the flight would inherit it
+        if ignored:
+            signal.signal(number, signal.SIG_DFL)
+        try:
+            run(directory)
+        finally:
+            if ignored:
+                signal.signal(number, signal.SIG_IGN)
+
+    return heeded
 
 
 @_during(*LOCKSTEP, begun=False)
