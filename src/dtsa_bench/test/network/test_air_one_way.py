@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,19 @@ MS = 1_000_000
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """cf1 and cf2 hear each other; cf3 hears them after 100 ms, and nobody hears cf3."""
+    """cf1 and cf2 hear each other; cf3 hears them after 100 ms, and nobody hears cf3.
+
+    Nobody corrects the clock of an agent that is not heard: on a busy machine it may lose the others' time for good.
+    Then they fly again; each time the same has to come about.
+    """
     helpers.need_multicast()
-    directory = tmp_path_factory.mktemp("one_way")
+    for _ in range(2):
+        with suppress(AssertionError):
+            return _flown(tmp_path_factory.mktemp("one_way"), 20.0)
+    return _flown(tmp_path_factory.mktemp("one_way"), 60.0)
+
+
+def _flown(directory: Path, patience_s: float) -> list[Path]:
     near, far = helpers.own_group(), helpers.own_group()
     paths = [directory / f"cf{agent}" / f"cf{agent}.mcap" for agent in (1, 2, 3)]
     flying: list[helpers.Flying] = []
@@ -42,9 +53,10 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
             udp = UdpSettings(interface="lo", group=far if agent == 3 else near)
             flying.append(helpers.Flying(AgentSettings(id=agent), CONFIG, udp, path))
         first, second, third = flying
-        wait_for(lambda: first.heard[2] > 20 and second.heard[1] > 20 and third.heard[1] > 20 and third.heard[2] > 20)
+        heard = (first.heard, 2), (second.heard, 1), (third.heard, 1), (third.heard, 2)
+        wait_for(lambda: all(frames[sender] > 20 for frames, sender in heard), patience_s)
         seen = len(third.slots)
-        wait_for(lambda: len(third.slots) > seen + 100)
+        wait_for(lambda: len(third.slots) > seen + 100, patience_s)
     finally:
         for one in flying:
             one.end()
