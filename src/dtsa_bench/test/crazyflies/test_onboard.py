@@ -171,7 +171,7 @@ def test_who_hears_nobody_hovers_and_then_lands() -> None:
 
 
 def test_an_agent_that_stays_for_old_news_gives_way_to_those_that_it_hears() -> None:
-    """To agent 1 all news is too old, where six meet; one that hovers like a post is passed at 0.22 m."""
+    """To agent 1 all news is too old, where six meet; one that held its place would be passed at 0.22 m."""
     swarm = SwarmConfig(agents=6, policy="lease", axis_x_m=0.8, axis_y_m=0.8, jitter_m=0.0, targets_known=False)
     nearest = []
     with OnBoard(swarm, LabSettings(), enable_s=6.0) as flight:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +35,16 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     Then they fly again; each time the same has to come about.
     """
     helpers.need_multicast()
-    for _ in range(2):
-        with suppress(AssertionError):
-            return _flown(tmp_path_factory.mktemp("one_way"), 20.0)
-    return _flown(tmp_path_factory.mktemp("one_way"), 60.0)
+    for patience_s in (20.0, 20.0, 120.0):
+        paths, apart = _flown(tmp_path_factory.mktemp("one_way"), patience_s)
+        if apart is None:
+            return paths
+    raise apart
 
 
-def _flown(directory: Path, patience_s: float) -> list[Path]:
+def _flown(directory: Path, patience_s: float) -> tuple[list[Path], AssertionError | None]:
+    """The bags, and what is said if the agents did not hear each other within the time."""
+    apart = None
     near, far = helpers.own_group(), helpers.own_group()
     paths = [directory / f"cf{agent}" / f"cf{agent}.mcap" for agent in (1, 2, 3)]
     flying: list[helpers.Flying] = []
@@ -57,11 +59,13 @@ def _flown(directory: Path, patience_s: float) -> list[Path]:
         wait_for(lambda: all(frames[sender] > 20 for frames, sender in heard), patience_s)
         seen = len(third.slots)
         wait_for(lambda: len(third.slots) > seen + 100, patience_s)
+    except AssertionError as error:
+        apart = error
     finally:
         for one in flying:
             one.end()
         carrier.end()
-    return paths
+    return paths, apart
 
 
 def _merged(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, dict[str, Any], str]:
