@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from dtsa_dev.network.hosts import CABLE, Host, hosts, inside, why_not
 from dtsa_dev.network.trial import Trial, under_way
-from metronome import flown_again_when_overloaded
 
 from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings
 from dtsa_agent.core import SwarmConfig
@@ -89,7 +88,7 @@ def test_an_interface_that_has_gone_is_said_once_and_found_when_it_is_back() -> 
 SWARM = SwarmConfig(agents=4, policy="lease", slot_ms=20.0, auth=True, auth_session=5, scenario="waypoints")
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_agents_fly_on_when_their_interfaces_change(tmp_path: Path) -> None:
     """cf2 gets another address, cf3 has no interface for a while, that of cf4 is off for a while."""
     with under_way(Trial(SWARM, seconds=4.0, spread_s=0.2), tmp_path) as flight:

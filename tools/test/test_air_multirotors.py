@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 from dtsa_dev.soak.air.multirotor_flight import fly, missing
-from metronome import flown_again_when_overloaded
 
 from dtsa_bench.runs.config import RunLimits
 
 
 @pytest.mark.ros
 @pytest.mark.skipif(bool(missing()), reason=missing() or "RotorPy is there")
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_agents_fly_multirotors_of_somebody_else_to_their_goals(tmp_path: Path) -> None:
     pytest.importorskip("dtsa_msgs.msg")
     found = fly(3, tmp_path)

@@ -20,7 +20,6 @@ from dtsa_dev.network.hosts import Host, hosts, why_not
 from dtsa_dev.network.intruder import Intruder
 from dtsa_dev.network.switch import Links, Switch
 from dtsa_dev.network.trial import NotFlown, Trial, flight_time, under_way
-from metronome import flown_again_when_overloaded
 
 import dtsa
 from dtsa_agent.air.datagram import Wrapping
@@ -179,7 +178,7 @@ SWARM = SwarmConfig(
 
 
 @pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_path: Path) -> None:
     """Cold start in random order, drifts, losses; one is killed and comes back; the air is cut in two for a while."""
     trial = Trial(SWARM, {"loss": 0.1}, seconds=2.0, spread_s=0.3, drift_ppm=50.0)

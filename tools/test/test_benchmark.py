@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from dtsa_dev.benchmark import baselines, crazyflie, environments, parts
 from dtsa_dev.registry import main
-from metronome import flown_again_when_overloaded
 
 
 def test_kernels_are_timed_by_number_of_agents(capsys: pytest.CaptureFixture[str]) -> None:
@@ -139,7 +138,7 @@ def test_rate_and_latency_of_commands() -> None:
 
 @pytest.mark.slow
 @pytest.mark.ros
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_the_bridge_is_measured_in_flight() -> None:
     pytest.importorskip("cflib")
     pytest.importorskip("dtsa_msgs.srv")

@@ -61,10 +61,7 @@ static const char *const REASONS[] = {
 };
 static_assert(NAME_COUNT(REASONS) == DTSA_REASON_COUNT, "a reason without a name");
 
-#define LIST(kind, names)                                                                          \
-    {                                                                                              \
-        kind, names, NAME_COUNT(names)                                                             \
-    }
+#define LIST(kind, names) {kind, names, NAME_COUNT(names)}
 static const dtsa_name_list LISTS[] = {
     LIST("policies", POLICIES),     LIST("estimators", ESTIMATORS), LIST("avoiders", AVOIDERS),
     LIST("selections", SELECTIONS), LIST("profiles", PROFILES),     LIST("reasons", REASONS),

@@ -29,23 +29,31 @@
 #include "watch.h"
 
 enum {
-    QUEUE_LENGTH = 16,   /* datagrams between the radio's task and this one */
-    CONTROL_US = 10000,  /* from one set-point to the next */
-    NEAR_US = 1500,      /* nearer than this to what is due it does not sleep */
+    QUEUE_LENGTH = 16,  /* datagrams between the radio's task and this one */
+    CONTROL_US = 10000, /* from one set-point to the next */
+    NEAR_US = 1500,     /* nearer than this to what is due it does not sleep */
     KEY_BYTES = 16
 };
 static const float DOWN_M_S = 0.4f; /* how fast it lands */
 
 /* ---- what the ground sets and sees ---- */
 
-static uint8_t mute, enable, goalsKnown = 1, agents = 12, policy = DTSA_POLICY_LEASE, p2pPort = 7, started;
+static uint8_t mute, enable, goalsKnown = 1, agents = 12, policy = DTSA_POLICY_LEASE, p2pPort = 7,
+                             started;
 static uint8_t estimator = DTSA_ESTIMATE_LINEAR;
 static uint16_t headerWord = 0x5444, steps = 1;
 static uint32_t beginSlot, slotUs = 10000, flightUs = 1500, seed = 1;
 static float height = 1.0f, vMax = 1.5f, pairRadius = 0.336f, horizon = 1.0f;
 static safety_settings limits = {
-    .news_s = 0.6f, .rests_s = 3.0f, .unheard_s = 0.5f, .land_s = 5.0f, .well_s = 0.5f, .battery_v = 3.2f,
-    .sag_s = 2.0f, .low = {-2.0f, -2.0f, 0.2f}, .high = {2.0f, 2.0f, 2.0f},
+    .news_s = 0.6f,
+    .rests_s = 3.0f,
+    .unheard_s = 0.5f,
+    .land_s = 5.0f,
+    .well_s = 0.5f,
+    .battery_v = 3.2f,
+    .sag_s = 2.0f,
+    .low = {-2.0f, -2.0f, 0.2f},
+    .high = {2.0f, 2.0f, 2.0f},
 };
 
 static uint32_t slotNow, digest, lost, sent, heard, unsent, refused;
@@ -80,7 +88,7 @@ static double starts[3 * BOARD_AGENTS], targets[3 * BOARD_AGENTS];
 static uint8_t key[KEY_BYTES], sealed, ordered;
 static uint64_t session, lots;
 static int64_t heardLast; /* ns */
-static float hold[3]; /* m, where it hovers */
+static float hold[3];     /* m, where it hovers */
 
 static int64_t now_ns(void) { return (int64_t)usecTimestamp() * 1000; }
 
@@ -181,7 +189,14 @@ static void send(const uint8_t *data, int length)
 
 /* ---- the ground ---- */
 
-enum { ORDER_START = 'S', ORDER_FROM = 'F', ORDER_TO = 'T', ORDER_KEY = 'K', ORDER_LOTS = 'D', ORDER_LAND = 'L' };
+enum {
+    ORDER_START = 'S',
+    ORDER_FROM = 'F',
+    ORDER_TO = 'T',
+    ORDER_KEY = 'K',
+    ORDER_LOTS = 'D',
+    ORDER_LAND = 'L'
+};
 
 static bool place(double *planes, const uint8_t *data, size_t length)
 {
@@ -203,12 +218,15 @@ static void obey(const uint8_t *data, size_t length)
     const bool flies = guard.mode != SAFETY_OFF;
     const char *fault = strchr("FTKDSL", data[0]) ? "length" : "order";
     const bool changes = !goalsKnown && data[0] == ORDER_TO && data[1] == agent.settings.id;
-    if (data[0] == ORDER_FROM && !flies && place(starts, data, length)) fault = NULL;
-    else if (data[0] == ORDER_TO && flies && !changes) fault = "goals known";
+    if (data[0] == ORDER_FROM && !flies && place(starts, data, length))
+        fault = NULL;
+    else if (data[0] == ORDER_TO && flies && !changes)
+        fault = "goals known";
     else if (data[0] == ORDER_TO && place(targets, data, length)) {
         if (started && changes) fly_to(data[1] - 1);
         fault = NULL;
-    } else if (data[0] == ORDER_LAND && length == 1) ordered = 1, fault = NULL;
+    } else if (data[0] == ORDER_LAND && length == 1)
+        ordered = 1, fault = NULL;
     else if (data[0] == ORDER_KEY && !flies && length == 1 + KEY_BYTES + sizeof session) {
         memcpy(key, data + 1, KEY_BYTES);
         memcpy(&session, data + 1 + KEY_BYTES, sizeof session);
@@ -276,9 +294,12 @@ static void look_around(safety_view *v, const double place[3], int64_t now)
         const int64_t age = board_age(&agent, k);
         const float age_s = (float)age * (float)slotUs * 1e-6f;
         float distance = 0.0f;
-        if (age < 0) oldest = -1.0f;
-        else if (board_rests(&agent, k)) rests = fmaxf(rests, age_s);
-        else if (oldest >= 0.0f) oldest = fmaxf(oldest, age_s);
+        if (age < 0)
+            oldest = -1.0f;
+        else if (board_rests(&agent, k))
+            rests = fmaxf(rests, age_s);
+        else if (oldest >= 0.0f)
+            oldest = fmaxf(oldest, age_s);
         if (age < 0) continue;
         for (int i = 0; i < 3; i++) {
             const float d = (float)(board_place(&agent, k, i) - place[i]);
@@ -330,7 +351,8 @@ static void steer(const double position[3], const double place[3], int64_t now, 
             for (int i = 0; i < 3; i++) hold[i] = (float)position[i];
         /* The others count on it to give way as they do: one whose news of somebody is old still does. */
         const int gives_way = next == SAFETY_HOVER && guard.reason == SAFETY_OLD_NEWS;
-        const double there[3] = {(double)hold[0], (double)hold[1], (double)hold[2] - (double)height}; /* frame map */
+        const double there[3] = {(double)hold[0], (double)hold[1],
+                                 (double)hold[2] - (double)height}; /* frame map */
         const int flies = gives_way ? board_stay(&agent, now, there, command)
                                     : next == SAFETY_FLY && board_command(&agent, now, command);
         set_point(flies ? command : NULL);
@@ -339,8 +361,8 @@ static void steer(const double position[3], const double place[3], int64_t now, 
     } else if (next == SAFETY_OFF && (before == SAFETY_FLY || before == SAFETY_HOVER) &&
                guard.reason == SAFETY_DISABLED && !view.ground) {
         /* The ground takes it back, hovering; unless it has commanded something else already. */
-        crtpCommanderHighLevelGoTo((float)position[0], (float)position[1], (float)position[2],
-                                   0.0f, 1.0f, false);
+        crtpCommanderHighLevelGoTo((float)position[0], (float)position[1], (float)position[2], 0.0f,
+                                   1.0f, false);
     }
     if (next == SAFETY_OFF && !enable) ordered = 0;
 }
@@ -379,7 +401,8 @@ void appMain(void)
         const double place[3] = {position[0], position[1], position[2] - (double)height};
         due = board_step(&agent, now_ns(), place, velocity, datagram, &length);
         if (length > 0) {
-            const int64_t late = now_ns() - dtsa_timebase_slot_start(&agent.hearing.base, agent.slot);
+            const int64_t late =
+                now_ns() - dtsa_timebase_slot_start(&agent.hearing.base, agent.slot);
             lateUs = (uint16_t)(late / 1000);
             send(datagram, length);
         }

@@ -11,9 +11,9 @@
 #include "hearing.h"
 
 enum {
-    BOARD_AGENTS = 20,       /* N at most */
-    BOARD_BYTES = 8704,      /* of an agent with so many */
-    BOARD_EARLY = 4,         /* frames of slots that are still to come */
+    BOARD_AGENTS = 20,  /* N at most */
+    BOARD_BYTES = 8704, /* of an agent with so many */
+    BOARD_EARLY = 4,    /* frames of slots that are still to come */
     BOARD_DATAGRAM = DTSA_FRAME_MAX
 };
 
@@ -51,15 +51,15 @@ typedef struct board {
     const board_watch *watch; /* NULL: nobody is told */
     hearing hearing;
     dtsa_agent *agent;
-    int64_t slot, first;   /* the present slot, the one with which it began; -1: none */
+    int64_t slot, first; /* the present slot, the one with which it began; -1: none */
     int64_t lead_ns, latest_lead_ns, latest_send_ns, too_long_ns;
-    int running, anew;     /* a slot is open; it is the first one */
-    int policy;            /* with which it begins, once all have a common time; else -1 */
-    int awaits;            /* the slot's sender is another one, and has not been heard yet */
-    int newcomer;          /* it hovers until the others know it */
-    int spoke;             /* it has sent in a turn of its own since it began */
-    double command[3];     /* m/s, when the present slot was opened */
-    int waiting;           /* bytes of the frame that lies ready */
+    int running, anew; /* a slot is open; it is the first one */
+    int policy;        /* with which it begins, once all have a common time; else -1 */
+    int awaits;        /* the slot's sender is another one, and has not been heard yet */
+    int newcomer;      /* it hovers until the others know it */
+    int spoke;         /* it has sent in a turn of its own since it began */
+    double command[3]; /* m/s, when the present slot was opened */
+    int waiting;       /* bytes of the frame that lies ready */
     uint8_t frame[DTSA_FRAME_MAX];
     struct {
         int64_t slot, arrival;

@@ -15,7 +15,8 @@ static int is_inside(const safety_settings *c, const safety_view *v)
 }
 
 /* Why it has to land, if it has to. */
-static safety_reason urgent(safety *s, const safety_settings *c, const safety_view *v, float elapsed)
+static safety_reason urgent(safety *s, const safety_settings *c, const safety_view *v,
+                            float elapsed)
 {
     s->sagged_s = v->battery_v >= c->battery_v ? 0.0f : s->sagged_s + elapsed;
     s->outside_s = is_inside(c, v) ? 0.0f : s->outside_s + elapsed;
@@ -58,13 +59,19 @@ safety_mode safety_step(safety *s, const safety_settings *c, const safety_view *
     }
     if (s->mode == SAFETY_LAND) return s->mode;
     if (s->mode == SAFETY_OFF) { /* nobody takes over a vehicle that would have to land at once */
-        if (!why_land && !why_hover && s->well_s >= c->well_s) enter(s, SAFETY_FLY, SAFETY_WELL);
-        else s->reason = why_land ? why_land : why_hover ? why_hover : SAFETY_WELL;
+        if (!why_land && !why_hover && s->well_s >= c->well_s)
+            enter(s, SAFETY_FLY, SAFETY_WELL);
+        else
+            s->reason = why_land ? why_land : why_hover ? why_hover : SAFETY_WELL;
         return s->mode;
     }
-    if (why_land) enter(s, SAFETY_LAND, why_land);
-    else if (s->mode == SAFETY_HOVER && s->since_s > c->land_s) enter(s, SAFETY_LAND, s->reason);
-    else if (why_hover) enter(s, SAFETY_HOVER, why_hover);
-    else if (s->mode == SAFETY_HOVER && s->well_s >= c->well_s) enter(s, SAFETY_FLY, SAFETY_WELL);
+    if (why_land)
+        enter(s, SAFETY_LAND, why_land);
+    else if (s->mode == SAFETY_HOVER && s->since_s > c->land_s)
+        enter(s, SAFETY_LAND, s->reason);
+    else if (why_hover)
+        enter(s, SAFETY_HOVER, why_hover);
+    else if (s->mode == SAFETY_HOVER && s->well_s >= c->well_s)
+        enter(s, SAFETY_FLY, SAFETY_WELL);
     return s->mode;
 }

@@ -16,26 +16,26 @@ typedef enum safety_mode { SAFETY_OFF, SAFETY_FLY, SAFETY_HOVER, SAFETY_LAND } s
 /* Why it is not FLY, the most urgent first. */
 typedef enum safety_reason {
     SAFETY_WELL,
-    SAFETY_DISABLED,      /* the ground has not enabled it, or has disabled it */
-    SAFETY_GROUND,        /* the ground commands the vehicle itself */
-    SAFETY_CANNOT_FLY,    /* says the supervisor */
-    SAFETY_ORDERED,       /* the ground says: land */
+    SAFETY_DISABLED,   /* the ground has not enabled it, or has disabled it */
+    SAFETY_GROUND,     /* the ground commands the vehicle itself */
+    SAFETY_CANNOT_FLY, /* says the supervisor */
+    SAFETY_ORDERED,    /* the ground says: land */
     SAFETY_BATTERY,
-    SAFETY_OUTSIDE,       /* of its box, or it does not know where it is */
-    SAFETY_UNHEARD,       /* no frame for too long */
-    SAFETY_OLD_NEWS,      /* news of somebody is too old */
-    SAFETY_NEWCOMER,      /* the others do not know it yet */
+    SAFETY_OUTSIDE,  /* of its box, or it does not know where it is */
+    SAFETY_UNHEARD,  /* no frame for too long */
+    SAFETY_OLD_NEWS, /* news of somebody is too old */
+    SAFETY_NEWCOMER, /* the others do not know it yet */
     SAFETY_REASONS
 } safety_reason;
 
 typedef struct safety_settings {
-    float news_s;    /* oldest news of one that moves with which it flies */
-    float rests_s;   /* ... of one that has said that it rests: it speaks seldom */
-    float unheard_s; /* without any frame it hovers after this time */
-    float land_s;    /* it has hovered for so long: it lands */
-    float well_s;    /* all has to be well for so long before it flies again */
-    float battery_v; /* it lands below this voltage, */
-    float sag_s;     /* if that lasts so long: motors that pull hard lower it for a moment */
+    float news_s;          /* oldest news of one that moves with which it flies */
+    float rests_s;         /* ... of one that has said that it rests: it speaks seldom */
+    float unheard_s;       /* without any frame it hovers after this time */
+    float land_s;          /* it has hovered for so long: it lands */
+    float well_s;          /* all has to be well for so long before it flies again */
+    float battery_v;       /* it lands below this voltage, */
+    float sag_s;           /* if that lasts so long: motors that pull hard lower it for a moment */
     float low[3], high[3]; /* m, frame map: the box */
 } safety_settings;
 
@@ -45,7 +45,8 @@ typedef struct safety_view {
     int can_fly, in_air;  /* says the supervisor */
     int newcomer;
     float battery_v, position[3];
-    float oldest_s;  /* age of the oldest news of those that move; negative: of somebody there is none */
+    float
+        oldest_s; /* age of the oldest news of those that move; negative: of somebody there is none */
     float rests_s;   /* ... of those that rest */
     float unheard_s; /* since any frame was heard; negative: never */
 } safety_view;
@@ -53,9 +54,9 @@ typedef struct safety_view {
 typedef struct safety {
     safety_mode mode;
     safety_reason reason;
-    float since_s;           /* for how long it has been in this mode */
+    float since_s; /* for how long it has been in this mode */
     float well_s, sagged_s, outside_s;
-    int refused;             /* the ground has to disable it before it may enable it again */
+    int refused; /* the ground has to disable it before it may enable it again */
 } safety;
 
 void safety_reset(safety *s);

@@ -48,8 +48,8 @@ static void opened(const board *b, int64_t now)
     peerLabRecord(&n, sizeof n);
 }
 
-static void heard(const board *b, int sender, int64_t slot, const uint8_t *datagram,
-                  int length, int64_t arrival, int accepted)
+static void heard(const board *b, int sender, int64_t slot, const uint8_t *datagram, int length,
+                  int64_t arrival, int accepted)
 {
     heard_note n = {'H', (uint8_t)accepted, (uint8_t)sender, (uint8_t)length, slot, arrival, {0}};
     (void)b;

@@ -22,7 +22,6 @@ pytest.importorskip("dtsa_msgs.srv")
 from bridge_helpers import end_process, fake_fleet, settings  # noqa: E402
 from builtin_interfaces.msg import Duration  # noqa: E402
 from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
-from metronome import flown_again_when_overloaded  # noqa: E402
 from node_helpers import ServedNode  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
@@ -134,7 +133,7 @@ def heard(messages: list[Any], number: int = 3) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not MESSAGES, reason="crazyflie_interfaces is not in the workspace")
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
     from crazyflie_interfaces.msg import (
         ConnectionStatisticsArray,

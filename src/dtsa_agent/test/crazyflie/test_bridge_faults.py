@@ -16,14 +16,13 @@ import pytest
 pytest.importorskip("cflib")
 
 from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, settings
-from metronome import ATTEMPTS, Metronome, flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
-pytestmark = pytest.mark.slow
-SLACK_S = 0.4  # what a busy machine may add to a reaction, besides the time for which it stands still
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
+SLACK_S = 0.4  # what scheduling may add to a reaction
 
 
 @dataclass
@@ -36,7 +35,6 @@ class FaultFlight:
     fleet_time: float  # ... and the fleet's
     states: dict[int, State]  # seven seconds later
     others: list[list[str]]  # what the supervisors of those without a fault went through, up to the ground
-    slack_s: float
 
     def reacted(self, pattern: str) -> float:
         return self.flight.logged(pattern, self.monotonic) - self.monotonic
@@ -49,12 +47,11 @@ def seen(pilot: Flight, cf: int) -> tuple[float, float, float]:
     return last.position
 
 
-def fly_with_faults(folder: Path) -> tuple[FaultFlight, bool]:
-    """The flight, and whether the machine was overloaded."""
+@pytest.fixture(scope="module")
+def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> FaultFlight:
     with (
-        fake_fleet(folder, 8, "--arming", "mixed") as fleet,
+        fake_fleet(tmp_path_factory.mktemp("faults"), 8, "--arming", "mixed") as fleet,
         flight(settings(fleet)) as pilot,
-        Metronome() as metronome,
     ):
         assert pilot.bridge.connect() == []
         pilot.take_off()
@@ -74,31 +71,11 @@ def fly_with_faults(folder: Path) -> tuple[FaultFlight, bool]:
         pilot.bridge.land_all("test over")
         pilot.bridge.wait_landed(lambda: False)
         others = [fleet.flown(cf) for cf in (7, 8)]
-    slack = SLACK_S + metronome.late_s
-    return FaultFlight(fleet, pilot, began, t, states, others, slack), metronome.overloaded
-
-
-@pytest.fixture(scope="module")
-def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> FaultFlight:
-    for _ in range(ATTEMPTS):
-        result, overloaded = fly_with_faults(tmp_path_factory.mktemp("faults"))
-        if not overloaded or all_as_promised(result):
-            break
-    return result
-
-
-def all_as_promised(result: FaultFlight) -> bool:
-    """Whether the tests of this flight pass."""
-    try:
-        for test in TESTS_OF_THE_FLIGHT:
-            test(result)
-    except (AssertionError, LookupError, StopIteration, ValueError):
-        return False
-    return True
+    return FaultFlight(fleet, pilot, began, t, states, others)
 
 
 def test_frozen_link_is_lost_within_half_a_second(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf1: flying -> lost") < 0.5 + fault_flight.slack_s
+    assert fault_flight.reacted("cf1: flying -> lost") < 0.5 + SLACK_S
     assert fault_flight.states[1] is State.LOST
     # The Crazyflie by itself: level after 0.5 s without setpoints, motors off 1 s after the last watchdog packet.
     level = fault_flight.fleet.state_event(1, "level out")
@@ -107,24 +84,24 @@ def test_frozen_link_is_lost_within_half_a_second(fault_flight: FaultFlight) -> 
 
 
 def test_closed_socket_is_lost(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf2: flying -> lost") < 0.5 + fault_flight.slack_s
+    assert fault_flight.reacted("cf2: flying -> lost") < 0.5 + SLACK_S
     assert fault_flight.states[2] is State.LOST
 
 
 def test_tumbled_vehicle_is_an_emergency(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted(r"cf3: flying -> emergency \(tumbled") < fault_flight.slack_s
+    assert fault_flight.reacted(r"cf3: flying -> emergency \(tumbled") < SLACK_S
     assert not any(e["event"] == "streaming" and e["t"] > fault_flight.fleet_time for e in fault_flight.fleet.events(3))
 
 
 def test_empty_battery_lands(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf4: battery: .* critical .*: land") < 1.0 + fault_flight.slack_s
+    assert fault_flight.reacted("cf4: battery: .* critical .*: land") < 1.0 + SLACK_S
     assert fault_flight.fleet.events(4, "land")
     assert fault_flight.states[4] in (State.READY, State.ARMED)
 
 
 def test_commands_that_cease_hold_then_land(fault_flight: FaultFlight) -> None:
-    assert fault_flight.reacted("cf5: commands: .*: hold") < 0.25 + fault_flight.slack_s
-    assert 2.5 < fault_flight.reacted("cf5: commands: .*: land") < 3.0 + fault_flight.slack_s
+    assert fault_flight.reacted("cf5: commands: .*: hold") < 0.25 + SLACK_S
+    assert 2.5 < fault_flight.reacted("cf5: commands: .*: land") < 3.0 + SLACK_S
     names = [e["event"] for e in fault_flight.fleet.events(5) if e["t"] > fault_flight.fleet_time]
     # Something to fly comes first: without it the end of the stream would stop the motors.
     assert names[:4] == ["go_to", "stream ended", "go_to", "land"]
@@ -166,19 +143,7 @@ def test_one_above_another_moves_aside_before_it_lands(fault_flight: FaultFlight
     assert len([e for e in events if e["cf"] == 7 and e["event"] == "land"]) == 1
 
 
-TESTS_OF_THE_FLIGHT = (
-    test_frozen_link_is_lost_within_half_a_second,
-    test_closed_socket_is_lost,
-    test_tumbled_vehicle_is_an_emergency,
-    test_empty_battery_lands,
-    test_commands_that_cease_hold_then_land,
-    test_geofence_lands_at_once,
-    test_nobody_else_is_harmed,
-    test_one_above_another_moves_aside_before_it_lands,
-)
-
-
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> None:
     with (
         fake_fleet(tmp_path, 3, "--layout", "line", "--half-axes", "1.2", "0.6") as fleet,
@@ -202,7 +167,7 @@ def test_too_close_lands_both_and_a_lost_heartbeat_stops_all(tmp_path: Path) -> 
         assert fleet.state_event(3, "locked")["reason"] == "emergency stop"
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 @pytest.mark.parametrize("protocol", ["10"])
 def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, protocol: str) -> None:
     with fake_fleet(tmp_path, 4, "--protocol", protocol, "--arming", "required") as fleet:
@@ -234,7 +199,7 @@ def test_missing_and_refusing_ones_do_not_ground_the_others(tmp_path: Path, prot
             wait_for(lambda: any(e["state"] == "locked" for e in fleet.events(4, "state")), 3)
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_control(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 6, "--arming", "mixed") as fleet, flight(settings(fleet)) as pilot:
         assert pilot.bridge.connect() == []
@@ -263,7 +228,7 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
         wait_for(lambda: link.received > forgotten + 20)
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_lossy_link_still_connects(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2) as fleet:
         with flight(settings(fleet)) as pilot:  # fills the cache of tables
@@ -303,7 +268,7 @@ with flight(data) as pilot:
 """
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_killed_bridge_leaves_it_to_the_firmware(tmp_path: Path) -> None:
     """One bridge with and one without the emergency watchdog, both killed."""
     import json

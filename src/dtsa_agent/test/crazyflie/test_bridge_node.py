@@ -27,7 +27,6 @@ from dtsa_msgs.msg import Position, Status, VelocityWorld  # noqa: E402
 from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff  # noqa: E402
 from geometry_msgs.msg import Point, TwistStamped  # noqa: E402
 from graph_helpers import COUNT, Graph  # noqa: E402
-from metronome import flown_again_when_overloaded  # noqa: E402
 from std_srvs.srv import Empty, Trigger  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
@@ -86,7 +85,7 @@ def refused_commands(graph: Graph, k: int) -> int:
     return next(int(v.value) for v in values if v.key == "commands refused")
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_flight_over_the_graph_and_ctrl_c_lands(tmp_path: Path) -> None:
     with swarm(tmp_path) as (fleet, process, graph):
         up(graph)
@@ -188,7 +187,7 @@ def test_one_that_is_lost_on_the_way_down_is_named_at_the_end(state: State, code
     bridge.close.assert_called_once_with()
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_second_ctrl_c_is_the_emergency_stop(tmp_path: Path) -> None:
     with swarm(tmp_path) as (fleet, process, graph):
         up(graph)
@@ -203,7 +202,7 @@ def test_second_ctrl_c_is_the_emergency_stop(tmp_path: Path) -> None:
             assert fleet.state_event(k, "locked")["reason"] == "emergency stop"
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_emergency_service(tmp_path: Path) -> None:
     with swarm(tmp_path) as (fleet, _, graph):
         up(graph)

@@ -11,7 +11,6 @@ import pytest
 pytest.importorskip("cflib")
 
 from bridge_helpers import fake_fleet, flight, settings
-from metronome import flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.motion.trajectories import Piece, Trajectory
@@ -30,7 +29,7 @@ def along_x(number: int, metres: float, pieces: int = 1) -> Trajectory:
     return Trajectory(number, 0, (way, *(rest,) * (pieces - 1)))
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_parameters_logs_and_trajectories(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2, "--arming", "mixed") as fleet, flight(settings(fleet)) as f:
         assert f.bridge.connect() == []

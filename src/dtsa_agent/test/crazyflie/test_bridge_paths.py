@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from metronome import flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.motion.paths import PEAK, shortest_s, too_short
@@ -37,7 +36,7 @@ def test_why_a_duration_is_too_short() -> None:
 
 
 @pytest.mark.slow
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_in_flight(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
     from bridge_helpers import fake_fleet, flight, settings
@@ -78,7 +77,7 @@ def test_in_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
     from bridge_helpers import fake_fleet, flight, settings

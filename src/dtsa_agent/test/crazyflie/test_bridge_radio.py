@@ -17,7 +17,6 @@ import yaml
 pytest.importorskip("cflib")
 
 from bridge_helpers import FakeFleet, Flight, fake_fleet, flight
-from metronome import flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
@@ -54,7 +53,7 @@ def radio_flight(
             yield fleet, pilot
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_link_that_cflib_closes_is_opened_again_in_flight(tmp_path: Path) -> None:
     with radio_flight(tmp_path, 2, {"safety": {"emergency_watchdog": False}}) as (fleet, pilot):
         one = pilot.bridge.vehicles["cf1"]
@@ -88,7 +87,7 @@ def test_an_emergency_stop_reaches_all_that_listen(tmp_path: Path) -> None:
         wait_for(lambda: {e["cf"] for e in fleet.events(name="state") if e["state"] == "locked"} == {1, 2, 3, 4}, 5.0)
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_gaps_of_the_air(tmp_path: Path) -> None:
     """One gap a vehicle while commands are streamed, all at one time."""
     gaps = {1: (0.25, "both"), 2: (0.7, "both"), 3: (1.5, "both"), 4: (1.5, "down")}

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from metronome import flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
@@ -218,7 +217,7 @@ def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.Monkey
 # -- flights ----------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.ros
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fails(tmp_path: Path) -> None:
     """A publisher at 100 Hz; then an estimate jumps, one freezes, one vehicle is not seen any more; one flies on."""
     pytest.importorskip("cflib")

@@ -25,7 +25,6 @@ pytest.importorskip("dtsa_msgs.srv")
 
 import aiohttp
 from bridge_helpers import FakeFleet, fake_fleet, settings
-from metronome import flown_again_when_overloaded
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from waiting import wait_for
@@ -153,7 +152,7 @@ async def told_in_flight(url: str) -> set[str]:
     return flying
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_bridge_that_dies_leaves_records_and_a_summary(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         out = tmp_path / "out"
@@ -188,7 +187,7 @@ def test_a_bridge_that_dies_leaves_records_and_a_summary(tmp_path: Path) -> None
         assert run_data(out)["mission"]["cut_short"] == mission["cut_short"]
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_take_off_exchange_landing(tmp_path: Path) -> None:
     """Over simulated radios, on which a twentieth of all packets is lost."""
     patient = {"link_age_s": 3.0, "command_age_s": 0.45, "emergency_watchdog": False}  # it would lock them
@@ -258,7 +257,7 @@ def test_whoever_may_not_exchange_roles_is_brought_over_the_others() -> None:
         plan_moves(names[:2], pair, pair[:, ::-1], narrow)
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> None:
     """The first one finds two at each other's places and may not exchange roles; the second one exchanges them."""
     with ros_domain() as domain:
@@ -298,7 +297,7 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
         assert gap.min() > 0.25
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_dry_run_flies_from_where_they_stand_and_nobody_moves(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2, *MIXED) as fleet:
         data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
@@ -322,7 +321,7 @@ def test_a_dry_run_flies_from_where_they_stand_and_nobody_moves(tmp_path: Path) 
         assert (result.returncode, "the places of cf2 are not known" in result.stderr) == (1, True)
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out"), "--tail-s", "60"]
@@ -378,7 +377,7 @@ def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyP
         require_cflib()
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2, *MIXED) as fleet:
         data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})

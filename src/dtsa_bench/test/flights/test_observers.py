@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import pytest
 from fly_helpers import readable
-from metronome import flown_again_when_overloaded
 from node_helpers import end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
@@ -273,7 +272,7 @@ def test_who_is_late_with_its_first_report_is_where_it_was_when_it_was_called(tm
 
 
 @pytest.mark.ros
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_path: Path) -> None:
     channel, sender = flown_with(LateSender, tmp_path, slots=150)
     assert channel.air.late == channel.late_frames == 1

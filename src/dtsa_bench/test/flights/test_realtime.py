@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fly_helpers import PATIENCE_S, fly, flying, pid_of, readable
-from metronome import flown_again_when_overloaded
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -44,7 +43,7 @@ def drifts(seconds: float) -> list[float]:
 
 
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path: Path) -> None:
     aligned = tmp_path / "aligned"
     together, apart = fly(aligned, *TIGHT, "--loss", "0.2"), fly(tmp_path / "apart", *TIGHT, "--no-align")
@@ -62,7 +61,7 @@ def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path:
 
 
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_beacons_begin_when_their_own_timers_say_and_overlap_by_time_on_the_air(tmp_path: Path) -> None:
     words = ("--agents", "4", "--policy", "beacons", "--processes", "2", "--mode", "realtime", "--seed", "5")
     summary = fly(tmp_path / "out", *words, "--bitrate", "40000", "--timeout-s", "1", "--no-picture")
@@ -85,7 +84,7 @@ def test_beacons_begin_when_their_own_timers_say_and_overlap_by_time_on_the_air(
 
 
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_radios_that_listen_begin_in_free_air_and_tell_their_agents(tmp_path: Path) -> None:
     words = ("--agents", "4", "--policy", "csma", "--processes", "2", "--mode", "realtime", "--seed", "5")
     more = ("--options", "csma.window_ms=10", "--bitrate", "40000", "--timeout-s", "1.5", "--no-picture")
@@ -132,7 +131,7 @@ def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path:
 
 
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
     """All that agents report is recorded, and a frame that one of them had not taken in would show in its view."""
     out, agents = tmp_path / "flight", 70
@@ -170,7 +169,7 @@ def test_seventy_agents_lose_no_message(tmp_path: Path) -> None:
             assert odd[agent] < agents - 5, f"cf{agent} has missed a frame"
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_an_agent_that_hangs_is_named_and_the_others_fly_on(tmp_path: Path) -> None:
     out = tmp_path / "flight"
     # Its vehicle hovers where it was, and somebody may fly into it: that is not what this is about.
@@ -189,7 +188,7 @@ def test_an_agent_that_hangs_is_named_and_the_others_fly_on(tmp_path: Path) -> N
 
 
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_in_real_time_agents_keep_their_own_clocks(tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = (
@@ -229,7 +228,7 @@ def test_in_real_time_agents_keep_their_own_clocks(tmp_path: Path) -> None:
 
 
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_in_real_time_the_others_fly_on_when_one_is_killed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = (

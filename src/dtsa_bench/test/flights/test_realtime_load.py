@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from dtsa_dev.soak.flights import children, end_all
 from fly_helpers import command
-from metronome import flown_again_when_overloaded
 from node_helpers import ros_graph
 from process_helpers import addresses, may_be_real_time, real_time, segments_of
 from waiting import wait_for
@@ -86,7 +85,7 @@ def test_a_signal_is_obeyed_at_any_load(tmp_path: Path, number: int) -> None:
 
 @pytest.mark.ros
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_channel_that_stood_still_shows_in_what_the_agents_knew_and_makes_nobody_lost(tmp_path: Path) -> None:
     out = tmp_path / "flight"
     words = ("--policy", "tdma", "--agents", "12", "--processes", "4", "--slot-ms", "20", "--scenario", "waypoints")

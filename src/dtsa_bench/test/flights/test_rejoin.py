@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dtsa_dev.soak.flights import children, end_all, process_with
-from metronome import flown_again_when_overloaded
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame_extended import decode_extended
@@ -158,7 +157,7 @@ def begins_at_an_anchor(found: list[Report], agent: int) -> bool:
     ],
 )
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
     tmp_path: Path, argument: str, agents: list[int], words: tuple[str, ...]
 ) -> None:
@@ -187,7 +186,7 @@ def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
 
 @pytest.mark.ros
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, *LEASE) as flight:
         asleep = flight.pid("__ns:=/cf2")
@@ -208,7 +207,7 @@ def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None
 
 @pytest.mark.ros
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_sigterm_lets_an_agent_say_farewell_and_a_second_one_does_not_wait(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, "--policy", "lease", "--respawn", "0") as flight:
         os.kill(flight.pid("__ns:=/cf2"), signal.SIGTERM)
@@ -255,7 +254,7 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
 
 @pytest.mark.ros
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_an_agent_may_come_late(tmp_path: Path) -> None:
     with flying(tmp_path / "flight", *ROOMY, *LEASE, "--late", "cf3=0.5") as flight:
         flight.until(lambda: "cf3 takes part\n" in flight.said)
@@ -274,7 +273,7 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
 
 @pytest.mark.ros
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) -> None:
     few = (
         "--agents",

@@ -41,6 +41,21 @@ def test_needs_the_machine_for_itself():
 def test_hangs():
     time.sleep(60)
 """
+REACTS = """
+from pathlib import Path
+import pytest
+
+@pytest.mark.realtime
+def test_too_slow_beside_others(tmp_path_factory):
+    mark = tmp_path_factory.getbasetemp().parent / "second"
+    second = mark.exists()
+    mark.touch()
+    assert second
+
+@pytest.mark.realtime
+def test_always_fails():
+    assert False
+"""
 
 
 def test_a_dead_worker_and_a_test_that_hangs_are_named_and_the_run_ends(tmp_path: Path) -> None:
@@ -50,6 +65,7 @@ def test_a_dead_worker_and_a_test_that_hangs_are_named_and_the_run_ends(tmp_path
     (tmp_path / "pyproject.toml").write_text("\n".join(("[tool.pytest.ini_options]", *lines, "")))
     (tmp_path / "test_dies.py").write_text(DIES)
     (tmp_path / "test_fails.py").write_text(FAILS)
+    (tmp_path / "test_reacts.py").write_text(REACTS)
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")}
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-n", "2", *SIDE_BY_SIDE, "-p", "no:cacheprovider"],
@@ -59,4 +75,6 @@ def test_a_dead_worker_and_a_test_that_hangs_are_named_and_the_run_ends(tmp_path
     # Which worker gets which file is open.
     assert re.search(r"worker 'gw[01]' crashed while running 'test_dies\.py::test_dies'", run.stderr)
     assert "test_fails.py::test_hangs: Failed: Timeout" in run.stderr  # said when it happens, and at the end again
-    assert "2 failed, 2 passed" in run.stdout
+    assert "RERUN test_reacts.py::test_too_slow_beside_others" in run.stdout
+    assert "FAILED test_reacts.py::test_always_fails" in run.stdout
+    assert "3 failed, 3 passed, 2 rerun" in run.stdout

@@ -21,7 +21,6 @@ pytest.importorskip("aiohttp")
 
 import aiohttp
 from dtsa_dev.soak.view import serving
-from metronome import flown_again_when_overloaded
 from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError
@@ -268,7 +267,7 @@ def test_usable_orders_are_read() -> None:
     assert read_order({"kind": "partition", "value": ""}) == Order("partition", value="")
 
 
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_link_to_a_server_that_stands_still_never_waits() -> None:
     """What it cannot take is dropped; that a process stands still is what SIGSTOP makes of it."""
     link = ViewLink()

@@ -17,7 +17,6 @@ pytest.importorskip("aiohttp")
 import aiohttp
 from dtsa_dev.soak.chromium import CHROMIUM, MISSING, browsing
 from dtsa_dev.soak.view import serving
-from metronome import flown_again_when_overloaded
 from view_helpers import AGENTS, PATIENCE_S, lossy_bag, numbers, track_of, viewed_flight
 from waiting import wait_for
 
@@ -113,7 +112,7 @@ def environment(process: int) -> dict[str, str]:
 
 @pytest.mark.ros
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_a_kill_from_the_page_reaches_the_node_and_is_seen_on_it(tmp_path: Path) -> None:
     from fly_helpers import pid_of
 

@@ -22,7 +22,6 @@ from builtin_interfaces.msg import Duration
 from dtsa_dev.soak.chromium import CHROMIUM, MISSING, browsing
 from dtsa_dev.soak.view import serving
 from dtsa_msgs.srv import Arm, Takeoff
-from metronome import flown_again_when_overloaded
 from node_helpers import ServedNode
 from waiting import wait_for
 
@@ -42,7 +41,7 @@ def all_are(state: str) -> str:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Path) -> None:
     """Without a run: the bridge alone."""
     from dtsa_bench.pages.view.graph import GraphSource

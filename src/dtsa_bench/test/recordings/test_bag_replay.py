@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 from bag_helpers import SECOND, SyntheticRun, ros_environment, synthetic_bag
-from metronome import flown_again_when_overloaded
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.recordings.bag import replay, schema
@@ -113,7 +112,7 @@ def test_topics_start_and_loop(run: SyntheticRun) -> None:
 
 
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 @pytest.mark.parametrize("rate", [1.0, 4.0])
 def test_messages_keep_their_time(run: SyntheticRun, rate: float) -> None:
     with steady_timing():
@@ -257,7 +256,7 @@ def filled(data: bytes) -> str:
 
 @pytest.mark.ros
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun) -> None:
     need_ros()
     environment = ros_environment()

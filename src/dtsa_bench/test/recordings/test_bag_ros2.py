@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 import yaml
 from bag_helpers import SECOND, SyntheticRun, ros_environment, synthetic_bag
-from metronome import flown_again_when_overloaded
 
 from dtsa_bench.recordings.bag.errors import UnusableBag
 from dtsa_bench.recordings.bag.metadata import ROOT
@@ -148,7 +147,7 @@ def expected(run: SyntheticRun, topic: str, start_ns: int = 0) -> list[str]:
 
 @pytest.mark.ros
 @pytest.mark.alone
-@flown_again_when_overloaded
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("options", "start_ns"), [((), 0), (("--rate", "2", "--start-offset", "0.4"), SECOND + 400_000_000)]
 )

@@ -8,9 +8,9 @@ enum { CYCLES = 8 };
 
 typedef struct contact {
     int64_t heard, named; /* slot of its last frame, and in which others named it last; -1: none */
-    int64_t denied;         /* slot in which it said last that it does not hear this agent */
-    int64_t seen;           /* largest slot in a frame of its own, of whatever time; -1: none */
-    int64_t unnamed;     /* its datagrams since it named this agent */
+    int64_t denied;       /* slot in which it said last that it does not hear this agent */
+    int64_t seen;         /* largest slot in a frame of its own, of whatever time; -1: none */
+    int64_t unnamed;      /* its datagrams since it named this agent */
     uint8_t still, probation, left;
     int8_t says; /* 1: it hears this agent; -1: it does not; 0: it has not said */
 } contact;

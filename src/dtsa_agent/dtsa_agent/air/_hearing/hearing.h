@@ -66,7 +66,7 @@ typedef struct hearing {
     uint8_t header[WITH_MAGIC], key[32];
     int agreed, late_bytes, peers, head; /* of the header: bytes agreed on; 2, or 0: it does not
                                             say how late it left; others told of; all bytes */
-    int key_length; /* 0: not sealed */
+    int key_length;                      /* 0: not sealed */
     uint64_t session;
     int64_t flight, slot_ns;
     double position_step;
@@ -79,7 +79,7 @@ typedef struct hearing {
     delays delay;
     contacts contact;
     int64_t timed, off; /* frames of about this time; of these off by over a quarter of a slot */
-    int64_t *last; /* (n) slot of the last frame, -1: none */
+    int64_t *last;      /* (n) slot of the last frame, -1: none */
     int64_t *memory;
 } hearing;
 

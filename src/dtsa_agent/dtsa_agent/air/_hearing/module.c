@@ -46,21 +46,20 @@ static PyObject *make(PyTypeObject *type, PyObject *args, PyObject *unused)
     air_port *port;
     (void)unused;
     if (!h) return PyErr_NoMemory();
-    if (!PyArg_ParseTuple(args, "iiiLKy#iiy#KLdiiLLLLLLLLO", &h->agents, &id, &anchor_every, &slot_ns,
-                          &seed, &header, &header_length, &h->late_bytes, &h->peers, &key,
+    if (!PyArg_ParseTuple(args, "iiiLKy#iiy#KLdiiLLLLLLLLO", &h->agents, &id, &anchor_every,
+                          &slot_ns, &seed, &header, &header_length, &h->late_bytes, &h->peers, &key,
                           &key_length, &session, &flight, &h->position_step, &h->length,
-                          &h->own_bytes, &limit, &trust, &began, &offset,
-                          &drift, &moving, &resting, &named, &capsule))
+                          &h->own_bytes, &limit, &trust, &began, &offset, &drift, &moving, &resting,
+                          &named, &capsule))
         goto failed;
     port = PyCapsule_GetPointer(capsule, DTSA_PORT);
     if (!port) goto failed;
     if (h->agents < 1 || h->agents > DTSA_AGENTS_MAX || id < 1 || id > h->agents ||
         header_length > WITH_MAGIC || (h->late_bytes && h->late_bytes != 2) || h->peers < 0 ||
-        h->peers > PEERS ||
-        key_length > (Py_ssize_t)sizeof h->key || h->length > LONGEST ||
+        h->peers > PEERS || key_length > (Py_ssize_t)sizeof h->key || h->length > LONGEST ||
         h->length <= header_length + h->late_bytes + 4 * h->peers + DTSA_TAG_BYTES ||
-        h->own_bytes < 0 || trust < 1 ||
-        drift < -DRIFT_MOST || drift > DRIFT_MOST || !(h->position_step > 0.0) ||
+        h->own_bytes < 0 || trust < 1 || drift < -DRIFT_MOST || drift > DRIFT_MOST ||
+        !(h->position_step > 0.0) ||
         !dtsa_timebase_init(&h->base, h->agents, anchor_every, slot_ns, id, seed)) {
         PyErr_SetString(PyExc_ValueError, "what is heard: a value is out of range");
         goto failed;

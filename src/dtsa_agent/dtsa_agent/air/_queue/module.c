@@ -21,7 +21,7 @@ typedef struct place {
 } place;
 
 typedef struct queue {
-    air_port port; /* the first member: receive() is called with it */
+    air_port port;               /* the first member: receive() is called with it */
     unsigned first, count, lent; /* of these the first `lent` are being looked at */
     unsigned overflowed;
     place places[ROOM];
@@ -137,9 +137,12 @@ static PyObject *get(PyObject *module, PyObject *capsule)
 }
 
 static PyMethodDef FUNCTIONS[] = {
-    {"open_queue", open_queue, METH_NOARGS, NULL}, {"put", put, METH_VARARGS, NULL},
-    {"get", get, METH_O, NULL},                    {"descriptor", descriptor, METH_O, NULL},
-    {"overflowed", overflowed, METH_O, NULL},      {0},
+    {"open_queue", open_queue, METH_NOARGS, NULL},
+    {"put", put, METH_VARARGS, NULL},
+    {"get", get, METH_O, NULL},
+    {"descriptor", descriptor, METH_O, NULL},
+    {"overflowed", overflowed, METH_O, NULL},
+    {0},
 };
 
 PyMODINIT_FUNC PyInit__queue(void)
