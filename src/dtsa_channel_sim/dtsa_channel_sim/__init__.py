@@ -7,7 +7,6 @@ from dtsa_channel_sim.model.clocks import AgentClock, ClockConfig, make_clocks
 from dtsa_channel_sim.model.config import CHANGEABLE, Change, ChannelConfig
 from dtsa_channel_sim.model.measured import MeasuredLosses
 from dtsa_channel_sim.model.medium import Medium, OnAir, Reception
-from dtsa_channel_sim.model.simulated_air import SimulatedAir, SimulatedPort
 from dtsa_channel_sim.model.topology import LinkLoss
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, OUTCOMES, SUCCESS, Verdict
 
@@ -30,8 +29,6 @@ __all__ = [
     "Medium",
     "OnAir",
     "Reception",
-    "SimulatedAir",
-    "SimulatedPort",
     "Verdict",
     "make_clocks",
 ]

@@ -1,9 +1,5 @@
 """An agent with a clock of its own (`agent`: its loop), and the ports through which frames get on an air.
 
-`port` says what is asked of a port. `udp` is the port of a network; the simulated one is in the channel. Nothing here
-imports a port: the program that starts an agent makes one and hands it over.
+`port` says what is asked of a port. `udp` is the port of a network. Nothing here imports a port: the program that
+starts an agent makes one and hands it over.
 """
-
-from .port import AirListener, AirPort, SlotHearing
-
-__all__ = ["AirListener", "AirPort", "SlotHearing"]

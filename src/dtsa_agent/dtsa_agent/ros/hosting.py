@@ -13,7 +13,6 @@ from rclpy.node import Node
 from dtsa_agent.core import AbstractSwarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
-from dtsa_agent.core.plugins.unslotted import check_carried, check_slotted
 from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.keys import with_key
 from dtsa_agent.plugin_watch import watched
@@ -104,9 +103,6 @@ def _run_agents(
 ) -> None:
     host = HostSettings(**declare_settings(node, HostSettings))
     priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
-    if host.mode == "lockstep":
-        check_slotted(config.policy)
-    check_carried(config.policy)
     swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared and host.mode == "lockstep"))
     if host.mode == "lockstep":
         agents: SwarmNode = SwarmNode(node, swarm, space)

@@ -42,7 +42,6 @@ from rclpy.task import Future
 from dtsa_agent.core.agents.joining import Listeners, check_joinable
 from dtsa_agent.core.agents.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.core.plugins.entry_points import plug_ins_of
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.priority import take_priority
@@ -51,7 +50,6 @@ from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_agent.ros.common.wire.slot_fields import SlotFields
 from dtsa_agent.ros.common.wire.stamps import header_of, time_of
 
-from .handed_over import HandedOver
 from .leaving import Leaving
 from .reporter import Reporter
 from .send_times import SendTimes
@@ -116,12 +114,9 @@ class RealtimeNode(SwarmNode):
         self._own_or_nobody = {0, *self.swarm.ids}
         self._awaits = False  # somebody here takes another one for the slot's sender, and has not heard it yet
         self.unsent = 0  # frames that would have left half a slot late or more
-        slotted = not self.config.policy_row.unslotted
-        parts = plug_ins_of(self.swarm) if self.config.policy_row.listens else None
-        self._handed = None if parts is None else HandedOver(parts)
-        self._clocks = SlotClocks(self.slot_ns, offset_ns, drift_ppb, align and slotted)
+        self._clocks = SlotClocks(self.slot_ns, offset_ns, drift_ppb, align)
         self._lengths: NDArray[np.uint8] = np.zeros(count, dtype=np.uint8)  # bytes sent in the present slot
-        self._send_times = SendTimes(self.swarm, jitter_ns, flight_time_ns, not slotted and self._handed is None)
+        self._send_times = SendTimes(self.swarm, jitter_ns, flight_time_ns)
         self._priority = priority  # still to be taken
         self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3).T
         self._called = False  # was there when the channel asked who is
@@ -303,10 +298,7 @@ class RealtimeNode(SwarmNode):
         if masks is not None:
             now = time.monotonic_ns() - self._zero
             for sender, mask in zip(message.sender, masks, strict=True):
-                own = self._handed is not None and self._handed.heard(
-                    sender, message.heard_slot, self._began_ns(message)
-                )
-                if own or mask.any():
+                if mask.any():
                     self._reporter.add_heard(sender, message.heard_slot, self.slot, now, mask)
         if masks is None or not (self._clocks.align or self._timeless.any()):
             return
@@ -380,18 +372,13 @@ class RealtimeNode(SwarmNode):
         self._lengths[:] = 0
         for index in senders:
             data = swarm.frame(index)
-            due = began + int(starts[index] + swarm.send_offset_ns[index])
-            start = self._send_times.start_ns(index, due, len(data))
+            start = self._send_times.start_ns(index, began + int(starts[index]))
             if start is None:
                 swarm.drop(index)
                 self.unsent += 1
-                if self._handed is not None:
-                    self._handed.not_sent(index, slot)
                 continue
             offset = start - began
             offsets[index], self._lengths[index] = offset, len(data)
-            if self._handed is not None:
-                self._handed.note(index, slot, slot * self.slot_ns + offset)
             header = header_of(names.slot_time_ns(slot, self.slot_ns) + offset)
             self._air.publish(
                 Frame(header=header, run=self.run_id, slot=slot, agent=swarm.ids[index], data=array("B", data))

@@ -1,4 +1,4 @@
-"""When frames start: when they are due, with the jitter of a timer, once they are ready and their radio is free."""
+"""When frames start: when they are due, with the jitter of a timer, once they are ready."""
 
 from __future__ import annotations
 
@@ -15,19 +15,13 @@ class SendTimes:
     :param jitter_ns: ns, standard deviation of the time of a single transmission.
     :param flight_time_ns: ns from the order to send a frame until the receivers' flight processors have it: for any
         frame, and for each of its bytes.
-    :param may_overlap: whether an agent may have a frame before its radio has done with the last one: with slots it
-        never has, and a radio that listens knows by itself.
     """
 
-    def __init__(
-        self, swarm: AbstractSwarm, jitter_ns: float, flight_time_ns: tuple[int, int], may_overlap: bool
-    ) -> None:
+    def __init__(self, swarm: AbstractSwarm, jitter_ns: float, flight_time_ns: tuple[int, int]) -> None:
         self._latest_ns = swarm.config.slot_ns // 2  # so much later the turn is as good as over
         self._jitter_ns = jitter_ns
         self._random = [generator(swarm.config.seed, STREAM_CLOCKS, agent) for agent in swarm.ids]
         self._fixed_ns, self._per_byte_ns = flight_time_ns
-        self._may_overlap = may_overlap
-        self._free_ns = [0] * len(swarm.ids)  # when each radio has done with its last frame, ns, CLOCK_MONOTONIC
 
     def under_way_ns(self, length: int) -> int:
         """From the order to send a frame until its receivers have it, ns.
@@ -36,19 +30,12 @@ class SendTimes:
         """
         return self._fixed_ns + self._per_byte_ns * length
 
-    def start_ns(self, index: int, due_ns: int, length: int) -> int | None:
-        """When a frame starts, ns, CLOCK_MONOTONIC; None: so late that it would disturb the next turn, or not at all.
+    def start_ns(self, index: int, due_ns: int) -> int | None:
+        """When a frame starts, ns, CLOCK_MONOTONIC; None: so late that it would disturb the next turn.
 
         :param index: position of its agent.
         :param due_ns: ns, CLOCK_MONOTONIC, when it should start.
-        :param length: its bytes.
         """
         jitter = self._jitter_ns * self._random[index].standard_normal() if self._jitter_ns else 0.0
         start = max(due_ns + int(jitter), time.monotonic_ns())
-        if start - due_ns > self._latest_ns:
-            return None
-        if self._may_overlap:
-            if start < self._free_ns[index]:
-                return None
-            self._free_ns[index] = start + self.under_way_ns(length)
-        return start
+        return None if start - due_ns > self._latest_ns else start

@@ -45,11 +45,9 @@ class ClockStatistics(ChannelObserver):
     """Collects when slots start and frames leave, and sums it up.
 
     :param agents: number of agents N.
-    :param slotted: frames leave when slots start; otherwise it says nothing of them.
     """
 
-    def __init__(self, agents: int, slotted: bool = True) -> None:
-        self._slotted = slotted
+    def __init__(self, agents: int) -> None:
         self._slot = np.full(_OPEN, -1, dtype=np.int64)  # each in row slot % _OPEN, -1: none yet
         self._starts = np.full((_OPEN, agents), np.nan)  # ns, own slot's start, nan: sent, or not known
         self._sends = np.full((_OPEN, agents), np.nan)  # ns, of the transmission
@@ -82,8 +80,6 @@ class ClockStatistics(ChannelObserver):
         open_ = (self._slot[rows] == slots)[:, None]
         silent, offsets = lengths.reshape(len(slots), -1) == 0, offsets_ns.reshape(len(slots), -1)
         self._starts[at] = np.where(open_ & silent, offsets, self._starts[at])
-        if not self._slotted:
-            return
         self._sends[at] = np.where(open_ & ~silent, offsets, self._sends[at])
 
     def _sum_up(self, row: int) -> None:

@@ -36,9 +36,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.core.agents.joining import check_joinable
+from dtsa_agent.core.agents.joining import check_joinable, check_slotted
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.core.plugins.unslotted import check_carried
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
@@ -146,9 +145,7 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
 def _check_policy(run: RunConfig, options: FlightOptions) -> None:
     """What the policy asks of a flight of nodes."""
     row = run.swarm.policy_row
-    check_carried(row.name)
-    if row.unslotted and run.mode == LOCKSTEP:
-        raise ConfigError("policy", row.name, "with --mode realtime: in lockstep all frames begin with their slot")
+    check_slotted(row.name)
     if row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or run.swarm.agents) > 1):
         raise ConfigError("policy", row.name, "in lockstep with --processes 1 only: it looks into all agents")
 

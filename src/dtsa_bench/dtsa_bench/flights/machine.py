@@ -53,7 +53,6 @@ def channel_summary(channel: RealtimeChannel) -> dict[str, Any]:
     pace = channel.pace
     return {
         "late_frames": channel.late_frames,
-        "frames_given_up": channel.air.given_up,
         "missed_reports": channel.missed,
         "round_ms": channel.round_ms,
         "channel_lag_p99_ms": pace.lag.quantile_ms(0.99),

@@ -73,7 +73,6 @@ class RecordedFlight:
         self.scenario = make_scenario(run.swarm)
         self.measurement = FlightMeasurement(run, self.scenario)
         model, steps, referee = Channel(run.air), run.swarm.steps, self.measurement
-        slotted = not run.swarm.policy_row.unslotted
         self.run_id = identity.number
         limits: dict[str, Any] = {"startup_s": startup_s, "end_s": end_s, "run": identity, "agreed": agreed}
         limits["swarm_namespace"] = space
@@ -81,7 +80,7 @@ class RecordedFlight:
         if run.mode == LOCKSTEP:
             self.channel = LockstepChannel(node, model, steps, answer_s, referee=referee, **limits)
         else:
-            self.channel = RealtimeChannel(node, model, steps, referee=referee, slotted=slotted, **limits)
+            self.channel = RealtimeChannel(node, model, steps, referee=referee, **limits)
         # The recorder comes first: whatever happens to the others, the bag is complete.
         self.channel.observe(
             FlightRecorder(directory / BAG, run, self.scenario, self.run_id),
@@ -89,7 +88,7 @@ class RecordedFlight:
             LiveTopics(node, self.scenario, run.swarm.slot_ns, self.run_id, space),
         )
         watch(self.channel, node, run.to_dict(), space)
-        self._clocks, self._delivery = ClockStatistics(run.swarm.agents, slotted), DeliveryStatistics(run.swarm.agents)
+        self._clocks, self._delivery = ClockStatistics(run.swarm.agents), DeliveryStatistics(run.swarm.agents)
         if run.mode != LOCKSTEP:
             self.channel.observe(self._clocks, self._delivery)
         follow_parameters(node, model, self.channel.change_settings)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import signal
@@ -16,10 +15,6 @@ pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_dev.soak.flights import children, process_with
 
-from dtsa_agent.core import AgentGroup, SwarmConfig
-from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.stamps import ns_of
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.verify import verify_bag
 from dtsa_channel_sim import ClockConfig, make_clocks
@@ -58,64 +53,6 @@ def test_with_alignment_slots_stay_together_and_without_frames_collide(tmp_path:
     assert results[tmp_path / "apart"].safety["frames_collided"] > 20
     # A busy machine may make a frame late now and then; clocks do not.
     assert results[aligned].safety["frames_collided"] < results[tmp_path / "apart"].safety["frames_collided"] / 4
-
-
-@pytest.mark.alone
-@pytest.mark.realtime
-def test_beacons_begin_when_their_own_timers_say_and_overlap_by_time_on_the_air(tmp_path: Path) -> None:
-    words = ("--agents", "4", "--policy", "beacons", "--processes", "2", "--mode", "realtime", "--seed", "5")
-    summary = fly(tmp_path / "out", *words, "--bitrate", "40000", "--timeout-s", "1", "--no-picture")
-    assert summary["sends_on_time_share"] is None
-    result = verify_bag(tmp_path / "out")
-    assert result.ok, result.difference
-    assert result.safety["frames_collided"] > 10
-    agents = AgentGroup(make_swarm(SwarmConfig(agents=4, policy="beacons", seed=5)))
-    due, late = {}, []
-    for slot in range(100):
-        for index in agents.on_slot(slot):  # two of them begin 0.6 ms apart
-            due[slot, index + 1] = int(agents.swarm.send_offset_ns[index])
-        agents.on_slot_end()
-    with Bag(tmp_path / "out" / "bag") as bag:
-        for _, said in bag.typed([f"{names.SWARM}/{names.AIR_FRAME}"]):
-            begin = said.header.stamp.sec * 1_000_000_000 + said.header.stamp.nanosec - names.TIME_ZERO_NS
-            late.append(begin - int(said.slot) * 10_000_000 - due[int(said.slot), int(said.agent)])
-    assert len(late) > 30
-    assert 0 == min(late) <= max(late) <= 5_000_000  # who is later than half a slot is silent
-
-
-@pytest.mark.alone
-@pytest.mark.realtime
-def test_radios_that_listen_begin_in_free_air_and_tell_their_agents(tmp_path: Path) -> None:
-    words = ("--agents", "4", "--policy", "csma", "--processes", "2", "--mode", "realtime", "--seed", "5")
-    more = ("--options", "csma.window_ms=10", "--bitrate", "40000", "--timeout-s", "1.5", "--no-picture")
-    summary = fly(tmp_path / "out", *words, *more)
-    result = verify_bag(tmp_path / "out")
-    assert result.ok, result.difference
-    frames = result.checked["frames that began in free air"]
-    assert frames == result.safety["frames"] > 60  # two of five of them on the air, which beacons lose
-    assert result.safety["frames_collided"] < 0.2 * frames
-    assert 0 <= result.safety["frames_not_begun"] - summary["frames_given_up"] <= 4  # what radios held at the end
-    with Bag(tmp_path / "out" / "bag") as bag:
-        begun = {
-            (int(m.slot), int(m.agent)): m.header.stamp for _, m in bag.typed([f"{names.SWARM}/{names.AIR_FRAME}"])
-        }
-        handed = handed_over(bag)
-    assert sum(ns_of(begun[key]) > at_ns for key, at_ns in handed if key in begun) > 10
-    # A policy hears when its frame began: the next one is half a period later at least.
-    times = sorted((agent, ns_of(stamp) / 1e6) for (_, agent), stamp in begun.items())
-    gaps = [after - before for (one, before), (other, after) in itertools.pairwise(times) if one == other]
-    assert min(gaps) >= 20.0
-
-
-def handed_over(bag: Bag) -> list[tuple[tuple[int, int], int]]:
-    """Slot and agent of each frame that was handed to a radio, and when, ns."""
-    return [
-        ((int(slot), int(agent)), names.slot_time_ns(int(slot), 10_000_000) + int(message.offset_ns[entry]))
-        for _, message in bag.typed([f"{names.SWARM}/{names.REPORT}"])
-        for row, slot in enumerate(message.slot)
-        for entry, agent in enumerate(message.agent, row * len(message.agent))
-        if message.length[entry]
-    ]
 
 
 def test_frames_of_a_fast_clock_arrive_before_the_slot_of_their_report(tmp_path: Path) -> None:

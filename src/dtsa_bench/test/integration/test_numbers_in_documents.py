@@ -16,7 +16,6 @@ from dtsa_agent import plugin_watch
 from dtsa_agent.air import datagram, slots
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.agents import authentication, pacing
-from dtsa_agent.core.plugins import unslotted
 from dtsa_agent.core.reference import alignment, frame, frame_extended
 from dtsa_agent.core.reference.lease import memory
 from dtsa_agent.core.registry import MAX_OWN_BYTES
@@ -96,12 +95,10 @@ FIGURES: dict[str, list[str]] = {
         f"or {span(realtime_channel._PATIENCE_NS / 1e9)} "
         f"({word(realtime_channel._PATIENCE_SLOTS)} slots, if that is more) after its end",
         f"A frame is settled {live_air._GRACE:g} slots after it has left the air",
-        f"in the order of time, {live_air._GRACE:g} slots behind the clock",
         f"at most {pacing.LEAD:g} slots ahead",
         f"until {pacing.LATEST_LEAD:g} slots before the start",
         f"until {realtime._LATEST:g} slots, at most {ms(realtime._LATEST_NS)}, after it",
         f"of each process {often(reporter._PERIOD_NS / 1e9)} a second",
-        f"nothing for two slots and {ms(unslotted.ANSWER_NS)}",
         f"If that is more than {realtime_channel._TIGHT:g}",
         f"for up to {word(roll_call._SETTLED_S)} seconds",
         f"half the median of {word(ALIGN['receptions'])} such offsets, ignoring those beyond {ms(ALIGN['limit_ns'])}",

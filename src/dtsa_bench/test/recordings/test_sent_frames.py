@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +9,6 @@ from hypothesis import strategies as st
 
 from dtsa_agent.core.reference.alignment import ClockAligner
 from dtsa_bench.flights.clock_statistics import ClockStatistics
-from dtsa_bench.recordings.verify.carrier_sense import CarrierSense
 from dtsa_bench.recordings.verify.frames import SentFrames
 from dtsa_bench.recordings.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig
@@ -71,36 +68,6 @@ def test_when_frames_began_and_arrived_behind_a_line_follows_from_who_received_t
         sent.judged(key[0], key[1], verdict.received, verdict.lost, verdict.collided)
     sent.check_overlaps()
     assert sent.check_verdicts([]) == len(frames)
-
-
-def test_a_frame_that_began_although_its_radio_heard_another_one_is_noticed() -> None:
-    config = ChannelConfig(agents=5)
-    turn = config.airtime.ramp_up_ns
-    for late, free in ((turn - 1, True), (turn, False)):
-        sense = CarrierSense(on_air(config, [(1, 1 * MS, 60), (2, 1 * MS + late, 60)]))
-        if free:
-            assert sense.check([]) == 2
-        else:
-            with pytest.raises(Mismatch, match="its radio listens before it sends"):
-                sense.check([])
-    # In another part of a partition nobody hears it.
-    assert sense.check([(0, {"partition": "1, 3-5 | 2"})]) == 2
-
-
-@pytest.mark.parametrize(("handed_ms", "right"), [(4.9, False), (5.0, True), (15.0, True), (15.1, False)])
-def test_a_frame_begins_when_it_was_handed_over_or_up_to_a_slot_later(handed_ms: float, right: bool) -> None:
-    config = ChannelConfig(agents=5)
-    sent = SentFrames(config, own_clocks=True)
-    sent.send(1, 2, 25 * MS, bytes(60))
-    sense = CarrierSense(sent)
-    lengths, offsets = np.array([60, 60, 0, 0]), np.array([round(handed_ms * MS), 0, 0, 0])
-    said = SimpleNamespace(agent=np.array([2, 4]), slot=np.array([1, 2]), length=lengths, offset_ns=offsets)
-    if right:
-        sense.report(said)
-        assert sense.not_sent == 1
-    else:
-        with pytest.raises(Mismatch, match="a radio sends what it was handed"):
-            sense.report(said)
 
 
 @given(FRAMES, st.integers(0, 99), st.integers(0, 4))

@@ -253,15 +253,6 @@ def test_a_flight_that_an_agent_has_left_is_checked_too(tmp_path: Path) -> None:
     assert decode_extended(last).leaving
 
 
-def test_what_radios_that_listen_told_their_agents_is_handed_over(tmp_path: Path) -> None:
-    """A radio tells of its own frame also where nobody else has heard that."""
-    words = ("--agents", "3", "--moving", "3", "--policy", "csma", "--loss", "0.6", "--mode", "realtime")
-    fly(tmp_path / "flight", *words, "--timeout-s", "1.5", "--no-picture")
-    result = verify_bag(tmp_path / "flight")
-    assert result.ok, result.difference
-    assert result.checked["decisions made again"] > 100
-
-
 @pytest.mark.parametrize("earlier", [True, False])
 def test_no_sender_hears_what_is_on_the_air_meanwhile(earlier: bool) -> None:
     """Neither the one that began first nor the other."""

@@ -15,9 +15,8 @@ from dtsa_dev.protocol.optimum import optimum
 import dtsa
 from dtsa_agent.core import AgentGroup, ConfigError, SwarmConfig
 from dtsa_agent.core.errors import PluginError
-from dtsa_agent.core.plugins.entry_points import make_swarm, plug_ins_of
+from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.plugins.table import Table
-from dtsa_agent.core.plugins.unslotted import check_slotted
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings.config import StationSettings, SwarmSettings
 from dtsa_agent.ros.common.process.loop import Stop
@@ -339,103 +338,15 @@ def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
         make_swarm(SwarmConfig(agents=21, policy="dtr"))
 
 
-def test_agents_that_open_their_own_slots_send_when_those_of_the_simulator_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[tuple[int, int]] = []
-    plain = UnslottedTraffic.send
-    monkeypatch.setattr(
-        UnslottedTraffic,
-        "send",
-        lambda self, k, now_ns, *more: plain(self, k, now_ns, *more) and not begun.append((now_ns, k)),
-    )
-    for policy, options in (("beacons", {"beacons.jitter_ms": 3.0}), ("pure-aloha", {})):
-        begun.clear()
-        run = run_config({"agents": 5, "policy": policy, "seed": 3, "timeout_s": 1.0, "options": options})
-        simulate(run)
-        agents = AgentGroup(make_swarm(run.swarm))
-        sent = set()
-        for slot in range(100):
-            senders = agents.on_slot(slot)
-            assert np.flatnonzero(agents.swarm.chosen).tolist() == list(senders)
-            offsets = agents.swarm.send_offset_ns[list(senders)].tolist()
-            sent |= {(slot * run.swarm.slot_ns + offset, k) for k, offset in zip(senders, offsets, strict=True)}
-            agents.swarm.fly(slot)
-            agents.on_slot_end()
-        # Of two frames that one of them would begin in a slot, the first.
-        first = {(now_ns // run.swarm.slot_ns, k): now_ns for now_ns, k in reversed(begun)}
-        assert sent == {(now_ns, k) for (_, k), now_ns in first.items()}
-        assert len(sent) > 80
-
-
-def test_an_agent_whose_radio_listens_waits_for_what_became_of_its_frame() -> None:
-    told: list[tuple[int, bool]] = []
-
-    class Eager:
-        port = ("send", "sent", "busy")
-
-        def __init__(self, config: SwarmConfig, agent: int) -> None:
-            pass
-
-        def wake(self, table: object, now_ns: int, radio: Any) -> int:
-            radio.send()
-            return 0  # does not count
-
-        def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> int:
-            return int(busy)
-
-        def sent(self, table: object, now_ns: int, begun: bool) -> int:
-            told.append((now_ns, begun))
-            return now_ns + 3_000_000
-
-    dtsa.register("policy", "eager", Eager)
-    agents = AgentGroup(make_swarm(SwarmConfig(agents=2, policy="eager")))
-    parts = plug_ins_of(agents.swarm)
-    assert parts is not None
-
-    def senders(*slots: int) -> list[tuple[int, ...]]:
-        result = []
-        for slot in slots:
-            result.append(agents.on_slot(slot))
-            agents.on_slot_end()
-        return result
-
-    assert senders(0, 1) == [(0, 1), ()]
-    parts.radio_told(0, 0, 12_000_000)  # began in slot 1: its policy acts 3 ms later, in the next slot that opens
-    parts.radio_told(1, 7, 5)  # of no frame that anybody waits for
-    assert senders(2) == [(0,)]
-    assert told == [(12_000_000, True)]
-    assert agents.swarm.send_offset_ns[0] == 0
-    parts.radio_told(0, 2, None)
-    assert senders(3, 4, 5, 6) == [(0,), (), (), ()]
-    assert told[1:] == [(30_000_000, False)]
-    assert agents.swarm.send_offset_ns[0] == 0
-    # A radio that says nothing has not sent: 50 ms beyond two slots.
-    assert senders(7) == [(1,)]
-    assert told[2:] == [(70_000_000, False)]
-
-
-def test_what_policies_without_slots_do_wrong_in_nodes_is_named() -> None:
-    class Rogue:
-        port = ("send",)
-        options = ("listens",)
-
-        def __init__(self, config: SwarmConfig, agent: int) -> None:
-            self.listens = config.options.get("rogue.listens", 0.0) > 0
-
-        def wake(self, table: object, now_ns: int, radio: Any) -> int:
-            return now_ns + 1 if not (self.listens and radio.busy()) else 0
-
-    class Deaf(Rogue):
+def test_a_policy_that_listens_needs_the_methods_of_its_radio() -> None:
+    class Deaf:
         port = ("send", "busy")
 
-    dtsa.register("policy", "rogue", Rogue)
+        def wake(self, table: object, now_ns: int, radio: Any) -> int:
+            return now_ns + 1
+
     with pytest.raises(ConfigError, match=r"deaf\.port.*'busy' with the methods sensed and sent"):
         dtsa.register("policy", "deaf", Deaf)
-    for options, said in (
-        ({"rogue.listens": 1.0}, "rogue, wake: .*has no attribute 'busy'"),
-        ({}, "more than 10000 times in a slot"),
-    ):
-        with pytest.raises(PluginError, match=said):
-            AgentGroup(make_swarm(SwarmConfig(agents=2, policy="rogue", options=options))).on_slot(0)
 
 
 def test_event_triggered_tdma_is_silent_while_it_would_say_nothing_new() -> None:
@@ -482,8 +393,7 @@ def test_every_scheme_flies_and_the_same_seed_gives_the_same_flight() -> None:
 def test_nodes_refuse_what_nodes_cannot_do() -> None:
     for policy, options, mode in (
         ("beacons", FlightOptions(processes=1), "lockstep"),
-        ("beacons", FlightOptions(respawn=1.0), "realtime"),
-        ("csma", FlightOptions(), "lockstep"),
+        ("csma", FlightOptions(), "realtime"),
         ("dtr", FlightOptions(), "realtime"),
         ("genie-age", FlightOptions(processes=2), "lockstep"),
         ("genie-age", FlightOptions(processes=1), "realtime"),
@@ -491,13 +401,11 @@ def test_nodes_refuse_what_nodes_cannot_do() -> None:
         with pytest.raises(ConfigError, match="policy"):
             check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode=mode), options)
     check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="genie-age")), FlightOptions(processes=1))
-    for policy in ("beacons", "csma"):
-        check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode="realtime"), FlightOptions())
-    with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: a slotted one here"):
-        check_slotted("pure-aloha")
+    with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: one with slots in live flights"):
+        AgentGroup(make_swarm(SwarmConfig(agents=4, policy="pure-aloha")))
     mission = RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime")
     settings = SwarmSettings((), StationSettings())
-    with pytest.raises(ConfigError, match="policy: got 'beacons'; allowed: a slotted one here"):
+    with pytest.raises(ConfigError, match="policy: got 'beacons'; allowed: one with slots in live flights"):
         fly_crazyflies(mission, settings, Path("swarm.yaml"), Path("out"), FlightOptions(), Stop())
     with pytest.raises(ConfigError, match="policy"):
         make_swarm(SwarmConfig(agents=4, policy="genie-age"), local=[1, 2])

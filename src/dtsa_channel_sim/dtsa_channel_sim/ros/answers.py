@@ -64,7 +64,6 @@ class Answers:
         self.goal = self._motion[-3:]  # m
         self.offset_ns = np.zeros(agents, dtype=np.int64)  # real time: of slot or transmission
         self.taken_in: list[TakenIn] | None = None  # real time: what the agents say to have taken in during the slot
-        self._begun: dict[int, int] = {}  # real time: ns, when frames of radios that listen began, by index
         self._goal_told = np.frombuffer(self._told, dtype=np.bool_)
         self._layouts: dict[bytes, tuple[int, slice | NDArray[np.intp]]] = {}
         # Numbers an agent in each field of a message, beside the frames' bytes.
@@ -149,20 +148,8 @@ class Answers:
         for name, values in decided.items():
             getattr(self, name)[at] = values
         self.offset_ns[at] = offset_ns
-        for index, begun_ns in self._begun.items():
-            self.offset_ns[index] = begun_ns
         self._goal_told[at] = self.answered[at] = True
         self.missing -= count
-
-    def begin(self, agent: int, frame: bytes, offset_ns: int) -> None:
-        """In real time: a frame goes on the air that its radio has held; what its agent reports is when it got it.
-
-        :param agent: id.
-        :param frame: the frame.
-        :param offset_ns: ns, start of its transmission, from the channel's start of the slot.
-        """
-        self.frames[agent] = frame
-        self._begun[agent - 1] = self.offset_ns[agent - 1] = offset_ns
 
     def _fields(self, message: Transmission, count: int) -> TransmissionFields:
         """The fields of a message, as long as its agents are many.

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from heapq import heappop, heappush
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from dtsa_agent.core.registry import POLICIES
-from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.settings.declaration import settings_of
-from dtsa_agent.plugin_watch import watched
 from dtsa_channel_sim.model.air import NEVER, Air, FrameVerdict
 from dtsa_channel_sim.model.channel import Channel
 from dtsa_channel_sim.model.medium import Positions
-from dtsa_channel_sim.model.radios import Radios, radio_rules
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 Sent = tuple[int, int]  # a frame: its slot as its sender counts, and the sender's id
@@ -26,22 +19,8 @@ _WINDOW = 0.5  # of a slot: a frame that reaches the channel later than this aft
 _BEFORE = -(2**63)  # ns
 
 
-class Begun(NamedTuple):
-    """A frame that goes on the air."""
-
-    key: Sent
-    """The frame."""
-    data: bytes
-    """Its bytes."""
-    start_ns: int
-    """When its transmission starts, ns from the start of slot 0."""
-
-
 class LiveAir:
-    """One time line of frames, and the radios that hold those that may not begin yet.
-
-    Time is settled a little behind the clock, when all that was handed over in time is known. Radios that listen do so
-    then, one after the other in the order of their times, so none of them misses a frame that has begun before.
+    """One time line of frames: time is settled a little behind the clock, when all handed over in time is known.
 
     :param channel: the medium.
     """
@@ -52,104 +31,31 @@ class LiveAir:
         # A delivery may come no earlier than the frame arrives.
         self.hold_ns = max(round(_GRACE * config.slot_ns), config.airtime.from_radio_ns(0))
         self.late = 0  # frames that came when the air had been settled past their start, and were dropped
-        self.given_up = 0  # frames whose radios found no free air for a slot
         self._window_ns = round(_WINDOW * config.slot_ns)
-        self._slot_ns = config.slot_ns
         self._frames: dict[Sent, bytes] = {}
         self._arriving: list[tuple[int, int, FrameVerdict[Sent]]] = []  # what lines still carry: a heap by arrival
         self._count = 0
         self._settled_ns = _BEFORE
-        self._radios: Radios[Sent] | None = None
-        self._held: dict[int, tuple[Sent, bytes]] = {}  # by id of the radio's agent
-        self._listened_ns = _BEFORE  # what radios did before this is known
-
-    @property
-    def listens(self) -> bool:
-        """Whether the radios listen before they send."""
-        return self._radios is not None
 
     @property
     def waits(self) -> bool:
         """Whether a frame waits for its delivery."""
         return bool(self.air.pending or self._arriving)
 
-    @property
-    def patience_ns(self) -> int:
-        """ns, for which a radio that listens tries to send a frame."""
-        return self._slot_ns if self.listens else 0
-
-    @contextmanager
-    def radios(self, agreed: Mapping[str, Any]) -> Iterator[None]:
-        """Within, agents have radios that listen before they send, if their policy asks for them.
-
-        :param agreed: settings that all agents share, as plain values.
-        :raises ConfigError: if the policy cannot be used here.
-        """
-        if "policy" not in agreed or not POLICIES.row(agreed["policy"]).listens:
-            yield
-            return
-        known = {setting.name for setting in settings_of(SwarmConfig)}
-        config = SwarmConfig.from_dict({name: value for name, value in agreed.items() if name in known})
-        with watched(config):
-            self._radios = Radios(self.air, radio_rules(config))
-            yield
-
     def holds(self, key: Sent) -> bool:
         """Whether a frame has been handed over, and has no verdict that was asked for yet."""
-        held = self._held.get(key[1])
-        return key in self._frames or (held is not None and held[0] == key)
+        return key in self._frames
 
-    def hand_over(self, key: Sent, start_ns: int, data: bytes) -> Begun | None:
-        """Takes a frame, in place of one that its radio holds.
-
-        :param key: the frame.
-        :param start_ns: when it is to begin, ns from the start of slot 0; a radio that listens does so then.
-        :param data: its bytes.
-        :returns: the frame, if it goes on the air; None: its radio listens first, or it came too late.
-        """
-        if self._radios is None:
-            return self._begin(key, start_ns, data)
-        until_ns, agent = start_ns + self._slot_ns, key[1]
-        if until_ns < self._listened_ns:
-            self.late += 1
-            return None
-        self.given_up += agent in self._held
-        self._held[agent] = key, data
-        self._radios.hand_over(agent, max(start_ns, self._listened_ns), until_ns)
-        return None
-
-    def _begin(self, key: Sent, start_ns: int, data: bytes) -> Begun | None:
+    def hand_over(self, key: Sent, start_ns: int, data: bytes) -> bool:
+        """Put a frame on the air at ``start_ns``, ns from the start of slot 0; False: it came too late."""
         if not self.air.begin(key, key[1], start_ns, len(data)):
             self.late += 1
-            return None
+            return False
         self._frames[key] = data
-        return Begun(key, data, start_ns)
-
-    def listen(self, now: int, positions: Positions) -> Iterator[Begun]:
-        """Lets the radios listen whose time has come.
-
-        :param now: ns from the start of slot 0.
-        :param positions: (3, N), m, frame map.
-        :returns: the frames that go on the air.
-        :raises PluginError: if a policy tells its radio what cannot be.
-        """
-        if self._radios is None:
-            return
-        ripe = now - self.hold_ns
-        while self._radios.next[0] <= ripe:
-            released = self._radios.listen(positions)
-            if released is None:
-                continue
-            key, data = self._held.pop(released.agent)
-            begun = self._begin(key, released.now_ns, data) if released.begun else None
-            if begun is None:
-                self.given_up += 1
-            else:
-                yield begun
-        self._listened_ns = max(self._listened_ns, ripe)
+        return True
 
     def settle(self, now: int, positions: Positions) -> list[FrameVerdict[Sent]]:
-        """The verdicts on all frames that have arrived; after :meth:`listen`.
+        """The verdicts on all frames that have arrived.
 
         :param now: ns from the start of slot 0.
         :param positions: (3, N), m, frame map.
@@ -188,11 +94,8 @@ class LiveAir:
         :param now: ns from the start of slot 0.
         :param most_ns: ns, at most.
         """
-        due = self.air.due_ns
-        if self._radios is not None:
-            due = min(due, self._radios.next[0])
         arrival = self._arriving[0][0] if self._arriving else NEVER
-        return min(max(0, min(due + self.hold_ns, arrival) - now), most_ns)
+        return min(max(0, min(self.air.due_ns + self.hold_ns, arrival) - now), most_ns)
 
 
 def slot_verdict(settled: Sequence[FrameVerdict[Sent]]) -> Verdict:

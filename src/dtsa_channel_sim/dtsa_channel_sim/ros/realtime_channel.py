@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from array import array
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -31,7 +30,7 @@ from dtsa_channel_sim.model.verdict import Verdict
 from .accounts import Accounts, Delivered
 from .answers import Answers
 from .attendance import Attendance
-from .live_air import Begun, LiveAir, Sent, slot_verdict
+from .live_air import LiveAir, Sent, slot_verdict
 from .pace import Pace
 from .roll_call import RollCall
 from .ros_channel import RosChannel, put_frames
@@ -65,7 +64,6 @@ class RealtimeChannel(RosChannel):
     :param steps: control instants in a slot.
     :param answer_s: not used: nobody waits.
     :param swarm_namespace: namespace of the swarm's topics.
-    :param slotted: frames begin with slots; others lie here for up to two slots before they begin.
     :param more: as for :class:`RosChannel`.
     """
 
@@ -78,7 +76,6 @@ class RealtimeChannel(RosChannel):
         steps: int,
         answer_s: float = 0.0,
         swarm_namespace: str = names.SWARM,
-        slotted: bool = True,
         **more: Any,
     ) -> None:
         super().__init__(
@@ -92,7 +89,7 @@ class RealtimeChannel(RosChannel):
         self.pace = Pace(self.slot_ns)
         self.round_ms: float | None = None  # of a round of messages before slot 0, median
         self._attendance = Attendance(self.agents, self.lost)
-        self._steps, self._slotted = steps, slotted
+        self._steps = steps
         self._zero = 0
         self._told = 0.0  # time.monotonic() of the last start message
         self._leisure_ns = -(2**63)  # when there was time for all that is not the air
@@ -123,9 +120,7 @@ class RealtimeChannel(RosChannel):
         """
         try:
             if self._prepare(stop):
-                with self.air.radios(self.roster.agreed):
-                    self._close_ns += self.air.patience_ns
-                    self._fly(stop)
+                self._fly(stop)
         finally:
             self._publish_end()
 
@@ -255,8 +250,7 @@ class RealtimeChannel(RosChannel):
 
     def _at_leisure(self, now: int) -> bool:
         """Whether there is time for the rest: no frame waits for its delivery, or the rest has waited for a slot."""
-        waits = self.air.waits if self._slotted else self.air.spare_ns(now, _TICK_NS) < _TICK_NS
-        if waits and now - self._leisure_ns < self.slot_ns:
+        if self.air.waits and now - self._leisure_ns < self.slot_ns:
             return False
         self._leisure_ns = now
         return True
@@ -317,34 +311,15 @@ class RealtimeChannel(RosChannel):
         key = (slot, agent)
         if self.air.holds(key):
             return
-        begun = self.air.hand_over(key, start_ns, bytes(message.data))
-        if begun is not None:
-            self._note(begun, data)
-        elif not self.air.listens:
+        if not self.air.hand_over(key, start_ns, bytes(message.data)):
             return  # too late: nobody hears it
+        if slot > self.slot:
+            self.accounts[slot].frames[agent] = bytes(message.data)
+        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, start_ns))
         self._attendance.hear((agent,), now)
 
-    def _note(self, begun: Begun, data: bytes) -> None:
-        """Takes note of a frame that goes on the air.
-
-        :param begun: the frame.
-        :param data: as a message, with the start of its transmission.
-        """
-        slot, agent = begun.key
-        if slot > self.slot:
-            if self.air.listens:
-                self.accounts[slot].begin(agent, begun.data, begun.start_ns - slot * self.slot_ns)
-            else:
-                self.accounts[slot].frames[agent] = begun.data
-        self._observers.frame_sent(max(slot, self.slot + 1), data, names.TIME_ZERO_NS + max(0, begun.start_ns))
-
     def _settle(self, now: int) -> None:
-        """Lets radios listen, and delivers all frames whose time has come."""
-        for begun in self.air.listen(now, self.answers.position):
-            slot, agent = begun.key
-            header, data = header_of(names.TIME_ZERO_NS + begun.start_ns), array("B", begun.data)
-            message = Frame(header=header, run=self.run_id, slot=slot, agent=agent, data=data)
-            self._note(begun, bytes(serialize_message(message)))
+        """Delivers all frames whose time has come."""
         for verdict in self.air.settle(now, self.answers.position):
             self._deliver(verdict)
 
@@ -353,8 +328,7 @@ class RealtimeChannel(RosChannel):
         slot, sender = verdict.frame_id
         self._settled.setdefault(max(slot, self.slot + 1), []).append(verdict)
         self.pace.lag.add(self._now() - max(verdict.end_ns + self.air.hold_ns, verdict.arrival_ns))
-        heard = bool(verdict.received.any())
-        if not heard and not self.air.listens:  # else its sender learns from the message when it began
+        if not verdict.received.any():
             return
         frame = self.air.frame(verdict.frame_id)
         time_ns = names.TIME_ZERO_NS + max(0, verdict.arrival_ns)
@@ -362,8 +336,7 @@ class RealtimeChannel(RosChannel):
         put_frames(message, [sender], [frame], verdict.received[None])
         data = bytes(serialize_message(message))
         self._publisher.publish(data)
-        if heard:
-            self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
+        self.accounts.deliver(slot, sender, Delivered(frame, verdict.arrival_ns, verdict.received))
         self._observers.slot_published(max(slot, self.slot + 1), data, time_ns)
 
     # The accounts.

@@ -91,7 +91,7 @@ class CsmaCa:
         self._tries += 1
         return after_ns + BACKOFF_NS * int(self._random.integers(2**self._be)) + LISTEN_NS
 
-    def sent(self, table: Table, now_ns: int, begun: bool) -> int:
+    def sent(self, table: Table, now_ns: int) -> int:
         """Waits from the frame's end."""
         return now_ns + self._sent_ns + next(self._waits)
 

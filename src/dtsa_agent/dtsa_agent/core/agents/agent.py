@@ -19,7 +19,7 @@ from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm, Bytes
 from dtsa_agent.core.swarms.outcome import SlotOutcome
 
 from .authentication import AuthenticatedSwarm, Authenticator
-from .joining import Newcomers
+from .joining import Newcomers, check_slotted
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +40,11 @@ class AgentGroup:
     """The agents of one process. In every slot call ``on_slot``, ``on_frames``, ``on_slot_end``, in this order.
 
     :param swarm: the agents; a shared table is given up with the first frame that not all of them have heard.
+    :raises ConfigError: for a policy without slots.
     """
 
     def __init__(self, swarm: AbstractSwarm) -> None:
+        check_slotted(swarm.config.policy)
         self.swarm = swarm
         self.newcomers = Newcomers(len(swarm.ids))
         self.refused = 0  # frames that reached an agent and were not taken in, over all agents

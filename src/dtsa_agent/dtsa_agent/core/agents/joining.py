@@ -1,4 +1,4 @@
-"""How agents come into a flight that is under way: they listen, take the time from a frame, and hover until known."""
+"""What a policy must have for live flights, and how agents come into one: they listen, then hover until known."""
 
 from __future__ import annotations
 
@@ -13,6 +13,17 @@ from dtsa_agent.core.reference.timebase import LISTENING, TimeBase
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+
+
+def check_slotted(policy: str) -> None:
+    """Refuse a policy whose frames may begin at any instant: only `simulate` and `sweep` carry those.
+
+    :raises ConfigError: if it is one.
+    """
+    if POLICIES.row(policy).unslotted:
+        raise ConfigError(
+            "policy", policy, "one with slots in live flights; those without slots only simulate and sweep"
+        )
 
 
 def check_joinable(policy: str) -> None:

@@ -29,7 +29,6 @@ from dtsa_agent.core.swarms.swarm import Swarm
 
 from .guard import Guarded
 from .table import Table
-from .unslotted import SILENT, Wakes
 
 _PLUGIN_REASON = REASONS.index("plugin")
 
@@ -94,8 +93,6 @@ class PluginSwarm(SwarmWrapper):
         everybody = self.config.policy_row.needs_everybody and bool(self.ids)
         self._genie = self._guarded(POLICIES, 0) if everybody else None
         self._policies, self._estimators, self._avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
-        row = self.config.policy_row
-        self._wakes = Wakes(self._policies, self._tables, self.config.slot_ns, row.listens) if row.unslotted else None
         self._list_speakers()
 
     def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
@@ -132,9 +129,6 @@ class PluginSwarm(SwarmWrapper):
         if not self._policies:
             self.inner.decide(slot)
             return
-        if self._wakes is not None:
-            self._act(self._wakes, slot)
-            return
         self.estimate(slot)  # the control instants and the metrics leave others, which depend on what flies it
         for index, agent in enumerate(self.ids):
             policy = self._policies[index]
@@ -150,24 +144,6 @@ class PluginSwarm(SwarmWrapper):
         for agent in senders:
             self.sends[agent - 1] = self.present[agent - 1] > 0
         self._note_decision()
-
-    def _act(self, wakes: Wakes, slot: int) -> None:
-        """Lets policies without slots act; who sends has chosen itself, the others nobody."""
-        for index, offset in enumerate(wakes.act(slot, self.present)):
-            self.sends[index] = offset != SILENT
-            self.send_offset_ns[index] = max(0, offset)
-            self.chosen[index] = self.ids[index] if self.sends[index] else 0
-        self._note_decision()
-
-    def radio_told(self, local_index: int, slot: int, delay_ns: int | None) -> None:
-        """An agent's radio, which listens before it sends, has said what became of a frame.
-
-        :param local_index: position in ``ids``.
-        :param slot: the slot in which the frame was handed over.
-        :param delay_ns: ns, how much later than handed over it began; None: it did not.
-        """
-        if self._wakes is not None:
-            self._wakes.told(local_index, slot, delay_ns)
 
     def _note_decision(self) -> None:
         self.reason[:] = _PLUGIN_REASON

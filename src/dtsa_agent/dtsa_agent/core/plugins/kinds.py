@@ -76,7 +76,10 @@ class Radio(Protocol):
 
 
 class Unslotted(Protocol):
-    """A policy that is not bound to slots. Slots only say how often vehicles are steered and ages are counted."""
+    """A policy that is not bound to slots, in the simulator only.
+
+    Slots only say how often vehicles are steered and ages are counted.
+    """
 
     def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
         """Acts at an instant; first called at 0.
@@ -98,21 +101,17 @@ class Listens(Unslotted, Protocol):
     def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> int:
         """What the radio does that holds a frame and has just listened.
 
-        In flights of nodes radios are where the air is, with an instance of the policy each: it must not depend on
-        what the other methods have noted.
-
         :param busy: whether it has found the air in use, or sends itself.
         :param now_ns: ns since the start of slot 0.
         :param sent_ns: ns, when it began its last frame; 0: none yet.
         :returns: ns until it listens again; 0: it begins now, if the air is free.
         """
 
-    def sent(self, table: Table, now_ns: int, begun: bool) -> int:
-        """The radio has begun to send, or given the frame up.
+    def sent(self, table: Table, now_ns: int) -> int:
+        """The radio has begun to send.
 
         :param table: what this agent knows.
-        :param now_ns: ns since the start of slot 0: when the frame began; else now.
-        :param begun: whether it has been sent.
+        :param now_ns: ns since the start of slot 0.
         :returns: when ``wake`` is to be called, ns, later than that.
         """
 
@@ -148,7 +147,7 @@ class PacketRadio(Radio, Protocol):
 
 
 class Reacts(Unslotted, Protocol):
-    """An unslotted policy that acts on each packet as it arrives, for example a token ring. In the simulator only."""
+    """An unslotted policy that acts on each packet as it arrives, for example a token ring."""
 
     def received(self, table: Table, now_ns: int, sender: int, note: bytes) -> int:
         """A packet has arrived, as far as the air lets this agent hear it.

@@ -74,7 +74,6 @@ class SwarmState:
     digest: Hashes  # (L,) of each agent's table
     score: Floats  # (L,) g of the chosen
     sends: Bytes  # (L,)
-    send_offset_ns: Slots  # (L,) ns, when each begins to send, after its slot's start; 0 but for policies without slots
     lease_state: Bytes  # (L, bytes of policy lease), of the compiled core
 
     def _begin(
@@ -135,7 +134,6 @@ class SwarmState:
         self.reason, self.sends = (np.zeros(count, dtype=np.uint8) for _ in range(2))
         self.digest = np.zeros(count, dtype=np.uint32)
         self.score = np.zeros(count)
-        self.send_offset_ns = np.zeros(count, dtype=np.int64)
         self.lease_state = np.zeros((count, 0), dtype=np.uint8)
 
 

@@ -25,7 +25,6 @@ from std_msgs.msg import Empty
 
 from dtsa_agent.core import AbstractSwarm
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.plugins.unslotted import check_slotted
 from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.crazyflie.state.conversions import rotate
 from dtsa_agent.keys import with_key
@@ -154,7 +153,6 @@ def _body(stop: Stop, supervised: bool) -> None:
         take_priority(station.priority)
         ids = parse_ids(ids, config.agents)
         zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
-        check_slotted(config.policy)
         swarm = with_key(make_swarm(config, local=ids))
         rate = station.command_hz
         agents = StationNode(node, swarm, space, command_hz=rate, offset_ns=zero, drift_ppb=zero, align=False)

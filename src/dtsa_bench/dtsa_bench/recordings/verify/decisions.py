@@ -8,7 +8,7 @@ import numpy as np
 
 from dtsa_agent.core import AgentGroup, make_scenario
 from dtsa_agent.core.frame_extended import decode_extended
-from dtsa_agent.core.plugins.entry_points import make_swarm, plug_ins_of
+from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_bench.runs.config import RunConfig
 
@@ -35,10 +35,6 @@ class Decisions:
         self._frames, self._config, self._agents = frames, run.swarm, run.swarm.agents
         self._steps = run.swarm.steps
         self._group = AgentGroup(with_key(make_swarm(run.swarm, make_scenario(run.swarm))))
-        # Radios that listen say when a frame began; an agent takes that in as if it heard its own frame.
-        self._parts = plug_ins_of(self._group.swarm) if run.swarm.policy_row.listens else None
-        self._handed: dict[tuple[int, int], int] = {}  # ns, when frames were handed over, by slot and id
-        self._told: dict[int, list[tuple[int, int]]] = {}  # slot and id of own frames, by the slot that was under way
         self._rows: dict[int, list[tuple[Any, dict[str, Any]]]] = {}
         self._heard: dict[int, list[_Heard]] = {}
 
@@ -51,7 +47,7 @@ class Decisions:
         slots = said.slot.tolist()
         for row, slot in enumerate(slots):
             part = slice(row * count, (row + 1) * count)
-            fields = {name: getattr(said, name)[part] for name in (*_DECIDED, "length", "offset_ns")}
+            fields = {name: getattr(said, name)[part] for name in (*_DECIDED, "length")}
             for name, planes in (("track", 3 * self._steps), ("velocity", 3), ("command", 3)):
                 at = slice(row * planes * count, (row + 1) * planes * count)
                 fields[name] = getattr(said, name)[at].reshape(-1, 3, count)
@@ -59,10 +55,7 @@ class Decisions:
         rows = np.asarray(said.heard_by, dtype=np.uint8).reshape(-1, -(-count // 8))
         masks = np.unpackbits(rows, axis=1, count=count, bitorder="little") if len(rows) else ()
         entries = zip(said.heard_in.tolist(), said.heard_slot.tolist(), said.heard_sender.tolist(), masks, strict=True)
-        own = set(said.agent.tolist()) if self._parts is not None else set()
         for here, slot, sender, mask in entries:
-            if sender in own:
-                self._told.setdefault(here, []).append((slot, sender))
             everybody = np.zeros(self._agents, dtype=np.uint8)
             everybody[index] = mask
             self._heard.setdefault(here, []).append(_Heard(slot, sender, everybody))
@@ -95,31 +88,12 @@ class Decisions:
                 equal += len(index)
                 for late in index[fields["length"] == 0]:
                     swarm.drop(int(late))  # it was too late to send
-                self._hand_over(slot, index, fields)
-            for told_slot, sender in self._told.pop(slot, []):
-                self._tell(told_slot, sender)
             for heard in self._heard.pop(slot, []):
                 sent = self._frames.get(heard.slot, heard.sender)
                 if sent is not None:
                     swarm.hear(heard.slot, sent.data, heard.mask)
             self._group.on_slot_end()
         return equal
-
-    def _hand_over(self, slot: int, index: Any, fields: dict[str, Any]) -> None:
-        """Takes note of the frames that radios which listen were handed, and of those that came too late for that."""
-        if self._parts is None:
-            return
-        begin_ns = slot * self._config.slot_ns
-        for k in np.flatnonzero(self._parts.sends[index]):
-            if fields["length"][k]:
-                self._handed[slot, int(index[k]) + 1] = begin_ns + int(fields["offset_ns"][k])
-            else:
-                self._parts.radio_told(int(index[k]), slot, None)
-
-    def _tell(self, slot: int, agent: int) -> None:
-        sent, handed_ns = self._frames.get(slot, agent), self._handed.pop((slot, agent), None)
-        if self._parts is not None and sent is not None and handed_ns is not None:
-            self._parts.radio_told(agent - 1, slot, sent.on_air.start_ns - handed_ns)
 
     def _leaves(self, slot: int, agent: int) -> bool:
         """Whether an agent says in a frame that it leaves: what made it leave came from outside."""

@@ -21,7 +21,6 @@ from dtsa_bench.recordings.rules.judge import Judge
 from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
-from .carrier_sense import CarrierSense
 from .decisions import Decisions
 from .frames import SentFrames
 from .intake import Intake
@@ -188,8 +187,7 @@ class RealtimeCheck:
                 why = "slots come one after the other"
                 self._fail("transmission.slot", f"more than {last}", slot, why, slot, agent)
             self._slots[agent - 1] = slot
-            handed = int(said.chosen[k]) == agent and self.run.swarm.policy_row.listens
-            if not frames[k] and not handed:  # a frame may leave late; the slot starts when it starts
+            if not frames[k]:  # a frame may leave late; the slot starts when it starts
                 starts[agent] = int(offsets[k])
             decided[agent] = int(said.chosen[k]), int(said.reason[k]), int(said.digest[k]), float(said.score[k])
             self.position[:, agent - 1] = track[-1, :, k]
@@ -242,13 +240,10 @@ class RealtimeCheck:
         intake, untold = Intake(self.frames, self.result.slots), 0
         replayable = self._own_states.has_key or not self.run.swarm.auth
         decisions = Decisions(self.run, self.frames) if replayable else None
-        sense = CarrierSense(self.frames) if self.run.swarm.policy_row.listens else None
         for _, said in self.bag.typed([REPORT]):
             intake.report(said)
             if decisions is not None:
                 decisions.report(said)
-            if sense is not None:
-                sense.report(said)
             self._note_unsent(said)
             ids = set(said.agent.tolist())
             untold += sum(len(ids - self._told.get(s, set())) for s in said.slot.tolist() if s < self.result.slots)
@@ -258,20 +253,11 @@ class RealtimeCheck:
                        "only who reported too late is missing", None)  # fmt: skip
         self.result.count("frames taken in as they were delivered", intake.checked)
         self.result.unheard = intake.hearing(self.result.slots).problem(summary.get("not_taken_in"))
-        if sense is not None:
-            self._carrier_sense(sense)
         if decisions is None:
             self.result.skipped["decisions"] = f"no key in {VARIABLE}"
         else:
             self.result.count("decisions made again", decisions.check(self.result.slots))
         self.result.safety |= intake.summary() | {"stalls": summary.get("stalls", [])}
-
-    def _carrier_sense(self, sense: CarrierSense) -> None:
-        if self.run.air.range_m or self.run.air.capture_db:
-            self.result.skipped["carrier sense"] = "it depends on where all were when each frame began"
-        else:
-            self.result.count("frames that began in free air", sense.check(self._events))
-        self.result.safety["frames_not_begun"] = sense.not_sent
 
     def _equal_time(self, what: str, expected: int, recorded: int, slot: int, agent: int | None = None) -> None:
         if expected != recorded:

@@ -109,9 +109,7 @@ class Csma:
         periods_old = max(0.1, (now_ns - sent_ns) / self._period_ns)
         return 1 + int(self._random.random() * self._window_ns / periods_old)
 
-    def sent(self, table: Table, now_ns: int, begun: bool) -> int:
-        """Waits for a period, or tries again."""
-        if not begun:
-            return now_ns + 1
+    def sent(self, table: Table, now_ns: int) -> int:
+        """Waits for a period."""
         rest = 10.0 if self._rests else 1.0
         return now_ns + 1 + int(self._random.uniform(0.5, 1.5) * self._period_ns * rest)
