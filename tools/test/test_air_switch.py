@@ -117,7 +117,7 @@ def test_frames_that_overlap_destroy_each_other() -> None:
 
 
 def test_a_cut_medium_carries_to_one_side(cables: Cables) -> None:
-    cables.switch.set(partition="1-2 | 3")
+    cables.switch.set(partition=[[1, 2], [3]])
     cables.send(1, frame(1, 3))
     cables.carry(1)
     assert [len(cables.heard(host)) for host in (1, 2, 3)] == [0, 1, 0]
@@ -187,7 +187,7 @@ def test_agents_on_hosts_of_their_own_live_through_a_death_and_a_partition(tmp_p
         assert os.readlink("/proc/self/ns/net") == home
         flight.carry(1.0)
         flight.signal(2, signal.SIGKILL)
-        flight.switch.set(partition="1-2 | 3-4")
+        flight.switch.set(partition=[[1, 2], [3, 4]])
         flight.start(2)
         flight.carry(1.0)
         flight.switch.set(partition="")

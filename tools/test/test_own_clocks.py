@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import pytest
+from drifting_clocks import to_channel, to_local
 from dtsa_dev.protocol.experiment import FAR, still_scenario
 
 from dtsa_agent.core import Swarm, SwarmConfig, decode_frame
@@ -110,7 +111,7 @@ class OwnClocks:
 
     def _turn(self, agent: _Agent, k: int, now: int, on: bool) -> None:
         """Whatever an agent does at a moment it has been waiting for."""
-        local = agent.clock.to_local(now)
+        local = to_local(agent.clock, now)
         if on:
             agent.on = True
             agent.forget()
@@ -129,7 +130,7 @@ class OwnClocks:
             self._push(k, agent.base.slot_start_ns(slot + 1))
 
     def _push(self, k: int, local_ns: int) -> None:
-        heapq.heappush(self._events, (self.agents[k].clock.to_channel(local_ns), k, False))
+        heapq.heappush(self._events, (to_channel(self.agents[k].clock, local_ns), k, False))
 
     def _deliver(self, now: int) -> None:
         for verdict in self._air.settle(now):
@@ -144,7 +145,7 @@ class OwnClocks:
         agent = self.agents[k]
         if not agent.on:
             return
-        local = agent.clock.to_local(arrival_ns)
+        local = to_local(agent.clock, arrival_ns)
         start = local - self._airtime.total_ns(len(data)) - self._delay_ns // 2
         listens = agent.align or agent.base.state == LISTENING
         if listens and agent.base.hear(decode_frame(data).slot, start) == RESTARTED:
@@ -162,7 +163,7 @@ class OwnClocks:
         starts = []
         slots = set()
         for agent in self.agents:
-            slot = agent.base.slot(agent.clock.to_local(at_ns) + self.config.slot_ns // 2)
+            slot = agent.base.slot(to_local(agent.clock, at_ns) + self.config.slot_ns // 2)
             if slot is None:
                 self.seen.spread_ns.append(-1)
                 return
@@ -171,7 +172,7 @@ class OwnClocks:
         if max(slots) - min(slots) > 1:
             self.seen.spread_ns.append(-1)
             return
-        times = [agent.clock.to_channel(agent.base.slot_start_ns(max(slots))) for _, agent in starts]
+        times = [to_channel(agent.clock, agent.base.slot_start_ns(max(slots))) for _, agent in starts]
         self.seen.spread_ns.append(max(times) - min(times))
 
 
@@ -204,7 +205,7 @@ def test_cold_start(loss: float, together: bool) -> None:
 
 def test_two_groups_meet() -> None:
     """Each finds a time of its own; then they hear each other, and one takes the other's."""
-    run = swarm(8, 0.1, schedule=({"slot": 0, "until": 2000, "partition": "1-4 | 5-8"},))
+    run = swarm(8, 0.1, schedule=({"slot": 0, "until": 2000, "partition": [[1, 2, 3, 4], [5, 6, 7, 8]]},))
     before = run.run(19 * S)
     assert max(before.spread_ns[10:18]) == -1
     seen = run.run(40 * S)

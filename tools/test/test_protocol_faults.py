@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dtsa_dev.protocol.experiment import Event, Experiment
-from dtsa_dev.protocol.faults import format_groups, random_schedule
+from dtsa_dev.protocol.faults import random_schedule
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
@@ -128,7 +128,7 @@ def test_a_jam_of_all_frames_causes_no_collision(agents: int, movers: int, loss:
 @pytest.mark.parametrize(("agents", "movers"), [(12, 12), (12, 6), (24, 8)])
 def test_groups_that_meet_again(agents: int, movers: int, loss: float) -> None:
     """Each side thought the other dead and used its turns."""
-    groups = format_groups([list(range(1, agents, 2)), list(range(2, agents + 1, 2))])
+    groups = [list(range(1, agents, 2)), list(range(2, agents + 1, 2))]
     merge = 1000 + 3000
     done = run(agents, movers, [{"slot": 1000, "until": merge, "partition": groups}], merge + 12 * 5 * agents, loss)
     apart = [slot for slot in done.outcome.collision_slots if slot < merge]

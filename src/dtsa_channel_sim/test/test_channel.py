@@ -50,10 +50,8 @@ def test_arguments_that_do_not_go_together():
     channel = Channel(ChannelConfig(agents=4))
     with pytest.raises(LocalProtocolError, match="slots count from 0"):
         channel.arbitrate(-1, ())
-    with pytest.raises(LocalProtocolError, match="lengths"):
-        channel.arbitrate(0, (1,), offsets_ns=[0])
     with pytest.raises(LocalProtocolError, match="lengths: 2 values for 1"):
-        channel.arbitrate(0, (1,), lengths=[10, 10], offsets_ns=[0])
+        Channel(ChannelConfig(agents=4, slot_ns=200_000)).arbitrate(0, (1,), lengths=[10, 10])
     with pytest.raises(LocalProtocolError, match="positions"):
         Channel(ChannelConfig(agents=4, range_m=1.0)).arbitrate(0, (1,))
 
@@ -94,7 +92,7 @@ def test_jam():
 
 
 def test_partition_and_merge():
-    channel = Channel(ChannelConfig(agents=5, schedule=({"slot": 2, "until": 4, "partition": "1-2 | 3-4"},)))
+    channel = Channel(ChannelConfig(agents=5, schedule=({"slot": 2, "until": 4, "partition": [[1, 2], [3, 4]]},)))
     assert channel.arbitrate(1, (1, 3)).outcome == COLLISION
     apart = channel.arbitrate(2, (1, 3))
     assert (apart.outcome, apart.lost, apart.collided) == (SUCCESS, (0, 0), (0, 0))
@@ -212,44 +210,6 @@ def test_airtimes_of_the_radio():
     assert Airtime(bitrate=3_000_000_0).on_air_ns(1) == -(-97 * 1000 // 30)
 
 
-@pytest.mark.parametrize(("gap_us", "outcome"), [(0, COLLISION), (140, COLLISION), (141, SUCCESS), (3000, SUCCESS)])
-def test_frames_collide_while_they_overlap_on_air(gap_us, outcome):
-    channel = Channel(ChannelConfig(agents=4))
-    verdict = channel.arbitrate(0, (1, 2), lengths=[24, 24], offsets_ns=[0, gap_us * 1000])
-    assert verdict.outcome == (COLLISION if gap_us < 271 else outcome)
-    received = verdict.received.astype(int).tolist()
-    if gap_us == 0 or gap_us == 140:
-        assert received == [[0, 0, 0, 0], [0, 0, 0, 0]]
-        assert verdict.collided == (3, 3)
-    elif gap_us == 141:
-        # Apart on air, but agent 2 had turned to sending while frame 1 was on air.
-        assert received == [[0, 0, 1, 1], [1, 0, 1, 1]]
-        assert verdict.collided == (1, 0)
-    else:
-        assert received == [[0, 1, 1, 1], [1, 0, 1, 1]]
-
-
-def test_a_late_frame_collides_with_the_next_slots_owner():
-    channel = Channel(ChannelConfig(agents=4))
-    late = 10 * MS - 200_000
-    first = channel.arbitrate(0, (1,), lengths=[60], offsets_ns=[late])
-    assert first.outcome == SUCCESS
-    assert first.received.sum() == 3
-    second = channel.arbitrate(1, (2,), lengths=[24], offsets_ns=[0])
-    assert (second.outcome, second.collided) == (COLLISION, (3,))
-    third = channel.arbitrate(2, (3,), lengths=[24], offsets_ns=[0])
-    assert third.outcome == SUCCESS
-    assert third.received.sum() == 3
-
-
-def test_an_early_frame_collides_with_the_slot_before():
-    channel = Channel(ChannelConfig(agents=3))
-    channel.arbitrate(0, (1,), lengths=[60], offsets_ns=[9 * MS])
-    assert channel.arbitrate(1, (2,), lengths=[24], offsets_ns=[-900_000]).collided == (2,)
-    channel.arbitrate(2, (1,), lengths=[60], offsets_ns=[9 * MS])
-    assert channel.arbitrate(3, (2,), lengths=[24], offsets_ns=[-500_000]).collided == (0,)
-
-
 def test_a_long_frame_spills_into_short_slots_even_in_lockstep():
     channel = Channel(ChannelConfig(agents=3, slot_ns=200_000))
     assert channel.arbitrate(0, (1,), lengths=[60]).outcome == SUCCESS
@@ -259,18 +219,6 @@ def test_a_long_frame_spills_into_short_slots_even_in_lockstep():
 
 
 def test_a_tail_does_not_survive_a_look_back():
-    channel = Channel(ChannelConfig(agents=3))
-    for _ in range(2):
-        assert channel.arbitrate(4, (1,), lengths=[60], offsets_ns=[10 * MS - 1]).outcome == SUCCESS
-    assert channel.arbitrate(0, (2,), lengths=[24], offsets_ns=[0]).outcome == SUCCESS
-
-
-def test_frames_at_different_times_of_one_slot_pass_the_losses_each():
-    slots = 6000
-    channel = Channel(ChannelConfig(agents=12, loss=0.2, seed=3))
-    lost = np.array(
-        [channel.arbitrate(s, (1, 2), lengths=[24, 24], offsets_ns=[0, 5 * MS]).lost for s in range(slots)],
-        dtype=float,
-    )
-    assert np.abs(lost.mean(axis=0) - 2.2).max() < 4.5 * math.sqrt(11 * 0.16 / slots)
-    assert abs(np.corrcoef(lost.T)[0, 1]) < 4.5 / math.sqrt(slots)
+    channel = Channel(ChannelConfig(agents=3, slot_ns=200_000))
+    assert channel.arbitrate(4, (1,), lengths=[60]).outcome == SUCCESS
+    assert channel.arbitrate(0, (2,), lengths=[24]).outcome == SUCCESS

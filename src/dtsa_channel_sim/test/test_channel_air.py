@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -96,7 +98,7 @@ MEDIA = st.fixed_dictionaries(
     optional={
         "range_m": st.just(4.0),
         "capture_db": st.just(6.0),
-        "partition": st.just("1-3 | 4-6"),
+        "partition": st.just([[1, 2, 3], [4, 5, 6]]),
         "burst_length": st.just(3.0),
     },
 )
@@ -125,7 +127,7 @@ def test_slots_are_transmissions_that_start_together(slots, medium, seed, length
     FRAMES,
     st.integers(0, 31 * MS),
     st.integers(1, 3),
-    st.sampled_from([{}, {"range_m": 4.0}, {"partition": "1-3, 7 | 4-6"}]),
+    st.sampled_from([{}, {"range_m": 4.0}, {"partition": [[1, 2, 3, 7], [4, 5, 6]]}]),
 )
 @settings(max_examples=120, deadline=None)
 def test_a_radio_senses_what_would_destroy_a_frame_there(frames, when, listener, medium):
@@ -181,7 +183,7 @@ def test_memory_does_not_grow():
     for slot in range(500):
         line.begin(slot, slot % 6 + 1, slot * MS, 60)
         line.settle(slot * MS)
-    assert len(line.near) < 5
+    assert len(line._near) < 5
     assert line.pending < 5
 
 
@@ -194,7 +196,7 @@ def test_a_backlog_costs_nothing():
     for slot in range(2000):
         settled += len(line.settle((slot + 1) * MS))
         line.busy(1, (slot + 1) * MS)
-        assert len(line.near) < 6
+        assert len(line._near) < 6
     assert settled == 2000
 
 
@@ -243,3 +245,20 @@ def test_a_sender_that_ends_as_another_frame_begins_hears_that_frame():
     assert not later.deafens(frame)
     assert OnAir(1, 0, 10, 21).deafens(frame)
     assert OnAir(3, 29, 40, 50).deafens(frame)
+
+
+@pytest.mark.parametrize("g", [0.2, 0.5, 1.0])
+def test_throughput_of_pure_aloha(g):
+    """Frames that begin at random instants: one that no other one overlaps is received, exp(-2 G) of them."""
+    senders, times, length = 40, 8000, 200
+    channel = Channel(ChannelConfig(agents=senders + 1, ramp_up_ns=0))
+    line, on_air_ns = Air(channel), channel.config.airtime.on_air_ns(length)
+    draw = np.random.default_rng(1)
+    starts = np.sort(draw.integers(0, times * on_air_ns, draw.poisson(g * times))).tolist()
+    for k, start in enumerate(starts):
+        line.begin(k, 2 + k % senders, start, length)
+    verdicts = line.settle((times + 1) * on_air_ns)
+    share = sum(v.received[0] for v in verdicts) / len(verdicts)
+    expected = math.exp(-2.0 * g)
+    # Fates of neighbours are not independent: twice the error of independent ones, four standard deviations.
+    assert share == pytest.approx(expected, abs=4.0 * 2.0 * math.sqrt(expected * (1 - expected) / len(verdicts)))

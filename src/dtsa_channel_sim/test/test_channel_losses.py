@@ -174,7 +174,7 @@ def test_certain_and_impossible_losses_are_exact():
 
 
 def test_links_may_be_asymmetric():
-    links = ({"from": 1, "to": "2-3", "loss": 1.0}, {"from": 4, "to": 1, "loss": 1.0, "both_ways": True})
+    links = ({"from": 1, "to": [2, 3], "loss": 1.0}, {"from": 4, "to": 1, "loss": 1.0, "both_ways": True})
     channel = Channel(ChannelConfig(agents=5, link_loss=links))
     mask = np.vstack([received(channel, 0, (sender,)) for sender in range(1, 6)]).astype(int)
     assert mask.tolist() == [

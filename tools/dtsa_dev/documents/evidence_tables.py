@@ -250,20 +250,6 @@ def flown_again(record: Row) -> str:
     )
 
 
-def losses(record: Row) -> str:
-    """How many intervals held what was flown.
-
-    :param record: of `dtsa soak losses`.
-    """
-    heads = ("channel", "chains", "rate", "p", "r", "loss when good", "when bad", "bursts found at 5 %", "at 1 %")
-    keys = ("rate", "enter", "leave", "loss_good", "loss_bad", "below 0.05", "below 0.01")
-    lines = [
-        [name, str(row["chains"]), *(f"{100 * row[key]:.1f} %" if key in row else "" for key in keys)]
-        for name, row in record["figures"].items()
-    ]
-    return f"{markdown(heads, lines)}\n"
-
-
 def serial(record: Row) -> str:
     """What came of flights over simulated modems.
 
@@ -471,7 +457,7 @@ def twelve(record: Row) -> str:
 
 QUOTED: dict[str, Callable[[Row], str]] = {
     "board": board, "board-cost": board_cost,
-    "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again, "losses": losses,
+    "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again,
     "mutants": mutants, "setup": setup, "serial": serial, "twelve": twelve, "ns3": ns3,
 }  # fmt: skip
 

@@ -12,7 +12,7 @@ from dtsa_agent.air.datagram import shortest_slot_ns
 from dtsa_agent.air.serial.modems import MODEMS, NONE
 from dtsa_agent.air.serial.settings import SerialSettings
 from dtsa_agent.core import SwarmConfig
-from dtsa_channel_sim.model.radio_table import RADIOS
+from dtsa_channel_sim.model.airtime import RADIOS
 
 from .markdown import table
 

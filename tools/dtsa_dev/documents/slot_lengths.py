@@ -22,8 +22,7 @@ from dtsa_bench.experiments.sweep.aggregate import Group, Table, collected
 from dtsa_bench.experiments.sweep.work import fly_one
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import Airtime
-from dtsa_channel_sim.model.airtime import Line
-from dtsa_channel_sim.model.radio_table import RADIOS
+from dtsa_channel_sim.model.airtime import RADIOS, Line
 
 from .markdown import table
 

@@ -16,7 +16,7 @@ from dtsa_bench.crazyflies.peer_lab.app import read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import FIRMWARE
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.experiments.batch.made_with import made_with
-from dtsa_channel_sim.model.radio_table import airtime_of
+from dtsa_channel_sim.model.airtime import airtime_of
 
 from .embedded import CORTEX, IN_PARTS, qemu, run_program
 from .library import HERE, compile_program, sources, tool

@@ -12,7 +12,6 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_channel_sim import ChannelConfig
 
 from .experiment import Event, Experiment, Outcome
-from .faults import format_groups
 
 # Columns: name -> settings of the swarm.
 PROTOCOLS: dict[str, dict[str, Any]] = {
@@ -279,7 +278,7 @@ def _jam(case: Case, ids: list[int], random: np.random.Generator, slots: int) ->
 
 def _merge(case: Case, ids: list[int], random: np.random.Generator, slots: int) -> dict[str, Any]:
     half, after = case.agents // 2, 2000 + 3000
-    groups = format_groups([ids[:half], ids[half:]])
+    groups = [ids[:half], ids[half:]]
     movers = [int(k) + 1 for k in random.permutation(case.agents)[: case.movers]]
     return {
         "movers": movers,

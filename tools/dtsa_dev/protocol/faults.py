@@ -7,14 +7,6 @@ from typing import Any
 import numpy as np
 
 
-def format_groups(groups: list[list[int]]) -> str:
-    """A partition as the channel's settings have it.
-
-    :param groups: ids of each group.
-    """
-    return " | ".join(",".join(map(str, sorted(group))) for group in groups)
-
-
 def random_schedule(random: np.random.Generator, agents: int, slots: int) -> list[dict[str, Any]]:
     """Jams and partitions, one after the other."""
     entries: list[dict[str, Any]] = []
@@ -28,6 +20,6 @@ def random_schedule(random: np.random.Generator, agents: int, slots: int) -> lis
         elif kind == 1 and agents > 3:
             ids = [int(k) + 1 for k in random.permutation(agents)]
             cut = int(random.integers(1, agents))
-            entries.append({"slot": slot, "until": slot + length, "partition": format_groups([ids[:cut], ids[cut:]])})
+            entries.append({"slot": slot, "until": slot + length, "partition": [ids[:cut], ids[cut:]]})
         slot += length
     return entries

@@ -19,7 +19,6 @@ SOAKS = {
     "serial": "agents over simulated modems: cold starts, losses, kills, partitions, modems unplugged, slow adapters",
     "board": "twelve apps on board in the laboratory, an hour of virtual time with faults",
     "league": "every entry of league-1 flown again, whole; entries with one number changed are found",
-    "losses": "losses of simulated channels learnt again: how many intervals hold what was flown",
     "ns3": "the simulated channel beside ns-3's, the same loads (needs a Python with ns-3's wheel)",
     "view": "what a live page costs a flight, 70 agents drawn, a page left open (needs Chromium)",
     "mutants": "small random changes of the source, each of which the tests should find",

@@ -58,7 +58,7 @@ def _disturbed(flight: SerialFlight, fault: str) -> None:
         flight.start(2)
         flight.await_frames([2])
     elif fault == "partition":
-        flight.modems.set(partition=f"1-{agents // 2} | {agents // 2 + 1}-{agents}")
+        flight.modems.set(partition=[list(range(1, agents // 2 + 1)), list(range(agents // 2 + 1, agents + 1))])
         flight.carry(_FAULT_S)
         flight.modems.set(partition="")
     elif fault == "unplug":

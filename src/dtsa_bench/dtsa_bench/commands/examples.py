@@ -59,11 +59,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("runs/cf* --json", "all of them, as JSON"),
         ("runs/cf* --out flight_1", "kept as one bag, for report, export and verify"),
     ),
-    "losses": (
-        ("runs/a --out hall.json", "for simulate, sweep and fly, as --losses hall.json"),
-        ("runs/a --csv hall.csv", "to be replayed slot by slot, as --losses hall.csv"),
-        ("trace.csv --slot-ms 100", "a table of others"),
-    ),
+    "losses": (("runs/a --out hall.json", "for simulate, sweep and fly, as --losses hall.json"),),
     "recover": (("runs/a", "into runs/a/bag_recovered"),),
     "view": (
         ("runs/a", "a recorded run, played; one that is being recorded is followed"),

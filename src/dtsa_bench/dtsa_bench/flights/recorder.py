@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from dtsa_msgs.msg import RunStatus
@@ -177,7 +178,8 @@ class FlightRecorder(ChannelObserver):
 
 def _parameter_event(time_ns: int, node: str, change: Change) -> bytes:
     """A rcl_interfaces/ParameterEvent as CDR; rclpy would leave unused bytes at its end, which some readers refuse."""
-    values = [(name, value) for name, value in change.values if isinstance(value, (bool, int, float, str))]
+    values = [(name, value) for name, value in change.to_dict().items() if name != "slot"]
+    values = [(name, json.dumps(value) if isinstance(value, list) else value) for name, value in values]
     message = CdrBuilder()
     seconds, nanoseconds = divmod(time_ns, SECOND)
     message.number("i", seconds)

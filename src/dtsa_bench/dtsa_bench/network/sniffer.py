@@ -18,13 +18,13 @@ from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
-from dtsa_bench.recordings.losses.sniffed import FRAME, METADATA
 from dtsa_bench.recordings.merge.agent_recorder import about_port
 from dtsa_bench.recordings.merge.json_bag import JsonBag, described
 from dtsa_bench.recordings.rules.judge import Judge
 
 from .pcap import PacketFile
 
+FRAME, METADATA = "frame", "dtsa_sniffer"  # topic of the frames in its bag, name of the metadata record
 FRAME_SCHEMA = described(
     "dtsa.SniffedFrame",
     arrival_ns=("integer", "when it arrived, ns, CLOCK_MONOTONIC"),

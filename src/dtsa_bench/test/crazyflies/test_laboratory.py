@@ -15,7 +15,7 @@ from dtsa_bench.crazyflies.peer_lab.engine import AppError
 from dtsa_bench.crazyflies.peer_lab.packet import Packet
 from dtsa_bench.crazyflies.peer_lab.process import fly
 from dtsa_bench.crazyflies.peer_lab.record import Observer
-from dtsa_channel_sim.model.radio_table import CRAZYFLIE_LINE
+from dtsa_channel_sim.model.airtime import CRAZYFLIE_LINE
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 

@@ -13,8 +13,7 @@ from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import ChannelConfig
-from dtsa_channel_sim.model.airtime import Airtime
-from dtsa_channel_sim.model.radio_table import CRAZYFLIE_LINE
+from dtsa_channel_sim.model.airtime import CRAZYFLIE_LINE, Airtime
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 

@@ -111,6 +111,8 @@ def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_pa
 
 
 def test_slots_of_a_clock_start_when_that_clock_says_so() -> None:
+    from drifting_clocks import to_channel
+
     from dtsa_agent.ros.slot_clocks import slot_starts
 
     config = ClockConfig(offset_ns=2_000_000, drift_ppm=50.0, seed=3)
@@ -119,7 +121,7 @@ def test_slots_of_a_clock_start_when_that_clock_says_so() -> None:
     drift = np.array([clock.drift_ppb for clock in clocks])
     for slot in (0, 1, 777, 60_000):
         local = slot * 10_000_000
-        expected = [clock.to_channel(local) - local for clock in clocks]
+        expected = [to_channel(clock, local) - local for clock in clocks]
         assert slot_starts(local, offset, drift).tolist() == expected
 
 
@@ -136,7 +138,7 @@ def test_the_channel_changes_in_flight_and_the_bag_still_verifies(tmp_path: Path
         graph.until(lambda: bag.exists() and bag.stat().st_size > 20_000)
         change = graph.node.create_client(SetParameters, "/swarm/channel/set_parameters")
         graph.until(change.service_is_ready)
-        for values, good in (({"loss": 0.5}, True), ({"loss": 1.5}, False), ({"partition": "1-2 | 3-4"}, True)):
+        for values, good in (({"loss": 0.5}, True), ({"loss": 1.5}, False), ({"partition": "[[1, 2], [3, 4]]"}, True)):
             request = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
             done = change.call_async(SetParameters.Request(parameters=request))
             graph.until(done.done)

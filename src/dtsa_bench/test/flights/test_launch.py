@@ -40,14 +40,14 @@ def launch(tmp_path: Path, *words: str, file: str = "swarm_launch.py") -> str:
 def test_a_launched_flight_is_recorded_and_ends(processes: str, tmp_path: Path) -> None:
     out = tmp_path / "flight"
     text = launch(
-        tmp_path, "agents:=4", "policy:=lease", "timeout_s:=1", f"processes:={processes}", "partition:=1-2 | 3-4",
+        tmp_path, "agents:=4", "policy:=lease", "timeout_s:=1", f"processes:={processes}", "partition:=[[1,2],[3,4]]",
         f"out:={out}",
     )  # fmt: skip
     assert "has died" not in text, text
     assert text.count("has finished cleanly") == 1 + (4 if processes == "per-agent" else int(processes))
     assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["end"] == "timed out"
     with Bag(out / "bag") as bag:
-        assert bag.config["channel"]["partition"] == "1-2 | 3-4"
+        assert bag.config["channel"]["partition"] == [[1, 2], [3, 4]]
         assert bag.topics["/cf4/odom"].count == 100
 
 

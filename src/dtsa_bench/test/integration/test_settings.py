@@ -64,15 +64,15 @@ MODEL_VALUES = st.dictionaries(st.sampled_from(["v_max", "tau", "spacing", "rule
 LINK = {"from": "1", "to": "2-3", "loss": 0.25, "both_ways": True}
 STRUCTURES: dict[str, st.SearchStrategy[Any]] = {
     "loss_matrix": st.lists(st.lists(st.floats(0, 1), min_size=4, max_size=4), min_size=4, max_size=4),
-    "link_loss": st.lists(st.just(LINK) | st.builds(lambda p: {"from": 4, "to": "all", "loss": p}, st.floats(0, 1))),
+    "link_loss": st.lists(st.just(LINK) | st.builds(lambda p: {"from": 4, "loss": p}, st.floats(0, 1))),
     "schedule": st.lists(
         st.fixed_dictionaries(
             {"slot": st.integers(0, 1000)},
-            optional={"jam": st.booleans(), "link_loss": st.just([LINK]), "partition": st.just("1, 3 | 2, 4")},
+            optional={"jam": st.booleans(), "link_loss": st.just([LINK]), "partition": st.just([[1, 3], [2, 4]])},
         ).filter(lambda entry: len(entry) > 1),
         max_size=3,
     ),
-    "partition": st.sampled_from(["", "1-2 | 3-4", "4"]),
+    "partition": st.sampled_from(["", [[1, 2], [3, 4]], [[4]]]),
 }
 
 

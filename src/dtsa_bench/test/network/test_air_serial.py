@@ -85,7 +85,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
             go_on(flying, 20)
             made.plug(2)
             wait_for(lambda: any("is back" in line for line in flying[1].said))
-            made.set(partition="1,2,4 | 3")
+            made.set(partition=[[1, 2, 4], [3]])
             go_on(flying, 30)
             made.set(partition="")
             go_on(flying, 100)

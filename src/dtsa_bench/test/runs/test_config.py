@@ -11,7 +11,7 @@ from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.runs.config import RunConfig, from_swarm
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import ChannelConfig
-from dtsa_channel_sim.model.radio_table import RADIOS
+from dtsa_channel_sim.model.airtime import RADIOS
 
 
 def run(radio: str, loss: float = 0.0, **swarm: Any) -> RunConfig:

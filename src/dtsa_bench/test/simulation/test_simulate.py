@@ -69,7 +69,7 @@ def test_without_loss_one_table_for_all_makes_no_difference(policy: str, more: d
         {"policy": "aloha"},
         {"jam": True},
         {"range_m": 3.0},
-        {"partition": "1-3 | 4-6"},
+        {"partition": [[1, 2, 3], [4, 5, 6]]},
         {"burst_length": 3.0, "loss": 0.1},
     ],
 )

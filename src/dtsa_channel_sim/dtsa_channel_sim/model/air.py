@@ -6,7 +6,8 @@ several processes, as long as each arrives before the time line is settled past 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections import deque
+from collections.abc import Hashable
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Generic, Protocol, TypeVar
@@ -15,9 +16,9 @@ import numpy as np
 
 from dtsa_agent.core.errors import LocalProtocolError
 
+from .airtime import Airtime
 from .config import ChannelConfig
-from .lines import Lines
-from .medium import Mask, Medium, OnAir, Positions, Reception
+from .medium import Mask, Medium, OnAir, Positions
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -60,11 +61,66 @@ class FrameVerdict(Generic[Key]):
     """Receivers in reach where it collided, or that were sending themselves."""
 
 
+class Lines:
+    """The lines between flight processors and their radios: one of each kind for every agent, one frame at a time.
+
+    A radio hands its receptions over in the order in which they ended, each when the one before it is through. One that
+    comes when the radio holds as many as it can is lost. A radio that waits (:class:`~.airtime.Line`) sends a frame of
+    its own when the reception that it hands over is through, before it turns to the next one. Calls come in the order
+    of their times, ns; agents are ids.
+    """
+
+    __slots__ = ("_airtime", "_held", "_sending_ns")
+
+    def __init__(self, airtime: Airtime, agents: int) -> None:
+        self._airtime = airtime
+        # By agent: when each reception that its radio holds is through, ns; the first is on the line.
+        self._held: list[deque[int]] = [deque() for _ in range(agents)]
+        self._sending_ns = [0] * agents  # when each radio has done with its own frames
+
+    def start_ns(self, agent: int, at_ns: int, length: int) -> int:
+        """Return when a radio begins to send a frame of its own that it has from ``at_ns`` on."""
+        held = self._release(agent - 1, at_ns)
+        start = held[0] if held and self._airtime.line.waits else at_ns
+        start = max(start, self._sending_ns[agent - 1])
+        self._sending_ns[agent - 1] = start + self._airtime.total_ns(length)
+        return start
+
+    def receive(self, end_ns: int, length: int, received: Mask) -> tuple[Mask, int]:
+        """Receive a frame that ends now; return the agents with room for it, (N,), and when the last has it, ns."""
+        takes_ns, queue = self._airtime.from_radio_ns(length), self._airtime.line.queue
+        taken, last = received.copy(), end_ns + takes_ns
+        for index in np.flatnonzero(received).tolist():
+            held = self._release(index, end_ns)
+            if queue and len(held) >= queue:
+                taken[index] = False
+                continue
+            held.append((held[-1] if held else end_ns) + takes_ns)
+            last = max(last, held[-1])
+        return taken, last
+
+    def handed_ns(self, agent: int) -> int:
+        """Return when the reception that a radio has just received is through."""
+        return self._held[agent - 1][-1]
+
+    def reset(self, agent: int) -> None:
+        """Forget what a radio holds: its power was off."""
+        self._held[agent - 1].clear()
+        self._sending_ns[agent - 1] = 0
+
+    def _release(self, index: int, now_ns: int) -> deque[int]:
+        """Return the receptions that a radio still holds."""
+        held = self._held[index]
+        while held and held[0] <= now_ns:
+            held.popleft()
+        return held
+
+
 class Air(Generic[Key]):
     """One time line of transmissions.
 
     What is on air at one time is a handful of frames; only these are looked at, whatever waits beside them. With radios
-    behind serial lines (:class:`~.lines.Lines`) starts depend on what was received before, so all goes by the order of
+    behind serial lines (:class:`Lines`) starts depend on what was received before, so all goes by the order of
     times: ends of transmissions before starts at the same instant.
 
     :param channel: the medium by slot.
@@ -102,11 +158,6 @@ class Air(Generic[Key]):
         """Until when to settle next, ns: before that nothing begins or ends that has been handed in."""
         end_ns = self._by_end[0][0] if self._by_end else NEVER
         return min(end_ns, self._asked[0][0] + 1 if self._asked else NEVER)
-
-    @property
-    def near(self) -> list[OnAir]:
-        """Transmissions that may still overlap others; always the same list."""
-        return self._near
 
     def begin(self, frame_id: Key, sender: int, start_ns: int, length: int) -> bool:
         """Hand in one transmission; False when it is too late for it: it is dropped then, and counted.
@@ -182,25 +233,6 @@ class Air(Generic[Key]):
         if verdicts:
             self._channel.advance(until_ns // self._channel.config.slot_ns)
         return verdicts
-
-    def judge_slot(
-        self, slot: int, frames: Sequence[OnAir], positions: Positions | None = None, keep: bool = False
-    ) -> list[Reception]:
-        """Judge a slot's transmissions as soon as they are known: what outlasts the slot disturbs the next ones only.
-
-        :param slot: slot whose settings and random numbers count.
-        :param frames: all its transmissions.
-        :param positions: (3, N), m, frame map; needed with a limited range or capture.
-        :param keep: True when transmissions of the next slot may begin before it.
-        """
-        medium = self._channel.medium(slot)
-        end_ns = (slot + 1) * self._channel.config.slot_ns
-        on_air = [*self._near, *frames]
-        first = len(self._near)
-        self._near[:] = [frame for k, frame in enumerate(on_air) if frame.end_ns > end_ns or (keep and k >= first)]
-        return [
-            medium.judge(slot, frame, on_air[:k] + on_air[k + 1 :], positions) for k, frame in enumerate(frames, first)
-        ]
 
     def _run(self, until_ns: int, before_ns: int, positions: Positions | None) -> None:
         """Let frames end up to and with a time, and radios begin what they have before another one."""

@@ -1,13 +1,15 @@
-"""How long a frame takes: on the air, and between a flight processor and its radio.
+"""How long a frame takes on the air, and between a flight processor and its radio; the radios by name.
 
-One class says it for every radio; the rows are in :mod:`dtsa_channel_sim.model.radio_table`. Unless said otherwise the
-times are those of a Crazyflie's nRF51 in its peer-to-peer mode.
+Unless said otherwise the times are those of a Crazyflie's nRF51 in its peer-to-peer mode.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from dtsa_agent.air.serial.lengths import FRAMING
+from dtsa_agent.air.serial.modems import MODEMS, NONE, Modem
 
 #: Bits around the data: preamble, address, length and control fields, checksum.
 OVERHEAD_BITS = 73
@@ -42,24 +44,10 @@ class Line:
         """Whether bytes go over it one after the other. Else it is a constant delay, which moves arrivals alone."""
         return bool(self.to_byte_ns or self.from_byte_ns)
 
-    def to_radio_ns(self, length: int) -> int:
-        """Return the time that a frame takes from the flight processor to the radio, ns.
-
-        :param length: bytes of the frame.
-        """
-        return self.to_fixed_ns + self.to_byte_ns * length
-
-    def from_radio_ns(self, length: int) -> int:
-        """Return the time that a frame takes from the radio to the flight processor, ns.
-
-        :param length: bytes of the frame.
-        """
-        return self.from_fixed_ns + self.from_byte_ns * length
-
 
 @dataclass(frozen=True, slots=True)
 class Airtime:
-    """Times of one transmission.
+    """Times of one transmission; lengths are the bytes of a frame.
 
     :param bitrate: bit/s on air.
     :param ramp_up_ns: ns from the order to send until the first bit is on air; the sender is deaf, the air
@@ -79,7 +67,7 @@ class Airtime:
     formula: Callable[[int], int] | None = None
 
     def on_air_ns(self, length: int) -> int:
-        """Return the time that the bits of a frame of ``length`` bytes are on air, ns, rounded up.
+        """Return the time that the bits of a frame are on air, ns, rounded up.
 
         nRF51: 73 + 8 (n + 2) bits; 24 bytes take 0.14 ms, 60 bytes 0.28 ms at 2 Mbit/s.
         """
@@ -89,34 +77,21 @@ class Airtime:
         return -(-bits * 1_000_000_000 // self.bitrate)
 
     def total_ns(self, length: int) -> int:
-        """Return the time from the order to send until the last bit has left, ns.
-
-        :param length: bytes of the frame.
-        """
+        """Return the time from the order to send until the last bit has left, ns."""
         return self.ramp_up_ns + self.on_air_ns(length)
 
     def to_radio_ns(self, length: int) -> int:
-        """Return the time that a frame takes from the flight processor to the radio, ns.
-
-        :param length: bytes of the frame.
-        """
-        return self.line.to_radio_ns(length)
+        """Return the time that a frame takes from the flight processor to the radio, ns."""
+        return self.line.to_fixed_ns + self.line.to_byte_ns * length
 
     def from_radio_ns(self, length: int) -> int:
-        """Return the time that a frame takes from the radio to the flight processor, ns.
-
-        :param length: bytes of the frame.
-        """
-        return self.line.from_radio_ns(length)
+        """Return the time that a frame takes from the radio to the flight processor, ns."""
+        return self.line.from_fixed_ns + self.line.from_byte_ns * length
 
     def latest_ns(self, length: int) -> int:
-        """Return the longest time from the order to send until a receiver's flight processor has a frame, ns.
-
-        :param length: bytes of the longest frame on the air.
-        """
-        line = self.line
-        waiting = self.from_radio_ns(length) * line.waits + self.from_radio_ns(length) * max(0, line.queue - 1)
-        return waiting + self.total_ns(length) + self.from_radio_ns(length)
+        """Return the longest time from the order to send until a receiver's flight processor has a frame, ns."""
+        line, from_ns = self.line, self.from_radio_ns(length)
+        return from_ns * line.waits + from_ns * max(0, line.queue - 1) + self.total_ns(length) + from_ns
 
     def shortest_slot_ns(self, length: int, *, guard_ns: int, decide_ns: int = 0, needs_frame: bool = False) -> int:
         """Return the shortest slot in which no frame overlaps another one or waits for one, ns.
@@ -126,7 +101,6 @@ class Airtime:
         at work while the next slot goes on; only a radio that does nothing else while it hands a reception over keeps
         the own frame waiting until then.
 
-        :param length: bytes of a frame.
         :param guard_ns: ns, largest difference of any clock from the common one, either way.
         :param decide_ns: ns, longest time to decide and to make a frame.
         :param needs_frame: whether an agent must have a slot's frame before it knows who sends in the next one.
@@ -136,3 +110,69 @@ class Airtime:
         if needs_frame:
             return on_air_ns + from_ns + decide_ns + to_ns
         return max(on_air_ns + (from_ns if self.line.waits else 0), from_ns, to_ns, decide_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class RadioRow:
+    """A radio: all that differs between them.
+
+    :param airtime: its times.
+    :param text: what it is, for a table.
+    :param source: where its times are from.
+    :param tuned: whether ``bitrate`` and ``ramp_up_ns`` are settings of it; else they are the row's.
+    """
+
+    airtime: Airtime
+    text: str
+    source: str
+    tuned: bool = False
+
+
+# Source of both ways: ``src/syslink.c`` and ``src/main.c`` of crazyflie2-nrf-firmware. At 1 Mbaud a byte takes 10 us.
+# Around a frame there are 6 bytes of syslink and the port; on the way back its signal strength, too. The main loop
+# writes a reception to the line byte by byte before it looks for frames to be sent. The queue has eight places, of
+# which one stays empty; a reception is copied out of it before it is handed over.
+_BYTE_NS = 10_000
+CRAZYFLIE_LINE = Line(7 * _BYTE_NS, _BYTE_NS, 8 * _BYTE_NS, _BYTE_NS, waits=True, queue=8)
+
+_SECOND = 1_000_000_000
+_BITS = 10  # of a byte on a modem's line
+
+
+def _modem(modem: Modem) -> RadioRow:
+    """Return a modem on a serial line; its frames carry a datagram's header and what marks them on the line."""
+    byte_ns = _BITS * _SECOND // modem.baud
+    line = Line((FRAMING + modem.gap_bytes) * byte_ns, byte_ns, FRAMING * byte_ns, byte_ns)
+    longest, formula = modem.packet - FRAMING, lambda length: modem.on_air_ns(FRAMING + length)
+    airtime = Airtime(modem.bitrate, modem.turn_round_ns, 0, line, longest, formula)
+    return RadioRow(airtime, f"{modem.text}, line of {modem.baud} baud, without turns of its own", modem.source)
+
+
+#: Radios by the name that the setting ``radio`` gives them.
+RADIOS: dict[str, RadioRow] = {
+    "plain": RadioRow(
+        Airtime(), "air time alone; `link_delay_ns` each way to and from the flight processor", "settings", tuned=True
+    ),
+    "crazyflie": RadioRow(
+        Airtime(line=CRAZYFLIE_LINE, longest=60),
+        "Crazyflie, nRF51 behind a line of 1 Mbaud, peer to peer",
+        "nRF51 reference manual; crazyflie2-nrf-firmware",
+        tuned=True,
+    ),
+    **{name: _modem(modem) for name, modem in MODEMS.items() if name != NONE},
+}
+
+
+def airtime_of(radio: str, bitrate: int, ramp_up_ns: int, link_delay_ns: int) -> Airtime:
+    """Return the times of a radio under settings.
+
+    :param radio: its name in the table.
+    :param bitrate: bit/s on air, where it is a setting of the radio.
+    :param ramp_up_ns: ns from the order to send to the first bit, likewise.
+    :param link_delay_ns: ns each way between flight processor and radio, with ``plain``.
+    """
+    row = RADIOS[radio]
+    if not row.tuned:
+        return row.airtime
+    line = Line(link_delay_ns, 0, link_delay_ns, 0) if radio == "plain" else row.airtime.line
+    return replace(row.airtime, bitrate=bitrate, ramp_up_ns=ramp_up_ns, line=line)

@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 
-from .air import Air
 from .config import ChannelConfig
 from .losses import NoiseSource
 from .medium import Medium, OnAir
-from .schedule import Change
-from .timeline import Epoch, Timeline
+from .schedule import Change, Epoch, Timeline
 from .verdict import COLLISION, IDLE, SUCCESS, Verdict
 
 Positions = NDArray[np.float64]
@@ -35,7 +33,7 @@ class Channel:
     """
 
     __slots__ = (
-        "_air", "_airtime", "_alone", "_changes", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near",
+        "_airtime", "_alone", "_changes", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near",
         "_plain", "_shared", "_simple", "_source", "_spills", "_timeline", "config",
     )  # fmt: skip
 
@@ -45,8 +43,7 @@ class Channel:
         self._source = NoiseSource(config.seed, config.agents)
         self._airtime = config.airtime
         self._changes: list[Change] = []
-        self._air: Air[int] = Air(self)  # carries from slot to slot what outlasts its own
-        self._near = self._air.near
+        self._near: list[OnAir] = []  # of the slots before, what outlasts them
         self._last = -1
         # A frame sent at the slot's start may be longer than the slot.
         self._spills = self._airtime.total_ns(self._airtime.longest) > config.slot_ns
@@ -90,10 +87,7 @@ class Channel:
         return change
 
     def advance(self, slot: int) -> None:
-        """Note that a slot has been dealt with (on an :class:`Air`): later changes of settings begin after it.
-
-        :param slot: number of the slot.
-        """
+        """Note that a slot has been dealt with (on an ``Air``): later changes of settings begin after it."""
         self._last = max(self._last, slot)
 
     def arbitrate(
@@ -102,31 +96,28 @@ class Channel:
         senders: Sequence[int],
         lengths: Sequence[int] | None = None,
         positions: Positions | None = None,
-        offsets_ns: Sequence[int] | None = None,
     ) -> Verdict:
         """Return who received what in one slot.
 
         :param slot: number of the slot, 0 or more; usually one after the other.
         :param senders: ids (1 to N) of the agents that send in it, each once.
-        :param lengths: bytes of each frame; None: nothing outlasts its slot.
-        :param positions: (3, N), m, frame map; needed with a limited range or capture.
-        :param offsets_ns: ns, start of each transmission from the slot's start by the channel's clock; None:
-            all start with the slot and any two overlap. Needs ``lengths``. What is still on air when its slot
-            ends disturbs the next slot's frames; its own verdict has been given by then (an
+        :param lengths: bytes of each frame; None: nothing outlasts its slot. A frame that is still on air when its
+            slot ends disturbs the next slot's frames; its own verdict has been given by then (an
             :class:`~dtsa_channel_sim.model.air.Air` waits with it).
+        :param positions: (3, N), m, frame map; needed with a limited range or capture.
         :raises LocalProtocolError: when the arguments do not go together.
         """
         if not self._first <= slot < self._end:
             self._use(slot)
         last, self._last = self._last, slot
-        if self._simple and offsets_ns is None and not self._near:
+        if self._simple and not self._near:
             if len(senders) == 1:
                 alone = self._alone.get(senders[0])
                 if alone is not None:
                     return alone if self._plain else self._one(slot, senders[0], alone)
             elif not len(senders):
                 return self._idle
-        return self._many(slot, slot > last, self._checked(senders), lengths, positions, offsets_ns)
+        return self._many(slot, slot > last, self._checked(senders), lengths, positions)
 
     def medium(self, slot: int) -> Medium:
         """Return the medium of a slot, with the settings that hold in it."""
@@ -165,45 +156,37 @@ class Channel:
         senders: tuple[int, ...],
         lengths: Sequence[int] | None,
         positions: Positions | None,
-        offsets_ns: Sequence[int] | None,
     ) -> Verdict:
         """Return the verdict on any number of frames, in full generality."""
         if not follows:
-            self._near.clear()
+            self._near = []
         agents = len(self._alone)
-        if self._shared and offsets_ns is None and not self._near and len(senders) > 1:
+        if self._shared and not self._near and len(senders) > 1:
             others = (agents - 1,) * len(senders)
             return Verdict(COLLISION, senders, np.zeros((len(senders), agents), np.bool_), (0,) * len(senders), others)
-        frames = self._laid(slot, senders, lengths, offsets_ns)
-        # A frame of the next slot may begin before that slot does, so what ends shortly before it is kept, too.
-        receptions = self._air.judge_slot(slot, frames, positions, keep=offsets_ns is not None)
+        on_air = [*self._near, *self._sent(slot, senders, lengths)]
+        first, end_ns = len(self._near), (slot + 1) * self.config.slot_ns
+        self._near = [frame for frame in on_air if frame.end_ns > end_ns]
         if not senders:
             return self._idle
+        receptions = [
+            self._medium.judge(slot, on_air[k], on_air[:k] + on_air[k + 1 :], positions)
+            for k in range(first, len(on_air))
+        ]
         received = np.array([reception.received for reception in receptions])
         lost = tuple(reception.lost for reception in receptions)
         collided = tuple(reception.collided for reception in receptions)
         return Verdict(COLLISION if any(collided) else SUCCESS, senders, received, lost, collided)
 
-    def _laid(
-        self,
-        slot: int,
-        senders: tuple[int, ...],
-        lengths: Sequence[int] | None,
-        offsets_ns: Sequence[int] | None,
-    ) -> list[OnAir]:
-        """Lay the frames of a slot on the channel's time line."""
-        for name, values in (("lengths", lengths), ("offsets_ns", offsets_ns)):
-            if values is not None and len(values) != len(senders):
-                raise LocalProtocolError(f"{name}: {len(values)} values for {len(senders)} frames")
+    def _sent(self, slot: int, senders: tuple[int, ...], lengths: Sequence[int] | None) -> list[OnAir]:
+        """Return the transmissions of a slot: all start with it."""
         start = slot * self.config.slot_ns
         if lengths is None:
-            if offsets_ns is not None and senders:
-                raise LocalProtocolError("offsets_ns: the lengths of the frames are needed with them")
             return [OnAir(sender, start, start, start + self.config.slot_ns) for sender in senders]
-        offsets = offsets_ns if offsets_ns is not None else (0,) * len(senders)
+        if len(lengths) != len(senders):
+            raise LocalProtocolError(f"lengths: {len(lengths)} values for {len(senders)} frames")
         return [
-            OnAir.of(self._airtime, sender, start + int(offset), int(length))
-            for sender, length, offset in zip(senders, lengths, offsets, strict=True)
+            OnAir.of(self._airtime, sender, start, int(length)) for sender, length in zip(senders, lengths, strict=True)
         ]
 
     def _checked(self, senders: Sequence[int]) -> tuple[int, ...]:

@@ -11,14 +11,11 @@ from typing import Any
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import REQUIRED, Setting, Settings, build, check, setting, settings_of
 
-from .airtime import Airtime
+from .airtime import RADIOS, Airtime, airtime_of
 from .gilbert import GilbertElliott
-from .loss_file import losses_of
-from .measured import MeasuredLosses
-from .radio_table import RADIOS, airtime_of
-from .schedule import Change, listed
-from .timeline import check_schedule
-from .topology import LinkLoss, format_partition, parse_matrix, parse_partition
+from .measured import MeasuredLosses, losses_of
+from .schedule import Change, Timeline
+from .topology import Groups, LinkLoss, Matrix, listed, parse_links, parse_matrix, parse_partition
 
 _SLOT_MS = Setting("slot_ms", "float", None, "length of a slot", unit="ms", minimum=1e-6, maximum=1e6)
 
@@ -57,14 +54,17 @@ class ChannelConfig(Settings):
     p_bad: float = setting(1.0, "loss within a bad phase", minimum=0.0, maximum=1.0, changeable=True)
     losses: MeasuredLosses | str = setting(
         "",
-        "file of losses that were measured, on top of all others: what `losses` has written, or a table (.csv) that is "
-        "replayed slot by slot",
+        "file of losses that were measured, on top of all others: what `losses` has written",
         kind="file",
         custom=True,
     )
     jam: bool = setting(False, "all frames are lost", changeable=True)
-    partition: str = setting(
-        "", 'groups that do not hear each other, as "1-6 | 7-12"; empty: all together', changeable=True, custom=True
+    partition: Groups | str = setting(
+        "",
+        "groups that do not hear each other: [[1, 2, 3], [4, 5]]; empty: all together",
+        kind="text",
+        changeable=True,
+        custom=True,
     )
     range_m: float = setting(
         0.0,
@@ -102,24 +102,16 @@ class ChannelConfig(Settings):
         minimum=0,
         maximum=10**9,
     )
-    loss_matrix: tuple[tuple[float, ...], ...] = setting(
-        (), "loss of each link on top of loss: row = sender, column = receiver"
-    )
+    loss_matrix: Matrix = setting((), "loss of each link on top of loss: row = sender, column = receiver")
     link_loss: tuple[LinkLoss, ...] = setting((), "loss of some links, laid over loss_matrix", changeable=True)
     schedule: tuple[Change, ...] = setting((), "changes at known slots")
 
     def __post_init__(self) -> None:
         check(self)
-        groups = parse_partition(self.partition, self.agents)
-        object.__setattr__(self, "partition", format_partition(groups))
+        object.__setattr__(self, "partition", parse_partition(self.partition, self.agents) or "")
         object.__setattr__(self, "loss_matrix", parse_matrix(self.loss_matrix, self.agents))
-        links = listed(self.link_loss, "link_loss")
-        object.__setattr__(
-            self,
-            "link_loss",
-            tuple(LinkLoss.from_dict(entry, self.agents, f"link_loss[{i}]") for i, entry in enumerate(links)),
-        )
-        object.__setattr__(self, "losses", losses_of(self.losses, self.slot_ns))
+        object.__setattr__(self, "link_loss", parse_links(self.link_loss, self.agents))
+        object.__setattr__(self, "losses", losses_of(self.losses))
         if isinstance(self.losses, MeasuredLosses):
             self.losses.check(self.agents, self.slot_ns)
             if self.burst_length:
@@ -128,15 +120,19 @@ class ChannelConfig(Settings):
                 )
         if self.burst_length:
             GilbertElliott.from_means(self.loss, self.burst_length, self.p_good, self.p_bad)
-        entries = listed(self.schedule, "schedule")
-        object.__setattr__(
-            self,
-            "schedule",
-            tuple(Change.from_dict(entry, self, f"schedule[{i}]") for i, entry in enumerate(entries)),
-        )
-        if self.schedule:
-            # Entries may be fine one by one and wrong together: try every state that the channel will be in.
-            check_schedule(self)
+        entries = enumerate(listed(self.schedule, "schedule"))
+        schedule = tuple(Change.from_dict(entry, self, f"schedule[{k}]") for k, entry in entries)
+        object.__setattr__(self, "schedule", schedule)
+        if self.schedule:  # entries may be fine one by one and wrong together: try every state of the channel
+            try:
+                Timeline(self)
+            except ConfigError as error:
+                raise ConfigError(f"schedule: {error.field}", error.value, error.allowed) from None
+
+    @property
+    def groups(self) -> Groups:
+        """The groups of the partition; empty: all together."""
+        return self.partition if isinstance(self.partition, tuple) else ()
 
     @property
     def airtime(self) -> Airtime:

@@ -21,20 +21,21 @@ from dtsa_agent.core.errors import ConfigError
 from .draws import WordBlocks, Words, threshold
 
 Mask = NDArray[np.bool_]
+Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class GilbertElliott:
-    """The chain's numbers.
+    """The numbers of one chain for all, or, as (N, N) arrays with row = sender, of one for each directed link.
 
     :param bad_share: share of slots in the bad state.
     :param enter: P(good -> bad) per slot, p.
     :param leave: P(bad -> good) per slot, r; 1 / r is the mean length of a bad phase in slots.
     """
 
-    bad_share: float
-    enter: float
-    leave: float
+    bad_share: float | Numbers
+    enter: float | Numbers
+    leave: float | Numbers
 
     @classmethod
     def from_means(cls, loss: float, burst_length: float, p_good: float = 0.0, p_bad: float = 1.0) -> GilbertElliott:
@@ -67,20 +68,6 @@ class GilbertElliott:
         return cls(share, leave * share / (1.0 - share), leave)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LinkChains:
-    """The numbers of a chain of its own for each directed link, (N, N), row = sender, or for each receiver, (1, N).
-
-    :param bad_share: as in :class:`GilbertElliott`.
-    :param enter: p of each.
-    :param leave: r of each; p + r is at most 1.
-    """
-
-    bad_share: NDArray[np.float64]
-    enter: NDArray[np.float64]
-    leave: NDArray[np.float64]
-
-
 class _Limits(NamedTuple):
     """Where words decide: scalars, or one for each receiver (N,)."""
 
@@ -96,28 +83,19 @@ class _Limits(NamedTuple):
 class Chains:
     """States of the chains of all receivers, or of all links, begun at slot 0 in their long-run mixture.
 
-    :param model: the chain's numbers, or those of each link.
+    :param model: the numbers of the chains.
     :param words: the words that drive it.
     :param factors: one constant per sender, indexed by id: makes the words of its links from those of the
         receivers.
     """
 
-    __slots__ = (
-        "_block",
-        "_end",
-        "_factors",
-        "_first",
-        "_known",
-        "_limits",
-        "_step",
-        "_words",
-    )
+    __slots__ = ("_block", "_end", "_factors", "_first", "_known", "_limits", "_step", "_words")
 
-    def __init__(self, model: GilbertElliott | LinkChains, words: WordBlocks, factors: Sequence[np.uint64]) -> None:
+    def __init__(self, model: GilbertElliott, words: WordBlocks, factors: Sequence[np.uint64]) -> None:
         self._words = words
         self._factors = factors
         limits = _Limits(threshold(model.enter), threshold(1.0 - model.leave), threshold(model.bad_share))
-        if isinstance(model, LinkChains):
+        if limits.enter.ndim:
             rows = [_Limits(*row) for row in zip(*limits, strict=True)]
             self._limits = [rows[0], *rows]  # by the sender's id; index 0 is not used
         else:
@@ -131,21 +109,14 @@ class Chains:
         self._known: dict[int, tuple[int, Mask]] = {}
 
     def receivers(self, slot: int) -> Mask:
-        """Return which receivers are in a bad phase, (1, N).
-
-        :param slot: the slot, 0 or later.
-        """
+        """Return which receivers are in a bad phase, (1, N)."""
         if not self._first <= slot < self._end:
             self._fill(slot // self._words.rows)
         row = slot - self._first
         return self._block[row : row + 1]
 
     def links(self, slot: int, sender: int) -> Mask:
-        """Return which links from one sender are in a bad phase, (1, N).
-
-        :param slot: the slot, 0 or later.
-        :param sender: id of the sender.
-        """
+        """Return which links from one sender, an id, are in a bad phase, (1, N)."""
         # Where the last look ended, this one may end too: it saves work and changes nothing.
         floor, before = self._known.get(sender, (-1, None))
         if floor == slot and before is not None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .config import ChannelConfig
 from .draws import LOSS, STATE, WordBlocks, sender_factors, threshold
 from .gilbert import Chains, GilbertElliott
-from .measured import LINK, MeasuredLosses
+from .measured import MeasuredLosses
 from .topology import link_matrix
 
 Mask = NDArray[np.bool_]
@@ -43,7 +43,7 @@ class Losses:
     :param source: the random numbers.
     """
 
-    __slots__ = ("_bad", "_certain", "_chains", "_good", "_per_link", "_record", "_source", "none")
+    __slots__ = ("_bad", "_certain", "_chains", "_good", "_per_link", "_source", "none")
 
     def __init__(self, config: ChannelConfig, source: NoiseSource) -> None:
         self._source = source
@@ -52,11 +52,9 @@ class Losses:
         measured = config.losses if isinstance(config.losses, MeasuredLosses) else None
         self.none = config.loss == 0.0 and links is None and measured is None
         self._chains: Chains | None = None
-        self._record = None if measured is None or not measured.record else measured.replay(config.agents)
-        self._per_link = config.burst_scope == "link"
-        if measured is not None and self._record is None:
+        self._per_link = config.burst_scope == "link" or measured is not None
+        if measured is not None:
             fitted = measured.fitted(config.agents)
-            self._per_link = measured.scope == LINK
             self._chains = Chains(fitted.chains, source.state_words, source.state_factors)
             self._good = _thresholds(config.loss, _both(links, fitted.loss_good), config.agents)
             self._bad = _thresholds(config.loss, _both(links, fitted.loss_bad), config.agents)
@@ -78,8 +76,7 @@ class Losses:
         :param sender: id of the sender.
         """
         if self._chains is None:
-            lost = self._source.words.row(slot) * self._source.factors[sender] < self._good[sender]
-            return lost if self._record is None else lost | self._record.lost(slot, sender)
+            return self._source.words.row(slot) * self._source.factors[sender] < self._good[sender]
         bad = self._chains.links(slot, sender) if self._per_link else self._chains.receivers(slot)
         if self._certain:
             return bad

@@ -17,7 +17,7 @@ from dtsa_agent.core.errors import LocalProtocolError
 from .airtime import Airtime
 from .config import ChannelConfig
 from .losses import Losses, NoiseSource
-from .topology import group_numbers, parse_partition, squared_distances
+from .topology import group_numbers, squared_distances
 
 Mask = NDArray[np.bool_]
 Positions = NDArray[np.float64]
@@ -88,8 +88,7 @@ class Medium:
         self._capture = 10.0 ** (config.capture_db / 10.0) if config.capture_db else 0.0
         self._exponent = config.path_loss_exponent
         self._jam = config.jam
-        groups = parse_partition(config.partition, config.agents)
-        self._groups = group_numbers(groups, config.agents) if groups else None
+        self._groups = group_numbers(config.groups, config.agents) if config.groups else None
         #: Which receivers lose a frame to noise.
         self.losses = Losses(config, source or NoiseSource(config.seed, config.agents))
         self.needs_positions = bool(config.range_m or config.capture_db)
@@ -114,6 +113,10 @@ class Medium:
         else:
             received = clear & ~self.losses.lost(slot, frame.sender)[0]
         return Reception(received, int(np.count_nonzero(clear) - np.count_nonzero(received)), collided)
+
+    def reach(self, sender: int, positions: Positions | None = None) -> Mask:
+        """Return who hears an agent alone on the air but for noise, (N,)."""
+        return self._heard(sender, positions, self._range2)[0]
 
     def senses(self, receiver: int, when_ns: int, frame: OnAir, positions: Positions | None = None) -> bool:
         """Return whether a radio that listens finds the air busy with a transmission.

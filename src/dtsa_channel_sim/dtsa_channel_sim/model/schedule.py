@@ -1,19 +1,21 @@
-"""Changes of the channel's settings: entries of the schedule, and changes made while it runs."""
+"""Changes of the channel's settings, by the schedule or while it runs, and which settings hold in which slot."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 
-from .topology import LinkLoss, format_partition, parse_partition
+from .topology import parse_links, parse_partition
 
 _NS_PER_S = 1_000_000_000
 _SLOT = Setting("slot", "int", None, "a slot", minimum=0, maximum=2**53)
 _SECONDS = Setting("at_s", "float", None, "seconds after the start of slot 0", unit="s", minimum=0, maximum=1e9)
+_TIMES = ("slot", "at_s", "until", "until_s")
 
 _Config = TypeVar("_Config", bound="Changing")
 
@@ -34,10 +36,7 @@ class Changing(Protocol):
         """Changes at known slots."""
 
     def changed(self: _Config, values: Mapping[str, Any]) -> _Config:
-        """These settings with some changed, without the schedule.
-
-        :param values: names and values of changeable settings.
-        """
+        """These settings with some changed, without the schedule."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +60,7 @@ class Change:
     def from_dict(cls, entry: object, config: Changing, name: str) -> Change:
         """Return an entry ``{slot | at_s: ..., until | until_s: ..., loss: ..., jam: ...}``, validated.
 
-        Seconds count from the start of slot 0; the change comes with the first slot that starts then or
-        later.
+        Seconds count from the start of slot 0; the change comes with the first slot that starts then or later.
 
         :param config: the settings it changes.
         :param name: name of the entry, for the errors.
@@ -78,19 +76,21 @@ class Change:
             raise ConfigError(f"{name}.slot", None, "a slot (slot: 100) or seconds (at_s: 1.0)")
         if until is not None and until <= slot:
             raise ConfigError(f"{name}.until", until, f"a slot after the entry's start, {slot}")
-        values = {key: value for key, value in entry.items() if key not in ("slot", "at_s", "until", "until_s")}
+        values = {key: value for key, value in entry.items() if key not in _TIMES}
         if not values:
             raise ConfigError(name, dict(entry), "at least one of " + _changeable(config))
         return cls(slot, tuple(_normal(config, key, value, name) for key, value in values.items()), until)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry as :meth:`from_dict` reads it."""
-        result: dict[str, Any] = {"slot": self.slot}
-        if self.until is not None:
-            result["until"] = self.until
-        for name, value in self.values:
-            result[name] = [link.to_dict() for link in value] if name == "link_loss" else value
-        return result
+        until = {} if self.until is None else {"until": self.until}
+        return {"slot": self.slot, **until, **{name: _plain(value) for name, value in self.values}}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value.to_dict() if hasattr(value, "to_dict") else value
 
 
 def _normal(config: Changing, name: str, value: object, entry: str) -> tuple[str, Any]:
@@ -98,12 +98,11 @@ def _normal(config: Changing, name: str, value: object, entry: str) -> tuple[str
     spec = next((spec for spec in settings_of(type(config)) if spec.name == name and spec.changeable), None)
     if spec is None:
         raise ConfigError(f"{entry}.{name}", value, "a setting that may change: " + _changeable(config))
-    if spec.kind in ("int", "float", "bool"):
-        return name, spec.check(value, f"{entry}.{name}")
     if name == "partition":
-        return name, format_partition(parse_partition(value, config.agents, f"{entry}.partition"))
-    links = listed(value, f"{entry}.{name}")
-    return name, tuple(LinkLoss.from_dict(e, config.agents, f"{entry}.{name}[{i}]") for i, e in enumerate(links))
+        return name, parse_partition(value, config.agents, f"{entry}.{name}") or ""
+    if name == "link_loss":
+        return name, parse_links(value, config.agents, f"{entry}.{name}")
+    return name, spec.check(value, f"{entry}.{name}")
 
 
 def _when(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, name: str) -> int | None:
@@ -117,19 +116,82 @@ def _when(entry: Mapping[str, Any], slot_key: str, time_key: str, slot_ns: int, 
     return None
 
 
-def listed(value: object, name: str) -> Sequence[Any]:
-    """The value, if it is a list; None: an empty one.
-
-    :param value: what the user gave.
-    :param name: name of the setting, for the error.
-    :raises ConfigError: if it is none.
-    """
-    if value is None:
-        return ()
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise ConfigError(name, value, "a list of entries")
-    return value
-
-
 def _changeable(config: Changing) -> str:
     return ", ".join(spec.name for spec in settings_of(type(config)) if spec.changeable)
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch(Generic[_Config]):
+    """Slots with the same settings: from ``first`` up to, not including, ``end``; None: it lasts."""
+
+    first: int
+    end: int | None
+    config: _Config
+
+
+class Timeline(Generic[_Config]):
+    """Settings by slot, a pure function of the configuration and of the changes.
+
+    Entries of the schedule may overlap: the one that began last counts (of two that begin together, the later
+    in the list), and when it ends, what would have held without it. A change in flight holds from its slot
+    until the next change of the same setting, scheduled or not.
+
+    :param config: the settings with their schedule.
+    :raises ConfigError: when some slot would have settings that do not go together.
+    """
+
+    __slots__ = ("_base", "_changes", "_configs", "_slots")
+
+    def __init__(self, config: _Config) -> None:
+        self._base = config.changed({})
+        self._changes: list[Change] = []  # by slot, ascending
+        self._slots: list[int] = [0]  # slots at which settings change, ascending
+        self._configs: list[_Config] = [self._base]
+        for change in scheduled_changes(config):
+            self.add(change)
+
+    def add(self, change: Change) -> None:
+        """Add a change; one in the same slot as others comes last.
+
+        :raises ConfigError: when it, or a later change on top of it, leads to settings that do not go
+            together. Nothing is changed then.
+        """
+        at = bisect_right(self._changes, change.slot, key=lambda other: other.slot)
+        changes = [*self._changes[:at], change, *self._changes[at:]]
+        keep = next((i for i, slot in enumerate(self._slots) if slot >= change.slot), len(self._slots))
+        slots, configs = self._slots[:keep] or [0], self._configs[:keep] or [self._base]
+        for item in changes:
+            if item.slot < change.slot:
+                continue
+            config = configs[-1].changed(dict(item.values))
+            if item.slot == slots[-1]:
+                configs[-1] = config
+            else:
+                slots.append(item.slot)
+                configs.append(config)
+        self._changes, self._slots, self._configs = changes, slots, configs
+
+    def at(self, slot: int) -> Epoch[_Config]:
+        """Return the slots with the same settings to which a slot belongs."""
+        i = bisect_right(self._slots, slot) - 1
+        end = self._slots[i + 1] if i + 1 < len(self._slots) else None
+        return Epoch(self._slots[i], end, self._configs[i])
+
+
+def scheduled_changes(config: Changing) -> Iterable[Change]:
+    """Turn entries of the schedule, which may end, into changes that stay, at most one per slot."""
+    names = {name for entry in config.schedule for name, _ in entry.values}
+    edges = sorted({e.slot for e in config.schedule} | {e.until for e in config.schedule if e.until is not None})
+    before = {name: getattr(config, name) for name in names}
+    for edge in edges:
+        now = {name: getattr(config, name) for name in names}
+        begun = dict.fromkeys(names, -1)
+        for entry in config.schedule:
+            if entry.slot <= edge and (entry.until is None or edge < entry.until):
+                for name, value in entry.values:
+                    if entry.slot >= begun[name]:
+                        now[name], begun[name] = value, entry.slot
+        values = tuple((name, now[name]) for name in sorted(names) if now[name] != before[name])
+        before = now
+        if values:
+            yield Change(edge, values)

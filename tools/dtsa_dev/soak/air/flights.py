@@ -31,7 +31,7 @@ AGE_MARGIN, ERROR_MARGIN = 0.05, 0.15  # mean age and mean error may differ from
 _HELD = limits_of(SwarmConfig(agents=AGENTS, policy="lease"), NETWORK.peers).named
 _SECONDS = 12.0
 _FAULT_S = 3.0
-_APART = f"1-{AGENTS // 2} | {AGENTS // 2 + 1}-{AGENTS}"
+_APART = [list(range(1, AGENTS // 2 + 1)), list(range(AGENTS // 2 + 1, AGENTS + 1))]
 _ON_THE_AIR: dict[str, dict[str, Any]] = {"jam": {"jam": True}, "partition": {"partition": _APART}}
 _LINKS = Links(delay_ns=200_000, jitter_ns=500_000, double=0.1)
 #: What goes wrong in a flight, and what it does to it.

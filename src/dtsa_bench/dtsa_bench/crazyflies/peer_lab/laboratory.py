@@ -25,10 +25,9 @@ from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
 from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
 from dtsa_bench.crazyflies.simulated.world import TICK_S, World
-from dtsa_channel_sim.model.airtime import HEADER_BYTES
-from dtsa_channel_sim.model.lines import Lines
+from dtsa_channel_sim.model.air import Lines
+from dtsa_channel_sim.model.airtime import HEADER_BYTES, airtime_of
 from dtsa_channel_sim.model.medium import Mask, OnAir
-from dtsa_channel_sim.model.radio_table import airtime_of
 
 from .app import App, Order
 from .compiling import compile_app, engine_library, private_copy

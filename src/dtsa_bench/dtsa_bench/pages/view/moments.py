@@ -16,7 +16,7 @@ from dtsa_agent.core import REASONS, AbstractSwarm, Scenario
 from dtsa_bench.pages.report.json_values import flatten, pack
 from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim import Change, ChannelConfig
-from dtsa_channel_sim.model.timeline import scheduled_changes
+from dtsa_channel_sim.model.schedule import scheduled_changes
 
 PLACES_HZ = 20.0  # positions in a simulated second
 MOST_FRAMES = 4000  # frames told in one moment: of more than these the last

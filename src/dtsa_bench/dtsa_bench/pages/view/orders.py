@@ -49,5 +49,5 @@ def read_order(content: Any) -> Order:
             raise ConfigError("emergency", str(value)[:80], f"{SURE!r}, the second step")
         return Order(kind, value=SURE)
     if type(value) is not str or len(value) > _LONGEST:
-        raise ConfigError("partition", str(value)[:80], 'groups, as "1-6 | 7-12"')
+        raise ConfigError("partition", str(value)[:80], "groups of ids, as [[1, 2, 3], [4, 5, 6]]")
     return Order(kind, value=value)

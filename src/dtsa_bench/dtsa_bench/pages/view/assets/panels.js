@@ -72,7 +72,7 @@ export class Panels {
   orders(order) {
     const agent = el("select", {"aria-label": "agent"}, ...this.rows.map(row => el("option", {value: row.id}, `cf${row.id}`)));
     const loss = el("input", {type: "number", min: 0, max: 100, step: 1, value: 0, "aria-label": "loss in percent"});
-    const half = Math.floor(this.run.agents / 2), groups = half ? `1-${half} | ${half + 1}-${this.run.agents}` : "";
+    const half = Math.floor(this.run.agents / 2), ids = [...Array(this.run.agents).keys()].map(k => k + 1), groups = half ? JSON.stringify([ids.slice(0, half), ids.slice(half)]) : "";
     const partition = el("input", {type: "text", placeholder: groups, "aria-label": "groups of a partition", size: 16});
     const button = (text, content, name) => el("button", {type: "button", "data-order": name, onclick: () => order(content())}, text);
     return el("section", {class: "orders"}, el("h2", {}, "Control"),

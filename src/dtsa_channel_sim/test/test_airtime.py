@@ -5,8 +5,7 @@ from dtsa_agent.air.serial.lengths import HEADER, LONGEST
 from dtsa_agent.air.serial.modems import MODEMS
 from dtsa_agent.air.serial.settings import SerialSettings
 from dtsa_agent.core import SwarmConfig
-from dtsa_channel_sim.model.airtime import Airtime, Line
-from dtsa_channel_sim.model.radio_table import RADIOS, RadioRow, airtime_of
+from dtsa_channel_sim.model.airtime import RADIOS, Airtime, Line, RadioRow, airtime_of
 
 
 def test_a_line_of_one_megabaud_takes_ten_microseconds_a_byte():

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_simulated_air import Receiver
 
-from dtsa_channel_sim import Air, Channel, ChannelConfig, SimulatedAir
-from dtsa_channel_sim.model.radio_table import RADIOS
+from dtsa_channel_sim import Air, Channel, ChannelConfig
+from dtsa_channel_sim.model.airtime import RADIOS
 
 MS = 1_000_000
 AIRTIME = RADIOS["crazyflie"].airtime
@@ -84,7 +83,7 @@ def test_a_radio_holds_eight_receptions_and_loses_the_ninth():
 
     The senders do not hear each other, so none of them waits.
     """
-    deaf = {"from": "1-20", "to": "1-20", "loss": 1}
+    deaf = {"from": list(range(1, 21)), "to": list(range(1, 21)), "loss": 1}
     air, bits = line(agents=21, link_loss=[deaf]), AIRTIME.on_air_ns(56)
     for k in range(20):
         air.begin(k, k + 1, k * bits, 56)
@@ -164,18 +163,6 @@ def test_a_radio_that_waits_begins_and_is_sensed_later():
     assert not air.busy(3, begins - 1)
     assert air.busy(3, begins)
     assert [v.frame_id for v in air.settle(10 * MS)] == ["heard", "own"]
-
-
-def test_the_port_of_an_agent_tells_when_its_frame_really_began():
-    air = SimulatedAir(Channel(ChannelConfig(agents=3, radio="crazyflie")))
-    agents = [Receiver() for _ in range(3)]
-    ports = [air.join(k + 1, agent) for k, agent in enumerate(agents)]
-    ports[0].send(bytes(56), 0)
-    ports[1].send(bytes(20), TOTAL + 1000)
-    air.run(10 * MS)
-    assert agents[1].starts == [TOTAL + BACK]
-    assert [when for when, _ in agents[0].heard] == [TOTAL + BACK + AIRTIME.total_ns(20) + AIRTIME.from_radio_ns(20)]
-    assert [len(frame) for _, frame in agents[2].heard] == [56, 20]
 
 
 def test_what_a_crazyflie_cannot_send_is_refused():
