@@ -38,10 +38,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def waiting(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight whose radios are behind lines, with frames at random instants: many wait for a reception."""
+    """A flight whose radios are behind lines, in slots that lie apart: frames wait for a reception, or meet."""
     out = tmp_path_factory.mktemp("waiting") / "flight"
-    words = ("--agents", "6", "--policy", "pure-aloha", "--options", "pure-aloha.load=0.3", "--radio", "crazyflie")
-    fly(out, *words, "--processes", "2", "--seed", "9", "--mode", "realtime", "--timeout-s", "1.5", "--no-picture")
+    words = ("--agents", "6", "--policy", "aloha", "--radio", "crazyflie", "--clock-offset-ns", "2000000", "--no-align")
+    fly(out, *words, "--processes", "2", "--seed", "9", "--mode", "realtime", "--timeout-s", "3", "--no-picture")
     return out
 
 

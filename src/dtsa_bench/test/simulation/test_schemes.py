@@ -401,11 +401,11 @@ def test_nodes_refuse_what_nodes_cannot_do() -> None:
         with pytest.raises(ConfigError, match="policy"):
             check_options(RunConfig(swarm=SwarmConfig(agents=4, policy=policy), mode=mode), options)
     check_options(RunConfig(swarm=SwarmConfig(agents=4, policy="genie-age")), FlightOptions(processes=1))
-    with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: one with slots in live flights"):
+    with pytest.raises(ConfigError, match="policy: got 'pure-aloha'; allowed: a policy with slots"):
         AgentGroup(make_swarm(SwarmConfig(agents=4, policy="pure-aloha")))
     mission = RunConfig(swarm=SwarmConfig(agents=4, policy="beacons"), mode="realtime")
     settings = SwarmSettings((), StationSettings())
-    with pytest.raises(ConfigError, match="policy: got 'beacons'; allowed: one with slots in live flights"):
+    with pytest.raises(ConfigError, match="policy: got 'beacons'; allowed: a policy with slots"):
         fly_crazyflies(mission, settings, Path("swarm.yaml"), Path("out"), FlightOptions(), Stop())
     with pytest.raises(ConfigError, match="policy"):
         make_swarm(SwarmConfig(agents=4, policy="genie-age"), local=[1, 2])

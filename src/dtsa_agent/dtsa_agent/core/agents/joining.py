@@ -21,9 +21,7 @@ def check_slotted(policy: str) -> None:
     :raises ConfigError: if it is one.
     """
     if POLICIES.row(policy).unslotted:
-        raise ConfigError(
-            "policy", policy, "one with slots in live flights; those without slots only simulate and sweep"
-        )
+        raise ConfigError("policy", policy, "a policy with slots; those without fly in simulate and sweep only")
 
 
 def check_joinable(policy: str) -> None:
