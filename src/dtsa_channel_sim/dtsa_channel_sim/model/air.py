@@ -41,24 +41,15 @@ class Media(Protocol):
 class FrameVerdict(Generic[Key]):
     """What became of one frame."""
 
-    frame_id: Key
-    """What the caller calls the frame."""
-    sender: int
-    """Id of the sender."""
-    slot: int
-    """Slot of the channel's clock in which the transmission started."""
-    start_ns: int
-    """Start of the transmission, ns from the start of slot 0 by the channel's clock: when the radio began."""
-    end_ns: int
-    """End of the last bit, same clock."""
-    arrival_ns: int
-    """When the last of the receivers' flight processors has it, same clock."""
-    received: Mask
-    """(N,): agent with id index + 1 received it."""
-    lost: int
-    """Receivers in reach that lost it to noise or jamming, or whose radios had no room for it."""
-    collided: int
-    """Receivers in reach where it collided, or that were sending themselves."""
+    frame_id: Key  # what the caller calls the frame
+    sender: int  # id
+    slot: int  # of the channel's clock, in which the transmission started
+    start_ns: int  # when the radio began to send, ns from the start of slot 0 by the channel's clock
+    end_ns: int  # end of the last bit, same clock
+    arrival_ns: int  # when the last of the receivers' flight processors has it, same clock
+    received: Mask  # (N,) agent with id index + 1 received it
+    lost: int  # receivers in reach that lost it to noise or jamming, or whose radios had no room for it
+    collided: int  # receivers in reach where it collided, or that were sending themselves
 
 
 class Lines:
@@ -123,11 +114,12 @@ class Air(Generic[Key]):
     behind serial lines (:class:`Lines`) starts depend on what was received before, so all goes by the order of
     times: ends of transmissions before starts at the same instant.
 
-    :param channel: the medium by slot.
+    Times are ns from the start of slot 0 by the channel's clock; positions are (3, N), m, frame map, and needed with a
+    limited range or capture.
     """
 
     __slots__ = (
-        "_airtime", "_asked", "_begun", "_by_end", "_by_start", "_channel", "_count", "_ids", "_lines", "_longest_ns",
+        "_airtime", "_asked", "_by_end", "_by_start", "_channel", "_count", "_ids", "_lines", "_longest_ns",
         "_near", "_settled", "_settled_ns", "late",
     )  # fmt: skip
 
@@ -137,7 +129,6 @@ class Air(Generic[Key]):
         self._longest_ns = airtime.total_ns(airtime.longest)
         self._lines = Lines(airtime, channel.config.agents) if airtime.line.serial else None
         self._asked: list[tuple[int, int, int, int, Key]] = []  # with lines, what no radio has begun to send: a heap
-        self._begun: dict[Key, int] = {}  # with lines, when those that have no verdict yet began
         self._settled: list[FrameVerdict[Key]] = []  # verdicts that have not been asked for yet
         self._count = 0  # makes entries of the heaps differ: keys need no order
         self._by_end: list[tuple[int, int, int, int, OnAir, int, Key]] = []  # not settled yet: a heap
@@ -160,14 +151,10 @@ class Air(Generic[Key]):
         return min(end_ns, self._asked[0][0] + 1 if self._asked else NEVER)
 
     def begin(self, frame_id: Key, sender: int, start_ns: int, length: int) -> bool:
-        """Hand in one transmission; False when it is too late for it: it is dropped then, and counted.
+        """Hand in a transmission of some bytes; False when it is too late for it: it is dropped then, and counted.
 
         A radio that is at work when it has the frame begins later.
 
-        :param frame_id: anything that tells frames apart until they are settled.
-        :param sender: id of the sender, 1 to N.
-        :param start_ns: start of the transmission, ns from the start of slot 0 by the channel's clock.
-        :param length: bytes, 1 to as many as the radio takes.
         :raises LocalProtocolError: for an id that is not the swarm's, a frame handed in twice, or an
             impossible length.
         """
@@ -189,26 +176,11 @@ class Air(Generic[Key]):
             heappush(self._asked, (start_ns, sender, self._count, length, frame_id))
         return True
 
-    def begun_ns(self, frame_id: Key, asked_ns: int, positions: Positions | None = None) -> int:
-        """Return when a radio begins to send a frame, ns, as soon as it has it.
-
-        :param frame_id: the frame, which is pending.
-        :param asked_ns: ns, for when it was handed in; all that begins before has been handed in.
-        :param positions: (3, N), m, frame map; needed with a limited range or capture.
-        """
-        if self._lines is None:
-            return asked_ns
-        self._run(asked_ns, asked_ns + 1, positions)
-        return self._begun[frame_id]
-
     def busy(self, receiver: int, when_ns: int, positions: Positions | None = None) -> bool:
         """Return whether an agent's radio finds the air busy, or cannot listen because it sends itself.
 
         A transmission that is still turning to sending is not sensed yet: two that begin within that time collide.
 
-        :param receiver: id of the agent.
-        :param when_ns: ns, same clock; not before what has been settled. What begins before it has been handed in.
-        :param positions: (3, N), m, frame map; needed with a limited range or capture.
         :raises LocalProtocolError: for a time that has been settled already.
         """
         if when_ns < self._settled_ns:
@@ -222,10 +194,8 @@ class Air(Generic[Key]):
     def settle(self, until_ns: int, positions: Positions | None = None) -> list[FrameVerdict[Key]]:
         """Return the verdicts on all frames that have left the air by a time, in the order of their ends.
 
-        The result does not depend on the order in which frames were handed in, nor on how often this is called.
-
-        :param until_ns: every frame that starts before this has been handed in; ns from the start of slot 0.
-        :param positions: (3, N), m, frame map; needed with a limited range or capture.
+        Every frame that starts before it has been handed in. The result does not depend on the order in which frames
+        were handed in, nor on how often this is called.
         """
         self._settled_ns = max(self._settled_ns, until_ns)
         self._run(until_ns, until_ns, positions)
@@ -244,7 +214,7 @@ class Air(Generic[Key]):
                     return
                 at_ns, sender, count, length, frame_id = heappop(asked)
                 assert self._lines is not None
-                start_ns = self._begun[frame_id] = self._lines.start_ns(sender, at_ns, length)
+                start_ns = self._lines.start_ns(sender, at_ns, length)
                 self._lay(sender, start_ns, count, length, frame_id)
             elif end_ns <= until_ns:
                 *_, frame, length, frame_id = heappop(by_end)
@@ -281,7 +251,6 @@ class Air(Generic[Key]):
         received, lost, collided = self._channel.medium(slot).judge(slot, frame, others, positions)
         arrival_ns = frame.end_ns + self._airtime.from_radio_ns(length)
         if self._lines is not None:
-            del self._begun[frame_id]
             reached = int(np.count_nonzero(received))
             received, arrival_ns = self._lines.receive(frame.end_ns, length, received)
             lost += reached - int(np.count_nonzero(received))

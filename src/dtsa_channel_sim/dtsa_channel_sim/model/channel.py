@@ -33,7 +33,7 @@ class Channel:
     """
 
     __slots__ = (
-        "_airtime", "_alone", "_changes", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near",
+        "_airtime", "_alone", "_end", "_first", "_idle", "_last", "_losses", "_medium", "_near",
         "_plain", "_shared", "_simple", "_source", "_spills", "_timeline", "config",
     )  # fmt: skip
 
@@ -42,7 +42,6 @@ class Channel:
         self._timeline = Timeline(config)
         self._source = NoiseSource(config.seed, config.agents)
         self._airtime = config.airtime
-        self._changes: list[Change] = []
         self._near: list[OnAir] = []  # of the slots before, what outlasts them
         self._last = -1
         # A frame sent at the slot's start may be longer than the slot.
@@ -50,20 +49,6 @@ class Channel:
         self._idle = Verdict(IDLE, (), None, None, None)
         self._alone = {i: Verdict(SUCCESS, (i,), None, None, None) for i in range(1, config.agents + 1)}
         self._use(0)
-
-    @property
-    def changes(self) -> tuple[Change, ...]:
-        """All changes made by :meth:`set`, in the order they were made."""
-        return tuple(self._changes)
-
-    @property
-    def settings(self) -> ChannelConfig:
-        """Settings that hold in the slot after the last one arbitrated."""
-        return self.settings_at(self._last + 1)
-
-    def settings_at(self, slot: int) -> ChannelConfig:
-        """Return the settings that hold in a slot (their schedule is empty: it is worked in)."""
-        return self._timeline.at(slot).config
 
     def set(self, *, slot: int | None = None, **values: Any) -> Change:
         """Change settings while the channel runs; return the change, to be recorded and made again.
@@ -82,7 +67,6 @@ class Channel:
         now = self._timeline.at(slot).config.changed(values)
         change = Change(slot, tuple((name, getattr(now, name)) for name in values))
         self._timeline.add(change)
-        self._changes.append(change)
         self._end = self._first  # look the settings up again
         return change
 

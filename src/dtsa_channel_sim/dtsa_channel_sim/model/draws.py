@@ -25,10 +25,7 @@ _KEPT_BLOCKS = 8
 
 
 def threshold(probability: float | NDArray[np.float64]) -> NDArray[np.uint64]:
-    """Return the number t for which a word is below t with the given probability; 0 and 1 are exact.
-
-    :param probability: scalar or array, 0 to 1.
-    """
+    """Return the number t for which a word is below t with the given probability; 0 and 1 are exact."""
     p = np.asarray(probability, dtype=np.float64)
     # 2^64 does not fit; the largest double below 1 times 2^64 does.
     scaled = np.minimum(p, 1.0 - 2.0**-53) * 2.0**64
@@ -41,12 +38,7 @@ def generator(seed: int, *key: int) -> np.random.Generator:
 
 
 def sender_factors(seed: int, stream: int, agents: int) -> list[np.uint64]:
-    """Return one odd 64-bit constant per sender, indexed by id (index 0 is not used).
-
-    :param seed: seed of all losses.
-    :param stream: number of what is drawn.
-    :param agents: number of agents.
-    """
+    """Return one odd 64-bit constant per sender, indexed by id (index 0 is not used)."""
     bits = generator(seed, stream, _FACTORS).bit_generator.random_raw(agents + 1)
     return [np.uint64(int(word) | 1) for word in bits]
 
@@ -87,10 +79,7 @@ class WordBlocks:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def block(self, number: int) -> Words:
-        """Return all words of a block, (rows, N).
-
-        :param number: of the block, from 0.
-        """
+        """Return all words of a block, (rows, N)."""
         block = self._blocks.get(number)
         if block is None:
             # Raw output: NumPy keeps it the same from version to version, other than that of its

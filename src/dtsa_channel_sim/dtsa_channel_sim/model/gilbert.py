@@ -41,13 +41,9 @@ class GilbertElliott:
     def from_means(cls, loss: float, burst_length: float, p_good: float = 0.0, p_bad: float = 1.0) -> GilbertElliott:
         """Return the chain with a given mean loss and mean length of its bad phases.
 
-        share = (loss - p_good) / (p_bad - p_good), r = 1 / burst_length, p = r share / (1 - share).
+        share = (loss - p_good) / (p_bad - p_good), r = 1 / burst_length, p = r share / (1 - share). The length is at
+        least 1 / (1 - share), the length of the runs that independent losses have.
 
-        :param loss: mean share of frames lost, from p_good to p_bad.
-        :param burst_length: mean length of a bad phase, slots; at least 1 / (1 - share), the length of the
-            runs that independent losses have.
-        :param p_good: share of frames lost in the good state, 0 to 1.
-        :param p_bad: share of frames lost in the bad state, more than p_good, up to 1.
         :raises ConfigError: when no such chain exists.
         """
         if p_bad <= p_good:
@@ -83,10 +79,7 @@ class _Limits(NamedTuple):
 class Chains:
     """States of the chains of all receivers, or of all links, begun at slot 0 in their long-run mixture.
 
-    :param model: the numbers of the chains.
-    :param words: the words that drive it.
-    :param factors: one constant per sender, indexed by id: makes the words of its links from those of the
-        receivers.
+    ``factors`` has one constant per sender, indexed by id: it makes the words of its links from those of the receivers.
     """
 
     __slots__ = ("_block", "_end", "_factors", "_first", "_known", "_limits", "_step", "_words")

@@ -18,11 +18,7 @@ Thresholds = Sequence[NDArray[np.uint64]]
 
 
 class NoiseSource:
-    """The random numbers of a channel: the same for all settings that it goes through.
-
-    :param seed: seed of the channel.
-    :param agents: number of agents N.
-    """
+    """The random numbers of a channel: the same for all settings that it goes through."""
 
     __slots__ = ("factors", "state_factors", "state_words", "words")
 
@@ -38,9 +34,6 @@ class Losses:
 
     Noise, the loss of a link and a loss that was measured are independent causes:
     P(received) = (1 - loss) (1 - link loss) (1 - measured loss).
-
-    :param config: the settings.
-    :param source: the random numbers.
     """
 
     __slots__ = ("_bad", "_certain", "_chains", "_good", "_per_link", "_source", "none")
@@ -70,11 +63,7 @@ class Losses:
         self._certain = measured is None and config.p_good == 0.0 and config.p_bad == 1.0 and links is None
 
     def lost(self, slot: int, sender: int) -> Mask:
-        """Return who would lose a frame to noise, (1, N); the sender's own entry has no meaning.
-
-        :param slot: the slot in which the frame is sent.
-        :param sender: id of the sender.
-        """
+        """Return who would lose a frame to noise, (1, N); the sender's own entry has no meaning."""
         if self._chains is None:
             return self._source.words.row(slot) * self._source.factors[sender] < self._good[sender]
         bad = self._chains.links(slot, sender) if self._per_link else self._chains.receivers(slot)

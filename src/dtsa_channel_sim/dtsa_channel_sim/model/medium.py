@@ -29,24 +29,14 @@ _NO_POWER = np.zeros(0)
 class OnAir(NamedTuple):
     """One transmission on the channel's time line."""
 
-    sender: int
-    """Id of the sender."""
-    start_ns: int
-    """The sender turns to sending, and stops hearing."""
-    air_ns: int
-    """The first bit is on air."""
-    end_ns: int
-    """The last bit has left; the sender hears again."""
+    sender: int  # id
+    start_ns: int  # the sender turns to sending, and stops hearing
+    air_ns: int  # the first bit is on air
+    end_ns: int  # the last bit has left; the sender hears again
 
     @classmethod
     def of(cls, airtime: Airtime, sender: int, start_ns: int, length: int) -> OnAir:
-        """The transmission of a frame.
-
-        :param airtime: times of the radio.
-        :param sender: id of the sender.
-        :param start_ns: ns, when the sender turns to sending.
-        :param length: bytes of the frame.
-        """
+        """The transmission of a frame of some bytes; its sender turns to sending at ``start_ns``."""
         return cls(sender, start_ns, start_ns + airtime.ramp_up_ns, start_ns + airtime.total_ns(length))
 
     def overlaps(self, other: OnAir) -> bool:
@@ -61,19 +51,15 @@ class OnAir(NamedTuple):
 class Reception(NamedTuple):
     """What became of one transmission at all receivers."""
 
-    received: Mask
-    """(N,): agent with id index + 1 received it."""
-    lost: int
-    """Receivers in reach that lost it to noise or jamming."""
-    collided: int
-    """Receivers in reach where it collided, or that were sending themselves."""
+    received: Mask  # (N,) agent with id index + 1 received it
+    lost: int  # receivers in reach that lost it to noise or jamming
+    collided: int  # receivers in reach where it collided, or that were sending themselves
 
 
 class Medium:
     """Who receives what, under one set of settings.
 
-    :param config: the settings.
-    :param source: the random numbers of the channel; None: those of the settings' seed.
+    Positions are (3, N), m, frame map; needed for range and capture only.
     """
 
     __slots__ = (
@@ -97,12 +83,8 @@ class Medium:
         self.everywhere = not self.needs_positions and self._groups is None
 
     def judge(self, slot: int, frame: OnAir, others: Sequence[OnAir], positions: Positions | None = None) -> Reception:
-        """Return what became of one transmission among others.
+        """Return what became of one transmission among others that may overlap it, by the random numbers of a slot.
 
-        :param slot: slot whose random numbers count.
-        :param frame: the transmission in question.
-        :param others: transmissions that may overlap it.
-        :param positions: (3, N), m, frame map; needed for range and capture only.
         :raises LocalProtocolError: when positions are needed and missing.
         """
         clear, collided = self._undisturbed(frame, others, positions)
@@ -122,11 +104,6 @@ class Medium:
         """Return whether a radio that listens finds the air busy with a transmission.
 
         A radio that sends itself, or turns to sending, cannot listen: its air is busy.
-
-        :param receiver: id of the agent that listens.
-        :param when_ns: ns, when.
-        :param frame: the transmission.
-        :param positions: (3, N), m, frame map; needed for range and capture only.
         """
         if frame.sender == receiver:
             return frame.start_ns <= when_ns < frame.end_ns

@@ -7,14 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-#: Nobody sent.
-IDLE = 0
-#: One frame, or several that disturbed nobody.
-SUCCESS = 1
-#: Frames destroyed each other at one receiver or more.
-COLLISION = 2
-#: Names of the outcomes, indexed by their number.
-OUTCOMES = ("idle", "success", "collision")
+#: Outcomes: nobody sent; one frame, or several that disturbed nobody; frames destroyed each other somewhere.
+IDLE, SUCCESS, COLLISION = range(3)
+OUTCOMES = ("idle", "success", "collision")  # their names
 
 
 class Verdict(NamedTuple):
@@ -24,22 +19,14 @@ class Verdict(NamedTuple):
     jammer is a SUCCESS with ``lost`` counting all of them.
     """
 
-    outcome: int
-    """IDLE, SUCCESS or COLLISION, the numbers of dtsa_msgs/Reception."""
-    senders: tuple[int, ...]
-    """Ids of all agents that sent, in the order given."""
-    received: NDArray[np.bool_] | None
-    """(F, N): frame f reached the agent with id column + 1. None: everybody but the sender has all."""
-    lost: tuple[int, ...] | None
-    """Per frame: receivers in reach that lost it to noise or jamming. None: none."""
-    collided: tuple[int, ...] | None
-    """Per frame: receivers in reach where it collided or that were sending themselves. None: none."""
+    outcome: int  # IDLE, SUCCESS or COLLISION, the numbers of dtsa_msgs/Reception
+    senders: tuple[int, ...]  # ids of all agents that sent, in the order given
+    received: NDArray[np.bool_] | None  # (F, N) frame f reached agent column + 1; None: all but the sender have all
+    lost: tuple[int, ...] | None  # per frame: receivers in reach that lost it to noise or jamming; None: none
+    collided: tuple[int, ...] | None  # per frame: receivers where it collided or that were sending; None: none
 
     def mask(self, agents: int) -> NDArray[np.bool_]:
-        """Return ``received`` written out, (F, N), also where it is None.
-
-        :param agents: number of agents N.
-        """
+        """Return ``received`` written out, (F, N), also where it is None."""
         if self.received is not None:
             return self.received
         mask = np.ones((len(self.senders), agents), dtype=np.bool_)

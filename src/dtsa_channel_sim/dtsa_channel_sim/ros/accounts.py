@@ -30,12 +30,7 @@ class Delivered(NamedTuple):
 
 
 class Accounts:
-    """One account a slot, filled by reports.
-
-    :param agents: number of agents N.
-    :param steps: control instants in a slot.
-    :param keep: slots for which frames are kept, for agents that say late that they took them in.
-    """
+    """One account a slot, filled by reports; frames are kept for ``keep`` slots, for agents that report late."""
 
     def __init__(self, agents: int, steps: int, keep: int) -> None:
         self.agents, self._steps, self._keep = agents, steps, keep
@@ -59,28 +54,17 @@ class Accounts:
         return None if book is None else book.silent
 
     def last_place(self, agent: int) -> NDArray[np.float64] | None:
-        """Where an agent has reported to be last, (3,) m; None: in no slot yet.
-
-        :param agent: its id.
-        """
+        """Where an agent has reported to be last, (3,) m; None: in no slot yet."""
         reported = [slot for slot, book in self._open.items() if book.answered[agent - 1]]
         return self._open[max(reported)].position[:, agent - 1] if reported else None
 
     def deliver(self, slot: int, sender: int, delivered: Delivered) -> None:
-        """A frame has been sent to its receivers.
-
-        :param slot: as its sender counts.
-        :param sender: its id.
-        :param delivered: the frame, and to whom.
-        """
+        """A frame has been sent to its receivers."""
         self._delivered[slot, sender] = delivered
 
     def add(self, message: ReportFields, latest: int) -> int:
-        """Takes in a report.
+        """Add a report; return its last slot that is still open, -1: none. No slot after ``latest`` can have begun.
 
-        :param message: its fields.
-        :param latest: no slot after this one can have begun.
-        :returns: its last slot that is still open; -1: none.
         :raises Unusable: if its fields do not fit together.
         """
         at, count = self._where(message.agent), len(message.agent)
@@ -126,10 +110,7 @@ class Accounts:
             taken.at_ns[at] = np.where(mask & found.received[at], max(0, at_ns), taken.at_ns[at])
 
     def close(self, slot: int) -> None:
-        """A slot is over: its account and what is too old is forgotten.
-
-        :param slot: the slot.
-        """
+        """A slot is over: its account and what is too old is forgotten."""
         self._closed = slot
         self._open.pop(slot, None)
         self._taken_in.pop(slot, None)

@@ -37,11 +37,7 @@ class TakenIn:
 
 
 class Answers:
-    """One entry an agent; vectors are planes of N.
-
-    :param agents: number of agents N.
-    :param steps: control instants in a slot, S.
-    """
+    """One entry for each of N agents, with S control instants (``steps``) a slot; vectors are planes of N."""
 
     def __init__(self, agents: int, steps: int) -> None:
         self.agents, self.steps = agents, steps
@@ -89,10 +85,8 @@ class Answers:
         self.frames = {}
 
     def add(self, message: TransmissionFields | Transmission) -> bool:
-        """Takes in one transmission message.
+        """Add one transmission message; return False if its agents have answered already: nothing is changed then.
 
-        :param message: its fields, or a message whose fields may not fit together.
-        :returns: False if its agents have answered already (a message sent twice); nothing is changed then.
         :raises Unusable: if its fields do not fit together, naming the agents as far as it does.
         """
         count, at = self._where(message.agent)
@@ -133,13 +127,9 @@ class Answers:
         return True
 
     def put(self, at: Any, count: int, offset_ns: Any, motion: Sequence[Array], **decided: Any) -> None:
-        """Takes in what some agents have reported, in real time; it has been checked.
+        """Add what agents have reported in real time, checked: start of their slots or transmissions, motion, decision.
 
-        :param at: their indices.
-        :param count: number of agents.
-        :param offset_ns: (n,) ns, start of each agent's slot or transmission, from the channel's start of the slot.
-        :param motion: track (m), velocity, command (m/s) and goal (m) of these agents, as in a report.
-        :param decided: chosen, reason, digest and score.
+        Their indices are ``at``; motion is track (m), velocity, command (m/s) and goal (m), as in a report.
         """
         track, velocity, command, goal = motion
         self.track[:, :, at] = track.reshape(self.steps, 3, count)
@@ -186,10 +176,7 @@ class Answers:
         return Unusable(reason, f"{named(message.agent)} sent an unusable answer: {detail}")
 
     def carry(self, before: Answers) -> None:
-        """Takes over from the slot before what nobody has told about this one: who is silent stays where it was.
-
-        :param before: the slot before.
-        """
+        """Takes over from the slot before what nobody has told about this one: who is silent stays where it was."""
         gone = ~self.answered
         if gone.any():
             self.track[:, :, gone] = before.position[:, gone]

@@ -13,11 +13,7 @@ _RETURN_SLOTS = 10  # a report for a slot that much after its agent was given up
 
 
 class Attendance:
-    """Keeps the ids of those that are lost. Times are ns from the start of slot 0.
-
-    :param agents: number of agents.
-    :param lost: ids of those that are lost; changed here.
-    """
+    """Keeps the ids of lost agents in ``lost``. Times are ns from the start of slot 0; agents are ids."""
 
     def __init__(self, agents: int, lost: set[int]) -> None:
         self._lost = lost
@@ -30,18 +26,11 @@ class Attendance:
         self._heard_ns[:] = 0
 
     def expect_later(self, agent: int) -> None:
-        """An agent that is lost because it comes later may come from slot 0 on.
-
-        :param agent: its id.
-        """
+        """An agent that is lost because it comes later may come from slot 0 on."""
         self._given_up[agent] = -_RETURN_SLOTS
 
     def lose(self, agent: int, slot: int) -> bool:
-        """Takes note that an agent is gone; whether that is new.
-
-        :param agent: its id.
-        :param slot: number of the present slot.
-        """
+        """Note in the present slot that an agent is gone; return whether that is new."""
         if agent in self._lost:
             return False
         self._lost.add(agent)
@@ -50,28 +39,16 @@ class Attendance:
         return True
 
     def hear(self, agents: Iterable[int], now: int) -> None:
-        """Agents were heard.
-
-        :param agents: their ids.
-        :param now: ns.
-        """
+        """Agents were heard."""
         index = np.fromiter(agents, dtype=np.intp) - 1
         self._heard_ns[index] = np.maximum(self._heard_ns[index], now)
 
     def excuse(self, stalled_ns: int, until_ns: int) -> None:
-        """The channel has stood still: silence of that time counts for no agent.
-
-        :param stalled_ns: ns, for how long.
-        :param until_ns: ns, when all that was sent meanwhile should have come.
-        """
+        """The channel has stood still: silence until then counts for no agent."""
         self._heard_ns[:] = np.maximum(self._heard_ns + stalled_ns, until_ns)
 
     def back(self, slot: int, answered: NDArray[np.bool_]) -> list[int]:
-        """Ids of those that were lost and have reported for a slot; they are not lost any more.
-
-        :param slot: number of the slot.
-        :param answered: (N,) who has reported for it.
-        """
+        """Ids of those that were lost and have reported for a slot; they are not lost any more."""
         again = [a for a in sorted(self._lost) if answered[a - 1] and slot > self._given_up[a] + _RETURN_SLOTS]
         self._lost.difference_update(again)
         self.returned.update(again)
@@ -81,8 +58,6 @@ class Attendance:
         """Which of some agents are to be taken for lost.
 
         They are compared with the others: if nobody is heard, it may be the channel that got no time.
-
-        :param agents: ids of those that have not reported.
         """
         newest = int(self._heard_ns.max())
         return [agent for agent in agents if newest - self._heard_ns[agent - 1] > LOST_AFTER_S * _NS]

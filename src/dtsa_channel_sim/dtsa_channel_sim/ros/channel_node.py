@@ -6,6 +6,7 @@ dtsa_bench adds the recording, the metrics and the end of a flight.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,34 +30,27 @@ from dtsa_channel_sim.model.config import CHANGEABLE, ChannelConfig
 from dtsa_channel_sim.model.schedule import Change
 
 from .answer_limits import AnswerLimits
-from .diagnostics import Diagnostics
 from .lockstep import LockstepChannel
 from .observer import SlotLimit
 from .realtime_channel import RealtimeChannel
 from .ros_channel import RosChannel
-from .run_log import RunLog
-from .run_topics import RunTopics
-from .transforms import Transforms
+from .run_topics import Diagnostics, RunLog, RunTopics, Transforms
 
 
 def declare_channel(node: Node, config: ChannelConfig | None = None) -> dict[str, Any]:
-    """Declares the channel's settings as parameters and reads them.
+    """Declare the channel's settings as parameters, with those of ``config`` as defaults, and read them.
 
-    :param node: the node.
-    :param config: settings that are the parameters' defaults.
     :raises ConfigError: for values that are not allowed.
     """
-    defaults = {} if config is None else {**config.to_dict(), "losses": str(config.losses)}  # their name
+    defaults = {}
+    if config is not None:  # parameters are texts: the name of the losses, the groups as JSON
+        groups = json.dumps(config.groups) if config.groups else ""
+        defaults = {**config.to_dict(), "losses": str(config.losses), "partition": groups}
     return declare_settings(node, ChannelConfig, changeable=True, defaults=defaults)
 
 
 def follow_parameters(node: Node, channel: Channel, changed: Callable[[Change], None] | None = None) -> None:
-    """Lets ``ros2 param set`` change the channel in flight, from the next slot on.
-
-    :param node: the node, with the parameters of :func:`declare_channel`.
-    :param channel: the channel.
-    :param changed: is told each change.
-    """
+    """Let ``ros2 param set`` change the channel in flight, from the next slot on; ``changed`` is told each change."""
     known = {setting.name: setting for setting in settings_of(ChannelConfig) if setting.name in CHANGEABLE}
 
     def apply(parameters: list[Parameter]) -> SetParametersResult:
@@ -90,13 +84,7 @@ class ChannelNodeSettings(AnswerLimits):
 
 
 def watch(channel: RosChannel, node: Node, settings: Mapping[str, Any], space: str) -> None:
-    """Lets everybody on the graph know how a run is doing: topics, diagnostics, transforms, the log.
-
-    :param channel: the channel.
-    :param node: its node.
-    :param settings: the settings of the run by section.
-    :param space: namespace of the swarm's topics.
-    """
+    """Tell the graph how a run is doing: topics in the swarm's namespace, diagnostics, transforms, the log."""
     lockstep = isinstance(channel, LockstepChannel)
     channel.observe(
         RunLog(node, channel.run_id, lockstep),

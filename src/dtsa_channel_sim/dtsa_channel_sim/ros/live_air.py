@@ -22,7 +22,7 @@ _BEFORE = -(2**63)  # ns
 class LiveAir:
     """One time line of frames: time is settled a little behind the clock, when all handed over in time is known.
 
-    :param channel: the medium.
+    Times are ns from the start of slot 0, positions (3, N), m, frame map.
     """
 
     def __init__(self, channel: Channel) -> None:
@@ -47,7 +47,7 @@ class LiveAir:
         return key in self._frames
 
     def hand_over(self, key: Sent, start_ns: int, data: bytes) -> bool:
-        """Put a frame on the air at ``start_ns``, ns from the start of slot 0; False: it came too late."""
+        """Put a frame on the air at ``start_ns``; False: it came too late."""
         if not self.air.begin(key, key[1], start_ns, len(data)):
             self.late += 1
             return False
@@ -55,11 +55,7 @@ class LiveAir:
         return True
 
     def settle(self, now: int, positions: Positions) -> list[FrameVerdict[Sent]]:
-        """The verdicts on all frames that have arrived.
-
-        :param now: ns from the start of slot 0.
-        :param positions: (3, N), m, frame map.
-        """
+        """The verdicts on all frames that have arrived."""
         ripe, late = now - self.hold_ns, now - max(self.hold_ns, self._window_ns)
         while (due := self.air.due_ns) <= ripe:
             self._settle(due, positions)
@@ -78,10 +74,7 @@ class LiveAir:
             heappush(self._arriving, (verdict.arrival_ns, self._count, verdict))
 
     def frame(self, key: Sent) -> bytes:
-        """The bytes of a frame that is or was on the air.
-
-        :param key: the frame.
-        """
+        """The bytes of a frame that is or was on the air."""
         return self._frames[key]
 
     def forget(self, key: Sent) -> bytes:
@@ -89,20 +82,13 @@ class LiveAir:
         return self._frames.pop(key)
 
     def spare_ns(self, now: int, most_ns: int) -> int:
-        """For how long there is nothing to do, ns.
-
-        :param now: ns from the start of slot 0.
-        :param most_ns: ns, at most.
-        """
+        """For how long there is nothing to do, ns, at most ``most_ns``."""
         arrival = self._arriving[0][0] if self._arriving else NEVER
         return min(max(0, min(self.air.due_ns + self.hold_ns, arrival) - now), most_ns)
 
 
 def slot_verdict(settled: Sequence[FrameVerdict[Sent]]) -> Verdict:
-    """What the air did in a slot, frame by frame.
-
-    :param settled: the verdicts on its frames.
-    """
+    """What the air did in a slot, frame by frame."""
     if not settled:
         return Verdict(IDLE, (), None, None, None)
     return Verdict(

@@ -31,11 +31,7 @@ _GARBAGE_PATIENCE_S = 0.5
 class LockstepChannel(RosChannel):
     """Slot clock and medium of a swarm whose agents wait for each other.
 
-    :param node: the ROS node.
-    :param channel: the medium.
-    :param steps: control instants in a slot.
     :param answer_s: s of wall time that all agents have to answer any slot but the first.
-    :param more: as for :class:`RosChannel`.
     """
 
     def __init__(self, node: Node, channel: Channel, steps: int, answer_s: float = 10.0, **more: Any) -> None:
@@ -47,7 +43,6 @@ class LockstepChannel(RosChannel):
     def _run(self, stop: object) -> None:
         """Runs slot after slot until the run is over or ``stop`` is true. The agents are told to end.
 
-        :param stop: looked at in every slot, true once a signal has come.
         :raises LocalProtocolError: when an agent does not answer in time.
         :raises RemoteProtocolError: when an agent sends unusable messages only.
         :raises ConfigError: before slot 0, when nodes do not fit together.

@@ -11,10 +11,7 @@ _BEHIND_NS, _TOO_LONG_NS = 1 * _NS, 8 * _NS  # who is that far behind for that l
 
 
 class Pace:
-    """Follows the passes of the channel's loop.
-
-    :param slot_ns: ns, length of a slot.
-    """
+    """Follows the passes of the channel's loop. Times are ns from the start of slot 0."""
 
     def __init__(self, slot_ns: int) -> None:
         self._stall_ns = max(_STALL_SLOTS * slot_ns, _STALL_NS)
@@ -26,10 +23,7 @@ class Pace:
         self._behind_since_ns: int | None = None
 
     def passed(self, now_ns: int) -> int:
-        """The next pass begins; for how long the channel stood still before it, ns, 0 if it did not.
-
-        :param now_ns: ns from the start of slot 0.
-        """
+        """The next pass begins; for how long the channel stood still before it, ns, 0 if it did not."""
         gap, begun = now_ns - self._last_ns, self._last_ns
         self._last_ns = now_ns
         if gap < self._stall_ns:
@@ -41,11 +35,7 @@ class Pace:
         return gap
 
     def falls_behind(self, now_ns: int, done_ns: int) -> bool:
-        """Whether the run is so far behind for so long that it will not catch up.
-
-        :param now_ns: ns from the start of slot 0.
-        :param done_ns: ns from the start of slot 0: when a run that keeps up has come as far as this one at the latest.
-        """
+        """Whether a run that should have come to ``done_ns`` by now is too far behind for too long to catch up."""
         if now_ns - done_ns < _BEHIND_NS:
             self._behind_since_ns = None
             return False

@@ -58,13 +58,6 @@ class RealtimeChannel(RosChannel):
     Slots are the channel's own. An agent that falls silent is missed, but nobody waits for it. Frames come apart from
     all else and are dealt with first; what the agents report fills an account of each slot, in which frames are long
     delivered.
-
-    :param node: the ROS node.
-    :param channel: the medium.
-    :param steps: control instants in a slot.
-    :param answer_s: not used: nobody waits.
-    :param swarm_namespace: namespace of the swarm's topics.
-    :param more: as for :class:`RosChannel`.
     """
 
     mode = "realtime"
@@ -134,11 +127,7 @@ class RealtimeChannel(RosChannel):
     # Who takes part.
 
     def expect_later(self, agent: int, place: NDArray[np.float64]) -> None:
-        """An agent will not be there at the start.
-
-        :param agent: its id.
-        :param place: (3,) m, where its vehicle waits.
-        """
+        """An agent will not be there at the start; its vehicle waits at a place, (3,) m."""
         self.answers.track[:, :, agent - 1] = place
         self.lose(agent)
         self._attendance.expect_later(agent)

@@ -28,14 +28,7 @@ _BURST = 256  # messages; whatever comes, the clock is looked at
 
 
 class RollCall:
-    """Calls all agents, by number, and takes their answers.
-
-    :param publisher: of dtsa_msgs/Slot.
-    :param reports: what they answer.
-    :param run_id: the run's id.
-    :param calling: what the channel's calls carry.
-    :param accounts: an empty one, for the answers to the first call.
-    """
+    """Calls all agents, by number, and takes their answers."""
 
     def __init__(
         self, publisher: Publisher, reports: Feed, run_id: int, calling: array[int], accounts: Accounts
@@ -81,10 +74,6 @@ class RollCall:
 
         Many processes may have found the channel and still look for each other. So a measurement is repeated for some
         seconds while only some answer in time, or rounds that take too long become shorter.
-
-        :param agents: ids of those that answer.
-        :param enough_ms: ms, what is short enough.
-        :param give_up: asked twice a second; whether to end with what is known.
         """
         end, before = time.monotonic() + _SETTLED_S, math.inf
         while True:

@@ -45,18 +45,12 @@ class RosChannel:
 
     It tells its observers what happens; a referee says when the run is over.
 
-    :param node: the ROS node.
-    :param channel: the medium.
-    :param steps: control instants in a slot.
-    :param waiting: number of messages that may wait to be read, for each agent.
     :param referee: ends the run; None: a signal does.
     :param swarm_namespace: namespace of the swarm's topics.
     :param startup_s: s of wall time that all agents have to answer for the first time.
     :param end_s: s of wall time that the nodes have to hear of the end.
     :param run: the run's id, which all its messages carry; None: a new one.
     :param agreed: settings that the agents must share; those of the medium in any case.
-    :param input_type: type of the messages that the loop waits for.
-    :param input_topic: their topic.
     """
 
     mode = "lockstep"
@@ -124,7 +118,6 @@ class RosChannel:
     def run(self, stop: object) -> None:
         """Runs until the run is over or ``stop`` is true. The agents are told to end.
 
-        :param stop: looked at again and again, true once a signal has come.
         :raises DtsaError: when an agent or an observer fails.
         """
         try:
@@ -147,7 +140,6 @@ class RosChannel:
     def _call(self, stop: object, absent: Set[int] = frozenset()) -> bool:
         """Calls the agents until all have shown who they are and what they fly with; False when stopped.
 
-        :param absent: ids of agents that nobody waits for.
         :raises ConfigError: when two do not fit together, or another channel is there.
         :raises LocalProtocolError: when some do not answer in time.
         """
@@ -304,13 +296,7 @@ class RosChannel:
 
 
 def put_frames(message: Slot, senders: list[int], frames: list[bytes], received: Any) -> None:
-    """Puts frames that somebody received into a slot message.
-
-    :param message: the message.
-    :param senders: ids of their senders.
-    :param frames: the frames.
-    :param received: (F, N) bool, who received which.
-    """
+    """Puts frames that somebody received into a slot message."""
     message.sender = array("H", senders)
     message.length = array("B", [len(frame) for frame in frames])
     message.data = array("B", b"".join(frames))

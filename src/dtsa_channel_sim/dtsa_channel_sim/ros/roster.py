@@ -52,10 +52,8 @@ class Member:
 class Roster:
     """Collects what the processes say about themselves before slot 0, and keeps out those that do not fit.
 
-    :param agents: number of agents N.
-    :param run: the run's id.
-    :param agreed: settings that all must share, as plain values.
-    :param channel: name of the channel's node, for errors.
+    All must share the settings ``agreed``. Times are s, monotonic; ``sender`` is who sent a message, None: not known;
+    ``number`` is the message's number, as its publisher counts; ``absent`` are ids of agents that nobody waits for.
     """
 
     def __init__(self, agents: int, run: int, agreed: Mapping[str, Any], channel: str) -> None:
@@ -71,21 +69,12 @@ class Roster:
         self.closed = False
 
     @property
-    def agreed(self) -> Mapping[str, Any]:
-        """The settings that all share, as plain values; those of the agents are known once they have told them."""
-        return self._agreed
-
-    @property
     def missing(self) -> list[int]:
         """Ids of the agents whose processes have not told about themselves."""
         return [agent for agent in range(1, self._agents + 1) if agent not in self._of]
 
     def complete(self, now_s: float, absent: Set[int] = frozenset()) -> bool:
-        """Whether all agents have one process, and nothing is in doubt.
-
-        :param now_s: s, monotonic.
-        :param absent: ids of agents that nobody waits for.
-        """
+        """Whether all agents have one process, and nothing is in doubt."""
         for process, (rival, since_s) in list(self._rivals.items()):
             if now_s - since_s > _DOUBT_S:  # the older process has not been heard since: it has gone
                 del self._rivals[process]
@@ -93,12 +82,7 @@ class Roster:
         return not self._rivals and not set(self.missing) - absent
 
     def settle(self, now_s: float, absent: Set[int]) -> list[tuple[int, ConfigError]]:
-        """Decides about processes that came while the run was under way.
-
-        :param now_s: s, monotonic.
-        :param absent: ids of agents that are lost: others may take their places.
-        :returns: processes that cannot take part, and why.
-        """
+        """Decide about processes that came while the run was under way; return those refused, and why."""
         refused = []
         for process, (rival, since_s) in list(self._rivals.items()):
             taken = {agent for agent in rival.ids if agent in self._of} - absent
@@ -118,9 +102,6 @@ class Roster:
     def hear(self, message: Process, now_s: float, sender: bytes | None = None) -> None:
         """Takes in what a process says about itself.
 
-        :param message: the message.
-        :param now_s: s, monotonic.
-        :param sender: who sent it; None: not known.
         :raises ConfigError: if it cannot take part, naming setting, both values and node.
         :raises Unusable: for a message that cannot be, or of another run.
         """
@@ -226,10 +207,6 @@ class Roster:
     def check_sender(self, ids: Any, number: int | None, now_s: float, sender: bytes | None = None) -> None:
         """Whether a message can be from the process that has some agents.
 
-        :param ids: ids of the agents, an array as messages carry it.
-        :param number: the message's number, as its publisher counts.
-        :param now_s: s, monotonic.
-        :param sender: who sent it; None: not known.
         :raises Unusable: if it cannot.
         """
         member = self._groups.get(ids.tobytes())
@@ -241,10 +218,6 @@ class Roster:
     def check_frame(self, agent: int, number: int | None, now_s: float, sender: bytes | None = None) -> None:
         """Whether a frame can be from the process that has its sender.
 
-        :param agent: id of the sender.
-        :param number: the message's number, as its publisher counts.
-        :param now_s: s, monotonic.
-        :param sender: who sent it; None: not known.
         :raises Unusable: if it cannot.
         """
         member = self._of.get(agent)

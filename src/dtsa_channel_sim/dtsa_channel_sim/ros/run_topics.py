@@ -1,4 +1,4 @@
-"""What the channel tells late subscribers: the run's settings, and how it is doing."""
+"""What the channel's node tells about a run: settings and status, diagnostics, transforms, lines of its log."""
 
 from __future__ import annotations
 
@@ -7,24 +7,30 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from dtsa_msgs.msg import Configuration, RunStatus
+from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
+from std_msgs.msg import Header
 
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.wire.stamps import header_of
+from dtsa_agent.ros.common.graph.names import named
+from dtsa_agent.ros.common.process.waiting import Waiting
+from dtsa_agent.ros.common.wire.stamps import header_of, time_of
+from dtsa_channel_sim.model.schedule import Change
+from dtsa_channel_sim.model.verdict import OUTCOMES, Verdict
 
 from .answers import Answers
 from .observer import ChannelObserver, ChannelStatus
 
-_PERIOD_S = 1.0  # wall time from one status to the next while nothing changes
+_STATUS_S = 1.0  # wall time from one status to the next while nothing changes
+_TRANSFORMS_S = 0.02  # wall time from one message of transforms to the next at the least
+_TRANSFORMS_DEPTH = 100  # as tf2's own broadcasters
+_SLOW_S = 1.0  # wall time after which an answer that is missing in flight is worth a warning
 
 
 def configuration_message(settings: Mapping[str, Any], run_id: int) -> Configuration:
-    """A dtsa_msgs/Configuration.
-
-    :param settings: the settings of the run by section, with ``mode`` among them.
-    :param run_id: the run's id.
-    """
+    """Return a dtsa_msgs/Configuration with the settings of a run by section, ``mode`` among them."""
     return Configuration(
         header=header_of(names.TIME_ZERO_NS),
         run=run_id,
@@ -34,11 +40,7 @@ def configuration_message(settings: Mapping[str, Any], run_id: int) -> Configura
 
 
 class RunState:
-    """What a status message says, kept up to date by who observes a channel.
-
-    :param run_id: the run's id.
-    :param slot_ns: ns, length of a slot.
-    """
+    """Content of a status message, kept up to date by an observer of the channel."""
 
     def __init__(self, run_id: int, slot_ns: int) -> None:
         self.phase: int = RunStatus.WAITING
@@ -51,17 +53,17 @@ class RunState:
         self._returned: set[int] = set()
 
     def lose(self, agent: int) -> None:
-        """Takes note that an agent has fallen silent."""
+        """Note that an agent has fallen silent."""
         self._lost.add(agent)
         self._returned.discard(agent)
 
     def regain(self, agents: list[int]) -> None:
-        """Takes note that agents report again."""
+        """Note that agents report again."""
         self._lost.difference_update(agents)
         self._returned.update(agents)
 
     def message(self) -> RunStatus:
-        """A dtsa_msgs/RunStatus."""
+        """Return a dtsa_msgs/RunStatus."""
         return RunStatus(
             header=header_of(names.slot_time_ns(self.slot, self._slot_ns)),
             run=self._run_id,
@@ -76,14 +78,7 @@ class RunState:
 
 
 class RunTopics(ChannelObserver):
-    """Publishes ``configuration`` and ``status`` in the swarm's namespace, transient local.
-
-    :param node: the channel's node.
-    :param settings: the settings of the run by section.
-    :param run_id: the run's id.
-    :param slot_ns: ns, length of a slot.
-    :param swarm_namespace: namespace of the swarm's topics.
-    """
+    """Publishes ``configuration`` and ``status`` in the swarm's namespace, transient local, for late subscribers."""
 
     def __init__(
         self, node: Node, settings: Mapping[str, Any], run_id: int, slot_ns: int, swarm_namespace: str = names.SWARM
@@ -94,32 +89,157 @@ class RunTopics(ChannelObserver):
         self._status = node.create_publisher(RunStatus, f"{swarm_namespace}/{names.STATUS}", qos)
         self._state = RunState(run_id, slot_ns)
         self._next_s = 0.0  # time.monotonic()
-        self._tell()
+        self._publish()
 
-    def _tell(self) -> None:
-        self._next_s = time.monotonic() + _PERIOD_S
+    def _publish(self) -> None:
+        self._next_s = time.monotonic() + _STATUS_S
         self._status.publish(self._state.message())
 
     def all_answered(self, slot: int, answers: Answers) -> None:
         if not slot:
             self._state.phase = RunStatus.FLYING
-            self._tell()
+            self._publish()
 
     def agent_silent(self, agent: int) -> None:
         self._state.lose(agent)
-        self._tell()
+        self._publish()
 
     def agents_back(self, agents: list[int]) -> None:
         self._state.regain(agents)
-        self._tell()
+        self._publish()
 
     def idle(self, status: ChannelStatus) -> None:
         state = self._state
         awaited = status.awaited != state.awaited and state.phase == RunStatus.WAITING
         state.slot, state.awaited, state.lag_ms = max(0, status.slot), status.awaited, status.lag_ms
         if awaited or time.monotonic() >= self._next_s:
-            self._tell()
+            self._publish()
 
     def ended(self, slot: int, reason: str, failed: bool) -> None:
         self._state.phase, self._state.slot, self._state.reason = RunStatus.ENDED, max(0, slot), reason
-        self._tell()
+        self._publish()
+
+
+class Diagnostics(ChannelObserver):
+    """Publishes the channel's status on ``/diagnostics`` once a second of wall time, while somebody subscribes."""
+
+    def __init__(self, node: Node, slot_ns: int) -> None:
+        self._slot_ns = slot_ns
+        self._name = f"{node.get_namespace().strip('/')}: channel"
+        self._counts = [0, 0, 0]  # slots by outcome
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._ticks = 0
+
+    def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
+        self._counts[verdict.outcome] += 1
+
+    def idle(self, status: ChannelStatus) -> None:
+        self._ticks += 1
+        if self._ticks % 10 or not self._publisher.get_subscription_count():
+            return
+        values = {
+            "slot": status.slot,
+            "not taken in": sum(status.dropped.values()),
+            "agents awaited": status.awaited,
+            **{f"not taken in: {reason}": count for reason, count in sorted(status.dropped.items())},
+            **{f"slots: {name}": count for name, count in zip(OUTCOMES, self._counts, strict=True)},
+        }
+        told = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if status.dropped else DiagnosticStatus.OK,
+            name=self._name,
+            message=f"slot {status.slot}",
+            hardware_id="simulated",
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        stamp = time_of(names.slot_time_ns(max(0, status.slot), self._slot_ns))
+        self._publisher.publish(DiagnosticArray(header=Header(stamp=stamp), status=[told]))
+
+
+class Transforms(ChannelObserver):
+    """Publishes ``map`` -> ``cfN/base_link`` of all agents on ``/tf`` in one message, while somebody subscribes.
+
+    Needs tf2_msgs, which an installation from apt has and the wheels lack; without it, it says so once and does
+    nothing. The attitude is not modelled: it is the identity.
+    """
+
+    def __init__(self, node: Node, agents: int, slot_ns: int, swarm_namespace: str = names.SWARM) -> None:
+        self._slot_ns = slot_ns
+        spaces = [names.agent_namespace(agent, swarm_namespace) for agent in range(1, agents + 1)]
+        self._bodies = [names.body_frame(space) for space in spaces]
+        self._next_s = 0.0  # time.monotonic()
+        self._watched = False
+        self._publisher: Any = None
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            node.get_logger().info("no transforms on /tf: tf2_msgs is not installed (apt: ros-jazzy-tf2-msgs)")
+            return
+        self._kind = TFMessage
+        self._publisher = node.create_publisher(TFMessage, "/tf", _TRANSFORMS_DEPTH)
+
+    def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
+        if not self._watched or time.monotonic() < self._next_s:
+            return
+        self._next_s = time.monotonic() + _TRANSFORMS_S
+        header = header_of(names.slot_time_ns(slot, self._slot_ns))
+        transforms = []
+        for body, (x, y, z) in zip(self._bodies, answers.position.T.tolist(), strict=True):
+            transform = TransformStamped(header=header, child_frame_id=body)
+            place = transform.transform.translation
+            place.x, place.y, place.z = x, y, z
+            transforms.append(transform)
+        self._publisher.publish(self._kind(transforms=transforms))
+
+    def idle(self, status: ChannelStatus) -> None:
+        self._watched = self._publisher is not None and self._publisher.get_subscription_count() > 0
+
+
+class RunLog(ChannelObserver):
+    """Logs whom the channel waits for, when slot 0 starts, which agents are lost or back, and why the run ends."""
+
+    def __init__(self, node: Node, run_id: int, lockstep: bool) -> None:
+        self._logger = node.get_logger()
+        self._lockstep = lockstep
+        self._waiting = Waiting(self._logger)
+        self._flying = False
+        self._slot, self._since_s = -1, time.monotonic()
+        self._warned = False  # that the slot is slow
+        self._logger.info(f"run {run_id:08x}: waiting for the agents")
+
+    def all_answered(self, slot: int, answers: Answers) -> None:
+        if not self._flying:
+            self._flying = True
+            self._logger.info("slot 0: all agents have answered, the run starts")
+
+    def idle(self, status: ChannelStatus) -> None:
+        if not self._flying:
+            if status.awaited:
+                self._waiting.tell(f"waiting for {named(status.awaited)} to answer")
+        elif self._lockstep:
+            self._watch(status)
+
+    def _watch(self, status: ChannelStatus) -> None:
+        """Warn once about a slot that an agent keeps waiting."""
+        now = time.monotonic()
+        if status.slot != self._slot or not status.awaited:
+            self._slot, self._since_s, self._warned = status.slot, now, False
+        elif not self._warned and now - self._since_s > _SLOW_S:
+            self._warned = True
+            self._logger.warning(f"slot {status.slot}: still waiting for {named(status.awaited)}")
+
+    def agent_silent(self, agent: int) -> None:
+        self._logger.warning(f"{named([agent])} is lost: it has not been heard of for a while")
+
+    def agents_back(self, agents: list[int]) -> None:
+        self._logger.info(f"{named(agents)} {'is' if len(agents) == 1 else 'are'} back")
+
+    def settings_changed(self, change: Change) -> None:
+        values = ", ".join(f"{name} = {value}" for name, value in change.values)
+        self._logger.info(f"from slot {change.slot} on: {values}")
+
+    def ended(self, slot: int, reason: str, failed: bool) -> None:
+        text = f"the run ends after slot {slot}: {reason}" if self._flying else f"no slot was flown: {reason}"
+        if failed:
+            self._logger.error(text)
+        else:
+            self._logger.info(text)
