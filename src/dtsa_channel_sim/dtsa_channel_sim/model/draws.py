@@ -12,6 +12,8 @@ Words are even, so a threshold of 2^64 - 1 means "always" and 0 means "never", e
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +23,6 @@ Words = NDArray[np.uint64]
 LOSS, STATE, CLOCK = 1, 2, 3
 _FACTORS = 1 << 32
 _BLOCK_WORDS = 1 << 16
-_KEPT_BLOCKS = 8
 
 
 def threshold(probability: float | NDArray[np.float64]) -> NDArray[np.uint64]:
@@ -51,14 +52,13 @@ class WordBlocks:
     :param agents: number of receivers N, the length of a row.
     """
 
-    __slots__ = ("_blocks", "_first", "_last", "_seed", "_stream", "_words", "agents", "rows")
+    __slots__ = ("_first", "_last", "_seed", "_stream", "_words", "agents", "rows")
 
     def __init__(self, seed: int, stream: int, agents: int) -> None:
         self._seed = seed
         self._stream = stream
         self.agents = agents
         self.rows = max(16, _BLOCK_WORDS // agents)
-        self._blocks: dict[int, Words] = {}
         self._first = self._last = 0
         self._words: Words = np.zeros((0, agents), dtype=np.uint64)
 
@@ -80,14 +80,13 @@ class WordBlocks:
 
     def block(self, number: int) -> Words:
         """Return all words of a block, (rows, N)."""
-        block = self._blocks.get(number)
-        if block is None:
-            # Raw output: NumPy keeps it the same from version to version, other than that of its
-            # distributions.
-            raw = generator(self._seed, self._stream, number).bit_generator.random_raw(self.rows * self.agents)
-            block = (raw & np.uint64(2**64 - 2)).reshape(self.rows, self.agents)
-            block.setflags(write=False)
-            while len(self._blocks) >= _KEPT_BLOCKS:
-                del self._blocks[next(iter(self._blocks))]
-            self._blocks[number] = block
-        return block
+        return _block(self._seed, self._stream, number, self.rows, self.agents)
+
+
+@lru_cache(maxsize=32)  # also from flight to flight: memory that is given back after each one costs more than the draws
+def _block(seed: int, stream: int, number: int, rows: int, agents: int) -> Words:
+    # Raw output: NumPy keeps it the same from version to version, other than that of its distributions.
+    raw = generator(seed, stream, number).bit_generator.random_raw(rows * agents)
+    block = (raw & np.uint64(2**64 - 2)).reshape(rows, agents)
+    block.setflags(write=False)
+    return block
