@@ -15,7 +15,7 @@ from dtsa_bench.crazyflies.peer_lab.engine import AppError
 from dtsa_bench.crazyflies.peer_lab.packet import Packet
 from dtsa_bench.crazyflies.peer_lab.process import fly
 from dtsa_bench.crazyflies.peer_lab.record import Observer
-from dtsa_channel_sim.model.airtime import CRAZYFLIE_LINE
+from dtsa_channel_sim.model.airtime import RADIOS
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 
@@ -258,7 +258,7 @@ def test_a_frame_takes_its_time_on_both_lines_and_on_the_air(write) -> None:
     with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.0)) as lab:
         lab.run(0.1)
         ((heard_us, size, sender),) = [map(int, line.split()) for _, _, line in lab.record.console]
-    line = CRAZYFLIE_LINE
+    line = RADIOS["crazyflie"].airtime
     on_air_us = 130 + (73 + 8 * 22) / 2
     way_us = (line.to_radio_ns(20) + line.from_radio_ns(20)) / 1000 + on_air_us
     assert (size, sender) == (20, 1)

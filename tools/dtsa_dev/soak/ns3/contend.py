@@ -143,9 +143,9 @@ def _watched(agent: int, policy: Guarded, sent_ns: int, found: Contention) -> No
     def note_wake(table: Table, now_ns: int, radio: Radio) -> Any:
         return wake(table, now_ns, Noting(radio, now_ns)) if agent > 1 else now_ns + _NEVER_NS
 
-    def note_sent(table: Table, now_ns: int, begun: bool) -> Any:
+    def note_sent(table: Table, now_ns: int) -> Any:
         found.sent.append((agent - 1, getattr(made, "handed_ns", handed[0]), now_ns + sent_ns))
-        return sent(table, now_ns, begun)
+        return sent(table, now_ns)
 
     def note_sensed(busy: bool, now_ns: int, sent_ns: int) -> Any:
         found.listened += 1
