@@ -14,6 +14,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
@@ -78,6 +79,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
         "out": LaunchConfiguration("out").perform(context),
         "channel_file": LaunchConfiguration("channel_file").perform(context),
     }
+    if "partition" in recorded:  # JSON: launch would make a list of lists of it, which no parameter can be
+        recorded["partition"] = ParameterValue(recorded["partition"], value_type=str)
     nodes = [
         Node(
             package="dtsa_bench",
