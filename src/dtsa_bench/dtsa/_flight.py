@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASONS
 from dtsa_bench.drawing.card import as_html, as_text
-from dtsa_bench.drawing.top_view import top_view
 from dtsa_bench.experiments.sweep.spec import run_config as _run_config
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import CRASHED
@@ -42,11 +41,13 @@ class Flight:
         return as_text(f"Flight: {what_flew(self.config)}", self._rows())
 
     def _repr_html_(self) -> str:
+        from dtsa_bench.drawing.flight_paths import svg_from_above  # Matplotlib takes longer to load than all the rest
+
         title = f"Flight: {what_flew(self.config)}"
         picture = ""
         if self._kept is not None:
             crash = self.summary["collided_pair"] if self.summary["end"] == CRASHED else None
-            picture = top_view(self.path, self.moving, title, ids=True, crash=crash)
+            picture = svg_from_above(self.path, self.moving, title, crash)
         folded = ("all settings", setting_rows(self.config)), ("all results", result_rows(self.summary))
         return as_html(title, self._rows(), picture=picture, folded=folded)
 

@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.drawing.flight_paths import paint
 from dtsa_bench.drawing.style import QUIET, colours, panels, style
 from dtsa_bench.experiments.figures import charts
-from dtsa_bench.experiments.figures.flights import draw_paths
 from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES
 
 from ._flight import Flight
@@ -46,7 +46,7 @@ _show_in_notebooks()
 
 
 def plot_trajectories(*flights: Flown, titles: Sequence[str] | None = None) -> Figure:
-    """Paths of the movers from above: a panel a flight, circles where they start and crosses where they end.
+    """Paths of the movers from above: a panel a flight, rings where they start and discs where they end.
 
     :param flights: simulated or recorded flights.
     :param titles: one a flight; None: policy and estimator.
@@ -56,7 +56,8 @@ def plot_trajectories(*flights: Flown, titles: Sequence[str] | None = None) -> F
     with style():
         figure, axes = panels(len(flights), width=3.3, height=3.6)
         for axis, flight, name in zip(axes, flights, names, strict=True):
-            draw_paths(axis, flight.path, flight.moving, flight.start)
+            paint(axis, flight.path, flight.moving, ids=False)
+            axis.set_aspect("equal", "datalim")
             axis.set_title(name)
             axis.set_xlabel("x [m]")
         axes[0].set_ylabel("y [m]")

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.drawing.card import as_html, as_text
-from dtsa_bench.drawing.top_view import top_view
 from dtsa_bench.recordings.bag.place import find_file
 from dtsa_bench.recordings.bag.run import RecordedRun, load_run
 from dtsa_bench.recordings.tables.ages import follow_run
@@ -46,8 +45,10 @@ class Recording:
         return as_text(self._title, self._rows())
 
     def _repr_html_(self) -> str:
+        from dtsa_bench.drawing.flight_paths import svg_from_above  # Matplotlib takes longer to load than all the rest
+
         crash = self.summary.get("collided_pair") if self.summary.get("end") == CRASHED else None
-        picture = top_view(self.path, self.moving, self._title, ids=True, crash=crash) if len(self.path) else ""
+        picture = svg_from_above(self.path, self.moving, self._title, crash) if len(self.path) else ""
         config, summary = self._usable_config, self.summary
         folded = [("all settings", setting_rows(config))] if config is not None else []
         folded += [("all results", result_rows(summary))] if summary else []

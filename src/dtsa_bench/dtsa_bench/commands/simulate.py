@@ -73,15 +73,14 @@ def _checked(picture: Path) -> Path:
 
 
 def _draw(picture: Path, flight: Flight, summary: dict[str, Any]) -> None:
-    from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.drawing.flight_paths import draw_flight
+    from dtsa_bench.drawing import optional_picture
 
     assert flight.trace is not None
-    try:
+    with optional_picture(picture):
+        from dtsa_bench.drawing.flight_paths import draw_flight
+
         draw_flight(picture, flight.scenario, flight.trace.positions(), summary)
-    except OSError as error:
-        raise ConfigError("picture", str(picture), f"a file that can be written ({error.strerror})") from error
-    print(f"picture: {picture}", file=sys.stderr)
+        print(f"picture: {picture}", file=sys.stderr)
 
 
 def _write(directory: Path, summary: str, config: str) -> None:

@@ -1,1 +1,18 @@
 """How flights and figures look: colours, style, and the picture of a flight's paths. It imports `runs`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def optional_picture(file: Path) -> Iterator[None]:
+    """Draw a picture that nothing depends on: whatever fails, its import included, is one line on standard error."""
+    try:
+        yield
+    except Exception as error:
+        text = " ".join(str(error).split())[:300] or type(error).__name__
+        print(f"dtsa: warning: no {file.name}: {text}", file=sys.stderr)

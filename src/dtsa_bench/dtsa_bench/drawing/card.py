@@ -11,12 +11,7 @@ Rows = Sequence[tuple[str, str]]  # names and what is said
 
 
 def as_text(title: str, rows: Rows, block: str = "") -> str:
-    """A title, then a line a row.
-
-    :param title: what it is.
-    :param rows: names and texts.
-    :param block: lines between the title and the rows, such as a table.
-    """
+    """A title, then a line a row; `block`: lines between them, such as a table."""
     width = max((len(name) for name, _ in rows), default=0)
     lines = [title, *block.splitlines(), *(f"{name:{width}}  {text}" for name, text in rows)]
     return "\n  ".join(lines)
@@ -29,9 +24,7 @@ def as_html(
 
     Where a notebook is not trusted, its front end leaves the style out, and the plain text is shown.
 
-    :param title: what it is.
-    :param rows: names and texts.
-    :param picture: SVG, see :func:`~dtsa_bench.drawing.top_view.top_view`.
+    :param picture: SVG, see :func:`~dtsa_bench.drawing.flight_paths.svg_from_above`.
     :param table: HTML between the title and the rows.
     :param folded: headings, each with rows that are shown when it is clicked.
     """

@@ -33,35 +33,23 @@ def agent_colour(agent: int) -> str:
 
 
 def agent_turn(agent: int) -> int:
-    """How often the colours were used up before this agent: index into `DASHES` and `SHAPES`.
-
-    :param agent: its id, from 1.
-    """
+    """How often the colours were used up before this agent (id, from 1): index into `DASHES` and `SHAPES`."""
     return (agent - 1) // len(AGENT_COLOURS) % len(SHAPES)
 
 
 def rgb(colour: str) -> tuple[float, float, float]:
-    """Red, green and blue, sRGB, 0 to 1.
-
-    :param colour: ``#rrggbb``.
-    """
+    """Red, green and blue of ``#rrggbb``, sRGB, 0 to 1."""
     red, green, blue = (int(colour[start : start + 2], 16) / 255 for start in (1, 3, 5))
     return red, green, blue
 
 
 def luminance(colour: str) -> float:
-    """Relative luminance of an sRGB colour, 0 (black) to 1 (white).
-
-    :param colour: ``#rrggbb``.
-    """
+    """Relative luminance of ``#rrggbb``, 0 (black) to 1 (white)."""
     linear = (part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in rgb(colour))
     red, green, blue = linear
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def ink_on(colour: str) -> str:
-    """Colour of text that can be read on another one.
-
-    :param colour: ``#rrggbb`` of the ground.
-    """
+    """Colour of text that can be read on another one, ``#rrggbb``."""
     return "#10151b" if luminance(colour) > 0.2 else "#ffffff"

@@ -10,9 +10,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.style import context
 
 from . import palette
 
@@ -47,17 +47,13 @@ _SETTINGS = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Settings that hold while figures are drawn and saved."""
-    with mpl.rc_context(_SETTINGS):
+    """Settings that hold while figures are drawn and saved, whatever stands in a user's matplotlibrc."""
+    with context(["default", _SETTINGS]):
         yield
 
 
 def colour(name: object, index: int) -> str:
-    """The colour of a series.
-
-    :param name: its name; schemes have a colour of their own.
-    :param index: index among the series of the figure, from 0.
-    """
+    """The colour of a series by its index in the figure, from 0; schemes have a colour of their own, by name."""
     return COLOURS.get(str(name), CYCLE[index % len(CYCLE)])
 
 
@@ -69,13 +65,7 @@ def colours(names: Sequence[object]) -> list[str]:
 
 
 def panels(count: int, width: float = 3.3, height: float = 3.1, columns: int = 3) -> tuple[Figure, list[Axes]]:
-    """A figure with some panels side by side.
-
-    :param count: number of panels.
-    :param width: inches, of a panel.
-    :param height: inches, of a panel.
-    :param columns: largest number in a row.
-    """
+    """A figure with some panels side by side, each so many inches large; `columns`: most in a row."""
     across = min(count, columns)
     down = -(-count // across)
     figure = Figure(figsize=(width * across, height * down), layout="constrained")
@@ -103,19 +93,13 @@ def svg_text(figure: Figure) -> str:
     """The figure as SVG that can stand inside HTML; equal figures give equal text."""
     buffer = io.StringIO()
     with style():
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
     return text[text.index("<svg") :]
 
 
 def save(figure: Figure, directory: Path, name: str) -> str:
-    """Saves a figure as PNG (200 dpi) and SVG.
-
-    :param figure: the figure.
-    :param directory: where; made if needed.
-    :param name: file name without suffix.
-    :returns: the SVG's text, with ids that are its own so that several fit on one page.
-    """
+    """Save a figure as PNG (200 dpi) and SVG; return the SVG with ids of its own, so that several fit on one page."""
     directory.mkdir(parents=True, exist_ok=True)
     text = svg_text(figure)
     (directory / f"{name}.svg").write_text('<?xml version="1.0" encoding="utf-8"?>\n' + text, encoding="utf-8")
@@ -125,14 +109,7 @@ def save(figure: Figure, directory: Path, name: str) -> str:
 
 
 def save_described(figure: Figure, path: Path, title: str, description: str, creator: str) -> None:
-    """Saves a figure as PDF, SVG or PNG that says how it was made.
-
-    :param figure: the figure.
-    :param path: the file; its suffix is the format.
-    :param title: what the figure shows.
-    :param description: how it was made.
-    :param creator: the program and its version.
-    """
+    """Save a figure as PDF, SVG or PNG with metadata: what it shows, how it was made, by which program."""
     now = datetime.now(timezone.utc).replace(microsecond=0)
     metadata = {
         ".pdf": {"Title": title, "Subject": description, "Creator": creator, "CreationDate": now},

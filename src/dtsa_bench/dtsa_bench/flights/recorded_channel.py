@@ -24,6 +24,7 @@ from dtsa_agent.ros.common.process.node_process import run_node
 from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
 from dtsa_agent.ros.common.process.runs import Run
 from dtsa_agent.ros.common.workarounds.kept_nodes import ending
+from dtsa_bench.drawing import optional_picture
 from dtsa_bench.runs.config import FROM_SWARM, LOCKSTEP, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.options import new_directory
 from dtsa_channel_sim import Channel, ChannelConfig, ClockConfig
@@ -125,10 +126,11 @@ class RecordedFlight:
         (self.directory / "summary.json").write_text(text, encoding="utf-8")
         positions = self.measurement.positions
         if positions and pictures:
-            from dtsa_bench.drawing.flight_paths import draw_flight
-
             picture = self.directory / "trajectories.png"
-            draw_flight(picture, self.scenario, positions.array(), summary)
+            with optional_picture(picture):
+                from dtsa_bench.drawing.flight_paths import draw_flight
+
+                draw_flight(picture, self.scenario, positions.array(), summary)
         return summary
 
 

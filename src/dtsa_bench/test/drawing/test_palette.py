@@ -83,7 +83,7 @@ def test_an_agent_has_one_colour_in_page_picture_layouts_and_markers() -> None:
 
     config = SwarmConfig(agents=count)
     axes = Figure().add_subplot()
-    paint(axes, make_scenario(config), np.zeros((2, 3, count)))
+    paint(axes, np.zeros((2, 3, count)), make_scenario(config).moving)
     inked = [to_hex(line.get_color()) for line in axes.lines if line.get_linestyle() == "-"]
     assert [colour for colour in inked if colour != "#ffffff"] == wanted
 

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dtsa_bench.drawing import palette
-from dtsa_bench.drawing.style import CYCLE, INK, QUIET, legend_above, panels
+from dtsa_bench.drawing.flight_paths import paint
+from dtsa_bench.drawing.style import CYCLE, INK, legend_above, panels
 from dtsa_bench.experiments.sweep.aggregate import Table
 from dtsa_bench.simulation.simulate import Flight, simulate
 
@@ -39,7 +39,8 @@ def trajectories(table: Table, spec: Spec) -> Figure:
     figure, axes = panels(len(flights), width=3.3, height=3.6)
     for axis, (name, flight) in zip(axes, flights, strict=True):
         assert flight.trace is not None
-        draw_paths(axis, flight.trace.positions(), flight.scenario.moving, flight.scenario.start)
+        paint(axis, flight.trace.positions(), flight.scenario.moving, ids=False)
+        axis.set_aspect("equal", "datalim")
         summary = flight.summary()
         time = summary["completion_time_s"]
         axis.set_title(name)
@@ -49,24 +50,6 @@ def trajectories(table: Table, spec: Spec) -> Figure:
         )
     axes[0].set_ylabel("y [m]")
     return figure
-
-
-def draw_paths(axis: Axes, path: NDArray[np.float64], moving: NDArray[np.bool_], start: NDArray[np.float64]) -> None:
-    """Paths of the movers from above, in the agents' colours; who hovers is a grey dot.
-
-    :param axis: where.
-    :param path: (T, 3, N) m, frame map; not a number where a position is not known.
-    :param moving: (N,) who moves.
-    :param start: (3, N) m, frame map.
-    """
-    hovering = np.flatnonzero(~moving)
-    axis.plot(*start[:2, hovering], "o", color=QUIET, alpha=0.45, markersize=6, markeredgewidth=0)
-    for k in np.flatnonzero(moving).tolist():
-        shade, dash = palette.agent_colour(k + 1), palette.DASHES[palette.agent_turn(k + 1)]
-        axis.plot(path[:, 0, k], path[:, 1, k], color=shade, linestyle=(0, dash) if dash else "-")
-        axis.plot(*path[0, :2, k], "o", color=shade, markersize=6)
-        axis.plot(*path[-1, :2, k], "x", color=shade, markersize=7, markeredgewidth=2)
-    axis.set_aspect("equal", "datalim")
 
 
 def estimate(table: Table, spec: Spec) -> Figure:

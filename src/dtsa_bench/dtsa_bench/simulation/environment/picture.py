@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
 from dtsa_bench.drawing.flight_paths import paint
+from dtsa_bench.drawing.style import style
 
 
 def from_above(
@@ -23,8 +24,9 @@ def from_above(
     :param crash: ids of two agents that crashed.
     :returns: (480, 480, 3), red, green and blue.
     """
-    figure = Figure(figsize=(4.8, 4.8), dpi=100, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    paint(figure.add_subplot(), scenario, positions, crash)
-    canvas.draw()
+    with style():
+        figure = Figure(figsize=(4.8, 4.8), dpi=100, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        paint(figure.add_subplot(), positions, scenario.moving, crash=crash)
+        canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
