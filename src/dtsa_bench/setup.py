@@ -15,7 +15,6 @@ setup(
         NAME: [
             "py.typed",
             *(f"**/*.{suffix}" for suffix in ASSETS),
-            "**/*.LICENSE",
             "**/*.in",
             "**/*.msg",
         ],

@@ -1,4 +1,4 @@
-"""Pages of the live view in tests: servers, flights with a page, and what moments tell."""
+"""Pages of the live view in tests: recorded flights as the ROS graph would tell them, and flights with a page."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from flight_helpers import flight_bag
 
-from dtsa_bench.pages.view.recording import BagSource
+from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
+from dtsa_bench.pages.view.follower import Follower
 from dtsa_bench.pages.view.track import Track
+from dtsa_bench.recordings.bag.reader import Bag
 
 SLOTS, AGENTS = 150, 6
 PATIENCE_S = 60.0
@@ -28,10 +32,46 @@ def lossy_bag(directory: Path) -> Path:
 
 
 def track_of(bag: Path) -> Track:
-    """All of a bag, as a page gets it."""
-    found = Track("lossy")
-    BagSource(bag, found).run()
-    return found
+    """All of a lockstep bag, as a page gets it from the ROS graph while it is flown."""
+    track = Track("lossy")
+    follower = Follower(track, {})
+    with Bag(bag) as opened:
+        follower.begin(opened.config)
+        sent: dict[int, Any] = {}
+        for _, message in opened.typed(["/swarm/transmission", "/swarm/reception"]):
+            if hasattr(message, "track"):
+                sent[message.slot] = message
+                continue
+            answer = sent.pop(message.slot)
+            follower.receive("Decision", answer)
+            follower.receive("MarkerArray", markers_of(answer))
+            follower.receive("Slot", delivery_of(answer, message))
+            follower.receive("Reception", message)
+    follower.finish("recorded")
+    assert not follower.unusable
+    return track
+
+
+def markers_of(answer: Any) -> SimpleNamespace:
+    """Where all agents are, of a transmission."""
+    place = answer.track.reshape(answer.steps, 3, -1)[-1].T
+    spheres = [
+        SimpleNamespace(
+            id=int(agent), header=answer.header, pose=SimpleNamespace(position=SimpleNamespace(x=x, y=y, z=z))
+        )
+        for agent, (x, y, z) in zip(answer.agent, place.tolist(), strict=True)
+    ]
+    return SimpleNamespace(markers=spheres)
+
+
+def delivery_of(answer: Any, reception: Any) -> SimpleNamespace:
+    """The frames of a transmission that at least one agent received, as the channel delivers them."""
+    frames = dict(zip(answer.agent.tolist(), split_frames(bytes(answer.data), answer.length.tolist()), strict=True))
+    mask = unpack_received(bytes(reception.received), len(reception.sender), len(answer.agent))
+    senders = [sender for sender, row in zip(reception.sender.tolist(), mask, strict=True) if row.any()]
+    data = np.frombuffer(b"".join(frames[sender] for sender in senders), np.uint8)
+    lengths = [len(frames[sender]) for sender in senders]
+    return SimpleNamespace(phase=0, heard_slot=answer.slot, sender=senders, length=lengths, data=data)
 
 
 def numbers(text: str, kind: str) -> np.ndarray:

@@ -62,8 +62,6 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "losses": (("runs/a --out hall.json", "for simulate, sweep and fly, as --losses hall.json"),),
     "recover": (("runs/a", "into runs/a/bag_recovered"),),
     "view": (
-        ("runs/a", "a recorded run, played; one that is being recorded is followed"),
-        ("runs/a runs/b", "two side by side"),
         ("--domain 7", "the swarm on a ROS domain"),
         ("--air udp --interface eth0 --auth-session 41", "agents on a network; the key is in DTSA_AUTH_KEY"),
     ),

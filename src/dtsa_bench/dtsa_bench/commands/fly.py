@@ -7,9 +7,8 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +19,7 @@ from dtsa_bench.runs.options import add_mode_options, add_options, add_run_optio
 from .bridge import add_simulated_radio, use_simulated_radio
 
 if TYPE_CHECKING:
-    from dtsa_agent.ros.common.process.loop import Stop
-    from dtsa_bench.flights.recorded_channel import RecordedFlight
-    from dtsa_bench.pages.view.link import ViewLink
+    from dtsa_bench.pages.view.process import PageOptions
 
 INTERRUPTED = 130
 LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
@@ -133,15 +130,30 @@ def run(args: argparse.Namespace) -> int:
         late=late_agents(args.late),
         **given(args, FlightOptions, "flight"),
     )
-    with Stop(LONGEST_END_S) as stop, viewed(args, stop) as view:
-        flight = fly(config, directory, options, stop, watch=_watch(view))
+    page = page_options(args)
+    with Stop(LONGEST_END_S) as stop, ExitStack() as pages:
+        process = None
+
+        def show(domain: int, environment: Mapping[str, str]) -> None:
+            nonlocal process
+            from dtsa_bench.pages.view.process import view_process
+
+            if page is not None:
+                process = pages.enter_context(view_process(domain, environment, page))
+
+        flight = fly(config, directory, options, stop, on_domain=show)
         interrupted = bool(stop)
         _tell(args, flight)
+        if process is not None and sys.stdin.isatty() and not stop:
+            print("the flight is over; the page stays until Ctrl-C", file=sys.stderr, flush=True)
+            while not stop and process.poll() is None:
+                time.sleep(0.1)
     if flight.summary.get("warning"):
         print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
     cut_short = flight.summary.get("cut_short")
-    if args.picture and not interrupted and not cut_short and not args.json:
-        print(f"picture: {directory / 'trajectories.png'}")
+    picture = directory / "trajectories.png"
+    if not args.json and picture.exists():
+        print(f"picture: {picture}")
     if interrupted:
         print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
         _unheard(flight.summary)
@@ -151,50 +163,18 @@ def run(args: argparse.Namespace) -> int:
     return 1 if _unheard(flight.summary) or cut_short else 0
 
 
-def _watch(view: ViewLink | None) -> Callable[[RecordedFlight, object], None] | None:
-    """What lets a page show the flight."""
-    if view is None:
-        return None
-    from dtsa_bench.pages.view.flight_observer import show_flight  # what it needs is large, and few flights are watched
+def page_options(args: argparse.Namespace) -> PageOptions | None:
+    """The page that is wanted; None: none is.
 
-    return partial(show_flight, view)
-
-
-@contextmanager
-def viewed(args: argparse.Namespace, stop: Stop) -> Iterator[ViewLink | None]:
-    """The server of a flight's page, where one is wanted; on a terminal the page stays until Ctrl-C.
-
-    :param args: the command line.
-    :param stop: set by signals.
-    """
-    port = page_port(args)
-    if port is None:
-        yield None
-        return
-    from dtsa_bench.pages.view.link import ViewLink
-
-    view = ViewLink(port, args.control)
-    try:
-        print(f"view: {view.url}", file=sys.stderr, flush=True)
-        yield view
-        if sys.stdin.isatty() and not stop:
-            print("the flight is over; the page stays until Ctrl-C", file=sys.stderr, flush=True)
-            while not stop and view.alive():
-                time.sleep(0.1)
-    finally:
-        view.close()
-
-
-def page_port(args: argparse.Namespace) -> int | None:
-    """The port of the page that is wanted, 0: any that is free; None: no page is wanted.
-
-    :param args: the command line.
     :raises ConfigError: for options of a page that is not wanted.
     """
     from dtsa_agent.core.errors import ConfigError
 
     if args.view:
-        return 0 if args.view_port is None else whole_number(args.view_port, "view_port", 0, 65535)
+        from dtsa_bench.pages.view.process import PageOptions
+
+        port = 0 if args.view_port is None else whole_number(args.view_port, "view_port", 0, 65535)
+        return PageOptions(port, args.control)
     for name in ("view_port", "control"):
         if getattr(args, name):
             raise ConfigError(name, getattr(args, name), "only with --view")
@@ -235,7 +215,6 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     settings = load_swarm(path)
     from dtsa_agent.ros.common.process.loop import Stop
     from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies, mission_defaults
-    from dtsa_bench.pages.view.mission import PageOptions
 
     if getattr(args, "run.mode") is None:
         setattr(args, "run.mode", "realtime")
@@ -245,8 +224,7 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     options = FlightOptions(domain=domain, pictures=args.picture)
     if args.dry_run and args.attach:
         raise ConfigError("dry_run", True, "either --dry-run or --attach: it connects by itself")
-    port = page_port(args)
-    page = None if port is None else PageOptions(port, args.control)
+    page = page_options(args)
     with Stop() as stop:
         if args.dry_run:
             from dtsa_bench.crazyflies.missions.rehearsal import rehearse

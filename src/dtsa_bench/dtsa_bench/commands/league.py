@@ -185,7 +185,7 @@ def _table(args: argparse.Namespace, there: League) -> int:
     from dtsa_bench.experiments.league.check import sums
     from dtsa_bench.experiments.league.entry import read_entry
     from dtsa_bench.experiments.league.table import HEADS, LeagueTable
-    from dtsa_bench.pages.report.league import write_league
+    from dtsa_bench.pages.report.tables import write_league
 
     entries = [read_entry(path) for path in args.what]
     for path, entry in zip(args.what, entries, strict=True):

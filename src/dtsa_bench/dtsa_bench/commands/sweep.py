@@ -121,7 +121,7 @@ def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
         if not args.json:
             print(f"paper: {directory / 'paper'}: {', '.join(files)}")
     if not args.no_report:
-        from dtsa_bench.pages.report.sweep import write_report
+        from dtsa_bench.pages.report.tables import write_report
 
         path = write_report(table, directory, work.code(), command)
         if not args.json:

@@ -6,10 +6,9 @@ import argparse
 import asyncio
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
-from .registry import RECORDED_RUN
 from .swarm_file import add_swarm_file, take_swarm_file
 
 if TYPE_CHECKING:
@@ -18,21 +17,20 @@ if TYPE_CHECKING:
     from dtsa_bench.pages.view.track import Track
 
 DESCRIPTION = """\
-Shows a swarm on a page that this machine alone can open: a recorded run to be played, one that is being
-recorded and followed while it grows, or without a bag the swarm on the ROS graph, or (--air) agents on a network or a
-radio, with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not know
-it gets nothing."""
-_MOST = 2  # runs side by side
+Shows a swarm on a page that this machine alone can open: the swarm on the ROS graph, or (--air) agents on a network or
+a radio, with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not
+know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
 _ROS = "ros"
+_LAST_S = 2.0  # for pages to receive the end of a flight
 
 
 class Source(Protocol):
-    """Tells a run moment by moment, in a thread of its own."""
+    """Hands over a run moment by moment, in a thread of its own."""
 
     stopped: bool
 
     def run(self) -> None:
-        """Tells it until it is over, or ``stopped`` is set."""
+        """Follow it until it is over, or ``stopped`` is set."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -42,19 +40,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="a swarm in the browser",
         description=DESCRIPTION,
     )
-    parser.usage = "%(prog)s [BAG ...] [OPTIONS]"
-    parser.add_argument("bags", nargs="*", metavar="BAG", help=f"{RECORDED_RUN}; two are shown side by side")
+    parser.usage = "%(prog)s [OPTIONS]"
+    parser.add_argument("bags", nargs="*", help=argparse.SUPPRESS)
     from dtsa_agent.air.ports import AIRS
 
-    parser.add_argument("--air", choices=(_ROS, *AIRS), help="without a bag: what carries the swarm's frames [ros]")
-    parser.add_argument("--domain", metavar="N", default=None, help="without a bag: ROS_DOMAIN_ID of the swarm")
-    parser.add_argument(
-        "--namespace", metavar="NAME", default=None, help="without a bag: namespace of the swarm [/swarm]"
-    )
+    parser.add_argument("--air", choices=(_ROS, *AIRS), help="what carries the swarm's frames [ros]")
+    parser.add_argument("--domain", metavar="N", default=None, help="ROS_DOMAIN_ID of the swarm")
+    parser.add_argument("--namespace", metavar="NAME", default=None, help="namespace of the swarm [/swarm]")
     parser.add_argument(
         "--control",
         action="store_true",
-        help="without a bag: the page may change the channel, land all Crazyflies and stop their motors",
+        help="the page may change the channel, kill and start agents, land all Crazyflies and stop their motors",
     )
     parser.add_argument("--port", metavar="N", default="0", help="where the page is [a free port]")
     parser.add_argument(
@@ -71,40 +67,28 @@ def run(args: argparse.Namespace) -> int:
     """Serve the page until a signal comes."""
     from dtsa_agent.air.ports import AIRS
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.pages.view.link import give_way
+    from dtsa_bench.pages.view.process import give_way
     from dtsa_bench.pages.view.server import ViewServer, new_token
-    from dtsa_bench.pages.view.track import Track
     from dtsa_bench.runs.options import whole_number
+    from dtsa_bench.runs.program import program
 
+    if args.bags:
+        bags = " ".join(args.bags)
+        raise ConfigError("bag", bags, f"none; a recorded run is shown by `{program()} report {bags}`")
     port = whole_number(args.port, "port", 0, 65535)
-    if len(args.bags) > _MOST:
-        raise ConfigError("bags", len(args.bags), f"at most {_MOST} side by side")
-    if args.swarm_file is not None and args.bags:
-        raise ConfigError("swarm", args.swarm_file, "only without a bag")
     take_swarm_file(args, _ROS if args.swarm_file is None else AIRS[0])
     _check_source(args)
     if args.listen is not None and not _plain_address(args.listen):
         raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
-    tracks: list[Track] = []
-    sources: list[Source] = []
-    order = None
-    if not args.bags:
-        give_way()
-        tracks, sources, order = _graph(args) if args.air == _ROS else _air(args)
-    for bag in args.bags:
-        from dtsa_bench.pages.view.recording import BagSource
-
-        tracks.append(Track(_name(bag)))
-        sources.append(BagSource(bag, tracks[-1]))
-    threads = [threading.Thread(target=source.run, daemon=True) for source in sources]
+    give_way()
+    track, source, order = _graph(args) if args.air == _ROS else _air(args)
+    thread = threading.Thread(target=source.run, daemon=True)
     try:
-        asyncio.run(_serve(ViewServer(tracks, new_token(), order), threads, port, args.listen))
+        asyncio.run(_serve(ViewServer(track, new_token(), order), thread, port, args.listen))
     finally:
-        for source in sources:
-            source.stopped = True
-        for thread in threads:
-            if thread.is_alive():
-                thread.join(3.0)
+        source.stopped = True
+        if thread.is_alive():
+            thread.join(3.0)
     return 0
 
 
@@ -116,11 +100,9 @@ def _check_source(args: argparse.Namespace) -> None:
     from dtsa_bench.runs.options import given
 
     for name in ("domain", "namespace", "control"):
-        if getattr(args, name) and (args.bags or args.air != _ROS):
-            raise ConfigError(name, getattr(args, name), "only without a bag" if args.bags else "only with --air ros")
+        if getattr(args, name) and args.air != _ROS:
+            raise ConfigError(name, getattr(args, name), "only with --air ros")
     if args.air != _ROS:
-        if args.bags:
-            raise ConfigError("air", args.air, "only without a bag")
         return
     own = {"policy": args.policy, "seal": args.seal}
     for air in AIRS:
@@ -130,7 +112,7 @@ def _check_source(args: argparse.Namespace) -> None:
             raise ConfigError(name, value, f"only with --air {' or '.join(AIRS)}")
 
 
-def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
+def _air(args: argparse.Namespace) -> tuple[Track, Source, None]:
     from dtsa_bench.pages.view.network_listener import NetworkListener
     from dtsa_bench.pages.view.track import Track
 
@@ -139,10 +121,10 @@ def _air(args: argparse.Namespace) -> tuple[list[Track], list[Source], None]:
     port = port_of(args)
     config = swarm_of(args)
     track = Track(port.where)
-    return [track], [NetworkListener(track, config, port)], None
+    return track, NetworkListener(track, config, port), None
 
 
-def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callable[[Order], str] | None]:
+def _graph(args: argparse.Namespace) -> tuple[Track, Source, Callable[[Order], str] | None]:
     from dtsa_agent.ros.common.graph import names
     from dtsa_bench.pages.view.graph import GraphSource
     from dtsa_bench.pages.view.track import Track
@@ -152,15 +134,7 @@ def _graph(args: argparse.Namespace) -> tuple[list[Track], list[Source], Callabl
     space = "/" + args.namespace.strip("/") if args.namespace else names.SWARM
     track = Track(space)
     source = GraphSource(track, domain, space, args.control)
-    return [track], [source], source.order if args.control else None
-
-
-def _name(bag: str) -> str:
-    from dtsa_bench.recordings.bag.place import find_file
-
-    path = find_file(bag).resolve()
-    inner = path.parent
-    return inner.parent.name if inner.name == "bag" else inner.name
+    return track, source, source.order if args.control else None
 
 
 def _plain_address(text: str) -> bool:
@@ -172,7 +146,7 @@ def _plain_address(text: str) -> bool:
         return False
 
 
-async def _serve(server: ViewServer, threads: Sequence[threading.Thread], port: int, address: str | None) -> None:
+async def _serve(server: ViewServer, thread: threading.Thread, port: int, address: str | None) -> None:
     """Serves until a signal comes."""
     import signal
 
@@ -182,10 +156,9 @@ async def _serve(server: ViewServer, threads: Sequence[threading.Thread], port: 
     over = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, over.set)
-    for thread in threads:
-        thread.start()
+    thread.start()
     print(url, flush=True)
     if sys.stderr.isatty():
         print("open it in a browser; Ctrl-C ends", file=sys.stderr, flush=True)
     await over.wait()
-    await server.stop()
+    await server.stop(_LAST_S)

@@ -22,7 +22,7 @@ ends this process after its patience, with the place of each thread.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -63,10 +63,6 @@ from .options import FlightOptions
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
 from .supervisor import LateStart, RealtimeSupervisor, Supervisor
-
-Watch = Callable[
-    [RecordedFlight, object], None
-]  # of a flight that is about to begin, and what looks after its processes
 
 ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -159,7 +155,7 @@ def fly(
     started: Callable[[Children], None] | None = None,
     observers: Sequence[ChannelObserver] = (),
     progress: ProgressLine | None = None,
-    watch: Watch | None = None,
+    on_domain: Callable[[int, Mapping[str, str]], None] | None = None,
 ) -> Flight:
     """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
 
@@ -171,7 +167,7 @@ def fly(
     :param started: is told the processes once they are started.
     :param observers: are told what happens on the channel, after all others.
     :param progress: shows how it goes; None: a line on standard error.
-    :param watch: called before the flight begins, to observe it.
+    :param on_domain: called with the ROS domain and the variables of its processes before the flight begins.
     :returns: its results, which are also in ``out``.
     :raises ConfigError: for options that are not usable; nothing has been started then.
     :raises DtsaError: when a node dies, hangs or sends garbage; the message names it.
@@ -192,6 +188,8 @@ def fly(
             late = _start_agents(children, run, options, directory, stop)
             try:
                 with stop.at_once():
+                    if on_domain:
+                        on_domain(domain, environment)
                     init_ros(QUIET, context, domain)
                     if started:
                         started(children)
@@ -201,7 +199,7 @@ def fly(
             except KeyboardInterrupt:
                 rmtree(directory / BAG, ignore_errors=True)  # there is nothing in it yet
                 raise
-            return _fly(flight, node, directory, children, progress, options, stop, late, observers, watch)
+            return _fly(flight, node, directory, children, progress, options, stop, late, observers)
         finally:
             children.stop(hurry=bool(stop))
             with stop.in_time():
@@ -218,7 +216,6 @@ def _fly(
     stop: Stop,
     late: Sequence[LateStart],
     observers: Sequence[ChannelObserver],
-    watch: Watch | None,
 ) -> Flight:
     failure: DtsaError | None = None
     try:
@@ -227,9 +224,8 @@ def _fly(
         supervisor: Supervisor | RealtimeSupervisor = Supervisor(children)
         if isinstance(channel, RealtimeChannel):
             supervisor = RealtimeSupervisor(children, channel, measurement, progress.say, options.respawn, late)
+            supervisor.follow_parameters(node)
         channel.observe(supervisor, shown, *observers)
-        if watch is not None:
-            watch(flight, supervisor)
         limit_s = wall_limit_s(options.wall_timeout_s, flight.run_config.limits.timeout_s)
         ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
         try:

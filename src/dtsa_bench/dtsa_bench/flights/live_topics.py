@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from dtsa_msgs.msg import Decision, Reception
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
@@ -16,7 +14,7 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 
 from .slot_messages import SlotMessages
 
-_MARKER_PERIOD_S = 0.04  # wall time
+_MARKER_PERIOD_NS = 50_000_000  # simulated
 
 
 class LiveTopics(ChannelObserver):
@@ -36,7 +34,7 @@ class LiveTopics(ChannelObserver):
             for kind, topic in ((Decision, names.DECISION), (Reception, names.RECEPTION), (MarkerArray, names.MARKERS))
         )
         self._watched = [False, False, False]
-        self._next_markers = 0.0
+        self._marker_slots = max(1, round(_MARKER_PERIOD_NS / slot_ns))
 
     def slot_over(self, slot: int, answers: Answers, verdict: Verdict) -> None:
         decision, reception, markers = self._watched
@@ -44,8 +42,7 @@ class LiveTopics(ChannelObserver):
             self._decision.publish(self._messages.decision(slot, answers))
         if reception:
             self._reception.publish(self._messages.reception(slot, verdict))
-        if markers and time.monotonic() >= self._next_markers:
-            self._next_markers = time.monotonic() + _MARKER_PERIOD_S
+        if markers and slot % self._marker_slots == 0:
             self._markers.publish(self._messages.markers(slot, answers, verdict))
 
     def idle(self, status: ChannelStatus) -> None:

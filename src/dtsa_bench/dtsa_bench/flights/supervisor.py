@@ -6,6 +6,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
 from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.graph.names import named
@@ -109,24 +113,30 @@ class RealtimeSupervisor(ChannelObserver):
         self._children.again(child, ["-p", f"resume_at:=[{', '.join(f'{value:.6f}' for value in places)}]"])
         self._say(f"{child.name} is started again")
 
-    def kill(self, agent: int) -> str:
-        """Kills the process of an agent, as a fault would; says what was done.
+    def follow_parameters(self, node: Node) -> None:
+        """Let parameters of the channel's node kill and start the processes of agents, as faults would."""
+        acts = {"kill": self._kill, "start": self._start}
+        for name in acts:
+            node.declare_parameter(name, 0, ParameterDescriptor(description=f"id of an agent to {name} now"))
 
-        :param agent: its id.
-        :raises ConfigError: if it has none that runs.
-        """
+        def apply(parameters: list[Parameter]) -> SetParametersResult:
+            try:
+                for parameter in parameters:
+                    if parameter.name in acts:
+                        acts[parameter.name](parameter.value)
+            except ConfigError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=True)
+
+        node.add_on_set_parameters_callback(apply)
+
+    def _kill(self, agent: int) -> None:
         child = self._child(agent)
         if child is None or child.process.poll() is not None:
             raise ConfigError("agent", f"cf{agent}", "one whose process runs")
         child.process.kill()
-        return f"{child.name} is killed"
 
-    def start(self, agent: int) -> str:
-        """Starts the process of an agent that has ended; says what was done.
-
-        :param agent: its id.
-        :raises ConfigError: if it runs, or its policy lets nobody come late.
-        """
+    def _start(self, agent: int) -> None:
         child = self._child(agent)
         if child is None or child.process.poll() is None:
             raise ConfigError("agent", f"cf{agent}", "one whose process has ended")
@@ -134,7 +144,6 @@ class RealtimeSupervisor(ChannelObserver):
         self._dead = [entry for entry in self._dead if entry[1] is not child]
         self._measurement.metrics.awaited.update(child.agents)
         self._start_again(child)
-        return f"{child.name} is started"
 
     def _child(self, agent: int) -> Child | None:
         return next((child for child in self._children.all if agent in child.agents), None)

@@ -16,7 +16,7 @@ from dtsa_bench.experiments.sweep import spec
 from dtsa_bench.experiments.sweep.aggregate import Table, collected
 from dtsa_bench.experiments.sweep.claims import FAILS, HOLDS, OPEN, PARTLY, claims_of, clean_up_to
 from dtsa_bench.experiments.sweep.work import fly_one
-from dtsa_bench.pages.report.sweep import write_report
+from dtsa_bench.pages.report.tables import write_report
 
 NAMED = (
     *("paper-12", "paper-18", "limits", "grid", "idle", "epsilon", "loss", "loss-idle"),

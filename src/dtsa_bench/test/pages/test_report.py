@@ -273,8 +273,8 @@ def test_equal_names_are_told_apart_and_bad_input_is_refused(flights: dict[str, 
     path = write_report([flights["clean"], flights["clean"]], tmp_path / "deep" / "report.html")
     assert "clean (2)" in path.read_text(encoding="utf-8")
     assert [entry.name for entry in path.parent.iterdir()] == ["report.html"]
-    with pytest.raises(ConfigError, match="1 to 6"):
-        write_report([flights["clean"]] * 7, tmp_path / "many.html")
+    with pytest.raises(ConfigError, match="1 to 8"):
+        write_report([flights["clean"]] * 9, tmp_path / "many.html")
     with pytest.raises(ConfigError, match="directory"):
         write_report([flights["clean"]], tmp_path)
     with pytest.raises(UnusableBag):

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import signal
 import socket
-import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +16,18 @@ from view_helpers import AGENTS, PATIENCE_S, SLOTS, lossy_bag, numbers, track_of
 pytest.importorskip("aiohttp")
 
 import aiohttp
-from dtsa_dev.soak.view import serving
-from waiting import wait_for
+from browser_helpers import serving
 
+from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.commands.cli import main
-from dtsa_bench.pages.view.link import BEGIN, ViewLink, record
-from dtsa_bench.pages.view.moments import UNKNOWN, Moment, belief
+from dtsa_bench.pages.view.moments import MOST_FRAMES, UNKNOWN, Moment, Moments
 from dtsa_bench.pages.view.orders import Order, read_order
-from dtsa_bench.pages.view.recording import BagSource
 from dtsa_bench.pages.view.server import ViewServer, _Reader
 from dtsa_bench.pages.view.track import MOST_BYTES, MOST_MOMENTS, Track
-from dtsa_bench.recordings.bag.errors import UnusableBag
 from dtsa_bench.recordings.bag.run import load_run
 from dtsa_bench.recordings.tables.ages import follow_run, observed
+from dtsa_channel_sim.model.verdict import SUCCESS
 
 
 @pytest.fixture(scope="module")
@@ -84,42 +78,9 @@ def test_ages_and_beliefs_are_those_of_the_report(bag: Path, track: Track) -> No
         assert np.nanmax(np.abs(np.where(told == UNKNOWN, np.nan, told) / 10 - known)) <= 0.051
         one = by_slot[moment.slot - 1]
         for observer in (1, AGENTS):
-            heard = np.frombuffer(belief(moment, observer, AGENTS).heard, "<u2")
+            heard = np.frombuffer(moment.belief(observer, AGENTS)[0], "<u2")
             for agent, age in zip(one.agent[one.observer == observer], one.age[one.observer == observer], strict=True):
                 assert heard[agent - 1] == age
-
-
-def test_a_bag_is_followed_while_it_grows(bag: Path, tmp_path: Path) -> None:
-    data = next(bag.glob("*.mcap")).read_bytes()
-    growing = tmp_path / "run" / "bag"
-    growing.mkdir(parents=True)
-    file = growing / "bag_0.mcap"
-    file.write_bytes(data[: len(data) // 2])
-    found = Track("growing")
-    source = BagSource(tmp_path / "run", found)
-    thread = threading.Thread(target=source.run, daemon=True)
-    thread.start()
-    time.sleep(0.3)
-    assert thread.is_alive()
-    assert found.state in ("", "waiting: nobody writes this bag at the moment")
-    with file.open("ab") as stream:
-        stream.write(data[len(data) // 2 :])
-    thread.join(PATIENCE_S)
-    assert not thread.is_alive()
-    _, moments = found.since(0, MOST_MOMENTS)
-    assert moments[-1].slot == SLOTS
-
-
-def test_what_is_no_bag_is_named_and_a_damaged_one_ends_in_words(bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "a.mcap").write_bytes(b"nothing")
-    with pytest.raises(UnusableBag, match="is not an MCAP file"):
-        BagSource(tmp_path / "a.mcap", Track("a"))
-    data = bytearray(next(bag.glob("*.mcap")).read_bytes())
-    data[len(data) // 3] ^= 0xFF
-    (tmp_path / "b.mcap").write_bytes(data)
-    found = Track("b")
-    BagSource(tmp_path / "b.mcap", found).run()
-    assert found.state
 
 
 def test_a_track_keeps_a_limited_number_of_moments() -> None:
@@ -137,6 +98,18 @@ def test_a_track_keeps_a_limited_number_of_moments() -> None:
     assert moments[-1].slot == 4
 
 
+def test_what_waits_for_a_page_is_limited() -> None:
+    swarm = Swarm(SwarmConfig(agents=AGENTS))
+    moments, reason = Moments(swarm.scenario), np.zeros(AGENTS, np.uint8)
+    for slot in range(5 * MOST_FRAMES // 2):
+        moments.frames(slot, SUCCESS, (slot % AGENTS + 1,), reason, None)
+    slots = [
+        numbers(json.loads(moments.take(slot, None, swarm.chosen, None).text)["frames"]["slot"], "<u4") for _ in "ab"
+    ]
+    assert slots[0].tolist() == list(range(slot - MOST_FRAMES + 1, slot + 1))
+    assert not len(slots[1])
+
+
 # Who may see it.
 
 
@@ -147,7 +120,6 @@ async def _statuses(url: str) -> dict[str, int]:
         for name, address, headers in (
             ("page", url, {}),
             ("script", url + "view.js", {}),
-            ("three", url + "three.module.min.js", {}),
             ("own origin", url, {"Origin": base}),
             ("nothing", base + "/", {}),
             ("wrong token", f"{base}/{token[:-1]}x/", {}),
@@ -174,11 +146,11 @@ async def _statuses(url: str) -> dict[str, int]:
 
 
 def test_only_who_knows_the_token_and_comes_from_here_gets_anything(track: Track) -> None:
-    with serving(ViewServer([track], "some-token")) as url:
+    with serving(ViewServer(track, "some-token")) as url:
         assert url.startswith("http://127.0.0.1:")
         found = asyncio.run(_statuses(url))
     allowed = {name: status for name, status in found.items() if status < 400}
-    assert allowed == {"page": 200, "script": 200, "three": 200, "own origin": 200, "stream": 101}
+    assert allowed == {"page": 200, "script": 200, "own origin": 200, "stream": 101}
     assert {status for name, status in found.items() if name not in allowed} <= {403, 404}
 
 
@@ -209,7 +181,7 @@ def test_a_page_that_does_not_read_costs_nothing_and_garbage_is_let_go() -> None
         sleeping.close()
         return got
 
-    with serving(ViewServer([found], "some-token")) as url:
+    with serving(ViewServer(found, "some-token")) as url:
         assert asyncio.run(session(url)) == 40
 
 
@@ -233,7 +205,7 @@ def test_a_page_is_let_go_wherever_sending_stands(steps: int) -> None:
         found.add(Moment(0, "{}", b"", b""))
 
     async def session() -> bool:
-        reader = _Reader(page := Page(), [found])  # type: ignore[arg-type]
+        reader = _Reader(page := Page(), found)  # type: ignore[arg-type]
         running = asyncio.create_task(reader.run())
         for _ in range(steps):
             await asyncio.sleep(0)
@@ -244,7 +216,7 @@ def test_a_page_is_let_go_wherever_sending_stands(steps: int) -> None:
 
 
 NO_ORDERS = [
-    *(None, [], {}, {"kind": "reboot"}, {"kind": "kill"}, {"kind": "kill", "agent": True}),
+    *(None, [], {}, {"kind": "reboot"}, {"kind": "kill"}, {"kind": "kill", "value": True}),
     *({"kind": "loss", "value": value} for value in (2, "1", True, float("nan"))),
     *(
         {"kind": "jam", "value": 1},
@@ -262,36 +234,15 @@ def test_orders_are_checked(content: Any) -> None:
 
 
 def test_usable_orders_are_read() -> None:
-    assert read_order({"kind": "kill", "agent": 3}) == Order("kill", 3)
+    assert read_order({"kind": "kill", "value": 3}) == Order("kill", 3)
     assert read_order({"kind": "loss", "value": 1}) == Order("loss", value=1.0)
     assert read_order({"kind": "partition", "value": ""}) == Order("partition", value="")
-
-
-@pytest.mark.realtime
-def test_a_link_to_a_server_that_stands_still_never_waits() -> None:
-    """What it cannot take is dropped; that a process stands still is what SIGSTOP makes of it."""
-    link = ViewLink()
-    try:
-        assert link.offer(record(BEGIN, {}))
-        os.kill(link.process_id, signal.SIGSTOP)
-        data = record(BEGIN, "x" * 100_000)
-        begin = time.monotonic()
-        taken = sum(link.offer(data) for _ in range(100))
-        assert time.monotonic() - begin < 1.0
-        assert taken < 50
-        assert link.dropped == 100 - taken
-        os.kill(link.process_id, signal.SIGKILL)
-        wait_for(lambda: not link.alive())
-        wait_for(lambda: (link.offer(data), link.gone)[1])
-    finally:
-        link.close()
 
 
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["view", "nowhere"], "there is no such file"),
-        (["view", "a", "b", "c"], "bags: got 3"),
+        (["view", "runs/a"], "a recorded run is shown by `tools/dtsa report runs/a`"),
         (["view", "--port", "99999"], "port: got"),
         (["view", "--listen", "0.0.0.0"], "listen: got"),
         (["fly", "--out", "x", "--control"], "control: got True; allowed: only with --view"),

@@ -1,4 +1,4 @@
-"""Crazyflies on the live page: their bridge's words are shown, and orders reach simulated vehicles."""
+"""Integration: Crazyflies on the live page: their bridge's words are shown, and orders reach simulated vehicles."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ pytest.importorskip("dtsa_msgs.srv")
 pytest.importorskip("aiohttp")
 
 from bridge_helpers import end_process, fake_fleet, settings
+from browser_helpers import CHROMIUM, MISSING, browsing, serving
 from builtin_interfaces.msg import Duration
-from dtsa_dev.soak.chromium import CHROMIUM, MISSING, browsing
-from dtsa_dev.soak.view import serving
 from dtsa_msgs.srv import Arm, Takeoff
 from node_helpers import ServedNode
 from waiting import wait_for
@@ -66,7 +65,7 @@ def test_orders_of_the_page_reach_the_crazyflies_and_are_seen_on_it(tmp_path: Pa
         listening = threading.Thread(target=source.run)
         listening.start()
         try:
-            with serving(ViewServer([track], "some-token", source.order)) as url:
+            with serving(ViewServer(track, "some-token", source.order)) as url:
                 browser.open(url)
                 browser.wait_for(all_are("ready"))
                 assert pilot.call(Arm, "/all/arm", arm=True).success

@@ -33,7 +33,7 @@ from dtsa_bench.flights.options import FlightOptions
 from dtsa_bench.flights.progress import FlightProgress, ProgressLine
 from dtsa_bench.flights.recorded_channel import BAG, RecordedFlight
 from dtsa_bench.flights.supervisor import RealtimeSupervisor
-from dtsa_bench.pages.view.mission import PageOptions, mission_page
+from dtsa_bench.pages.view.process import PageOptions, view_process
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_bench.runs.options import new_directory, whole_number
@@ -233,7 +233,8 @@ def fly_crazyflies(
         directory = new_directory(out)
         (directory / "log").mkdir()
         environment = run_environment(domain, directory / "log", shared_memory=False)
-        shown.enter_context(mission_page(domain, environment, page))
+        if page is not None:
+            shown.enter_context(view_process(domain, environment, page))
         station, ended = _Station(settings, directory, environment, attach), Ended(stop)
         station.start(swarm_yaml)
         try:

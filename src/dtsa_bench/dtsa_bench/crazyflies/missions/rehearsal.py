@@ -21,7 +21,7 @@ from dtsa_bench.crazyflies.simulated.ports import free_base_port
 from dtsa_bench.crazyflies.simulated.process import FleetError, running_fleet
 from dtsa_bench.flights.flight import Flight
 from dtsa_bench.flights.options import FlightOptions
-from dtsa_bench.pages.view.mission import PageOptions
+from dtsa_bench.pages.view.process import PageOptions
 from dtsa_bench.runs.config import RunConfig
 
 from .mission_flight import fly_crazyflies

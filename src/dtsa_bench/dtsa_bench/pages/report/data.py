@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
+from dtsa_bench.pages.html import BINS, flatten, pack, reduce_bins, thin
 from dtsa_bench.recordings.bag.metadata import RECOVERED_FROM
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.run import OUTCOMES, RecordedRun, load_run
@@ -17,20 +19,19 @@ from dtsa_bench.recordings.tables.followed import Ages
 from dtsa_bench.runs.hearing import recorded_problem, sentence
 
 from .distances import collision_m, crashes_of, distance_charts, pair_distances
-from .json_values import BINS, flatten, pack, reduce_bins, thin
-from .mission import mission_data
 
 SCENE_HZ = 20.0  # frames of the 3-D replay in a simulated second
 SCENE_VALUES = 600_000  # most numbers in the replay: longer runs of larger swarms get fewer frames
-UNKNOWN = -32768  # in the replay: nobody knows where it was
+UNKNOWN = -32768  # in the replay: it is not known where the agent was
+VALUES = ("battery_first_v", "battery_least_v", "link_quality_least", "log_age_most_s", "latency_most_ms")
+EVENTS = 1000  # of a mission, most that are shown
 
 Array = NDArray[np.float64]
 
 
 def run_data(path: str | Path) -> dict[str, Any]:
-    """Everything that the page needs to know about one run, as JSON types.
+    """All that the page shows of one run (run directory, bag directory or .mcap file), as JSON types.
 
-    :param path: run directory, bag directory or .mcap file.
     :raises UnusableBag: if it is none of a swarm's run.
     """
     with Bag(path) as bag:
@@ -269,3 +270,28 @@ def _heard_share(run: RecordedRun, mine: NDArray[np.bool_]) -> float | None:
     if not mine.any() or (run.told is not None and not offered):
         return None
     return round(float(run.frames.received[mine].sum()) / max(1, offered), 4)
+
+
+def mission_data(path: str | Path) -> dict[str, Any] | None:
+    """What `mission.json` beside a bag says of a mission with Crazyflies; None: there is none."""
+    place = Path(path)
+    for directory in (place, place.parent, place.parent.parent):
+        file = directory / "mission.json"
+        if (directory == place or directory / "bag" in (place, place.parent)) and file.is_file():
+            break
+    else:
+        return None
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        vehicles = [
+            [
+                str(name),
+                *(values.get(key) for key in VALUES),
+                " → ".join(str(s["state"]) for s in values["states"]),
+            ]
+            for name, values in found["vehicles"].items()
+        ]
+        events = [[float(e["t_s"]), str(e["level"]), str(e["text"])] for e in found["events"]]
+        return {"cut_short": str(found["cut_short"]), "vehicles": vehicles, "events": events[:EVENTS]}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dtsa_bench.pages.html import reduce_bins, thin
 from dtsa_bench.recordings.bag.run import RecordedRun, swarm_section
-
-from .json_values import reduce_bins, thin
 
 CRASHES = 50  # most that are shown
 PAIRS = 5  # closest pairs whose distance is drawn
@@ -33,11 +32,7 @@ class Distances:
 
 
 def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | None:
-    """Distances at the recorded moments; None with fewer than two agents.
-
-    :param run: the run.
-    :param collision_m: m, below which two have crashed.
-    """
+    """Distances at the recorded moments, and pairs below `collision_m`; None with fewer than two agents."""
     motion = run.motion
     count = len(motion.ids)
     if count < 2 or not len(motion.time_ns):
@@ -68,21 +63,13 @@ def pair_distances(run: RecordedRun, collision_m: float = 0.2) -> Distances | No
 
 
 def collision_m(run: RecordedRun) -> float:
-    """Below this distance two agents have crashed, m.
-
-    :param run: the run.
-    """
+    """Below this distance two agents have crashed, m."""
     limits = run.config.get("limits", {})
     return float(limits.get("collision_m", 0.2)) if isinstance(limits, Mapping) else 0.2
 
 
 def crashes_of(distances: Distances | None, run: RecordedRun, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Who crashed, when and where; the first ones if there are many.
-
-    :param distances: of the run; None: there are none.
-    :param run: the run.
-    :param summary: its results.
-    """
+    """Which agents crashed, when and where; the first ones if there are many."""
     if distances is None:
         return []
     found = list(distances.crashes)
@@ -108,11 +95,7 @@ def crashes_of(distances: Distances | None, run: RecordedRun, summary: Mapping[s
 
 
 def distance_charts(distances: Distances | None, run: RecordedRun) -> dict[str, Any] | None:
-    """Distances over time as a page shows them, and what they are compared with.
-
-    :param distances: of the run; None: there are none.
-    :param run: the run.
-    """
+    """Distances over time as a page shows them, and what they are compared with."""
     if distances is None:
         return None
     return {

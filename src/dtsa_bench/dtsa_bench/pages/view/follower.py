@@ -1,4 +1,4 @@
-"""Follows a run by its messages, from a bag or from the ROS graph, and tells it moment by moment."""
+"""Follows a run by its messages on the ROS graph, and hands it to a page moment by moment."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import AbstractSwarm, make_scenario
 from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.hearing import Hearing, Unheard
 from dtsa_bench.runs.metrics import metrics_tables
 
-from .moments import BELIEFS, Moments, estimate_now, run_info
+from .moments import BELIEFS, Moments, run_info
+from .orders import PROCESS_ORDERS
 from .track import Track
 
 _PAIRS = 100  # agents: of larger swarms crashes are not looked for
 _FARTHEST_M = 1e6
+_PERIOD_NS = 50_000_000  # simulated, from one moment to the next
 _SLOTS = 64  # whose frames wait for the channel's verdict
 
 
 class Follower:
-    """Takes in a run's messages slot by slot; what cannot be one is counted and left out.
+    """Receives a run's messages slot by slot; those that cannot be used are counted and left out.
 
     Objects of rclpy and of other decoders will do: only the fields' names and contents matter.
 
@@ -36,7 +39,6 @@ class Follower:
 
     def __init__(self, track: Track, info: Mapping[str, Any]) -> None:
         self._track, self._more = track, dict(info)
-        self._wanted = 0  # slots from one moment to the next; 0: 20 moments a simulated second
         self._run: RunConfig | None = None
         self.unusable = 0
 
@@ -45,38 +47,31 @@ class Follower:
         """Whether the run's settings are known."""
         return self._run is not None
 
-    def set_pace(self, slots: int) -> None:
-        """Sets how many slots pass from one moment to the next; before the run begins."""
-        self._wanted = slots
-
     def begin(self, settings: Mapping[str, Any]) -> None:
-        """The settings of the run are known; from now on its messages are taken in.
+        """Set up for a run with settings as its Configuration message and its bag hold them.
 
-        :param settings: as a bag holds them.
         :raises DtsaError: if they cannot be used.
         """
         if self._run is not None:
             return
         run = RunConfig.from_dict(dict(settings) if "swarm" in settings else {"swarm": dict(settings)})
-        self._run, self.scenario = run, make_scenario(run.swarm)
-        agents, steps = run.swarm.agents, run.swarm.steps
-        self.agents, self.steps = agents, steps
+        self._run, self.scenario, self.agents = run, make_scenario(run.swarm), run.swarm.agents
         self._tables = self._make_tables(run)
-        self._hearing, self._unheard = Hearing(agents), Unheard(run.swarm.slot_ns)
-        self._oracle = run.swarm.estimator_row.needs_everybody
-        self._moments = Moments(self.scenario, run.swarm.slot_ns, run.air)
-        self._every = self._wanted or self._moments.place_slots
-        self._way = np.repeat(np.ascontiguousarray(self.scenario.start)[None], steps, axis=0)  # (S, 3, N) m
-        self._chosen = np.zeros(agents, np.uint16)
-        self._digest = np.zeros(agents, np.uint32)
-        self._reason = np.zeros(agents, np.uint8)
-        self._frames: dict[int, dict[int, bytes]] = {}  # by slot and sender, until it is told
-        self._slot = 0  # the slot that is being told
+        self._hearing, self._unheard = Hearing(self.agents), Unheard(run.swarm.slot_ns)
+        self._slot_ns = run.swarm.slot_ns
+        self._every = max(1, round(_PERIOD_NS / self._slot_ns))  # slots from one moment to the next
+        self._moments = Moments(self.scenario, run.air)
+        self._place = np.array(self.scenario.start)  # (3, N) m
+        self._chosen = np.zeros(self.agents, np.uint16)
+        self._digest = np.zeros(self.agents, np.uint32)
+        self._reason = np.zeros(self.agents, np.uint8)
+        self._frames: dict[int, dict[int, bytes]] = {}  # by slot and sender, until the slot's verdict is there
+        self._slot = 0  # the slot that is under way
         self._next = 0  # first slot of the next moment
         self._absent: frozenset[int] = frozenset()
         self._crashed: set[tuple[int, int]] = set()
         self._lag_ms, self._ended = 0.0, ""
-        self._pairs = np.triu_indices(agents, 1)
+        self._pairs = np.triu_indices(self.agents, 1)
         self._track.begin(run_info(self._track.name, run, self.scenario) | self._more)
 
     def _make_tables(self, run: RunConfig) -> AbstractSwarm | None:
@@ -87,12 +82,8 @@ class Follower:
         except DtsaError:
             return None  # frames with a key that is not here, or a policy that is not installed
 
-    def take(self, kind: str, message: Any) -> None:
-        """Takes in a message.
-
-        :param kind: its type without the package, as ``Reception``.
-        :param message: an object with its fields.
-        """
+    def receive(self, kind: str, message: Any) -> None:
+        """Take in a message; `kind` is its type without the package, as ``Reception``."""
         try:
             if kind == "Configuration":
                 settings = json.loads(message.settings)
@@ -109,63 +100,53 @@ class Follower:
             raise ValueError("an id that is none of the swarm's")
         return index
 
-    def _transmission(self, message: Any) -> None:
-        """What some agents answer to a slot: where they are, what they decided, their frames."""
-        index, n = self._index(message.agent), len(message.agent)
-        way = np.asarray(message.track, dtype=np.float64).reshape(self.steps, 3, n)
-        if not np.abs(way).max(initial=0.0) < _FARTHEST_M:
-            raise ValueError("positions that are no numbers, or far away")
+    def _receive_slot(self, message: Any) -> None:
+        """The frames of a slot that at least one agent received, as the channel delivers them."""
+        if message.phase or not len(message.sender):  # Slot.RUN is 0
+            return
         frames = split_frames(bytes(np.asarray(message.data, np.uint8)), np.asarray(message.length).tolist())
-        self._way[:, :, index] = way
-        self._decided(index, message)
-        self._slot = int(message.slot)
-        self._keep(self._slot, np.asarray(message.agent).tolist(), frames)
-
-    def _keep(self, slot: int, senders: list[int], frames: list[bytes]) -> None:
-        """Keeps frames until it is known who received them."""
-        self._frames.setdefault(slot, {}).update((s, f) for s, f in zip(senders, frames, strict=False) if f)
+        self._index(message.sender)
+        kept = self._frames.setdefault(int(message.heard_slot), {})
+        kept.update(zip(np.asarray(message.sender).tolist(), frames, strict=False))
         while len(self._frames) > _SLOTS:
             del self._frames[min(self._frames)]
 
-    def _heard(self, message: Any) -> None:
-        """The frames that somebody received in a slot, as the channel delivers them."""
-        if message.phase == 0 and len(message.sender):  # Slot.RUN
-            frames = split_frames(bytes(np.asarray(message.data, np.uint8)), np.asarray(message.length).tolist())
-            self._index(message.sender)
-            self._keep(int(message.heard_slot), np.asarray(message.sender).tolist(), frames)
-
-    def note(self, text: str, kind: str = "note") -> None:
-        """Something that people should read has happened now."""
-        if self._run is not None:
-            self._moments.event(self._slot, kind, text)
-
-    def _decision(self, message: Any) -> None:
-        self._decided(self._index(message.agent), message)
-
-    def place(self, agent: int, position: tuple[float, float, float]) -> None:
-        """Takes in where an agent is, where no transmissions tell it.
-
-        :param agent: its id.
-        :param position: m, frame map.
-        """
-        if self._run is not None and 1 <= agent <= self.agents and all(abs(x) < _FARTHEST_M for x in position):
-            self._way[:, :, agent - 1] = position
-
-    def _decided(self, index: NDArray[np.intp], message: Any) -> None:
+    def _receive_decision(self, message: Any) -> None:
+        index = self._index(message.agent)
         self._chosen[index] = np.asarray(message.chosen, np.uint16)
         self._digest[index] = np.asarray(message.digest, np.uint32)
         self._reason[index] = np.asarray(message.reason, np.uint8)
 
-    def _reception(self, message: Any) -> None:
-        """What became of a slot: with it the slot is told, and what was heard in it is taken in."""
+    def note(self, text: str, kind: str = "note") -> None:
+        """Add an event that has happened now."""
+        if self._run is not None:
+            self._moments.event(self._slot, kind, text)
+
+    def _receive_markers(self, message: Any) -> None:
+        """Where all agents are at the start of a slot: the spheres, which come first."""
+        spheres = message.markers[: self.agents]
+        place = np.array([(one.pose.position.x, one.pose.position.y, one.pose.position.z) for one in spheres])
+        if not np.abs(place).max(initial=0.0) < _FARTHEST_M:
+            raise ValueError("positions that are no numbers, or far away")
+        self._place[:, self._index([one.id for one in spheres])] = place.T
+        stamp = spheres[0].header.stamp
+        past_ns = stamp.sec * 10**9 + stamp.nanosec - names.TIME_ZERO_NS
+        self._moments.place(past_ns // self._slot_ns, self._place)
+        self._find_crashes(past_ns // self._slot_ns)
+
+    def _receive_reception(self, message: Any) -> None:
+        """What became of a slot: the slot is complete, and its frames go into the tables."""
         slot, senders = int(message.slot), np.asarray(message.sender).tolist()
         self._index(senders)
         mask = unpack_received(bytes(np.asarray(message.received, np.uint8)), len(senders), self.agents)
-        self._look(slot)
+        if slot >= self._next:
+            self._next = slot + self._every
+            self._hand_over(slot)
         frames = self._frames.pop(slot, {})
         if self._tables is not None:
             self.scenario.advance(slot, self._tables)
-            known = [row for row, sender in enumerate(senders) if sender in frames]
+            # A frame that no agent received is not delivered, and none that a listener has missed.
+            known = [row for row, sender in enumerate(senders) if sender in frames or not mask[row].any()]
             if known or not senders:
                 self._hearing.slot(len(known), mask[known])
             for row, sender in enumerate(senders):
@@ -178,40 +159,30 @@ class Follower:
         self._moments.choices(self._chosen[here])
         self._slot = slot + 1
 
-    def _look(self, slot: int) -> None:
-        """All agents have answered a slot: where they are is known."""
-        position = self._way[-1]
-        self._find_crashes(slot)
-        if slot % self._moments.place_slots == 0 or slot >= self._next:
-            self._moments.place(slot, position)
-        if slot < self._next:
-            return
-        self._next = slot + self._every
-        self._tell(slot)
-
-    def _tell(self, slot: int) -> None:
-        if self._tables is not None:
-            estimate_now(self._tables, self._oracle, slot, self._way[-1])
+    def _hand_over(self, slot: int) -> None:
+        if self._tables is not None and self._run is not None:
+            if self._run.swarm.estimator_row.needs_everybody:
+                self._tables.estimate_position[:] = self._place
+            else:
+                self._tables.estimate(slot)
         if problem := self._unheard.news(slot, self._hearing.problem()):
             self._moments.event(slot, "bad", problem)
         more: dict[str, Any] = {"lag_ms": round(self._lag_ms, 2)}
-        gathered = self._moments.gather(slot, self._tables, self._chosen, self._digest, self._absent, **more)
-        self._track.add(self._moments.moment(gathered))
+        self._track.add(self._moments.take(slot, self._tables, self._chosen, self._digest, self._absent, **more))
 
     def _find_crashes(self, slot: int) -> None:
         if self.agents > _PAIRS or self.agents < 2 or self._run is None:
             return
         one, other = self._pairs
-        gap = self._way[:, :, one] - self._way[:, :, other]
-        least = np.einsum("sip,sip->sp", gap, gap).min(axis=0)
-        for k in np.flatnonzero(least < self._run.limits.collision_m**2).tolist():
+        gap = ((self._place[:, one] - self._place[:, other]) ** 2).sum(axis=0)
+        for k in np.flatnonzero(gap < self._run.limits.collision_m**2).tolist():
             pair = int(one[k]) + 1, int(other[k]) + 1
             if pair not in self._crashed:
                 self._crashed.add(pair)
-                self._moments.crash(slot, pair, math.sqrt(least[k]))
+                self._moments.crash(slot, pair, math.sqrt(gap[k]))
 
-    def _status(self, message: Any) -> None:
-        """Who has fallen silent, and whether the run is over."""
+    def _receive_status(self, message: Any) -> None:
+        """Which agents have fallen silent, and whether the run is over."""
         slot, lost = int(message.slot), frozenset((self._index(message.lost) + 1).tolist())
         for agent in sorted(lost - self._absent):
             self._moments.event(slot, "lost", f"cf{agent} has fallen silent")
@@ -222,30 +193,28 @@ class Follower:
             self._ended = str(message.reason)[:300] or "over"
             self._moments.event(slot, "end", f"the run has ended: {self._ended}")
 
-    def _changed(self, message: Any) -> None:
+    def _receive_change(self, message: Any) -> None:
         """A setting of the channel was changed while it ran."""
         for parameter in list(message.changed_parameters)[:20]:
             value = parameter.value
             fields = (value.bool_value, value.integer_value, value.double_value, value.string_value)
-            text = fields[int(value.type) - 1] if 1 <= int(value.type) <= 4 else "?"
-            self._moments.event(self._slot, "air", f"{str(parameter.name)[:40]} is {str(text)[:80]!r} from now on")
+            text = repr(fields[int(value.type) - 1])[:80] if 1 <= int(value.type) <= 4 else "?"
+            if parameter.name in PROCESS_ORDERS:
+                self._moments.event(self._slot, "note", f"{parameter.name} cf{text}")
+            else:
+                self._moments.event(self._slot, "air", f"{str(parameter.name)[:40]} is {text} from now on")
 
     def finish(self, state: str) -> None:
-        """No more will come.
-
-        :param state: why, as people read it.
-        """
+        """Hand over the last moment; `state` says to people why no more will come."""
         if self._run is not None and self._slot:
-            self._find_crashes(self._slot)
-            self._moments.place(self._slot, self._way[-1])
-            self._tell(self._slot)
+            self._hand_over(self._slot)
         self._track.end(f"{state}: {self._ended}" if getattr(self, "_ended", "") else state)
 
     _HANDLERS: Mapping[str, Callable[[Follower, Any], None]] = {
-        "Transmission": _transmission,
-        "Slot": _heard,
-        "Decision": _decision,
-        "Reception": _reception,
-        "RunStatus": _status,
-        "ParameterEvent": _changed,
+        "Slot": _receive_slot,
+        "Decision": _receive_decision,
+        "MarkerArray": _receive_markers,
+        "Reception": _receive_reception,
+        "RunStatus": _receive_status,
+        "ParameterEvent": _receive_change,
     }

@@ -1,4 +1,4 @@
-"""A swarm on the ROS graph as a source of moments: a node that listens, and never holds up who speaks."""
+"""A swarm on the ROS graph as a source of moments: a node that listens, and for which no agent ever waits."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from dtsa_msgs.msg import Configuration, Decision, Reception, RunStatus, Slot
 from dtsa_msgs.srv import Land
-from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import Empty
+from visualization_msgs.msg import MarkerArray
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.graph import names
@@ -33,16 +34,12 @@ from .track import Track
 from .vehicles import VehicleWatch, listening
 
 _POLL_S = 0.02
-_PLACES_S = 0.05  # wall time from one look at all positions to the next
+_VEHICLES_S = 0.05  # wall time from one look at the vehicles to the next
 _WAITING = 500  # messages that wait for the next poll
 _ENDED = 2  # RunStatus.ENDED
 _MOST_ORDERS = 20  # that wait
 _ANSWER_S = 5.0
 _LAND_S = 3
-
-
-def _latched() -> QoSProfile:
-    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class GraphSource:
@@ -65,21 +62,21 @@ class GraphSource:
             "view", namespace=space, context=self._context, enable_rosout=False, start_parameter_services=False
         )
         self._intake = Intake(self._node.get_logger())
-        self._settings = self._feed(Configuration, names.CONFIGURATION, _latched())
-        self._status = self._feed(RunStatus, names.STATUS, _latched())
-        self._slots = [
-            (kind.__name__, self._feed(kind, topic, listening(_WAITING)))
-            for kind, topic in ((Slot, names.SLOT), (Decision, names.DECISION), (Reception, names.RECEPTION))
-        ]
-        self._places: list[Feed] = []
+        self._settings = self._feed(Configuration, f"{space}/{names.CONFIGURATION}", names.latched_qos())
+        self._status = self._feed(RunStatus, f"{space}/{names.STATUS}", names.latched_qos())
+        self._changes = self._feed(ParameterEvent, "/parameter_events", listening(_WAITING))
+        self._markers = self._feed(MarkerArray, f"{space}/{names.MARKERS}", listening(_WAITING))
+        kinds = ((Slot, names.SLOT), (Decision, names.DECISION), (Reception, names.RECEPTION))
+        self._slots = [self._feed(kind, f"{space}/{topic}", listening(_WAITING)) for kind, topic in kinds]
+        self._kept: list[tuple[int, int, Any]] = []  # messages of the newest slot, which may not be complete
         self._vehicles = VehicleWatch(self._node, self._intake, track, names.swarm_prefix(space))
         self._orders = _Orders(self._node, self._context, space) if control else None
         self._run = 0
         self._follower: Follower | None = None
         self.stopped = False
 
-    def _feed(self, kind: Any, topic: str, qos: QoSProfile, space: str = "") -> Feed:
-        return Feed(self._node, kind, f"{space or self._space}/{topic}", qos, intake=self._intake)
+    def _feed(self, kind: Any, topic: str, qos: QoSProfile) -> Feed:
+        return Feed(self._node, kind, topic, qos, intake=self._intake)
 
     def run(self) -> None:
         """Listens until ``stopped`` is set."""
@@ -87,14 +84,12 @@ class GraphSource:
         look = 0.0
         try:
             while not self.stopped and self._context.ok():
-                self._settle()
+                self._follow_runs()
                 if (now := time.monotonic()) >= look:
-                    look = now + _PLACES_S
+                    look = now + _VEHICLES_S
                     self._vehicles.look(now)
-                    if self._follower is not None:
-                        self._look(self._follower)
                 if self._follower is not None:
-                    self._hear(self._follower)
+                    self._receive(self._follower)
                 for text in self._orders.carry_out() if self._orders else ():
                     self._vehicles.answer = text
                     if self._follower is not None:
@@ -102,8 +97,7 @@ class GraphSource:
                 time.sleep(_POLL_S)
         finally:
             self._vehicles.close()
-            slots = (feed for _, feed in self._slots)
-            for feed in (self._settings, self._status, *slots, *self._places):
+            for feed in (self._settings, self._status, self._changes, self._markers, *self._slots):
                 feed.close()
             if self._orders:
                 self._orders.close()
@@ -111,57 +105,56 @@ class GraphSource:
             self._context.try_shutdown()
 
     def order(self, order: Order) -> str:
-        """Takes an order; what has come of it stands among the events.
+        """Accept an order; what has come of it stands among the events.
 
         :raises ConfigError: if it cannot be one.
         """
         if self._orders is None:
             raise ConfigError("order", order.kind, "only with --control")
-        return self._orders.take(order)
+        return self._orders.accept(order)
 
-    def _settle(self) -> None:
-        """Takes in which run is under way, and how it is doing."""
+    def _follow_runs(self) -> None:
+        """Receive which run is under way, and how it is doing."""
         message = self._settings.take()
         if message is not None and message.run != self._run:
-            self._run = message.run
+            self._run, self._kept = message.run, []
             self._follower = Follower(self._track, {"live": True, "control": self._orders is not None})
-            self._follower.take("Configuration", message)
+            self._follower.receive("Configuration", message)
             if not self._follower.begun:
                 self._follower = None
                 return
-            for feed in self._places:
-                feed.close()
-                self._node.destroy_subscription(feed.subscription)
-            spaces = [names.agent_namespace(agent, self._space) for agent in range(1, self._follower.agents + 1)]
-            self._places = [self._feed(Odometry, names.ODOMETRY, listening(1), space) for space in spaces]
         status = self._status.take()
         if status is not None and self._follower is not None and status.run == self._run:
-            self._follower.take("RunStatus", status)
             if status.phase == _ENDED:
-                self._hear(self._follower)
+                self._receive(self._follower, last=True)
+            self._follower.receive("RunStatus", status)
+            if status.phase == _ENDED:
                 self._follower.finish("ended")
 
-    def _look(self, follower: Follower) -> None:
-        """Takes in where everybody is now."""
-        for agent, feed in enumerate(self._places, 1):
-            message = feed.take()
-            if message is not None:
-                place = message.pose.pose.position
-                follower.place(agent, (place.x, place.y, place.z))
+    def _receive(self, follower: Follower, last: bool = False) -> None:
+        """Receive what has come since the last poll: of each slot decisions and frames before the verdict.
 
-    def _hear(self, follower: Follower) -> None:
-        """Takes in what has been said since the last look: decisions and frames before the verdicts on them."""
-        found: list[tuple[int, int, str, Any]] = []
-        for order, (kind, feed) in enumerate(self._slots):
+        :param last: nothing more will come: the newest slot is complete, too.
+        """
+        while (event := self._changes.take()) is not None:
+            if event.node == f"{self._space}/channel":
+                follower.receive("ParameterEvent", event)
+        while (markers := self._markers.take()) is not None:
+            follower.receive("MarkerArray", markers)
+        for place, feed in enumerate(self._slots):
             for _ in range(_WAITING):
                 message = feed.take()
                 if message is None:
                     break
                 if message.run == self._run:
-                    slot = message.heard_slot if kind == "Slot" else message.slot
-                    found.append((slot, order, kind, message))
-        for _, _, kind, message in sorted(found, key=lambda entry: entry[:2]):
-            follower.take(kind, message)
+                    slot = message.heard_slot if place == 0 else message.slot
+                    self._kept.append((slot, place, message))
+        self._kept.sort(key=lambda entry: entry[:2])
+        newest = self._kept[-1][0] if self._kept else 0
+        complete = [entry for entry in self._kept if last or entry[0] < newest]
+        del self._kept[: len(complete)]
+        for _, _, message in complete:
+            follower.receive(type(message).__name__, message)
 
 
 class _Orders:
@@ -181,25 +174,20 @@ class _Orders:
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(node)
 
-    def take(self, order: Order) -> str:
-        """Takes an order; called by the server's thread.
-
-        :raises ConfigError: if nobody here could carry it out.
-        """
-        if order.kind in ("kill", "start"):
-            raise ConfigError("order", order.kind, "only by the flight that started the agents: fly --view --control")
+    def accept(self, order: Order) -> str:
+        """Accept an order; called by the server's thread."""
         self._waiting.append(order)
         return f"ordered: {order.kind}"
 
     def carry_out(self) -> list[str]:
-        """Calls what is ordered, never waits; what has come of orders, as people read it."""
-        told = []
+        """Call what is ordered, never wait; what has come of orders, as people read it."""
+        results = []
         while self._waiting:
             order = self._waiting.popleft()
             client, request = self._request(order)
             text = f"{order.kind} {order.value!r}" if client is self._channel else order.kind
             if not client.service_is_ready():
-                told.append(f"refused: {text}: nobody offers {client.srv_name}")
+                results.append(f"refused: {text}: no node offers {client.srv_name}")
             else:
                 self._asked.append((text, time.monotonic() + _ANSWER_S, client.call_async(request)))
         if self._asked:
@@ -208,8 +196,8 @@ class _Orders:
             text, until, future = entry
             if future.done() or time.monotonic() > until:
                 self._asked.remove(entry)
-                told.append(f"{text}: {_said(future.result()) if future.done() else 'no answer'}")
-        return told
+                results.append(f"{text}: {_answer_text(future.result()) if future.done() else 'no answer'}")
+        return results
 
     def _request(self, order: Order) -> tuple[Any, Any]:
         if order.kind == "land":
@@ -224,7 +212,7 @@ class _Orders:
         self._executor.shutdown(timeout_sec=0)
 
 
-def _said(response: Any) -> str:
+def _answer_text(response: Any) -> str:
     """What a service has answered, in words."""
     results = getattr(response, "results", None)
     if results is not None:

@@ -1,11 +1,10 @@
-"""What a page shows of one moment of a run: gathered where it arises, told where nobody waits for it."""
+"""What a page shows of one moment of a run: collected slot by slot, handed over a few times a second."""
 
 from __future__ import annotations
 
 import json
-from array import array
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,19 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import REASONS, AbstractSwarm, Scenario
-from dtsa_bench.pages.report.json_values import flatten, pack
+from dtsa_bench.pages.html import flatten, pack
 from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim import Change, ChannelConfig
 from dtsa_channel_sim.model.schedule import scheduled_changes
 
-PLACES_HZ = 20.0  # positions in a simulated second
-MOST_FRAMES = 4000  # frames told in one moment: of more than these the last
+MOST_FRAMES = 4000  # frames in one moment: of more than these the last
 MOST_PLACES = 400  # likewise positions
 MOST_EVENTS = 100  # likewise events
-BELIEFS = 100  # agents: of larger swarms it is not told what each believes about each
+BELIEFS = 100  # agents: of larger swarms a page does not get what each believes about each
 UNKNOWN = 65535  # an age that is not known
-_AGE_STEPS = 10  # mean ages are told in tenths of slots
-_MM = 1000.0  # believed positions are told in mm
+_AGE_STEPS = 10  # mean ages are in tenths of slots
+_MM = 1000.0  # believed positions are in mm
 _FARTHEST = 32767
 _FRAME = (("slot", "<u4"), ("sender", "<u2"), ("outcome", "u1"), ("reason", "u1"), ("received", "u1"))
 
@@ -38,41 +36,18 @@ class Moment:
 
     slot: int  # slots flown; positions are those at the start of this one
     text: str  # what the page takes in, a JSON object
-    heard: bytes  # (N, N) uint16, slots since each observer heard each agent; empty: not told
-    believed: bytes  # (N, 3, N) int16 mm, frame map, where each observer takes each agent to be; empty: not told
+    heard: bytes  # (N, N) uint16, slots since each observer heard each agent; empty: not known
+    believed: bytes  # (N, 3, N) int16 mm, frame map, where each observer takes each agent to be; empty: not known
 
-
-@dataclass(frozen=True, slots=True)
-class Gathered:
-    """What has come in between two moments, and what the agents know now: bytes as they are, quickly made."""
-
-    slot: int  # slots flown; positions are those at the start of this one
-    frames: bytes  # (F, 5) int64, slot, sender, outcome, reason and share of receivers of each frame
-    at: bytes  # (P,) uint32, slots of the positions
-    place: bytes  # (P, 3, N) float32 m, frame map
-    chosen: bytes  # (N,) uint16, ids that the agents take for the sender
-    digest: bytes  # (N,) uint32, of their tables; empty: not known
-    in_ap: bytes  # (M, N) uint8, what the tables hold; empty: not known
-    sent_slot: bytes  # (M, N) int64, likewise
-    estimate: bytes  # (M, 3, N) float64 m, frame map, likewise; empty: not told
-    more: dict[str, Any]  # the rest as JSON types; absent: ids of agents that have fallen silent
-
-
-@dataclass(frozen=True, slots=True)
-class Belief:
-    """What one observer believes at one moment."""
-
-    heard: bytes  # (N,) uint16
-    believed: bytes  # (3, N) int16
+    def belief(self, observer: int, agents: int) -> tuple[bytes, bytes]:
+        """Rows of `heard` and `believed` of one observer; empty where they are not known."""
+        row = observer - 1
+        heard = self.heard[2 * agents * row : 2 * agents * (row + 1)]
+        return heard, self.believed[6 * agents * row : 6 * agents * (row + 1)]
 
 
 def run_info(name: str, run: RunConfig, scenario: Scenario) -> dict[str, Any]:
-    """What a page has to know of a run before its first moment, as JSON types.
-
-    :param name: what the page calls it.
-    :param run: its settings.
-    :param scenario: its scenario.
-    """
+    """What a page has to know of a run before its first moment, as JSON types."""
     both = np.concatenate([scenario.start, scenario.target], axis=1)
     swarm = run.swarm
     return {
@@ -93,22 +68,18 @@ def run_info(name: str, run: RunConfig, scenario: Scenario) -> dict[str, Any]:
 
 
 class Moments:
-    """Collects what happens in a run, and gives it away moment by moment; all that it holds is bounded.
+    """Collects what happens in a run, and hands it over moment by moment; all that it holds is bounded.
 
     :param scenario: the run's scenario.
-    :param slot_ns: ns, length of a slot.
-    :param air: the channel's settings: what changes by their schedule is told; None: nothing does.
+    :param air: the channel's settings, whose scheduled changes become events; None: there are none.
     """
 
-    def __init__(self, scenario: Scenario, slot_ns: int, air: ChannelConfig | None = None) -> None:
+    def __init__(self, scenario: Scenario, air: ChannelConfig | None = None) -> None:
         self._scheduled = deque([] if air is None else scheduled_changes(air))
         self.agents = scenario.start.shape[1]
-        self.place_slots = max(1, round(1e9 / PLACES_HZ / slot_ns))  # slots from one position to the next
-        self._moving = scenario.moving.tolist()
-        most = max(1, self.agents - 1)
-        self._shares = [min(255, round(255 * count / most)) for count in range(self.agents + 1)]  # by receivers
-        self._frames = array("q")  # the columns of one frame after the other
-        self._places: deque[tuple[int, bytes]] = deque(maxlen=MOST_PLACES)
+        self._moving = scenario.moving
+        self._frames: deque[tuple[int, int, int, int, int]] = deque(maxlen=MOST_FRAMES)  # the columns of `_FRAME`
+        self._places: deque[tuple[int, Floats]] = deque(maxlen=MOST_PLACES)
         self._events: deque[tuple[int, str, str]] = deque(maxlen=MOST_EVENTS)
         self._crashes: deque[tuple[int, int, int, float]] = deque(maxlen=MOST_EVENTS)
         self._compared = self._same = 0
@@ -116,73 +87,49 @@ class Moments:
     def frames(
         self, slot: int, outcome: int, senders: Sequence[int], reason: Any, received: NDArray[np.bool_] | None
     ) -> None:
-        """Takes in what became of a slot.
+        """Adds the frames of a slot.
 
-        :param slot: its number.
         :param outcome: the channel's verdict, as in dtsa_msgs/Reception.
-        :param senders: ids of those that sent.
         :param reason: (N,) why each agent decided as it did, index into ``REASONS``.
-        :param received: (F, N) who received each frame; None: all others.
+        :param received: (F, N) which agents received each frame; None: all others.
         """
+        most = max(1, self.agents - 1)
         for row, sender in enumerate(senders):
-            share = 255 if received is None else self._shares[np.count_nonzero(received[row])]
-            self._frames.extend((slot, sender, outcome, reason.item(sender - 1), share))
-        if len(self._frames) > 2 * len(_FRAME) * MOST_FRAMES:  # not at every frame: all that is left moves
-            del self._frames[: -len(_FRAME) * MOST_FRAMES]
+            share = 255 if received is None else min(255, round(255 * np.count_nonzero(received[row]) / most))
+            self._frames.append((slot, sender, outcome, reason.item(sender - 1), share))
 
     def choices(self, chosen: NDArray[Any]) -> None:
-        """Takes in whom the agents take for a slot's sender.
-
-        :param chosen: ids, of those that take part.
-        """
-        data, size = chosen.tobytes(), chosen.itemsize
-        if data:  # compared as bytes, which is faster: this is asked in every slot
+        """Adds whom the agents that take part take for a slot's sender (ids)."""
+        if len(chosen):
             self._compared += 1
-            self._same += data == data[:size] * len(chosen)
+            self._same += bool((chosen == chosen[0]).all())
 
     def place(self, slot: int, position: Floats) -> None:
-        """Takes in where all agents are.
-
-        :param slot: the slot that starts.
-        :param position: (3, N) m, frame map.
-        """
-        self._places.append((slot, position.astype("<f4").tobytes()))
+        """Adds where all agents are, (3, N) m, frame map, when a slot starts."""
+        self._places.append((slot, position.astype("<f4")))
 
     def event(self, slot: int, kind: str, text: str) -> None:
-        """Takes in something that people should read.
-
-        :param slot: when.
-        :param kind: a word for the page's style: note, lost, back, air, bad, end.
-        :param text: one line.
-        """
+        """Adds a line for people; `kind` is a word for the page's style: note, lost, back, air, bad, end."""
         self._events.append((slot, kind, text))
 
     def change(self, change: Change) -> None:
-        """Takes in that settings of the channel have changed.
-
-        :param change: what, and when.
-        """
+        """Adds that settings of the channel have changed."""
         values = ", ".join(f"{name} is {value!r}" for name, value in change.values)
         self.event(change.slot, "air", f"{values} from now on")
 
     def crash(self, slot: int, pair: tuple[int, int], distance_m: float) -> None:
-        """Takes in that two agents have crashed.
-
-        :param slot: the slot that starts.
-        :param pair: their ids.
-        :param distance_m: m, how close they came.
-        """
+        """Adds that two agents (ids) have crashed, and how close they came."""
         self._crashes.append((slot, *pair, round(distance_m, 4)))
 
-    def gather(
+    def take(
         self,
         slot: int,
         tables: AbstractSwarm | None,
         chosen: NDArray[Any],
         digest: NDArray[Any] | None,
-        absent: Iterable[int] = (),
+        absent: Collection[int] = (),
         **more: Any,
-    ) -> Gathered:
+    ) -> Moment:
         """All that has come in since the last moment, and what the agents know now.
 
         :param slot: the slot that starts.
@@ -194,120 +141,50 @@ class Moments:
         """
         while self._scheduled and self._scheduled[0].slot <= slot:
             self.change(self._scheduled.popleft())
-        in_ap = sent_slot = estimate = b""
-        if tables is not None:
-            in_ap, sent_slot = tables.in_ap.tobytes(), tables.sent_slot.tobytes()
-            if self.agents <= BELIEFS and len(tables.sent_slot) == self.agents:
-                estimate = tables.estimate_position.tobytes()
-        gathered = Gathered(
-            slot,
-            self._frames[-len(_FRAME) * MOST_FRAMES :].tobytes(),
-            array("I", [at for at, _ in self._places]).tobytes(),
-            b"".join([place for _, place in self._places]),
-            chosen.astype("<u2").tobytes(),
-            b"" if digest is None else digest.astype("<u4").tobytes(),
-            in_ap,
-            sent_slot,
-            estimate,
-            {
-                "agree": [self._compared, self._same],  # of those that `choices` has taken in
-                "absent": sorted(absent),
-                "events": list(self._events),
-                "crashes": list(self._crashes),
-                **more,
-            },
-        )
-        del self._frames[:]
-        self._places.clear()
-        self._events.clear()
-        self._crashes.clear()
+        here = np.ones(self.agents, bool)
+        here[[agent - 1 for agent in absent]] = False
+        rows = np.array(self._frames, np.int64).reshape(-1, len(_FRAME))
+        places = np.array([place for _, place in self._places], "<f4")
+        content = {
+            "slot": slot,
+            "at": pack(np.array([at for at, _ in self._places], "<u4")),
+            "place": pack(places),
+            "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(_FRAME)},
+            "tables": 0 if digest is None else len(set(digest[here].tolist())),
+            "chosen": pack(chosen.astype("<u2")),
+            "age": pack(self._mean_ages(slot, tables)),
+            "agree": [self._compared, self._same],
+            "absent": sorted(absent),
+            "events": list(self._events),
+            "crashes": list(self._crashes),
+            **more,
+        }
+        heard = believed = b""
+        if tables is not None and self.agents <= BELIEFS and len(tables.sent_slot) == self.agents:
+            heard, believed = _beliefs(slot, tables.sent_slot, tables.estimate_position)
+        for kept in (self._frames, self._places, self._events, self._crashes):
+            kept.clear()
         self._compared = self._same = 0
-        return gathered
+        return Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed)
 
-    def moment(self, gathered: Gathered) -> Moment:
-        """The moment as it goes to a page.
-
-        :param gathered: what :meth:`gather` has given.
-        """
-        return told(gathered, self._moving)
-
-
-def told(gathered: Gathered, moving: Sequence[bool]) -> Moment:
-    """The moment as it goes to a page.
-
-    :param gathered: what it is made of.
-    :param moving: (N,) which agents move.
-    :raises ValueError: if its parts do not fit together.
-    """
-    agents, slot = len(moving), gathered.slot
-    rows = np.frombuffer(gathered.frames, np.int64).reshape(-1, len(_FRAME))
-    here = np.ones(agents, dtype=bool)
-    here[[agent - 1 for agent in gathered.more["absent"]]] = False
-    in_ap = np.frombuffer(gathered.in_ap, np.uint8).reshape(-1, agents)
-    sent_slot = np.frombuffer(gathered.sent_slot, np.int64).reshape(-1, agents)
-    estimate = np.frombuffer(gathered.estimate).reshape(-1, 3, agents)
-    content = {
-        "slot": slot,
-        "at": pack(np.frombuffer(gathered.at, np.uint32).astype("<u4")),
-        "place": pack(np.frombuffer(gathered.place, "<f4")),
-        "frames": {name: pack(rows[:, column].astype(kind)) for column, (name, kind) in enumerate(_FRAME)},
-        "tables": len(set(np.frombuffer(gathered.digest, "<u4")[here].tolist())) if gathered.digest else 0,
-        "chosen": pack(np.frombuffer(gathered.chosen, "<u2")),
-        "age": pack(_mean_ages(slot, in_ap, sent_slot, np.array(moving, dtype=bool))),
-        **gathered.more,
-    }
-    heard, believed = _beliefs(slot, sent_slot, estimate) if len(estimate) else (b"", b"")
-    return Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed)
-
-
-def _mean_ages(
-    slot: int, in_ap: NDArray[np.uint8], sent_slot: NDArray[np.int64], moving: NDArray[np.bool_]
-) -> NDArray[np.uint16]:
-    """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
-    ages = np.full(len(moving), UNKNOWN, np.uint16)
-    counted = (in_ap != 0) & (sent_slot >= 0) & moving
-    if len(counted) == len(moving):
-        np.fill_diagonal(counted, False)
-    observers = counted.sum(axis=0)
-    some = observers > 0
-    old = np.where(counted, slot - 1 - sent_slot, 0).sum(axis=0)
-    ages[some] = np.minimum(UNKNOWN - 1, np.rint(_AGE_STEPS * np.maximum(0, old[some]) / observers[some]))
-    return ages
+    def _mean_ages(self, slot: int, tables: AbstractSwarm | None) -> NDArray[np.uint16]:
+        """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
+        ages = np.full(self.agents, UNKNOWN, np.uint16)
+        if tables is None:
+            return ages
+        counted = (tables.in_ap != 0) & (tables.sent_slot >= 0) & self._moving
+        if len(counted) == self.agents:
+            np.fill_diagonal(counted, False)
+        observers = counted.sum(axis=0)
+        some = observers > 0
+        old = np.where(counted, slot - 1 - tables.sent_slot, 0).sum(axis=0)
+        ages[some] = np.minimum(UNKNOWN - 1, np.rint(_AGE_STEPS * np.maximum(0, old[some]) / observers[some]))
+        return ages
 
 
 def _beliefs(slot: int, sent_slot: NDArray[np.int64], estimate: Floats) -> tuple[bytes, bytes]:
     """Age and place in mm of each agent as each observer knows them."""
     age = np.clip(slot - 1 - sent_slot, 0, UNKNOWN - 1).astype("<u2")
     age[sent_slot < 0] = UNKNOWN
-    place = estimate * _MM
-    np.clip(place, -_FARTHEST, _FARTHEST, out=place)
-    place[place != place] = 0.0  # not a number: of somebody never heard
-    return age.tobytes(), np.rint(place, out=place).astype("<i2").tobytes()
-
-
-def estimate_now(tables: AbstractSwarm, oracle: bool, slot: int, position: Floats) -> None:
-    """Fills the estimates of tables for the start of a slot.
-
-    :param tables: what the agents know.
-    :param oracle: whether their estimator is the truth.
-    :param slot: the slot.
-    :param position: (3, N) m, frame map: the truth.
-    """
-    if oracle:
-        tables.estimate_position[:] = position
-    else:
-        tables.estimate(slot)
-
-
-def belief(moment: Moment, observer: int, agents: int) -> Belief:
-    """What one observer believed at a moment; empty where that was not told.
-
-    :param moment: the moment.
-    :param observer: its id.
-    :param agents: number of agents N.
-    """
-    row = observer - 1
-    return Belief(
-        moment.heard[2 * agents * row : 2 * agents * (row + 1)],
-        moment.believed[6 * agents * row : 6 * agents * (row + 1)],
-    )
+    place = np.nan_to_num(estimate, nan=0.0) * _MM  # not a number: of an agent never heard
+    return age.tobytes(), np.rint(np.clip(place, -_FARTHEST, _FARTHEST)).astype("<i2").tobytes()

@@ -30,7 +30,7 @@ from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.frame_extended import decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import authenticator
-from dtsa_bench.pages.report.json_values import pack
+from dtsa_bench.pages.html import pack
 from dtsa_bench.recordings.merge.known_pairs import all_known_after
 from dtsa_bench.recordings.rules.judge import Judge
 from dtsa_bench.runs.config import REALTIME, RunConfig
@@ -40,6 +40,7 @@ from .moments import UNKNOWN, Moments, run_info
 from .track import Track
 
 _PATIENCE_S = 0.02
+_PERIOD_NS = 50_000_000  # from one moment to the next
 _BURST = 64  # datagrams at a time: whatever comes, time goes on
 _WAITS = 2  # slots that are kept open for frames that come late
 _SILENCE_NS = 2_000_000_000  # after this a frame of an earlier time is of a swarm that began anew
@@ -51,10 +52,8 @@ _NO_REASON = 255
 class HeardRun:
     """What a listener makes of the frames of a swarm, slot by slot.
 
-    :param track: where the moments go.
-    :param config: the settings that all agents share.
     :param air: name of the kind of port.
-    :param first: the first slot that is told.
+    :param first: the first slot that is shown.
     :param zero_ns: ns, CLOCK_MONOTONIC, when slot 0 began or would have begun.
     """
 
@@ -63,7 +62,7 @@ class HeardRun:
         self.slot, self.zero_ns, self.heard_ns = first, zero_ns, 0
         self._scenario = make_scenario(config)
         self._tables = make_swarm(config, self._scenario, local=[], observers=[0])
-        self._moments = Moments(self._scenario, config.slot_ns)
+        self._moments = Moments(self._scenario)
         self._judge = Judge(config)
         self._frames: dict[int, dict[int, tuple[bytes, bytes]]] = {}  # by slot, sender: with and without its tag
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
@@ -71,6 +70,7 @@ class HeardRun:
         self._lost: dict[int, int] = {}  # slot since when, of those that were heard before
         self._quiet = all_known_after(config)  # slots, in which every agent has had a turn
         self._late_ns: deque[int] = deque(maxlen=_LATENESS)
+        self._every = max(1, round(_PERIOD_NS / config.slot_ns))  # slots from one moment to the next
         self._nobody = np.zeros(config.agents, np.uint16)  # whom they take for the sender, only the agents know
         self._reason = np.full(config.agents, _NO_REASON, np.uint8)
         seen = {"live": True, "control": False, "mode": air, "listener": True}
@@ -79,10 +79,8 @@ class HeardRun:
     def hear(self, said: Said, sealed: bytes, zero_ns: int, now_ns: int) -> str:
         """Takes in a frame of a slot that is still open; why not, or an empty text.
 
-        :param said: what its datagram says.
         :param sealed: the frame as it was on the air.
         :param zero_ns: ns, CLOCK_MONOTONIC, when slot 0 began by this frame.
-        :param now_ns: ns, CLOCK_MONOTONIC.
         """
         if said.slot not in self._frames and len(self._frames) >= MOST_EARLY:
             return EARLY
@@ -100,14 +98,10 @@ class HeardRun:
         return ""
 
     def tell(self, refused: Counter[str], now_ns: int) -> None:
-        """Tells the slots that are over.
-
-        :param refused: datagrams that were not taken in so far.
-        :param now_ns: ns, CLOCK_MONOTONIC.
-        """
+        """Hand over the slots that are over; `refused`: datagrams that were not accepted so far, by reason."""
         until = (now_ns - self.zero_ns) // self._config.slot_ns - _WAITS
         while self.slot < until:
-            if self.slot % self._moments.place_slots == 0:
+            if self.slot % self._every == 0:
                 self._tell_moment(refused)
             self._close(self.slot)
             self.slot += 1
@@ -117,8 +111,7 @@ class HeardRun:
         self._moments.place(self.slot, self._places())
         late = statistics.median(self._late_ns) / 1e6 if self._late_ns else 0.0
         more = {"lag_ms": round(late, 2), "refused": refused.total(), "age": pack(self._ages())}
-        gathered = self._moments.gather(self.slot, self._tables, self._nobody, None, self._absent, **more)
-        self._track.add(self._moments.moment(gathered))
+        self._track.add(self._moments.take(self.slot, self._tables, self._nobody, None, self._absent, **more))
 
     def _places(self) -> NDArray[np.float64]:
         """(3, N) m, frame map, where the agents are: those that are lost where the last frame left them."""
@@ -174,9 +167,6 @@ class HeardRun:
 class NetworkListener:
     """Listens to agents without taking part.
 
-    :param track: where the moments go.
-    :param config: the settings that all agents share.
-    :param port: what carries the frames.
     :raises ConfigError: for a swarm that cannot fly by itself, a port that cannot be used, or without the key of
         sealed frames.
     """
@@ -207,12 +197,7 @@ class NetworkListener:
                 self.pass_time(time.monotonic_ns())
 
     def take(self, data: bytes, arrival_ns: int, now_ns: int) -> str:
-        """Takes in a datagram; why not, or an empty text.
-
-        :param data: its bytes.
-        :param arrival_ns: ns, CLOCK_MONOTONIC.
-        :param now_ns: ns, CLOCK_MONOTONIC.
-        """
+        """Take in a datagram (times: ns, CLOCK_MONOTONIC); why not, or an empty text."""
         said = self._wrapping.read(data)
         if said.fault:
             return said.fault
@@ -227,10 +212,7 @@ class NetworkListener:
         return run.hear(said, frame_in(data, self._config), zero_ns, now_ns)
 
     def pass_time(self, now_ns: int) -> None:
-        """Tells what is over. Who stood still for too long begins anew.
-
-        :param now_ns: ns, CLOCK_MONOTONIC.
-        """
+        """Hand over the slots that are over; a swarm that stood still for too long starts a new run."""
         run = self._run
         if run is None:
             return

@@ -19,12 +19,12 @@ _OVERHEAD = 200  # bytes of a moment beside its contents
 class Vehicles:
     """Crazyflies as their bridge sees them now."""
 
-    told: tuple[tuple[str, str, float, float, str], ...]  # name, state, battery in V, link quality 0 to 1, reason
+    rows: tuple[tuple[str, str, float, float, str], ...]  # name, state, battery in V, link quality 0 to 1, reason
     answer: str = ""  # what has come of the last order
 
 
 class Track:
-    """A run as it is told; one thread writes, others read. The oldest moments go when there are too many.
+    """A run as a page shows it; one thread writes, others read. The oldest moments go when there are too many.
 
     :param name: what it is called until its settings are known.
     """
@@ -53,10 +53,7 @@ class Track:
         return self._state
 
     def begin(self, info: dict[str, Any]) -> None:
-        """A run begins; what is known of another one is dropped.
-
-        :param info: as `run_info` gives it.
-        """
+        """A run begins, `info` as `run_info` gives it; what is known of another one is dropped."""
         with self._lock:
             self._runs += 1
             self._info, self._state = info, ""
@@ -74,18 +71,11 @@ class Track:
                 self._first += 1
 
     def end(self, state: str) -> None:
-        """The run, or what is known of it, has come to an end.
-
-        :param state: why, as people read it.
-        """
+        """The run, or what is known of it, has come to an end; `state` says to people why."""
         self._state = state
 
     def since(self, number: int, most: int) -> tuple[int, list[Moment]]:
-        """Moments from a number on, and the number of the first of them: a later one where older are gone.
-
-        :param number: of the first moment wanted.
-        :param most: how many are given at most.
-        """
+        """At most so many moments from a number on, and the first one's number: a later one where older are gone."""
         with self._lock:
             start = max(number, self._first)
             place = start - self._first

@@ -24,10 +24,7 @@ _STATE, _REASON = 20, 80  # characters that are shown
 
 
 def listening(depth: int) -> QoSProfile:
-    """Quality of service of a listener: nobody waits for it, and what it does not take in time is lost to it alone.
-
-    :param depth: messages that wait for it.
-    """
+    """QoS of a listener that no publisher waits for; `depth`: messages that wait for it, of more the last."""
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -35,24 +32,18 @@ def listening(depth: int) -> QoSProfile:
 class _Vehicle:
     feed: Feed
     heard_s: float  # time.monotonic() of the last status
-    told: tuple[str, str, float, float, str] | None = None
+    row: tuple[str, str, float, float, str] | None = None
 
-    def seen(self, now: float) -> tuple[str, str, float, float, str] | None:
-        """What it last said; that it says nothing where that is long ago."""
-        if self.told is None or now - self.heard_s <= _SILENT_S:
-            return self.told
-        name, state, battery, _, _ = self.told
+    def row_now(self, now: float) -> tuple[str, str, float, float, str] | None:
+        """Its last status; that it is silent where that is long ago."""
+        if self.row is None or now - self.heard_s <= _SILENT_S:
+            return self.row
+        name, state, battery, _, _ = self.row
         return name, f"silent ({state})"[:_STATE], battery, 0.0, "the bridge tells nothing of it"
 
 
 class VehicleWatch:
-    """Finds the vehicles of a bridge, and tells a track how they are.
-
-    :param node: listens.
-    :param intake: of the node.
-    :param track: is told.
-    :param prefix: what stands before the vehicles' names, as ``/north``.
-    """
+    """Finds the vehicles of a bridge, whose names have a prefix, as ``/north``, and shows them on a track."""
 
     def __init__(self, node: Node, intake: Intake, track: Track, prefix: str = "") -> None:
         self._node, self._intake, self._track = node, intake, track
@@ -62,10 +53,7 @@ class VehicleWatch:
         self.answer = ""  # what has come of the last order
 
     def look(self, now: float) -> None:
-        """Takes in what vehicles say, and looks for new ones.
-
-        :param now: s, ``time.monotonic()``.
-        """
+        """Receive statuses, and search for new vehicles; `now`: s, ``time.monotonic()``."""
         if now >= self._search_s:
             self._search_s = now + _SEARCH_S
             self._search(now)
@@ -73,12 +61,12 @@ class VehicleWatch:
             message = vehicle.feed.take()
             if message is not None and math.isfinite(message.battery_voltage) and math.isfinite(message.link_quality):
                 numbers = round(message.battery_voltage, 2), round(message.link_quality, 2)
-                vehicle.told = name, message.state_name[:_STATE], *numbers, message.reason[:_REASON]
+                vehicle.row = name, message.state_name[:_STATE], *numbers, message.reason[:_REASON]
                 vehicle.heard_s = now
-        seen = [vehicle.seen(now) for vehicle in self._vehicles.values()]
-        found = Vehicles(tuple(one for one in seen if one is not None), self.answer)
-        if found.told and found != self._track.vehicles:
-            self._track.vehicles = found
+        rows = [vehicle.row_now(now) for vehicle in self._vehicles.values()]
+        vehicles = Vehicles(tuple(row for row in rows if row is not None), self.answer)
+        if vehicles.rows and vehicles != self._track.vehicles:
+            self._track.vehicles = vehicles
 
     def _search(self, now: float) -> None:
         found = dict(self._vehicles)

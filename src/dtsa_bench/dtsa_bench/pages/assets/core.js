@@ -27,6 +27,13 @@ class Recording {
 }
 const recordingOf = run => run.record ??= new Recording(run);
 
+/* Index of the first of some ascending values that is greater than one; how many there are if none is. */
+function after(values, value, count = values.length) {
+  let low = 0, high = count;
+  while (low < high) { const middle = (low + high) >> 1; if (values[middle] <= value) low = middle + 1; else high = middle; }
+  return low;
+}
+
 /* An element: el("div", {class: "a", onclick: f}, child, "text"). Text is never read as HTML. */
 function el(name, attributes, ...children) {
   const svg = ["svg", "g", "path", "line", "rect", "text", "polyline", "circle"].includes(name);
@@ -60,6 +67,9 @@ const REASONS = (() => {
 const LINES = PALETTE.series, HUES = [...LINES, ...PALETTE.agents];
 const reasonColor = name => REASONS.includes(name) ? HUES[REASONS.indexOf(name) % HUES.length] : theme.color("idle");
 const reasonText = name => DATA.reasons[name] || "";
+/* What colours of slots mean: reasons, and [name, colour, text] of what else there is. */
+const reasonLegend = (reasons, more) => reasons.map(name => [name, reasonColor(name), reasonText(name)]).concat(more)
+  .map(([name, color, text]) => el("span", {}, el("i", {class: "box", style: `background:${color}`}), el("b", {}, name), text ? " " + text : ""));
 const runColor = index => LINES[index % LINES.length];
 /* An agent has one colour in page, pictures and layouts, by its id; who hovers is grey. */
 const agentColor = (id, moving) => moving ? PALETTE.agents[(id - 1) % PALETTE.agents.length] : PALETTE.hovering;
@@ -118,6 +128,10 @@ function onRedraw(node, draw) {
 }
 const redrawAll = () => redraws.forEach(draw => draw());
 function setTheme(name) { theme.set(name); redrawAll(); clock.tell(); }
+function themeButton() {
+  const name = () => theme.dark ? "Light" : "Dark", button = el("button", {type: "button", onclick: () => { setTheme(name().toLowerCase()); button.textContent = name(); }}, name());
+  return button;
+}
 let beforePrint = null;
 addEventListener("beforeprint", () => { beforePrint = document.documentElement.dataset.theme; setTheme("light"); });
 addEventListener("afterprint", () => { if (beforePrint) setTheme(beforePrint); });
@@ -165,3 +179,19 @@ function showTip(event, text) {
   tip.style.top = (event.clientY + 16 + box.height > innerHeight ? event.clientY - box.height - 12 : event.clientY + 16) + "px";
 }
 const hideTip = () => { tip.hidden = true; };
+
+/* The player at the foot of the page: play, time, speed. */
+const player = {slot_s: RUNS.length ? RUNS[0].slot_s : 0.01}; // s, what shift and an arrow key move by
+const slider = el("input", {type: "range", min: 0, max: DURATION, step: "any", value: 0, "aria-label": "time", oninput: () => clock.set(+slider.value)});
+const play = el("button", {class: "play", type: "button", "aria-label": "play or pause", onclick: () => clock.toggle()}, "▶");
+const speed = el("select", {"aria-label": "speed", onchange: () => { clock.speed = +speed.value; }}, ...[0.1, 0.25, 0.5, 1, 2, 5].map(value => el("option", {value, selected: value === 1 ? "" : null}, `${value}×`)));
+const output = el("output");
+document.body.append(el("div", {class: "player"}, el("div", {}, play, slider, output, speed)));
+clock.listen(time => { slider.max = DURATION; slider.value = time; output.textContent = `${num(time, 2)} of ${num(DURATION, 2, "s")}`; play.textContent = clock.playing ? "❚❚" : clock.over ? "↻" : "▶"; });
+addEventListener("keydown", event => {
+  if (event.target instanceof HTMLSelectElement || event.ctrlKey || event.metaKey || event.altKey) return;
+  const step = event.shiftKey ? player.slot_s : DURATION / 50;
+  if (event.key === " ") { clock.toggle(); event.preventDefault(); }
+  else if (event.key === "ArrowRight") { clock.set(clock.time + step); event.preventDefault(); }
+  else if (event.key === "ArrowLeft") { clock.set(clock.time - step); event.preventDefault(); }
+});

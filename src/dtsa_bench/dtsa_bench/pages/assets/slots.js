@@ -3,21 +3,20 @@
 const WINDOW = 120, LEFT = 52, RIGHT = 14;
 
 class SlotLine {
-  constructor(run, shared) {
-    this.run = run; this.shared = shared; this.record = recordingOf(run);
+  constructor(run) {
+    this.run = run; this.record = recordingOf(run);
     this.whole = el("canvas", {role: "img", "aria-label": "Who sent, over the whole run"});
     this.part = el("canvas", {role: "img", "aria-label": "Who sent, slot by slot"});
     this.node = el("div", {}, this.whole, this.part);
     this.row = Math.max(2, Math.min(9, 300 / run.agents)); this.rowPart = Math.max(3.2, Math.min(15, 420 / run.agents));
     onRedraw(this.node, width => { this.width = width; this.cache = null; this.draw(clock.time); });
     clock.listen(time => this.width && this.draw(time));
-    shared.lines.push(this);
     this.point(this.whole, () => [this.record.first, this.record.count]); this.point(this.part, () => [this.from, this.shown]);
   }
 
   color(index) {
     if (this.record.outcome[index] === 2) return theme.color("collision");
-    return this.shared.reasons && this.record.reason[index] < 255 ? reasonColor(this.run.decisions.names[this.record.reason[index]]) : theme.color("success");
+    return this.record.reason[index] < 255 ? reasonColor(this.run.decisions.names[this.record.reason[index]]) : theme.color("success");
   }
 
   point(canvas, range) {
@@ -37,11 +36,8 @@ class SlotLine {
     canvas.style.cursor = "crosshair";
   }
 
-  find(slot) { // index of the first frame in a slot or later
-    let low = 0, high = this.record.sent;
-    while (low < high) { const middle = (low + high) >> 1; if (this.record.slot[middle] < slot) low = middle + 1; else high = middle; }
-    return low;
-  }
+  /* Index of the first frame in a slot or later. */
+  find(slot) { return after(this.record.slot, slot - 1, this.record.sent); }
 
   describe(slot) {
     const rows = [`slot ${whole(slot)}, ${num(slot * this.run.slot_s, 3, "s")}`];

@@ -77,8 +77,8 @@ class LiveRecord {
 }
 
 export class LiveRun {
-  constructor(info, index) {
-    Object.assign(this, info, {index, crashes: [], events: [], lost: new Set(), state: "", watched: 0, dirty: true, time: 0, begin: 0});
+  constructor(info) {
+    Object.assign(this, info, {crashes: [], events: [], lost: new Set(), state: "", watched: 0, dirty: true, time: 0, begin: 0});
     const n = this.agents, ids = Array.from({length: n}, (_, k) => k + 1);
     this.scene = {ids, target: this.target};
     this.slots = {};
@@ -86,7 +86,7 @@ export class LiveRun {
     this.record = new LiveRecord(n, [this.box[0].slice(), this.box[1].slice()]);
     this.moments = new Table(MOMENTS, {at: [Float64Array, 1], compared: [Uint16Array, 1], same: [Uint16Array, 1], tables: [Uint16Array, 1], lag: [Float32Array, 1],
       age: [Uint16Array, n], chosen: [Uint16Array, n], closest: [Float32Array, 1], one: [Uint16Array, 1], other: [Uint16Array, 1],
-      heard: [Uint16Array, n], believed: [Int16Array, 3 * n], told: [Uint16Array, 1], stalls: [Uint32Array, 1]});
+      heard: [Uint16Array, n], believed: [Int16Array, 3 * n], told: [Uint16Array, 1], refused: [Uint32Array, 1]});
     this.number = 0; // of the first moment that has come
     this.distance = new Series(["closest of all"]); this.ages = new Series(["mean of agents", "worst agent"]);
     this.shares = new Series(["success", "collision", "idle", "agents agree"]);
@@ -126,7 +126,7 @@ export class LiveRun {
     record.count = Math.max(record.count, moment.slot - record.first);
     const held = this.moments, row = held.more(1), near = record.frames ? closestOf(record.places, 3 * n * (record.frames - 1), n, this.scene.ids) : null;
     held.at[row] = time; held.compared[row] = moment.agree[0]; held.same[row] = moment.agree[1]; held.tables[row] = moment.tables;
-    held.lag[row] = moment.lag_ms ?? 0; held.stalls[row] = moment.stalls ?? moment.refused ?? 0; held.told[row] = 0;
+    held.lag[row] = moment.lag_ms ?? 0; held.refused[row] = moment.refused ?? 0; held.told[row] = 0;
     held.age.set(new Uint16Array(bytes(moment.age)), n * row); held.chosen.set(new Uint16Array(bytes(moment.chosen)), n * row);
     [held.closest[row], held.one[row], held.other[row]] = near ?? [NaN, 0, 0];
     this.time = Math.max(this.time, time);
@@ -171,9 +171,8 @@ export class LiveRun {
   load(time, span) {
     const record = this.record, last = Math.min(Math.floor(time / this.slot_s + 1e-6), record.first + record.count), first = Math.max(record.first, last - Math.round(span / this.slot_s)), slots = last - first;
     if (slots <= 0) return null;
-    let low = 0, high = record.sent, success = 0, collision = 0, before = -1;
-    while (low < high) { const middle = (low + high) >> 1; if (record.slot[middle] < first) low = middle + 1; else high = middle; }
-    for (let i = low; i < record.sent && record.slot[i] < last; i++) {
+    let success = 0, collision = 0, before = -1;
+    for (let i = after(record.slot, first - 1, record.sent); i < record.sent && record.slot[i] < last; i++) {
       if (record.slot[i] === before) continue;
       before = record.slot[i];
       if (record.outcome[i] === 2) collision++; else success++;
@@ -182,12 +181,7 @@ export class LiveRun {
   }
 
   /* Row of the last moment at a time; -1: none. */
-  momentAt(time) {
-    const held = this.moments;
-    let low = 0, high = held.length;
-    while (low < high) { const middle = (low + high) >> 1; if (held.at[middle] <= time + 1e-9) low = middle + 1; else high = middle; }
-    return low - 1;
-  }
+  momentAt(time) { return after(this.moments.at, time + 1e-9, this.moments.length) - 1; }
 
   /* What has come of the chosen agent's beliefs; message: at, heard, place. */
   takeGhosts(message) {

@@ -4,10 +4,7 @@ import {NOT_KNOWN} from "./run.js";
 
 /* Who sent in the last slot before a time, and why. */
 function sending(run, time) {
-  const record = run.record, current = Math.floor(time / run.slot_s + 1e-6);
-  let low = 0, high = record.sent;
-  while (low < high) { const middle = (low + high) >> 1; if (record.slot[middle] <= current) low = middle + 1; else high = middle; }
-  const last = low - 1;
+  const record = run.record, last = after(record.slot, Math.floor(time / run.slot_s + 1e-6), record.sent) - 1;
   if (last < 0) return ["–", ""];
   const slot = record.slot[last], senders = [];
   for (let i = last; i >= 0 && record.slot[i] === slot; i--) senders.unshift(record.sender[i]);
@@ -37,7 +34,12 @@ const FIGURES = [
     for (let k = 0; row >= 0 && k < n; k++) { const age = held.age[n * row + k]; if (age !== NOT_KNOWN) { sum += age; count++; most = Math.max(most, age); } }
     return count ? [num(sum / count / 10, 1, "slots"), `${run.listener ? "here; " : ""}worst agent ${num(most / 10, 1)}`] : ["–", ""];
   }],
-  [run => run.listener ? "Frames leave late" : "Channel's lag", (run, row) => run.listener ? row < 0 ? ["–", ""] : [num(run.moments.lag[row], 1, "ms"), `${whole(run.moments.stalls[row])} datagrams not taken in`] : run.mode === "realtime" && row >= 0 ? [num(run.moments.lag[row], 1, "ms"), `${whole(run.moments.stalls[row])} stalls`, run.moments.lag[row] > 500 * run.slot_s ? "bad" : ""] : ["–", "in lockstep nobody is late"]],
+  [run => run.listener ? "Frames leave late" : "Channel's lag", (run, row) => {
+    if (!run.listener && run.mode !== "realtime") return ["–", "in lockstep nobody is late"];
+    if (row < 0) return ["–", ""];
+    const lag = run.moments.lag[row];
+    return [num(lag, 1, "ms"), run.listener ? `${whole(run.moments.refused[row])} datagrams not taken in` : "", !run.listener && lag > 500 * run.slot_s ? "bad" : ""];
+  }],
 ];
 
 export class Panels {
@@ -76,7 +78,7 @@ export class Panels {
     const partition = el("input", {type: "text", placeholder: groups, "aria-label": "groups of a partition", size: 16});
     const button = (text, content, name) => el("button", {type: "button", "data-order": name, onclick: () => order(content())}, text);
     return el("section", {class: "orders"}, el("h2", {}, "Control"),
-      this.run.kills ? el("div", {class: "line"}, agent, button("Kill", () => ({kind: "kill", agent: +agent.value}), "kill"), button("Start", () => ({kind: "start", agent: +agent.value}), "start")) : null,
+      this.run.mode === "realtime" ? el("div", {class: "line"}, agent, button("Kill", () => ({kind: "kill", value: +agent.value}), "kill"), button("Start", () => ({kind: "start", value: +agent.value}), "start")) : null,
       el("div", {class: "line"}, loss, "% loss", button("Set", () => ({kind: "loss", value: Math.min(1, Math.max(0, +loss.value / 100))}), "loss")),
       el("div", {class: "line"}, button("Jam", () => ({kind: "jam", value: true}), "jam"), button("Stop jamming", () => ({kind: "jam", value: false}), "clear")),
       el("div", {class: "line"}, partition, button("Part", () => ({kind: "partition", value: partition.value || groups}), "part"), button("Join", () => ({kind: "partition", value: ""}), "join")),
@@ -109,5 +111,38 @@ export class Panels {
     if (last === this.listed) return;
     this.listed = last;
     this.list.replaceChildren(...events.slice(-60).reverse().map(event => el("li", {class: `is-${event.kind}`}, el("button", {type: "button", onclick: () => clock.set(event.time)}, num(event.time, 2, "s")), " ", event.text)));
+  }
+}
+
+const SURE_MS = 3000;
+
+/* Crazyflies as their bridge sees them, with or without a run. */
+export class Crazyflies {
+  /* order(content): sends an order; null: nothing may be ordered. */
+  constructor(order) {
+    this.rows = el("tbody");
+    this.answer = el("output", {class: "answer"});
+    const titles = ["", "State", "Battery", "Link"].map(name => el("th", {}, name));
+    this.node = el("section", {class: "vehicles"}, el("h2", {}, "Crazyflies"), el("table", {}, el("thead", {}, el("tr", {}, ...titles)), this.rows),
+      ...(order ? [el("div", {class: "line"}, el("button", {type: "button", "data-order": "land", onclick: () => order({kind: "land"})}, "Land all"), this.stop(order)), this.answer] : []));
+  }
+
+  /* To stop all motors takes two clicks within three seconds. */
+  stop(order) {
+    const button = el("button", {type: "button", class: "danger", "data-order": "emergency", onclick: () => {
+      if (button.dataset.sure) { order({kind: "emergency", value: "stop all motors"}); calm(); return; }
+      button.dataset.sure = "1"; button.textContent = "Once more: all motors stop, all fall";
+      setTimeout(calm, SURE_MS);
+    }}, "");
+    const calm = () => { delete button.dataset.sure; button.textContent = "Emergency stop …"; };
+    calm();
+    return button;
+  }
+
+  /* rows: [name, state, battery (V), link quality (0 to 1), reason] of each; answer: what has come of the last order. */
+  show(rows, answer) {
+    this.rows.replaceChildren(...rows.map(([name, state, battery, link, reason]) => el("tr", {class: `is-${state.split(" ")[0]}`, title: reason},
+      el("td", {}, name), el("td", {}, state, reason ? el("small", {}, reason) : null), el("td", {}, battery > 0 ? num(battery, 2, "V") : "–"), el("td", {}, percent(link, 0)))));
+    this.answer.textContent = answer;
   }
 }

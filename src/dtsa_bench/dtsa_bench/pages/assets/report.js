@@ -43,14 +43,13 @@ function lede(run) {
   const how = ["policy", "estimator", "avoider"].filter(name => config[name] !== undefined).map(name => `${name} ${config[name]}`);
   return [who, ...how, config.seed !== undefined ? `seed ${config.seed}` : null].filter(Boolean).join(", ");
 }
-const themeButton = el("button", {type: "button", onclick: () => { setTheme(theme.dark ? "light" : "dark"); themeButton.textContent = theme.dark ? "Light" : "Dark"; }}, theme.dark ? "Light" : "Dark");
 const scaleButton = single ? null : el("button", {type: "button", "aria-pressed": "true", onclick: () => {
   scales.common = !scales.common; scaleButton.setAttribute("aria-pressed", String(scales.common)); redrawAll();
 }}, "Common scales");
 root.append(el("header", {},
   el("div", {}, el("p", {class: "kicker"}, single ? "Recorded run" : `${RUNS.length} recorded runs`), el("h1", {}, single ? RUNS[0].name : RUNS.map(run => run.name).join("  ·  ")),
     single ? el("p", {class: "lede"}, lede(RUNS[0])) : null),
-  el("span", {class: "options"}, scaleButton, " ", themeButton, " ", el("button", {type: "button", onclick: () => print()}, "Print"))));
+  el("span", {class: "options"}, scaleButton, " ", themeButton(), " ", el("button", {type: "button", onclick: () => print()}, "Print"))));
 for (const run of RUNS) for (const note of run.notes) root.append(el("p", {class: "note"}, single ? note : `${run.name}: ${note}`));
 if (single) {
   root.append(el("div", {class: "figures"}, ...shownFigures.map(([label, value, extra, kind]) => {
@@ -112,16 +111,15 @@ section("Mission", "With Crazyflies, from take-off to landing, as the ground sta
         el("tr", {}, el("td", {}, num(time, 2, "s")), el("td", {class: level === "error" ? "bad" : ""}, level), el("td", {style: "white-space:normal;text-align:left"}, text)))))))),
 }, "wide");
 
-const lines = {reasons: true, lines: []};
 section("Slots", "Who sent in which slot, and why. The strip on top says what became of each slot. Click to go there.", {
-  has: run => run.slots.count, draw: run => new SlotLine(run, lines).node,
+  has: run => run.slots.count, draw: run => new SlotLine(run).node,
   extra: () => {
     const legend = el("div", {class: "reasons"});
     const names = REASONS.filter(name => RUNS.some(run => run.sent_for.includes(name)));
-    onRedraw(main, () => legend.replaceChildren(
-      ...(lines.reasons && names.length ? names.map(name => [name, reasonColor(name), reasonText(name)]) : [["sent", theme.color("success"), ""]])
-        .concat([["collision", theme.color("collision"), "two or more sent: tall in the strip"], ["idle", theme.color("idle"), "nobody sent"], ["partly lost", "linear-gradient(var(--line) 60%, var(--ink) 60%)", "paler, with an edge: some did not receive it"]])
-        .map(([name, color, text]) => el("span", {}, el("i", {class: "box", style: `background:${color}`}), el("b", {}, name), text ? " " + text : ""))));
+    onRedraw(main, () => legend.replaceChildren(...reasonLegend(names, [
+      ...(names.length ? [] : [["sent", theme.color("success"), ""]]),
+      ["collision", theme.color("collision"), "two or more sent: tall in the strip"], ["idle", theme.color("idle"), "nobody sent"],
+      ["partly lost", "linear-gradient(var(--line) 60%, var(--ink) 60%)", "paler, with an edge: some did not receive it"]])));
     return legend;
   },
 });

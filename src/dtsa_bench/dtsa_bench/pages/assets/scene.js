@@ -22,18 +22,12 @@ class Scene {
     });
     const views = [["3D", -0.9, 0.62], ["top", -Math.PI / 2, Math.PI / 2 - 1e-3], ["side", -Math.PI / 2, 0.04]].map(([name, yaw, pitch]) =>
       el("button", {type: "button", onclick: () => { shared.yaw = yaw; shared.pitch = pitch; shared.zoom = 1; shared.draw(); }}, name));
-    // Where a page draws bodies by WebGL, floor and ways lie below them, names and marks above.
-    this.layer = Scene.bodies ? Scene.bodies(this) : null;
-    this.back = this.layer ? el("canvas", {"aria-hidden": "true"}) : null;
-    const stage = this.layer ? el("div", {class: "stage"}, this.back, this.layer.canvas, this.canvas) : this.canvas;
-    this.node = el("div", {class: "scene"}, el("div", {class: "bar"}, this.label, el("span", {class: "options"}, ...views), el("span", {class: "options"}, ...buttons)), stage);
+    this.node = el("div", {class: "scene"}, el("div", {class: "bar"}, this.label, el("span", {class: "options"}, ...views), el("span", {class: "options"}, ...buttons)), this.canvas);
     this.steer();
     shared.scenes.push(this);
     onRedraw(this.node, width => {
       this.width = width; this.height = Math.round(Math.min(560, Math.max(300, width * 0.64)));
       this.context = prepare(this.canvas, this.width, this.height);
-      this.behind = this.layer ? prepare(this.back, this.width, this.height) : this.context;
-      if (this.layer) this.layer.resize(this.width, this.height);
       this.draw(clock.time);
     });
     clock.listen(time => this.context && this.draw(time));
@@ -89,7 +83,6 @@ class Scene {
     const up = [right[1] * forward[2] * -1, right[0] * forward[2], right[1] * forward[0] - right[0] * forward[1]].map(value => -value);
     const eye = this.middle.map((value, axis) => value - forward[axis] * away);
     const focal = Math.min(this.width, this.height * 1.5) * 1.2 * zoom;
-    this.eye = {eye, right, up, forward, focal};
     this.project = (px, py, pz) => {
       const dx = px - eye[0], dy = py - eye[1], dz = pz - eye[2];
       const depth = Math.max(0.05, dx * forward[0] + dy * forward[1] + dz * forward[2]);
@@ -101,9 +94,8 @@ class Scene {
   /* Positions at a time, straight between two recorded moments. */
   at(time, out) {
     const {times, places, scale, frames} = this.record, n = this.count;
-    let low = 0, high = frames - 1;
-    if (high < 0) return 0;
-    if (time >= times[high]) low = high; else while (high - low > 1) { const middle = (low + high) >> 1; if (times[middle] <= time) low = middle; else high = middle; }
+    if (!frames) return 0;
+    const low = Math.max(0, after(times, time, frames) - 1);
     const next = Math.min(low + 1, frames - 1), gap = times[next] - times[low];
     const part = gap > 0 ? Math.min(1, Math.max(0, (time - times[low]) / gap)) : 0;
     for (let i = 0; i < 3 * n; i++) out[i] = (places[3 * n * low + i] * (1 - part) + places[3 * n * next + i] * part) * scale;
@@ -175,9 +167,7 @@ class Scene {
   /* Who sent lately: 1 now, falling to 0 within a few slots; negative for frames that collided. */
   senders(time) {
     const glow = new Map(), record = this.record, slots = this.run.slot_s, current = Math.floor(time / slots + 1e-6), fade = Math.max(1, Math.ceil(0.12 / slots));
-    let low = 0, high = record.sent;
-    while (low < high) { const middle = (low + high) >> 1; if (record.slot[middle] <= current) low = middle + 1; else high = middle; }
-    for (let i = low - 1; i >= 0 && record.slot[i] > current - fade; i--) {
+    for (let i = after(record.slot, current, record.sent) - 1; i >= 0 && record.slot[i] > current - fade; i--) {
       const level = 1 - (current - record.slot[i]) / fade;
       if (!glow.has(record.sender[i])) glow.set(record.sender[i], record.outcome[i] === 2 ? -level : level);
     }
@@ -185,8 +175,8 @@ class Scene {
   }
 
   draw(time) {
-    const front = this.context, c = this.behind, n = this.count;
-    front.clearRect(0, 0, this.width, this.height); c.clearRect(0, 0, this.width, this.height);
+    const c = this.context, n = this.count;
+    c.clearRect(0, 0, this.width, this.height);
     this.now ??= new Float64Array(3 * n);
     const row = this.at(time, this.now), now = this.now;
     this.camera(); this.drawFloor(c); this.drawTrails(c, time, row);
@@ -209,11 +199,10 @@ class Scene {
     c.globalAlpha = 1;
     order.sort((a, b) => b[0][2] - a[0][2]);
     const ghosts = this.run.ghosts ? this.run.ghosts(time) : null;
-    if (this.layer) this.layer.draw(radius, ghosts);
-    if (ghosts) this.drawGhosts(front, ghosts, radius);
-    for (const [p, agent] of order) this.drawAgent(front, p, agent, radius * p[3], glow.get(this.ids[agent]) || 0);
-    if (this.shared.names) for (const [p, agent] of order) this.drawName(front, p, agent, radius * p[3]);
-    this.run.crashes.forEach((crash, index) => this.drawCrash(front, crash, time, radius, index));
+    if (ghosts) this.drawGhosts(c, ghosts, radius);
+    for (const [p, agent] of order) this.drawAgent(c, p, agent, radius * p[3], glow.get(this.ids[agent]) || 0);
+    if (this.shared.names) for (const [p, agent] of order) this.drawName(c, p, agent, radius * p[3]);
+    this.run.crashes.forEach((crash, index) => this.drawCrash(c, crash, time, radius, index));
     const slot = Math.floor(time / this.run.slot_s + 1e-6);
     this.label.textContent = this.record.count ? `slot ${whole(Math.min(slot, this.record.first + this.record.count - 1))}` : "";
   }
@@ -224,7 +213,6 @@ class Scene {
       c.globalAlpha = Math.abs(level); c.lineWidth = level > 0 ? 2.2 : 3.2; c.setLineDash(level > 0 ? [] : [3, 3]);
       c.beginPath(); c.arc(p[0], p[1], size * (1.35 + 0.9 * (1 - Math.abs(level))), 0, 7); c.stroke(); c.globalAlpha = 1; c.setLineDash([]);
     }
-    if (this.layer) return; // it has drawn the body
     const color = this.color(agent), shade = c.createRadialGradient(p[0] - size * 0.35, p[1] - size * 0.4, size * 0.1, p[0], p[1], size);
     shade.addColorStop(0, mixed(color, "#ffffff", 0.45)); shade.addColorStop(0.55, color); shade.addColorStop(1, mixed(color, "#000000", 0.22));
     c.fillStyle = shade; this.outline(c, p, size, this.moves(agent) ? agentTurn(this.ids[agent]) : 0); c.fill();

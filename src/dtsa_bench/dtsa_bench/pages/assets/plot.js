@@ -60,8 +60,7 @@ function timePlot(options) {
 
 /* Index of the sample nearest to a time. */
 function nearest(times, time) {
-  let low = 0, high = times.length - 1;
-  while (high - low > 1) { const middle = (low + high) >> 1; if (times[middle] < time) low = middle; else high = middle; }
+  const high = Math.min(times.length - 1, after(times, time)), low = Math.max(0, high - 1);
   return Math.abs(times[low] - time) <= Math.abs(times[high] - time) ? low : high;
 }
 
