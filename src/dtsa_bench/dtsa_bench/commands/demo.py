@@ -1,26 +1,27 @@
-"""`demo`: nine flights that tell in four steps what this software is about; one page, one picture."""
+"""`demo`: nine flights that show in four steps what this software is about; one picture, and the report of them all."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
+import webbrowser
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dtsa_bench.pages.browser import open_page
 from dtsa_bench.runs.options import new_directory, whole_number
 from dtsa_bench.runs.program import program
 
 if TYPE_CHECKING:
-    from dtsa_bench.pages.demo.flown import Flights
-    from dtsa_bench.pages.demo.flying import Landed
-    from dtsa_bench.pages.demo.story import Step
+    from dtsa_bench.pages.demo.flights import FinishedFlight
 
 INTERRUPTED = 130
 NUMBERS = "demo.json"
+_REMOTE = ("SSH_CONNECTION", "SSH_CLIENT", "SSH_TTY", "CI")
 
 
 def add_parser(subparsers: Any) -> None:
@@ -29,9 +30,9 @@ def add_parser(subparsers: Any) -> None:
         "demo",
         help="nine recorded flights that show who sends next, a page and a picture; under a minute",
         description="Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a "
-        "channel that quadcopters share, and what goes wrong when messages are lost. They become one page and one "
-        "picture. The first eight are the same on every machine; in the last one, in real time, a process is killed "
-        "and comes back.",
+        "channel that quadcopters share, and what goes wrong when messages are lost. One picture shows them all. The "
+        "first eight, which are the same on every machine, stand side by side on a page; in the last one, in real "
+        "time, a process is killed and comes back.",
     )
     parser.add_argument(
         "--out", metavar="DIR", default=None, help="new directory for everything [runs/demo-1, -2, ...]"
@@ -50,15 +51,6 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
 
 
-def _directory(wanted: str | None) -> Path:
-    if wanted is not None:
-        return new_directory(wanted)
-    number = 1
-    while Path(f"runs/demo-{number}").exists():
-        number += 1
-    return new_directory(f"runs/demo-{number}")
-
-
 def run(args: argparse.Namespace) -> int:
     """Flies, checks, draws.
 
@@ -75,77 +67,79 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> tuple[int, Path]:
     seed = whole_number(args.seed, "seed", 0, 2**63 - 1)
-    directory = _directory(args.out)
+    number = 1
+    while args.out is None and Path(f"runs/demo-{number}").exists():
+        number += 1
+    directory = new_directory(args.out or f"runs/demo-{number}")
 
     from dtsa_agent.ros.common.process.loop import Stop
-    from dtsa_bench.pages.demo.flying import fly_all
-    from dtsa_bench.pages.demo.story import story
+    from dtsa_bench.pages.demo.flights import HEAD, demo_steps, fly_all, table_rows
+    from dtsa_bench.pages.report.page import write_report
 
     begin = time.monotonic()
-    steps = story(seed)
-    count = sum(len(step.takes) for step in steps)
-    print(f"{count} flights of ROS 2 nodes, recorded to {directory}", flush=True)
+    steps = demo_steps(seed)
+    print(f"{sum(map(len, steps))} flights of ROS 2 nodes, recorded to {directory}", flush=True)
     with Stop() as stop:
-        landed = fly_all(steps, directory, stop, sys.stderr)
+        flights = fly_all(steps, directory, stop)
     if stop:
         print(f"dtsa: the demo was interrupted; what was flown is in {directory}", file=sys.stderr)
         return INTERRUPTED, directory
-    checks = [_check(key, entry.flight.bag) for key, entry in landed.items()]
-    page = _show(steps, landed, directory, args.animation)
+    good = [_is_verified(key, directory / key) for key in flights]
+    numbers = {key: dict(finished.summary) for key, finished in flights.items()}
+    (directory / NUMBERS).write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    print("drawing the picture and the page ...", file=sys.stderr, flush=True)
+    _draw(steps, flights, directory, args.animation)
+    compared = [directory / key for key, finished in flights.items() if not finished.flight.live]
+    page = write_report(compared, directory / "demo.html")
+    print("\n" + aligned([HEAD, *table_rows(steps, flights)]) + "\n")
+    print(f"picture    {directory / 'demo.png'}\nflights    {directory}/{{{','.join(flights)}}}")
+    for text, command in _next_commands(directory):
+        print(f"{text:44} {command}")
     print(f"\n{time.monotonic() - begin:.0f} s in all. The page:", flush=True)
     open_page(page, args.open)
     print(page)
-    return 0 if all(checks) else 1, directory
+    return 0 if all(good) else 1, directory
 
 
-def _check(key: str, bag: Path) -> bool:
-    """Verifies a bag and says in a line what was found."""
+def _is_verified(key: str, bag: Path) -> bool:
+    """Verify a bag and print a line about it."""
     from dtsa_bench.recordings.verify import verify_bag
 
-    found = verify_bag(bag)
-    if found.ok:
-        print(f"verified  {key:14} {sum(found.checked.values()):6} checks: all is what the protocol gives", flush=True)
+    result = verify_bag(bag)
+    if result.ok:
+        print(f"verified  {key:14} {sum(result.checked.values()):6} checks: all is what the protocol gives", flush=True)
     else:
-        print(f"NOT GOOD  {key}: {found.difference}")
-    return found.ok
+        print(f"NOT GOOD  {key}: {result.difference}")
+    return result.ok
 
 
-def _show(steps: tuple[Step, ...], landed: dict[str, Landed], directory: Path, animation: bool) -> Path:
-    """Writes everything that is to be looked at.
+def _draw(steps: Any, flights: Mapping[str, FinishedFlight], directory: Path, animation: bool) -> None:
+    from dtsa_bench.drawing import optional_picture
 
-    :returns: the page.
-    """
-    from dtsa_bench.pages.demo.flown import read
-    from dtsa_bench.pages.demo.page import write_page
-    from dtsa_bench.pages.demo.picture import draw_demo
-    from dtsa_bench.pages.demo.table import for_terminal
+    with optional_picture(directory / "demo.png"):
+        from dtsa_bench.pages.demo.picture import draw_demo
 
-    flights = {}
-    for take in (take for step in steps for take in step.takes):
-        flight, times = landed[take.key].flight, landed[take.key].times
-        flights[take.key] = read(take, flight.bag, flight.summary, flight.positions, times)
-    _progress("drawing the picture and the page")
-    picture, page = directory / "demo.png", directory / "demo.html"
-    draw_demo(picture, steps, flights)
-    write_page(page, steps, flights, _commands(directory))
+        draw_demo(directory / "demo.png", steps, flights)
     if animation:
-        from dtsa_bench.pages.demo.animation import draw_animation
+        with optional_picture(directory / "demo.gif"):
+            from dtsa_bench.pages.demo.picture import draw_animation
 
-        _progress("drawing the animation")
-        draw_animation(directory / "demo.gif", flights)
-    print("\n" + for_terminal(steps, flights) + "\n")
-    _tell(directory, picture, flights)
-    return page
+            draw_animation(directory / "demo.gif", flights)
 
 
-def _progress(text: str) -> None:
-    print(f"{text} ...", file=sys.stderr, flush=True)
+def aligned(rows: list[list[str]]) -> str:
+    """Rows of cells in columns, with a rule below the first."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows = [rows[0], ["-" * width for width in widths], *rows[1:]]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
 
 
-def _commands(directory: Path) -> list[tuple[str, str]]:
+def _next_commands(directory: Path) -> list[tuple[str, str]]:
     """What to do with the recordings."""
     return [
-        ("a flight with everything in it, as a page", f"{program()} report {directory}/two-tdma {directory}/two-dtsa"),
+        ("the flight in which one is killed, as a page", f"{program()} report {directory}/killed-lease"),
         ("was every decision what the protocol says?", f"{program()} verify {directory}/two-lease"),
         ("play a recording into the ROS graph", f"{program()} replay {directory}/two-lease"),
         ("as tables", f"{program()} export {directory}/two-lease"),
@@ -155,10 +149,18 @@ def _commands(directory: Path) -> list[tuple[str, str]]:
     ]
 
 
-def _tell(directory: Path, picture: Path, flights: Flights) -> None:
-    """Says where everything is and how to go on."""
-    print(f"picture    {picture}\nflights    {directory}/{{{','.join(flights)}}}")
-    for text, command in _commands(directory):
-        print(f"{text:44} {command}")
-    numbers = {key: dict(flown.summary) for key, flown in flights.items()}
-    (directory / NUMBERS).write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+def has_display(environment: Mapping[str, str], platform: str) -> bool:
+    """Whether this process has a display of its user's: not over ssh, not in CI."""
+    if any(environment.get(name) for name in _REMOTE):
+        return False
+    return platform == "darwin" or bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
+
+
+def open_page(path: Path, wanted: bool | None = None) -> bool:
+    """Open a page; whether a browser took it. None: where there is a display."""
+    if not (has_display(os.environ, sys.platform) if wanted is None else wanted):
+        return False
+    try:
+        return webbrowser.open(path.resolve().as_uri())
+    except webbrowser.Error:
+        return False

@@ -22,7 +22,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="HTML page about one recorded run, or several side by side",
         description=DESCRIPTION,
     )
-    parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{RECORDED_RUN}; up to 6")
+    parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{RECORDED_RUN}; up to 8")
     parser.add_argument("--out", metavar="FILE", help="the page (default: report.html beside the first bag)")
 
 

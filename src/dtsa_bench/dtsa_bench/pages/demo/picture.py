@@ -1,310 +1,322 @@
-"""The demo's picture: four rows, a sentence each."""
+"""The demo's picture and its moving picture; every number in them comes from the flights."""
 
 from __future__ import annotations
 
-import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from PIL import Image
 
+from dtsa_bench.drawing.flight_paths import frame_bare, paint
 from dtsa_bench.drawing.palette import COLLIDED, SERIES, agent_colour, ink_on
+from dtsa_bench.drawing.style import GRID, INK, QUIET, style
 from dtsa_bench.runs.program import program
 
-from .flown import Flights, Flown, compared_s, of_step
-from .story import KILLED, Step
-from .strips import HOVER, Cell, cells, killed_windows, window
-from .text import INTRO, LIVE_NOTE, TITLE, lines, sentence
+from .flights import AGENTS, KILLED, LIVE_AGENTS, LIVE_SLOT_MS, DemoFlight, FinishedFlight, Flights
 
-INK, MUTED, RULE, BAD = "#16202c", "#5a6778", "#dfe4ea", COLLIDED
-AFTER, BEFORE = SERIES[:2]  # two lines of one chart
-WIDTH, DPI = 8.6, 220  # inches
-_LEFT, _RIGHT = 0.42, 0.36  # margins, inches
-_LABEL_X, _STRIP_X, _STRIP_W = 1.98, 3.32, 4.12  # of all strips, inches
-_HEIGHTS = (1.95, 1.93, 1.98, 1.5)  # inches, of each step without its text
-_FONT = {"font.family": "sans-serif", "font.sans-serif": ["DejaVu Sans"], "font.size": 8.5, "text.color": INK}
+HOVER = "#c3ccd6"  # of cells: an agent that hovers has nothing new to say
+FIRST, COUNT = 100, 40  # the slots that are shown, well under way
+ROUNDS = 16  # columns of each part around a death or a return
+WIDTH, LEFT, RIGHT = 8.6, 0.4, 0.4  # inches, of the picture and its margins
+TITLE = "One radio channel, twelve quadcopters: who speaks next?"
+INTRO = (
+    "Quadcopters that fly across each other's way must know where the others are. They tell each other by radio, on "
+    "one channel: time is cut into slots of 10 ms, and in each slot one of them can send its position and velocity."
+)
+LIVE_NOTE = (
+    f"Live, in real time: {LIVE_AGENTS} processes, slots of {LIVE_SLOT_MS:g} ms. Its figures describe this machine; "
+    "those above are the same everywhere."
+)
+
+Cell = tuple[float, float, tuple[int, ...]]  # x, y, ids of the agents that sent
 
 
 class _Sheet:
-    """A figure that is filled from the top, in inches.
+    """A figure that is filled in inches, from its top left corner."""
 
-    :param height: of the whole, inches.
-    """
-
-    def __init__(self, height: float) -> None:
-        self.height = height
-        self.figure = Figure(figsize=(WIDTH, height))
-        self.y = 0.0  # inches from the top
+    def __init__(self, height: float, width: float = WIDTH, dpi: float = 220) -> None:
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width, height), dpi=dpi)
 
     def text(self, x: float, y: float, text: str, size: float, **more: object) -> None:
-        """Text whose first line has its top at (x, y), inches from the top left corner."""
+        """Text whose first line has its top at (x, y)."""
         more = {"va": "top", "linespacing": 1.35, **more}
-        self.figure.text(x / WIDTH, 1 - y / self.height, text, fontsize=size, **more)  # type: ignore[arg-type]
+        self.figure.text(x / self.width, 1 - y / self.height, text, fontsize=size, **more)  # type: ignore[arg-type]
 
-    def axes(self, x: float, y: float, width: float, height: float) -> Axes:
-        """Axes with their top left corner at (x, y), inches."""
-        return self.figure.add_axes((x / WIDTH, 1 - (y + height) / self.height, width / WIDTH, height / self.height))
+    def axes(self, x: float, y: float, width: float, height: float, bare: bool = True) -> Axes:
+        """Axes with their top left corner at (x, y); bare: with nothing but what is drawn."""
+        place = x / self.width, 1 - (y + height) / self.height, width / self.width, height / self.height
+        axes = self.figure.add_axes(place)
+        if bare:
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+        axes.tick_params(labelsize=6.5, length=2, width=0.6, labelcolor=QUIET)
+        axes.grid(not bare)
+        return axes
 
-    def rule(self, y: float) -> None:
+    def rule(self, y: float, margin: float = LEFT) -> None:
         """A thin line across the sheet."""
-        line = mpl.lines.Line2D(
-            [_LEFT / WIDTH, 1 - _RIGHT / WIDTH], [1 - y / self.height] * 2, color=RULE, linewidth=0.8
-        )
-        self.figure.add_artist(line)
+        ends, height = [margin / self.width, 1 - margin / self.width], 1 - y / self.height
+        self.figure.add_artist(Line2D(ends, [height, height], color=GRID, linewidth=0.8))
 
 
-def draw_demo(path: Path, steps: Sequence[Step], flights: Flights) -> None:
-    """Draws the picture as PNG.
-
-    :param path: file to write.
-    :param steps: the steps of the demo.
-    :param flights: its flights.
-    """
-    with mpl.rc_context(_FONT):
-        said = [textwrap.wrap(sentence(step, flights), 122) for step in steps]
-        heights = [rows + 0.5 + 0.155 * len(text) for rows, text in zip(_HEIGHTS, said, strict=True)]
-        sheet = _Sheet(1.22 + sum(heights) + 0.36)
-        sheet.text(_LEFT, 0.3, TITLE, 15.5, fontweight="bold")
-        sheet.text(_LEFT, 0.68, textwrap.fill(INTRO, 118), 9, color=MUTED)
-        sheet.y = 1.22
-        for step, text, draw, height in zip(steps, said, _DRAW, heights, strict=True):
-            sheet.rule(sheet.y)
-            _heading(sheet, step, text)
-            draw(sheet, sheet.y + height - _HEIGHTS[step.number - 1], step, flights)
-            sheet.y += height
-        swarm = steps[0].takes[0].run.swarm
+def draw_demo(path: Path, steps: Sequence[Sequence[DemoFlight]], flights: Flights) -> None:
+    """Draw the picture as PNG."""
+    with style():
+        sheet = _Sheet(12.5)
+        sheet.text(LEFT, 0.3, TITLE, 15.5, fontweight="bold")
+        sheet.text(LEFT, 0.68, textwrap.fill(INTRO, 118), 9, color=QUIET)
+        draws: tuple[Callable[[_Sheet, float, Sequence[FinishedFlight]], None], ...]
+        draws = (_draw_paths, _draw_ages, _draw_losses, _draw_killing)
+        for number, (top, step, draw) in enumerate(zip((1.22, 3.98, 6.88, 9.84), steps, draws, strict=True), 1):
+            title, sentence = step_text(number, flights)
+            sheet.rule(top)
+            sheet.text(LEFT, top + 0.1, f"{number}", 12, fontweight="bold", color=SERIES[0])
+            sheet.text(LEFT + 0.22, top + 0.1, title, 11.5, fontweight="bold")
+            lines = textwrap.wrap(sentence, 122)
+            sheet.text(LEFT + 0.22, top + 0.36, "\n".join(lines), 8.3)
+            draw(sheet, top + 0.5 + 0.155 * len(lines), [flights[flight.key] for flight in step])
         note = (
-            f"Drawn by “{program()} demo” from the recordings of {sum(len(step.takes) for step in steps)} flights of "
-            f"ROS 2 nodes, seed {swarm.seed}. Seen from above: rings are starts, dots are ends."
+            f"Drawn by “{program()} demo” from the recordings of {len(flights)} flights of ROS 2 nodes, seed "
+            f"{steps[0][0].run.swarm.seed}. Seen from above: rings are starts, dots are ends."
         )
-        sheet.rule(sheet.height - 0.34)
-        sheet.text(_LEFT, sheet.height - 0.25, note, 7.5, color=MUTED)
-        FigureCanvasAgg(sheet.figure)
-        drawn = io.BytesIO()
-        sheet.figure.savefig(drawn, dpi=DPI, facecolor="white")
-    with Image.open(drawn) as image:  # a third of the size, and no eye sees the difference
+        sheet.rule(12.16)
+        sheet.text(LEFT, 12.25, note, 7.5, color=QUIET)
+        sheet.figure.savefig(path)
+    with Image.open(path) as image:  # a third of the size, and no eye sees the difference
         few = image.convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-        few.save(path, optimize=True, dpi=(DPI, DPI))
+    few.save(path, optimize=True)
 
 
-def _heading(sheet: _Sheet, step: Step, text: Sequence[str]) -> None:
-    sheet.text(_LEFT, sheet.y + 0.1, f"{step.number}", 12, fontweight="bold", color=AFTER)
-    sheet.text(_LEFT + 0.22, sheet.y + 0.1, step.title, 11.5, fontweight="bold")
-    sheet.text(_LEFT + 0.22, sheet.y + 0.36, "\n".join(text), 8.3, color=INK)
+def step_text(number: int, flights: Flights) -> tuple[str, str]:
+    """Title of a step, and what it shows in a sentence or two."""
+    error, age = ({key: getattr(flight, name) for key, flight in flights.items() if not flight.flight.live}
+                  for name in ("error", "age"))  # fmt: skip
+    if number == 1:
+        return (
+            "Between two messages, let the others fly on.",
+            f"In round robin (TDMA) each is heard every {AGENTS}th slot. Who takes the others to stand where they were "
+            f"last heard is wrong by {error['all-tdma-hold']} on average; who lets them fly on as they last said, by "
+            f"{error['all-tdma']}, with the same messages.",
+        )
+    if number == 2:
+        return (
+            "Let those speak who have something to say.",
+            "Round robin gives ten of twelve slots to quadcopters that have nothing new to say: what is known of the "
+            f"flying two is {age['two-tdma']} old. DTSA lets every quadcopter compute whose state is most urgent: "
+            f"{age['two-dtsa']}. With lease a hovering quadcopter lends its turns to a flying one: {age['two-lease']}.",
+        )
+    if number == 3:
+        at_once = {}
+        for key in ("loss-dtsa", "loss-lease"):
+            slots = flights[key].summary["slots"]
+            count = f"{slots['collision']} of {slots['total']} slots"
+            at_once[key] = f"two speak at once in {count}" if slots["collision"] else "no two speak at once"
+        return (
+            "Lose one message in ten, and DTSA falls apart.",
+            "DTSA works as long as all know the same. After the first lost message they do not: all agree in "
+            f"{flights['loss-dtsa'].agreement} of the slots, {at_once['loss-dtsa']} or nobody does, positions are "
+            f"wrong by {error['loss-dtsa']}. With lease only whose turn it is gives it away, in its own message: "
+            f"{at_once['loss-lease']}, {error['loss-lease']}. Round robin does not mind losses, but is slow: "
+            f"{error['loss-tdma']}.",
+        )
+    live = flights["killed-lease"]
+    killed, _, back = killed_slots(live)
+    later = "" if back is None else f" {(back - killed) * live.flight.run.swarm.slot_s:.1f} s later"
+    return (
+        "One is killed in flight, and comes back.",
+        f"The turns of quadcopter {KILLED} stay empty until the others take it for dead; then the next one alive uses "
+        f"them. Started again it listens, speaks{later}, and has its turns back.",
+    )
 
 
-def _bare(axes: Axes) -> None:
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_visible(False)
+def _top_view(axes: Axes, finished: FinishedFlight) -> None:
+    paint(axes, finished.position, finished.scenario.moving, scale=0.72)
+    frame_bare(axes, finished.position)
 
 
-def top_view(axes: Axes, flown: Flown, until: int | None = None) -> None:
-    """The flight from above.
-
-    :param axes: where to.
-    :param flown: the flight.
-    :param until: slots of it that are shown; None: all.
-    """
-    place = flown.position[:until]
-    for k in range(place.shape[2]):
-        colour = agent_colour(k + 1)
-        start, path = place[0, :2, k], place[:, :2, k]
-        if not flown.moving[k]:
-            axes.add_patch(Circle(start, 0.13, facecolor=HOVER, edgecolor="white", linewidth=0.6, zorder=2))
-            continue
-        axes.plot(path[:, 0], path[:, 1], color="white", linewidth=2.2, zorder=3)
-        axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.15, zorder=3, solid_capstyle="round")
-        axes.add_patch(Circle(start, 0.13, facecolor="white", edgecolor=colour, linewidth=1.1, zorder=4))
-        axes.add_patch(Circle(path[-1], 0.13, facecolor=colour, edgecolor="white", linewidth=0.6, zorder=5))
-    extent = 1.13 * float(np.abs(flown.position[:, :2]).max())
-    axes.set_xlim(-extent, extent)
-    axes.set_ylim(-extent, extent)
-    axes.set_aspect("equal")
-    _bare(axes)
-    axes.plot([extent - 1.0, extent], [-extent * 0.97] * 2, color=MUTED, linewidth=1.0)
-    axes.text(extent - 0.5, -extent * 0.93, "1 m", ha="center", va="bottom", fontsize=6.5, color=MUTED)
-
-
-def _paths(sheet: _Sheet, top: float, step: Step, flights: Flights) -> None:
-    """Step a: paths of both flights, and the error over time."""
-    shades = (BEFORE, AFTER)
-    found = of_step(step, flights)
-    said = lines(step, flights)
-    for index, (flown, line, shade) in enumerate(zip(found, said, shades, strict=True)):
-        x = _LEFT + 0.12 + 1.88 * index
-        sheet.text(x + 0.78, top, line.does, 7.2, color=shade, ha="center", fontweight="bold")
-        top_view(sheet.axes(x, top + 0.17, 1.56, 1.56), flown)
-    axes = sheet.axes(4.6, top + 0.2, 2.95, 1.2)
-    end_s = compared_s(found)
-    for flown, line, shade in zip(found, said, shades, strict=True):
-        time_s = (np.arange(len(flown.error_m)) + 1) * flown.slot_s
-        shown = time_s <= end_s
-        axes.plot(time_s[shown], 1000 * flown.error_m[shown], color=shade, linewidth=1.4)
+def _draw_paths(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
+    """Step 1: paths of both flights, and the error over time."""
+    axes = sheet.axes(4.6, top + 0.2, 2.95, 1.2, bare=False)
+    ends = [finished.summary["completion_time_s"] or finished.summary["flight_time_s"] for finished in step]
+    end_s = max(0.5, int(10 * min(ends)) / 10 - 0.1)  # errors after an arrival say little
+    for index, (finished, shade) in enumerate(zip(step, SERIES[1::-1], strict=True)):
+        x = LEFT + 0.12 + 1.88 * index
+        sheet.text(x + 0.78, top, finished.flight.does, 7.2, color=shade, ha="center", fontweight="bold")
+        _top_view(sheet.axes(x, top + 0.17, 1.56, 1.56), finished)
+        time_s = (np.arange(len(finished.error_m)) + 1) * finished.flight.run.swarm.slot_s
+        error_mm = 1000 * finished.error_m[time_s <= end_s]
+        axes.plot(time_s[time_s <= end_s], error_mm, color=shade, linewidth=1.4)
         axes.annotate(
-            f"{line.value}", (end_s, float(np.nanmean(1000 * flown.error_m[shown][-40:]))), xytext=(5, 0),
-            textcoords="offset points", color=shade, fontsize=9, fontweight="bold", va="center", annotation_clip=False,
+            finished.error, (end_s, float(np.nanmean(error_mm[-40:]))), xytext=(5, 0), textcoords="offset points",
+            color=shade, fontsize=9, fontweight="bold", va="center", annotation_clip=False,
         )  # fmt: skip
-    axes.set_xlim(0, end_s)
-    axes.set_ylim(0, None)
-    axes.set_xlabel("time (s)", fontsize=7.5, color=MUTED, labelpad=2)
-    axes.set_title("how far off the others are thought to be (mm)", fontsize=7.8, color=INK, loc="left", pad=5)
-    _plain(axes)
+    axes.set(xlim=(0, end_s), ylim=(0, None))
+    axes.set_xlabel("time (s)", fontsize=7.5, color=QUIET, labelpad=2)
+    axes.set_title("how far off the others are thought to be (mm)", fontsize=7.8, fontweight="normal", pad=5)
 
 
-def _plain(axes: Axes) -> None:
-    axes.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6)
-    axes.grid(color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
-    for name, side in axes.spines.items():
-        side.set_visible(name in ("left", "bottom"))
-        side.set_color(RULE)
+def _draw_ages(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
+    _draw_strips(sheet, top, step, "known state is\nthis old", [finished.age for finished in step])
 
 
-def paint_cells(axes: Axes, shown: Sequence[Cell], width: int, size: float) -> None:
-    """Slots as cells.
+def _draw_losses(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
+    _draw_strips(sheet, top, step, "position is\nwrong by", [finished.error for finished in step])
 
-    :param axes: where to; a slot is 1 wide and 1 high.
-    :param shown: the cells.
-    :param width: of the axes, cells.
-    :param size: of the ids, points; 0: none.
-    """
-    faces = PatchCollection(
-        [
-            Rectangle((cell.x + 0.06 + index * 0.88 / len(cell.colours), cell.y + 0.06), 0.88 / len(cell.colours), 0.88)
-            for cell in shown
-            for index in range(len(cell.colours))
-        ],
-        facecolor=[colour for cell in shown for colour in cell.colours],
-        edgecolor="none",
-    )
-    axes.add_collection(faces)
-    for cell in shown:
-        if not cell.colours:
+
+def _draw_strips(sheet: _Sheet, top: float, step: Sequence[FinishedFlight], head: str, values: Sequence[str]) -> None:
+    """Steps 2 and 3: which agents sent in each slot."""
+    _top_view(sheet.axes(LEFT, top + 0.03, 1.42, 1.42), step[-1])
+    sheet.text(WIDTH - RIGHT, top - 0.02, head, 7, color=QUIET, ha="right")
+    first, width = slots_shown(step), 4.12
+    for index, (finished, value) in enumerate(zip(step, values, strict=True)):
+        y = top + 0.28 + 0.36 * index
+        sheet.text(1.98, y - 0.03, finished.flight.name, 8.6, fontweight="bold")
+        sheet.text(1.98, y + 0.125, finished.flight.does, 6.4, color=QUIET)
+        sheet.text(WIDTH - RIGHT, y - 0.01, value, 9.5, fontweight="bold", ha="right")
+        axes = sheet.axes(3.32, y, width, width / COUNT * 1.6)
+        draw_cells(axes, finished, [(x, 0, finished.senders[first + x]) for x in range(COUNT)], 5.2)
+        axes.set(xlim=(0, COUNT), ylim=(0, 1))
+    ticks = [slot for slot in range(first, first + COUNT) if slot % 10 == 0]
+    axes.set_xticks([slot - first + 0.5 for slot in ticks], [str(slot) for slot in ticks])
+    axes.set_xlabel("slot (10 ms each)", fontsize=7, color=QUIET, labelpad=1)
+    keys = [(agent_colour(5), "none", "sent by one that flies"), (HOVER, "none", "sent by one that hovers")]
+    if any(len(senders) > 1 for finished in step for senders in finished.senders[first : first + COUNT]):
+        keys.append((agent_colour(4), COLLIDED, "two or more at once: nobody understands them"))
+    keys.append(("white", HOVER, "nobody sends"))
+    handles = [Rectangle((0, 0), 1, 1, facecolor=face, edgecolor=edge, label=text) for face, edge, text in keys]
+    sheet.figure.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(1.9 / WIDTH, 1 - (top + 1.5) / sheet.height), ncols=4,
+        fontsize=6.6, handlelength=1, handleheight=1, columnspacing=1.6, handletextpad=0.5, labelcolor=QUIET,
+    )  # fmt: skip
+
+
+def slots_shown(step: Sequence[FinishedFlight]) -> int:
+    """The first of the slots that are shown of flights side by side."""
+    return min(FIRST, *(max(0, len(finished.senders) - COUNT) for finished in step))
+
+
+def draw_cells(axes: Axes, finished: FinishedFlight, cells: Sequence[Cell], size: float) -> None:
+    """Draw slots as cells, 1 wide and 1 high; `size`: of the ids in them, points."""
+    for x, y, senders in cells:
+        shades = [agent_colour(one) if finished.scenario.moving[one - 1] else HOVER for one in senders] or ["white"]
+        for index, shade in enumerate(shades):
+            wide = 0.88 / len(shades)
+            edge = "none" if senders else HOVER
             axes.add_patch(
-                Rectangle((cell.x + 0.1, cell.y + 0.1), 0.8, 0.8, fill=False, edgecolor="#c3ccd6", linewidth=0.5)
+                Rectangle((x + 0.06 + index * wide, y + 0.06), wide, 0.88, facecolor=shade, edgecolor=edge, lw=0.5)
             )
-        elif len(cell.colours) > 1:
-            axes.add_patch(
-                Rectangle(
-                    (cell.x + 0.06, cell.y + 0.06), 0.88, 0.88, fill=False, edgecolor=BAD, linewidth=1.3, zorder=4
-                )
-            )
-            axes.text(cell.x + 0.5, cell.y + 0.53, "×", fontsize=size * 1.9, ha="center", va="center", color="white",
+        if len(senders) > 1:
+            frame = {"fill": False, "edgecolor": COLLIDED, "linewidth": 1.3, "zorder": 4}
+            axes.add_patch(Rectangle((x + 0.06, y + 0.06), 0.88, 0.88, **frame))  # type: ignore[arg-type]
+            axes.text(x + 0.5, y + 0.5, "×", fontsize=1.9 * size, ha="center", va="center_baseline", color="white",
                       weight="bold", zorder=5, path_effects=[withStroke(linewidth=1.4, foreground=INK)])  # fmt: skip
-        elif size:
-            axes.text(cell.x + 0.5, cell.y + 0.54, cell.label, fontsize=size, ha="center", va="center",
-                      color=ink_on(cell.colours[0]))  # fmt: skip
-    axes.set_xlim(0, width)
-    _bare(axes)
+        elif senders:
+            axes.text(x + 0.5, y + 0.5, str(senders[0]), fontsize=size, ha="center", va="center_baseline",
+                      color=ink_on(shades[0]))  # fmt: skip
 
 
-def _strips(sheet: _Sheet, top: float, step: Step, flights: Flights) -> None:
-    """Steps b and c: who sent in each slot."""
-    found = of_step(step, flights)
-    said = lines(step, flights)
-    top_view(sheet.axes(_LEFT + 0.0, top + 0.03, 1.42, 1.42), found[-1])
-    sheet.text(
-        WIDTH - _RIGHT,
-        top - 0.02,
-        "known state is" if step.letter == "b" else "position is",
-        7,
-        color=MUTED,
-        ha="right",
+def killed_slots(finished: FinishedFlight) -> tuple[int, int | None, int | None]:
+    """Slots: the last own turn before the death, the first one that others use, the first one after the return."""
+    turns = range(KILLED - 1, len(finished.senders), finished.flight.run.swarm.agents)
+    empty = [slot for slot in turns if not finished.senders[slot]]
+    dead = next((slot for slot in empty if {slot + k * turns.step for k in range(1, 5)} <= set(empty)), len(turns))
+    used = next((slot for slot in turns if slot > dead and {KILLED, *finished.senders[slot]} != {KILLED}), None)
+    back = next((slot for slot in turns if slot > dead and KILLED in finished.senders[slot]), None)
+    return dead - turns.step, used, back
+
+
+def killed_parts(finished: FinishedFlight) -> list[tuple[str, int, int]]:
+    """Captions, first rounds and the rounds at which it happens: the death, the new use of its turns, the return."""
+    agents = finished.flight.run.swarm.agents
+    killed, used, back = killed_slots(finished)
+    parts = [(f"{KILLED} is killed", killed // agents + 1)]
+    if used is not None:
+        parts.append((f"its turns are used again, by {'/'.join(map(str, finished.senders[used]))}", used // agents))
+    if back is not None:
+        parts.append(("it is back", back // agents))
+    last = len(finished.senders) // agents - ROUNDS
+    return [(caption, max(0, min(at - ROUNDS // 4, last)), at) for caption, at in parts]
+
+
+def killed_cells(finished: FinishedFlight, first: int) -> list[Cell]:
+    """Some rounds from the first on, a column each; rows are the turns of the agents."""
+    agents = finished.flight.run.swarm.agents
+    slots = ((column, row, (first + column) * agents + row) for column in range(ROUNDS) for row in range(agents))
+    return [(x, y, finished.senders[slot] if slot < len(finished.senders) else ()) for x, y, slot in slots]
+
+
+def _draw_killing(sheet: _Sheet, top: float, step: Sequence[FinishedFlight]) -> None:
+    """Step 4: the turns of all agents around what happens."""
+    finished = step[0]
+    agents, slot_s = finished.flight.run.swarm.agents, finished.flight.run.swarm.slot_s
+    round_s, parts, gap, x = agents * slot_s, killed_parts(finished), 0.22, LEFT + 0.95
+    for own in range(1, agents + 1):
+        mark = {"color": agent_colour(KILLED), "fontweight": "bold"} if own == KILLED else {"color": QUIET}
+        sheet.text(x - 0.08, top + 0.01 + 0.18 * own, f"turns of {own}", 6.6, ha="right", **mark)
+    width = (WIDTH - RIGHT - x - gap * 2) / 3
+    for place, (caption, first, at) in enumerate(parts):
+        axes = sheet.axes(x + place * (width + gap), top + 0.16, width, 0.18 * agents)
+        draw_cells(axes, finished, killed_cells(finished, first), 4.6)
+        axes.set(xlim=(0, ROUNDS), ylim=(agents, 0))
+        axes.axvline(at - first, color=COLLIDED, linewidth=1.3, zorder=6)
+        sheet.text(x + place * (width + gap), top, caption, 7.4, fontweight="bold")
+        marks = np.arange(np.ceil(first * round_s / 0.2) * 0.2, (first + ROUNDS) * round_s, 0.2)
+        axes.set_xticks(marks / round_s - first, [f"{mark:.1f}" for mark in marks])
+        if not place:
+            text = f"time (s); one column is one round of {1000 * round_s:g} ms"
+            axes.set_xlabel(text, fontsize=7, color=QUIET, labelpad=1)
+    sheet.text(LEFT + 0.22, top + 1.22, LIVE_NOTE, 7, color=QUIET)
+
+
+def draw_animation(path: Path, flights: Flights, slots: int = 80) -> None:
+    """Draw a moving picture as GIF: four flights, a slot a frame; where agents are, and which one sends."""
+    rows = (
+        ("two-tdma", "TDMA", "All speak in turn, also the ten that hover and have nothing new to say."),
+        ("two-dtsa", "DTSA", "All compute whose state is most urgent: the two that fly speak."),
+        ("loss-dtsa", "DTSA, 1 message in 10 lost", "They no longer know the same: two speak at once, or nobody."),
+        ("loss-lease", "lease, 1 message in 10 lost", "Who hovers lends its turns, so only one can speak."),
     )
-    sheet.text(WIDTH - _RIGHT, top + 0.1, "this old" if step.letter == "b" else "wrong by", 7, color=MUTED, ha="right")
-    first, count = window(found)
-    pitch = 0.36
-    for index, (flown, line) in enumerate(zip(found, said, strict=True)):
-        y = top + 0.28 + pitch * index
-        sheet.text(_LABEL_X, y - 0.03, line.name, 8.6, fontweight="bold")
-        axes = sheet.axes(_STRIP_X, y, _STRIP_W, _STRIP_W / count * 1.6)
-        paint_cells(axes, cells(flown, first, count), count, 5.2)
-        axes.set_ylim(0, 1)
-        sheet.text(WIDTH - _RIGHT, y - 0.01, line.value, 9.5, fontweight="bold", ha="right")
-        sheet.text(_LABEL_X, y + 0.125, line.does, 6.4, color=MUTED)
-        if index == len(found) - 1:
-            axes.tick_params(labelsize=6.5, colors=MUTED, length=2, width=0.6)
-            places = [slot for slot in range(first, first + count) if slot % 10 == 0]
-            axes.set_xticks([slot - first + 0.5 for slot in places], [str(slot) for slot in places])
-            axes.set_xlabel("slot (10 ms each)", fontsize=7, color=MUTED, labelpad=1)
-    _legend(sheet, top + 0.28 + pitch * len(found) + 0.2, step)
-
-
-def _legend(sheet: _Sheet, y: float, step: Step) -> None:
-    entries = [("colour", "sent by one that flies"), (HOVER, "sent by one that hovers")]
-    if step.letter == "c":
-        entries += [(BAD, "two or more at once: nobody understands them"), ("none", "nobody sends")]
-    else:
-        entries += [("none", "nobody sends")]
-    width = WIDTH - _RIGHT - _LABEL_X
-    axes = sheet.axes(_LABEL_X, y, width, 0.13)
-    axes.set_xlim(0, width)
-    axes.set_ylim(0, 0.13)
-    x = 0.0
-    for shade, text in entries:
-        if shade == "colour":
-            for index, part in enumerate((agent_colour(1), agent_colour(2))):
-                axes.add_patch(Rectangle((x + 0.055 * index, 0.01), 0.055, 0.1, facecolor=part))
-        elif shade == BAD:
-            axes.add_patch(Rectangle((x, 0.01), 0.11, 0.1, facecolor=agent_colour(4), edgecolor=BAD, linewidth=1.2))
-            axes.text(x + 0.055, 0.062, "×", color="white", fontsize=7, fontweight="bold", ha="center", va="center")
-        else:
-            axes.add_patch(
-                Rectangle(
-                    (x, 0.01),
-                    0.1,
-                    0.1,
-                    facecolor="white" if shade == "none" else shade,
-                    edgecolor="#c3ccd6",
-                    linewidth=0.5,
-                )
-            )
-        axes.text(x + 0.16, 0.06, text, fontsize=6.6, color=MUTED, va="center")
-        x += 0.34 + 0.0465 * len(text)
-    _bare(axes)
-
-
-def _killing(sheet: _Sheet, top: float, step: Step, flights: Flights) -> None:
-    """Step d: the turns of all agents, a row a turn, around what happens."""
-    flown = flights[step.takes[0].key]
-    agents = flown.take.run.swarm.agents
-    parts = killed_windows(flown)
-    rounds = sum(part.rounds for part in parts)
-    gap, x = 0.22, _LEFT + 0.95
-    width = (WIDTH - _RIGHT - x - gap * (len(parts) - 1)) / rounds
-    for own in range(agents):
-        sheet.text(x - 0.08, top + 0.19 + 0.18 * own, f"turns of {own + 1}", 6.6, ha="right",
-                   color=agent_colour(KILLED) if own + 1 == KILLED else MUTED,
-                   fontweight="bold" if own + 1 == KILLED else "normal")  # fmt: skip
-    for part in parts:
-        axes = sheet.axes(x, top + 0.16, width * part.rounds, 0.18 * agents)
-        paint_cells(axes, part.cells, part.rounds, 4.6)
-        axes.set_ylim(agents, 0)
-        sheet.text(x, top - 0.0, part.caption, 7.4, fontweight="bold")
-        if part.mark is not None:
-            axes.axvline(part.mark, color=BAD, linewidth=1.3, zorder=6)
-        seconds = agents * flown.slot_s
-        low, high = part.first * seconds, (part.first + part.rounds) * seconds
-        marks = np.arange(np.ceil(low / 0.2) * 0.2, high, 0.2)
-        axes.set_xticks((marks - low) / seconds, [f"{mark:.1f}" for mark in marks])
-        axes.tick_params(labelsize=6.5, colors=MUTED, length=2, width=0.6)
-        if part is parts[0]:
-            axes.set_xlabel(
-                f"time (s); one column is one round of {1000 * seconds:g} ms", fontsize=7, color=MUTED, labelpad=1
-            )
-        x += width * part.rounds + gap
-    sheet.text(_LEFT + 0.22, top + 1.22, LIVE_NOTE, 7, color=MUTED)
-
-
-_DRAW = (_paths, _strips, _strips, _killing)
+    across, row_height = 40, 1.42
+    with style():
+        sheet = _Sheet(6.34, 8.8, dpi=100)
+        sheet.text(0.14, 0.14, "Twelve quadcopters, one radio channel: who speaks next?", 13, fontweight="bold")
+        reading = (
+            "A cell is a slot of 10 ms, its number says who sends in it. Grey: that one hovers. White: nobody sends."
+        )
+        sheet.text(0.14, 0.42, reading, 8.7, color=QUIET)
+        drawn = []
+        for index, (key, name, text) in enumerate(rows):
+            top, finished = 0.66 + row_height * index, flights[key]
+            sheet.rule(top, 0.14)
+            sheet.text(1.6, top + 0.1, name, 10, fontweight="bold")
+            sheet.text(1.6, top + 0.33, text, 8.7, color=QUIET)
+            value = f"{finished.age} old" if index < 2 else f"wrong by {finished.error}"
+            sheet.text(8.64, top + 0.1, f"positions are {value}", 10, fontweight="bold", ha="right")
+            strip = sheet.axes(1.6, top + 0.6, 7.04, 0.52)
+            strip.set(xlim=(0, across), ylim=(2, 0))
+            drawn.append((finished, sheet.axes(0.1, top + 0.06, 1.3, 1.3), strip))
+        writer = PillowWriter(fps=11)
+        with writer.saving(sheet.figure, path, 100):
+            for frame in range(slots):
+                for finished, view, strip in drawn:
+                    slot = min(FIRST + frame, len(finished.senders) - 1)
+                    cell = frame % across, frame // across, finished.senders[slot] if slot == FIRST + frame else ()
+                    draw_cells(strip, finished, [cell], 7)
+                    view.clear()
+                    paint(view, finished.position[: slot + 1], finished.scenario.moving, ids=False, scale=0.62)
+                    senders = [sender - 1 for sender in finished.senders[slot]]
+                    shade = COLLIDED if len(senders) > 1 else INK
+                    view.plot(*finished.position[slot][:2, senders], "o", mfc="none", mec=shade, ms=13, mew=1.4)
+                    frame_bare(view, finished.position)
+                writer.grab_frame()
+            for _ in range(38):  # the last one stays
+                writer.grab_frame()
