@@ -70,7 +70,7 @@ const reasonText = name => DATA.reasons[name] || "";
 /* What colours of slots mean: reasons, and [name, colour, text] of what else there is. */
 const reasonLegend = (reasons, more) => reasons.map(name => [name, reasonColor(name), reasonText(name)]).concat(more)
   .map(([name, color, text]) => el("span", {}, el("i", {class: "box", style: `background:${color}`}), el("b", {}, name), text ? " " + text : ""));
-const runColor = index => LINES[index % LINES.length];
+const runColor = index => HUES[index % HUES.length];
 /* An agent has one colour in page, pictures and layouts, by its id; who hovers is grey. */
 const agentColor = (id, moving) => moving ? PALETTE.agents[(id - 1) % PALETTE.agents.length] : PALETTE.hovering;
 const agentTurn = id => Math.floor((id - 1) / PALETTE.agents.length) % PALETTE.shapes.length;
