@@ -148,7 +148,7 @@ async def told_in_flight(url: str) -> set[str]:
         while len(flying) < COUNT or moments < 10:
             content = await stream.receive_json(timeout=60)
             moments += len(content.get("moments", ()))
-            flying |= {told[0] for told in content.get("told", ()) if told[1] == "flying"}
+            flying |= {row[0] for row in content.get("rows", ()) if row[1] == "flying"}
     return flying
 
 

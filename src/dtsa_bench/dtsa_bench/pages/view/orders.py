@@ -29,7 +29,10 @@ _VALUES = {
     **dict.fromkeys(PROCESS_ORDERS, (_is_agent, "the id of an agent")),
     "loss": (lambda value: type(value) in (int, float) and 0.0 <= value <= 1.0, "0 to 1"),
     "jam": (lambda value: type(value) is bool, "true or false"),
-    "partition": (lambda value: type(value) is str and len(value) <= _LONGEST, "groups of ids, as [[1, 2, 3], [4, 5, 6]]"),
+    "partition": (
+        lambda value: type(value) is str and len(value) <= _LONGEST,
+        "groups of ids, as [[1, 2, 3], [4, 5, 6]]",
+    ),
     "land": (lambda value: value is None, "nothing"),
     "emergency": (lambda value: value == SURE, f"{SURE!r}, the second step"),
 }
