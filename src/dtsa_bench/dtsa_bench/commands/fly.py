@@ -144,6 +144,9 @@ def run(args: argparse.Namespace) -> int:
         flight = fly(config, directory, options, stop, on_domain=show)
         interrupted = bool(stop)
         _tell(args, flight)
+        picture = directory / "trajectories.png"
+        if not args.json and picture.exists():
+            print(f"picture: {picture}", flush=True)
         if process is not None and sys.stdin.isatty() and not stop:
             print("the flight is over; the page stays until Ctrl-C", file=sys.stderr, flush=True)
             while not stop and process.poll() is None:
@@ -151,9 +154,6 @@ def run(args: argparse.Namespace) -> int:
     if flight.summary.get("warning"):
         print(f"dtsa: warning: {flight.summary['warning']}", file=sys.stderr)
     cut_short = flight.summary.get("cut_short")
-    picture = directory / "trajectories.png"
-    if not args.json and picture.exists():
-        print(f"picture: {picture}")
     if interrupted:
         print("dtsa: the flight was interrupted; its bag is complete up to that point", file=sys.stderr)
         _unheard(flight.summary)

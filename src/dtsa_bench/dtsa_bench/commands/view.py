@@ -21,7 +21,7 @@ Shows a swarm on a page that this machine alone can open: the swarm on the ROS g
 a radio, with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not
 know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
 _ROS = "ros"
-_LAST_S = 2.0  # for pages to receive the end of a flight
+_LAST_S = 2.0  # for the source to end, and for pages to receive the end of a flight
 
 
 class Source(Protocol):
@@ -82,13 +82,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
     give_way()
     track, source, order = _graph(args) if args.air == _ROS else _air(args)
-    thread = threading.Thread(target=source.run, daemon=True)
-    try:
-        asyncio.run(_serve(ViewServer(track, new_token(), order), thread, port, args.listen))
-    finally:
-        source.stopped = True
-        if thread.is_alive():
-            thread.join(3.0)
+    asyncio.run(_serve(ViewServer(track, new_token(), order), source, port, args.listen))
     return 0
 
 
@@ -146,12 +140,13 @@ def _plain_address(text: str) -> bool:
         return False
 
 
-async def _serve(server: ViewServer, thread: threading.Thread, port: int, address: str | None) -> None:
-    """Serves until a signal comes."""
+async def _serve(server: ViewServer, source: Source, port: int, address: str | None) -> None:
+    """Serve until a signal comes."""
     import signal
 
     from dtsa_bench.pages.view.server import LOOPBACK
 
+    thread = threading.Thread(target=source.run, daemon=True)
     url = await server.start(port, address or LOOPBACK)
     over = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -161,4 +156,6 @@ async def _serve(server: ViewServer, thread: threading.Thread, port: int, addres
     if sys.stderr.isatty():
         print("open it in a browser; Ctrl-C ends", file=sys.stderr, flush=True)
     await over.wait()
+    source.stopped = True
+    await asyncio.get_running_loop().run_in_executor(None, thread.join, _LAST_S)
     await server.stop(_LAST_S)

@@ -95,6 +95,7 @@ class GraphSource:
                     if self._follower is not None:
                         self._follower.note(text)
                 time.sleep(_POLL_S)
+            self._follow_runs()  # the run may have ended since the last poll
         finally:
             self._vehicles.close()
             for feed in (self._settings, self._status, self._changes, self._markers, *self._slots):
