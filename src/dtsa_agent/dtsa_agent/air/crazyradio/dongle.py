@@ -120,16 +120,19 @@ class Dongle:
         self._release(self._device)
 
 
-def _backend(settings: CrazyradioSettings) -> Any:
+def _devices(settings: CrazyradioSettings) -> list[Any]:
     if settings.simulated_radio:
-        from .simulated import SimulatedBackend
+        from .simulated import simulated_dongles
 
-        return SimulatedBackend(Path(settings.simulated_radio))
+        return simulated_dongles(Path(settings.simulated_radio))
+    import usb.core
+
+    backend = None  # pyusb looks for a libusb of the system
     if importlib.util.find_spec("libusb_package") is not None:
         import libusb_package
 
-        return libusb_package.get_libusb1_backend()
-    return None  # pyusb looks for a libusb of the system
+        backend = libusb_package.get_libusb1_backend()
+    return list(usb.core.find(idVendor=_VENDOR, idProduct=_PRODUCT, find_all=True, backend=backend) or ())
 
 
 def _found(settings: CrazyradioSettings) -> Any:
@@ -139,9 +142,9 @@ def _found(settings: CrazyradioSettings) -> Any:
     """
     import usb.core
 
-    backend, radio = _backend(settings), settings.place.radio
+    radio = settings.place.radio
     try:
-        found = list(usb.core.find(idVendor=_VENDOR, idProduct=_PRODUCT, find_all=True, backend=backend) or ())
+        found = _devices(settings)
         if len(radio) <= _BY_NUMBER and radio.isdigit():
             chosen = found[int(radio) : int(radio) + 1]
         else:

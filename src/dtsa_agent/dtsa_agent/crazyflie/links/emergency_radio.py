@@ -22,11 +22,7 @@ ROUNDS, PAUSE_S = 25, 0.02  # packets on each channel, and the time between two
 
 
 class EmergencyRadio:
-    """Stops all Crazyflies of the given links.
-
-    :param uris: the links' addresses; those that need no radio are passed over.
-    :param log: called with a level (info, warn, error) and a line.
-    """
+    """Stops all Crazyflies of the given links; those that need no radio are passed over."""
 
     def __init__(self, uris: Sequence[str], log: Callable[[str, str], None]) -> None:
         from cflib.crtp.radiodriver import RadioDriver
@@ -47,9 +43,9 @@ class EmergencyRadio:
 
     def _open(self, used: set[int]) -> None:
         """Take the first dongle that no link uses."""
-        from cflib.drivers.crazyradio import Crazyradio, _find_devices
+        from cflib.drivers.crazyradio import Crazyradio, get_serials
 
-        for number in range(len(_find_devices())):
+        for number in range(len(get_serials())):
             if number in used:
                 continue
             try:

@@ -27,9 +27,8 @@ from dtsa_agent.crazyflie.settings.config import RobotSettings
 from dtsa_agent.crazyflie.state.conversions import LOG_VARIABLES, Setpoint, Vector, VehicleState, decode_log
 
 from .board_orders import BoardOrders
-from .errors import LinkError
 from .estimator_reset import settle
-from .outbox import Order, Outbox, Position
+from .outbox import LinkError, Order, Outbox, Position
 from .radio_link import Heard, RadioPort, keep_links_open, packets_of
 
 SIMULATED_RADIO = "DTSA_SIMULATED_RADIO"  # environment: socket of simulated Crazyradios, for simulation only
@@ -59,12 +58,9 @@ def require_cflib() -> None:
         import cflib.crtp
 
     if path := os.environ.get(SIMULATED_RADIO):
-        import libusb_package
+        from dtsa_agent.air.crazyradio.simulated import replace_real_dongles
 
-        from dtsa_agent.air.crazyradio.simulated import SimulatedBackend
-
-        backend = SimulatedBackend(Path(path))
-        libusb_package.get_libusb1_backend = lambda: backend  # cflib finds these dongles, and no others
+        replace_real_dongles(Path(path))
     if not cflib.crtp.CLASSES:
         cflib.crtp.init_drivers()
     keep_links_open()
@@ -100,12 +96,10 @@ class _Opening:
 class Link:
     """One Crazyflie's connection, worker and log.
 
-    :param robot: address and settings.
     :param cache: folder for the tables of variables.
     :param on_state: called with each decoded log packet and when it was logged (s, monotonic), in a thread of cflib's.
     :param on_broken: called with a reason when the connection ends by itself, in a thread of cflib's.
     :param on_answer: called with the first byte of a high-level order and the firmware's answer, in such a thread.
-    :param settling: decides when the estimator has settled.
     :param seen: where motion capture sees the Crazyflie (m, world); None: not at all.
     """
 
@@ -265,9 +259,8 @@ class Link:
                 self.reopened += 1
 
     def _connect(self, *, again: bool = False) -> None:
-        """Connect.
+        """Connect; `again`: in flight perhaps, so nothing is set and the estimator is left alone.
 
-        :param again: in flight perhaps: nothing is set, the estimator is left alone.
         :raises LinkError: it did not work.
         """
         from cflib.crazyflie import Crazyflie
@@ -329,11 +322,7 @@ class Link:
             self._log_order_s = LOG_ORDER_S + 1.0 / self.robot.log_rate_hz + 5.0 / self.board.polls_hz
 
     def _watch(self, cf: Any, again: bool) -> _Opening:
-        """Takes note of all that cflib says about a connection, from its threads.
-
-        :param cf: the `Crazyflie` object, not connected yet.
-        :param again: as of `_connect`.
-        """
+        """Take note of all that cflib says about a connection, from its threads."""
         from cflib.crtp.crtpstack import CRTPPort
 
         opening = _Opening()
@@ -447,10 +436,7 @@ class Link:
         self.outbox.close()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the worker to end (s); False if it has not.
-
-        :param timeout: s, how long it waits.
-        """
+        """Wait for the worker to end (s); False if it has not."""
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
