@@ -13,8 +13,8 @@ import pytest
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
-from dtsa_agent.crazyflie.links.ownership import Ownership
-from dtsa_agent.crazyflie.settings.config import LogTopic, load_swarm, parse_swarm
+from dtsa_agent.crazyflie.node.bridge import Ownership
+from dtsa_agent.crazyflie.settings.config import load_swarm, parse_swarm
 from dtsa_agent.crazyflie.settings.radio_budget import check_budget, radio_loads, radio_of
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -65,8 +65,6 @@ def test_robot_beats_type_beats_all() -> None:
     assert (second.command_rate_hz, second.log_rate_hz) == (20, 20)
     assert (second.battery.voltage_warning, second.battery.voltage_critical) == (3.6, 3.1)
     assert second.firmware_params == {"stabilizer.estimator": 2}
-    assert second.firmware_logging == {"volts": LogTopic("volts", 5.0, ("pm.vbat",))}
-    assert parse_swarm(settings.to_dict()) == settings
 
 
 @pytest.mark.parametrize(
@@ -168,9 +166,6 @@ TWELVE_WRONG_FILES = {
     "a list of robots": ("robots: [cf1, cf2]", "a mapping"),
     "a parameter that is no number": (
         "robots: {cf1: {uri: 'udp://h:1', firmware_params: {locSrv: {extPosStdDev: .nan}}}}", "extPosStdDev"
-    ),
-    "a log without a rate": (
-        "robots: {cf1: {uri: 'udp://h:1', firmware_logging: {custom_topics: {a: {vars: [pm.vbat]}}}}}", "a.frequency"
     ),
     "a fence without an end": (
         "robots: {cf1: {uri: 'udp://h:1'}}\nstation: {safety: {geofence_max: [1.5, .inf, 1]}}", "geofence_max"

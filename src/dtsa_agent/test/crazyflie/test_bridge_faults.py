@@ -19,6 +19,7 @@ from bridge_helpers import FakeFleet, Flight, end_process, fake_fleet, flight, s
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.state.state_machine import State
+from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
@@ -40,13 +41,6 @@ class FaultFlight:
         return self.flight.logged(pattern, self.monotonic) - self.monotonic
 
 
-def seen(pilot: Flight, cf: int) -> tuple[float, float, float]:
-    """Where one believes to be, m, world."""
-    last = pilot.bridge.vehicles[f"cf{cf}"].last
-    assert last is not None
-    return last.position
-
-
 @pytest.fixture(scope="module")
 def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> FaultFlight:
     with (
@@ -65,9 +59,6 @@ def fault_flight(tmp_path_factory: pytest.TempPathFactory) -> FaultFlight:
         pilot.velocity["cf6"] = (-1.0, 0.0, 0.0)
         time.sleep(7)
         states = {k: pilot.state(k) for k in range(1, 9)}
-        x, y, _ = seen(pilot, 8)
-        pilot.bridge.vehicles["cf7"].go_to((x + 0.05, y, 1.6), 0.0, 2.8, False)
-        time.sleep(3.0)
         pilot.bridge.land_all("test over")
         pilot.bridge.wait_landed(lambda: False)
         others = [fleet.flown(cf) for cf in (7, 8)]
@@ -130,17 +121,6 @@ def test_nobody_else_is_harmed(fault_flight: FaultFlight) -> None:
     # The first one arms itself, the second one is locked by the bridge once it has landed.
     assert [states[:3] for states in fault_flight.others] == 2 * [["ready to fly", "flying", "landed"]]
     assert fault_flight.others[1][3:] == ["pre-flight checks not passed", "pre-flight checks passed"]
-
-
-def test_one_above_another_moves_aside_before_it_lands(fault_flight: FaultFlight) -> None:
-    over = fault_flight.flight.logged("cf7: flying -> landing")
-    fault_flight.flight.logged("cf7: cf8 is below it: moves aside to", over)
-    _, track, events = read_truth(fault_flight.fleet.truth)
-    up, low = track[:, :, 6], track[:, :, 7]
-    assert np.linalg.norm(up - low, axis=1).min() > 0.4
-    assert np.linalg.norm(up[-1, :2] - low[-1, :2]) > 0.4
-    assert up[-1, 2] < 0.05
-    assert len([e for e in events if e["cf"] == 7 and e["event"] == "land"]) == 1
 
 
 @pytest.mark.realtime
@@ -228,11 +208,30 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
         wait_for(lambda: link.received > forgotten + 20)
 
 
+def check_parameters(one: Vehicle, two: Vehicle) -> None:
+    """By an unmodified cflib, with their types."""
+    known = one.onboard.parameters()
+    assert (known["ring.effect"].value, known["hlCommander.vland"].value) == (6, 0.5)
+    for name, value, problem in (
+        ("ring.effect", 7, ""),
+        ("ring.effect", 256, "ring.effect: 256 is not a whole number from 0 to 255"),
+        ("ring.effect", 1.5, "ring.effect: 1.5 is not a whole number from 0 to 255"),
+        ("hlCommander.vland", 0.25, ""),
+        ("hlCommander.vland", float("nan"), "hlCommander.vland: nan is not a number"),
+        ("firmware.modified", 1, "firmware.modified is read-only"),
+    ):
+        assert known[name].problem(value) == problem
+    one.onboard.set_parameter("ring.effect", 7)
+    wait_for(lambda: one.onboard.parameters()["ring.effect"].value == 7)
+    assert two.onboard.parameters()["ring.effect"].value == 6
+
+
 @pytest.mark.realtime
 def test_a_lossy_link_still_connects(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2) as fleet:
         with flight(settings(fleet)) as pilot:  # fills the cache of tables
             assert pilot.bridge.connect() == []
+            check_parameters(*pilot.bridge.vehicles.values())
         fleet.fault("drop", 1, rate=0.005)
         with flight(settings(fleet, connect_attempts=20, connect_timeout_s=1.0)) as pilot:
             assert pilot.bridge.connect() == []

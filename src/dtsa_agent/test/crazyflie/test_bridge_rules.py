@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import LocalProtocolError
-from dtsa_agent.crazyflie.links.delivery import LAND, TAKEOFF, Delivery
 from dtsa_agent.crazyflie.links.outbox import Outbox
+from dtsa_agent.crazyflie.motion.controls import LAND, TAKEOFF, Delivery
 from dtsa_agent.crazyflie.motion.limits import check_stream, outside_fence
 from dtsa_agent.crazyflie.safety.rules import ESTIMATE_HOLD_S, Action, SafetyMonitor, SafetySettings, Watched
 from dtsa_agent.crazyflie.settings.config import StationSettings
@@ -290,14 +290,11 @@ def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> 
     for setpoint in (
         conversions.velocity_world((1.5, 0.0, 0.0), 0.0, 0.0),
         conversions.position((1.0, 2.0, 1.0), 0.0, 0.0),
-        conversions.hover(1.0, 0.0, 0.0, 1.0, 0.0),
         conversions.full_state((1.0, 0.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0),
     ):
         check_stream(setpoint, station)
     for setpoint, words in (
         (conversions.velocity_world((50.0, 0.0, 0.0), 0.0, 0.0), "50.00 m/s is refused (station.max_stream_mps is 3)"),
-        (conversions.hover(0.0, -50.0, 0.0, 1.0, 0.0), "50.00 m/s"),
-        (conversions.hover(0.0, 0.0, 0.0, 3.0, 0.0), "outside the geofence in z"),
         (conversions.position((1.95, 0.0, 1.0), 0.0, 0.0), "0.45 m outside the geofence in x"),
         (conversions.full_state((0.0, 3.0, 1.0), still, still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "geofence in y"),
         (conversions.full_state((0.0, 0.0, 1.0), (0.0, 9.0, 0.0), still, (0.0, 0.0, 0.0, 1.0), still, 0.0), "9.00 m/s"),

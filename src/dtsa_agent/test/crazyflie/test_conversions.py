@@ -80,7 +80,6 @@ def test_yaw_of_streamed_commands_is_in_degrees() -> None:
         (0.5, -0.25, 0.125, 90.0)
     )
     assert conversions.position((1.0, 2.0, 3.0), -math.pi, 0.0).arguments == pytest.approx((1.0, 2.0, 3.0, -180.0))
-    assert conversions.hover(0.5, -0.5, math.pi, 0.4, 0.0).arguments == pytest.approx((0.5, -0.5, 180.0, 0.4))
     assert conversions.velocity_world((0.0, 0.0, 0.0), 0.0, 7.0).stamp == 7.0
 
 

@@ -19,9 +19,9 @@ from waiting import wait_for
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.positions.estimates import EstimateWatch, Settling
 from dtsa_agent.crazyflie.positions.motion_capture import MOVED_AGAIN, PositionSettings, Tracker
-from dtsa_agent.crazyflie.settings.config import parse_swarm
+from dtsa_agent.crazyflie.settings.config import RobotSettings, StationSettings, parse_swarm
 from dtsa_agent.crazyflie.state.conversions import VehicleState
-from dtsa_agent.crazyflie.vehicle.captured_poses import CapturedPoses
+from dtsa_agent.crazyflie.vehicle.known_state import KnownState
 
 ROOM = ((-1.5, -2.3, -0.95), (1.5, 2.3, 0.95))
 ORIGIN = (0.0, 0.0, 0.95)
@@ -121,15 +121,19 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
     from dtsa_agent.crazyflie.links.radio_link import packets_of
 
     for send, size, header in (("extpose", 29, 0x61), ("extpos", 12, 0x60)):
-        captured = CapturedPoses("cf1", PositionSettings(source="pose", send=send), ORIGIN, ROOM, lambda *line: None)
-        packet = captured.see((1.0, 2.0, 0.5), LEVEL, "world", 0.0, 5.0, flying=False)
+        station = StationSettings(positions=PositionSettings(source="pose", send=send))
+        known = KnownState(RobotSettings(name="cf1", id=1, uri="udp://h:1"), station, lambda *line: None)
+        packet, captured = known.see((1.0, 2.0, 0.5), LEVEL, "world", 0.0), known.tracker
         assert packet is not None
+        assert captured is not None
+        assert captured.last is not None
         (data,) = packets_of(SimpleNamespace(platform=None), packet.send) or []
-        assert (len(data) - 1, data[0] & 0xF3, captured.tracker.sent) == (size, header, 1)
-        assert captured.place(5.2) == (1.0, 2.0, 0.5)
-        assert captured.disagrees((1.0, 2.0, 0.45), 5.2) == ""
-        assert "0.30 m from where it believes to be" in captured.disagrees((1.0, 2.0, 0.8), 5.2)
-        assert "not seen by motion capture (no pose comes)" in captured.disagrees((1.0, 2.0, 0.5), 6.0)
+        assert (len(data) - 1, data[0] & 0xF3, captured.sent) == (size, header, 1)
+        soon, late = captured.last.time + 0.2, captured.last.time + 1.0
+        assert captured.place(soon) == (1.0, 2.0, 0.5)
+        assert captured.disagrees((1.0, 2.0, 0.45), soon) == ""
+        assert "0.30 m from where it believes to be" in captured.disagrees((1.0, 2.0, 0.8), soon)
+        assert "not seen by motion capture (no pose comes)" in captured.disagrees((1.0, 2.0, 0.5), late)
 
 
 # -- estimates --------------------------------------------------------------------------------------------------------
@@ -186,7 +190,7 @@ def test_jumps_standstill_and_errors_in_flight_are_noticed() -> None:
 # -- settings ---------------------------------------------------------------------------------------------------------
 def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy")
-    from dtsa_agent.crazyflie.node.position_inputs import _named, named_pose_array
+    from dtsa_agent.crazyflie.node.inputs import _named, named_pose_array
 
     assert PositionSettings(source="pose").topic_of("cf3") == "/cf3/pose"
     assert PositionSettings(source="named_poses").topic_of("cf3") == "/poses"

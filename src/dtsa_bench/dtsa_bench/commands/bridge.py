@@ -37,9 +37,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "needs crazyflie_interfaces in the workspace (default %(default)s)",
     )
     parser.add_argument(
-        "--teleop", metavar="NAME", default="", help="the vehicle that a person steers: it listens to /NAME/cmd_vel"
-    )
-    parser.add_argument(
         "--check",
         nargs="?",
         const=ALL,
@@ -85,22 +82,15 @@ def run(args: argparse.Namespace) -> int:
     require_cflib()
     with ExitStack() as stack:
         config = simulated(args.config, stack) if args.backend == "sim" else args.config
-        return run_bridge(config, interfaces=args.interfaces, teleop=args.teleop, check=args.check == ALL)
+        return run_bridge(config, interfaces=args.interfaces, check=args.check == ALL)
 
 
-def run_bridge(config: Path, *, interfaces: str = "dtsa", teleop: str = "", check: bool = False) -> int:
-    """The bridge in this process.
-
-    :param config: the swarm's YAML.
-    :param interfaces: whose messages, names and units.
-    :param teleop: name of the vehicle that a person steers; empty: of none.
-    :param check: only connect, and say what a flight would lack.
-    """
+def run_bridge(config: Path, *, interfaces: str = "dtsa", check: bool = False) -> int:
+    """The bridge in this process; `check`: only connect, and say what a flight would lack."""
     from dtsa_agent.crazyflie.node import bridge_node
 
     arguments = ["crazyflie_bridge", "--ros-args", "-p", f"config:={config.resolve()}"]
     arguments += ["-p", f"interfaces:={interfaces}"] if interfaces != "dtsa" else []
-    arguments += ["-p", f"teleop:={teleop}"] if teleop else []
     if check:
         # Too many for a radio is a line of the list here, not the end.
         arguments += ["--log-level", "error"]

@@ -84,11 +84,6 @@ def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:
     )
     add_simulated_radio(crazyflies)
     crazyflies.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="ask where the Crazyflies stand, then fly the whole mission in simulation from there; no motor turns",
-    )
-    crazyflies.add_argument(
         "--attach",
         action="store_true",
         help="by the bridge that runs already (dtsa bridge) on the ROS domain of --domain or ROS_DOMAIN_ID, and goes "
@@ -108,8 +103,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.config is not None:
         raise ConfigError("config", args.config, "a swarm.yaml together with --backend cflib")
-    if args.attach or args.dry_run:
-        raise ConfigError("attach" if args.attach else "dry_run", True, "a mission, --backend cflib")
+    if args.attach:
+        raise ConfigError("attach", True, "a mission, --backend cflib")
 
     processes = None
     if args.processes != "per-agent":
@@ -222,18 +217,11 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     config = run_config(args, **mission_defaults(settings, chosen))
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     options = FlightOptions(domain=domain, pictures=args.picture)
-    if args.dry_run and args.attach:
-        raise ConfigError("dry_run", True, "either --dry-run or --attach: it connects by itself")
     page = page_options(args)
     with Stop() as stop:
-        if args.dry_run:
-            from dtsa_bench.crazyflies.missions.rehearsal import rehearse
-
-            flight, cut_short = rehearse(config, settings, path, args.out, options, stop, page=page)
-        else:
-            flight, cut_short = fly_crazyflies(
-                config, settings, path, args.out, options, stop, attach=args.attach, page=page
-            )
+        flight, cut_short = fly_crazyflies(
+            config, settings, path, args.out, options, stop, attach=args.attach, page=page
+        )
     _tell(args, flight)
     unheard = _unheard(flight.summary)
     not_landed = [] if stop and not cut_short else flight.summary.get("not_landed", [])

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -35,9 +36,8 @@ from dtsa_agent.crazyflie.links.link import require_cflib
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
 from dtsa_bench.commands.fly import mission_problem
 from dtsa_bench.crazyflies.missions.ground_station import Ended
-from dtsa_bench.crazyflies.missions.mission_flight import CrashWatch
-from dtsa_bench.crazyflies.missions.moves_to_places import plan_moves
-from dtsa_bench.crazyflies.missions.places import MissionError, assign_places, check_standing, crossings
+from dtsa_bench.crazyflies.missions.mission_flight import MissionWatch
+from dtsa_bench.crazyflies.missions.places import MissionError, assign_places, check_crossings, check_standing
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.pages.report.data import run_data
@@ -85,9 +85,9 @@ def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
     found = assign_places(config, measured)
     assert found.place_numbers == np.roll(np.arange(1, 13), 5).tolist()
     check_standing(names, measured, fence)
-    assert not crossings(make_scenario(found), names, measured)
-    across = crossings(make_scenario(config), names, np.roll(start, 6, axis=1))  # all through the middle
-    assert "cf1 and cf7 at 0.0" in ", ".join(across)
+    check_crossings(make_scenario(found), names, measured)
+    with pytest.raises(MissionError, match=r"cf1 and cf7 would come within 0\.0. m.*: put each on its place, or"):
+        check_crossings(make_scenario(config), names, np.roll(start, 6, axis=1))  # all through the middle
     assert assign_places(found, start) is found  # roles that the user has given are kept
     measured = start.copy()
     measured[:2, 3] = measured[:2, 4] + (0.1, 0.0)
@@ -107,7 +107,8 @@ def test_two_as_near_as_in_a_crash_cut_the_exchange_short() -> None:
     swarm = SwarmConfig(agents=3)
     run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
     metrics, ended = FlightMetrics(run, make_scenario(swarm)), Ended(MagicMock())
-    watch, status = CrashWatch(metrics, ended), ChannelStatus(0, {}, [])
+    mission: Any = SimpleNamespace(ended=ended, bridge_alive=lambda: None)
+    watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, {}, [])
     watch.idle(status)
     assert not ended.reason
     metrics.update(0, np.array([[[0.0, 0.19, 2.0], [0.0] * 3, [0.0] * 3]]), None, 0)
@@ -227,39 +228,9 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
         assert summary["min_distance_m"] == pytest.approx(gap.min(), abs=0.05)
 
 
-def test_whoever_may_not_exchange_roles_is_brought_over_the_others() -> None:
-    config = SwarmConfig(agents=12, permute=False, shape="ellipse", axis_x_m=1.2, axis_y_m=2.0)
-    names = [f"cf{k}" for k in range(1, 13)]
-    goal, fence, random = make_scenario(config).start, SafetySettings(), np.random.default_rng(3)
-    for order in (np.roll(np.arange(12), 1), np.roll(np.arange(12), 6), *(random.permutation(12) for _ in range(20))):
-        here = goal[:, order] + np.array([[0.08], [0.08], [0.0]]) * random.uniform(-1, 1, (3, 12))
-        for move in plan_moves(names, here, goal, fence):
-            for waypoint in move.waypoints:
-                begin = here[:, move.index, None]
-                steps = begin + (np.array(waypoint)[:, None] - begin) * np.linspace(0, 1, 50)
-                assert (np.abs(steps) <= np.array(fence.geofence_max)[:, None]).all()
-                others = np.delete(here, move.index, axis=1)
-                gap = np.linalg.norm(steps[:2, :, None] - others[:2, None], axis=0)
-                below = steps[2, :, None] - others[2, None] < 0.5
-                assert gap[below].min(initial=1.0) > 0.34
-                here[:, move.index] = waypoint
-        assert np.abs(here - goal).max() < 0.06
-    crowded = goal.copy()
-    crowded[:2, 1] = crowded[:2, 0] - (0.1, 0.0)
-    with pytest.raises(MissionError, match=r"cf1 and cf2 hover 0\.10 m apart"):
-        plan_moves(names, crowded, goal, fence)
-    low = SafetySettings(geofence_max=(1.5, 2.3, 0.4))
-    with pytest.raises(MissionError, match=r"is above the geofence's 0\.4 m"):
-        plan_moves(names, np.roll(goal, 1, axis=1), goal, low)
-    pair = np.array([[-0.3, 0.3], [0.0, 0.0], [0.0, 0.0]])
-    narrow = SafetySettings(geofence_min=(-0.5, -0.3, -0.95), geofence_max=(0.5, 0.3, 0.95))
-    with pytest.raises(MissionError, match=r"cf1, cf2 stand at each other's places, and no place aside"):
-        plan_moves(names[:2], pair, pair[:, ::-1], narrow)
-
-
 @pytest.mark.realtime
 def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> None:
-    """The first one finds two at each other's places and may not exchange roles; the second one exchanges them."""
+    """The first one finds two at each other's places, and all exchange roles; the second one may not: nobody flies."""
     with ros_domain() as domain:
         pass  # free: the bridge's now
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
@@ -273,15 +244,16 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
         command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config)]
         bridge = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
         try:
-            for number, (options, words) in enumerate((
-                (["--places", "1 2 3 4"], "brought to their places one by one: cf1 and cf3 at 0.0"),
-                ([], "exchange of roles, places 3 4 1 2"),
+            for number, (options, code, words) in enumerate((
+                ([], 0, "exchange of roles, places 3 2 1 4"),
+                ([], 0, "exchange of roles, places 1 4 3 2"),
+                (["--places", "1 2 3 4"], 1, "to where they begin cf1 and cf3 would come within 0.0"),
             )):  # fmt: skip
                 command = [*FLY, "--config", str(config), "--attach", "--out", str(tmp_path / str(number)), *options]
                 result = subprocess.run(
                     command, env=environment, capture_output=True, text=True, timeout=150, check=False
                 )
-                assert result.returncode == 0, result.stderr + (tmp_path / "bridge.log").read_text()
+                assert result.returncode == code, result.stderr + (tmp_path / "bridge.log").read_text()
                 assert words in result.stderr
             bridge.send_signal(signal.SIGINT)
             assert bridge.wait(60) == 0
@@ -295,30 +267,6 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
         flown = track[track[:, 2].min(axis=1) > 0.5]
         gap = np.linalg.norm(flown[:, :, :, None] - flown[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
         assert gap.min() > 0.25
-
-
-@pytest.mark.realtime
-def test_a_dry_run_flies_from_where_they_stand_and_nobody_moves(tmp_path: Path) -> None:
-    with fake_fleet(tmp_path, 2, *MIXED) as fleet:
-        data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
-        for cf, x in (("cf1", -1.2), ("cf2", 1.2)):  # at each other's places
-            data["robots"][cf]["initial_position"] = [-x, 0.0, 0.0]
-            data["robots"][cf]["uri"] = fleet.uri(1 if x > 0 else 2)
-        config, out = tmp_path / "swarm.yaml", tmp_path / "out"
-        config.write_text(yaml.safe_dump(data))
-        command = [*FLY, "--config", str(config), "--out", str(out), "--dry-run"]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
-        assert result.returncode == 0, result.stderr
-        assert "exchange of roles, places 2 1" in result.stderr
-        assert json.loads((out / "summary.json").read_text())["end"] == "completed"
-        assert not [e for e in fleet.events(name="state") if e["state"] in ("flying", "locked")]
-        # Somebody who cannot be asked is named, and nothing is flown.
-        fleet.fault("close", 1)
-        data["all"] |= {"connect_attempts": 1, "connect_timeout_s": 2.0}
-        config.write_text(yaml.safe_dump(data))
-        command[command.index(str(out))] = str(tmp_path / "again")
-        result = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
-        assert (result.returncode, "the places of cf2 are not known" in result.stderr) == (1, True)
 
 
 @pytest.mark.realtime

@@ -43,7 +43,7 @@ def test_a_test_file_stands_beside_a_module_or_says_that_it_is_an_integration_te
     assert tests
     for path in tests:
         name = path.stem.removeprefix("test_")
-        tail = name.partition("_")[2]  # test_bridge_paths.py: paths.py of the bridge's room
+        tail = name.partition("_")[2]  # test_bridge_limits.py: limits.py of the bridge's room
         beside = name in everywhere or tail in set(modules(room(path, ROOT / place)))
         if not beside and not path.read_text(encoding="utf-8").startswith('"""Integration: '):
             silent.append(path.name)

@@ -162,7 +162,7 @@ ROBOTS = {
 def test_a_swarms_yaml_survives() -> None:
     swarm = parse_swarm(ROBOTS)
     assert swarm.robots[0].firmware_params == {"stabilizer.estimator": 2, "ctrlMel.kp_xy": 0.4}
-    for values in ways(swarm.to_dict()):
+    for values in ways(ROBOTS):
         again = parse_swarm(values)
         assert again == swarm
         assert isinstance(again.robots[0].firmware_params["stabilizer.estimator"], int)

@@ -8,7 +8,7 @@ from typing import Any
 
 from dtsa_agent.crazyflie.settings.on_board import START
 
-from .errors import LinkError
+from .outbox import LinkError
 
 _ANSWER_S = 0.5  # longest wait for the answer to an order
 _TIMES = 4  # that an order is sent
@@ -30,7 +30,6 @@ class BoardOrders:
     def prepare(self, cf: Any) -> None:
         """Everything that the app has to know before its agent starts.
 
-        :param cf: the connected `Crazyflie`.
         :raises LinkError: it has no such app, or the app refuses.
         """
         missing, confirmed = set(self._parameters), threading.Event()
@@ -56,7 +55,6 @@ class BoardOrders:
     def start(self, cf: Any) -> None:
         """Its agent starts: it listens, then takes part.
 
-        :param cf: the connected `Crazyflie`.
         :raises LinkError: it does not.
         """
         _tell(cf, START)

@@ -10,8 +10,7 @@ from typing import Any
 from dtsa_agent.crazyflie.positions.estimates import Settling
 from dtsa_agent.crazyflie.state.conversions import Vector
 
-from .errors import LinkError
-from .outbox import Position
+from .outbox import LinkError, Position
 
 VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
 PLACE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
@@ -28,13 +27,10 @@ def settle(
     position: Callable[[], Position | None],
     timeout: float,
 ) -> None:
-    """Restart the filter, feed it with positions, and wait until it has settled. In the link's worker.
+    """Restart the filter, feed it with positions, and wait (s, at most) until it has settled. In the link's worker.
 
-    :param cf: the connected `Crazyflie` object of cflib.
-    :param settling: decides.
     :param seen: where motion capture sees it, m, world.
     :param position: the latest position that waits to be sent.
-    :param timeout: s.
     :raises LinkError: it does not settle in time, and why.
     """
     from cflib.crazyflie.log import LogConfig

@@ -1,4 +1,4 @@
-"""What one worker thread has to send: orders in sequence, of streamed commands and of positions only the latest."""
+"""What one link's worker has to send: orders in sequence, of streamed commands and of positions only the latest."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from typing import Any
 from dtsa_agent.crazyflie.state.conversions import Setpoint
 
 Order = Callable[[], None]
+
+
+class LinkError(Exception):
+    """A connection could not be made; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,17 +55,11 @@ class Outbox:
     def take_position(self) -> Position | None:
         """The position that waits, if any, for a worker that is busy with an order."""
         with self._condition:
-            return self._take_position()
-
-    def _take_position(self) -> Position | None:
-        position, self._position = self._position, None
-        return position
+            position, self._position = self._position, None
+            return position
 
     def put_order(self, order: Order, *, urgent: bool = False) -> None:
-        """Append an order, and forget the setpoint that waits: an order ends the stream before it.
-
-        :param urgent: forget all orders that wait, too.
-        """
+        """Append an order, which ends the stream: the setpoint that waits (urgent: and all orders) is forgotten."""
         with self._condition:
             if urgent:
                 self._orders.clear()
@@ -85,7 +83,8 @@ class Outbox:
                     setpoint, self._setpoint = self._setpoint, None
                     return setpoint
                 if self._position is not None:
-                    return self._take_position()
+                    position, self._position = self._position, None
+                    return position
                 if self._closed:
                     return None
                 self._condition.wait()

@@ -38,10 +38,7 @@ def keep_links_open() -> None:
 
 
 class Recorder:
-    """Takes cflib's commands and keeps their packets instead of sending them.
-
-    :param cf: the connected `Crazyflie`, whose version of the protocol counts.
-    """
+    """Takes cflib's commands and keeps their packets instead of sending them."""
 
     def __init__(self, cf: Any) -> None:
         from cflib.crazyflie.commander import Commander
@@ -64,11 +61,7 @@ class Recorder:
 
 
 def packets_of(cf: Any, action: Callable[[Any], None]) -> list[bytes] | None:
-    """The packets of an order; None if it does not consist of commands alone.
-
-    :param cf: the connected `Crazyflie`.
-    :param action: the order.
-    """
+    """The packets of an order; None if it does not consist of commands alone."""
     recorder = Recorder(cf)
     try:
         action(recorder)
@@ -78,10 +71,7 @@ def packets_of(cf: Any, action: Callable[[Any], None]) -> list[bytes] | None:
 
 
 class RadioPort:
-    """The radio of one link, which the worker looks at before it sends.
-
-    :param cf: the `Crazyflie`, with a link over a radio.
-    """
+    """The radio of one link, which the worker looks at before it sends."""
 
     def __init__(self, cf: Any) -> None:
         self._driver = cf.link
@@ -96,10 +86,7 @@ class RadioPort:
         return cls(cf) if isinstance(cf.link, RadioDriver) else None
 
     def limit(self, polls_hz: float) -> None:
-        """From now on at most so many packets a second go to the Crazyflie.
-
-        :param polls_hz: Hz.
-        """
+        """From now on at most so many packets a second go to the Crazyflie."""
         thread = self._driver._thread
         if thread is not None:
             thread.rate_limit = polls_hz  # it sleeps for that long after each acknowledgement
@@ -120,10 +107,7 @@ class RadioPort:
             return there
 
     def send(self, cf: Any, packets: Sequence[bytes]) -> bool:
-        """Send packets one after the other; False when there was no room for one: the rest was sent past it.
-
-        :param cf: the `Crazyflie`.
-        """
+        """Send packets one after the other; False when there was no room for one: the rest was sent past it."""
         from cflib.crtp.crtpstack import CRTPPacket
 
         for number, packet in enumerate(packets):
@@ -198,7 +182,7 @@ class Heard:
     """When something was last acknowledged, and how old the log is that comes.
 
     After a gap the Crazyflie delivers what it logged meanwhile: packets that come are not always new. Their time stamps
-    tell, as the smallest delay that was ever seen is that of a packet without a wait.
+    tell, as the smallest delay that was ever seen is that of a packet without a wait. Times (`now`) are s, monotonic.
     """
 
     DRIFT = 1e-4  # of the Crazyflie's clock against ours, at most
@@ -213,17 +197,11 @@ class Heard:
         self._lock = threading.Lock()
 
     def age(self, now: float) -> float:
-        """Seconds since something was acknowledged, or came over another way than the air; infinite before that.
-
-        :param now: s, monotonic.
-        """
+        """Seconds since something was acknowledged, or came over another way than the air; infinite before that."""
         return now - self._acknowledged
 
     def acknowledge(self, now: float) -> bool:
-        """Something was acknowledged, or came, at a time (s, monotonic); whether that ends a gap.
-
-        :param now: s, monotonic.
-        """
+        """Something was acknowledged, or came; whether that ends a gap."""
         gap = self.age(now) > GAP_S
         if gap:
             self.since = now
@@ -231,11 +209,7 @@ class Heard:
         return gap
 
     def sampled(self, stamp_ms: int, now: float) -> float:
-        """When a log packet's values were taken, s, monotonic.
-
-        :param stamp_ms: its time stamp, by the Crazyflie's clock.
-        :param now: when it came, s, monotonic.
-        """
+        """When the values of a log packet that has come now were taken; its time stamp is of the Crazyflie's clock."""
         with self._lock:
             self.logged = now
             stamp = stamp_ms / 1000

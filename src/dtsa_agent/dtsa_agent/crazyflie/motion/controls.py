@@ -1,25 +1,43 @@
-"""What a Crazyflie's firmware is told to fly: a stream of commands, a path, or a velocity that needs no place.
+"""What a Crazyflie's firmware is told to fly: a stream of commands, a path, a landing, or a velocity without a place.
 
-The vehicle decides what is flown; here is how it is said so that the motors keep turning. The vehicle's lock protects
-all of it.
+The vehicle decides what is flown; here is how it is told so that the motors keep turning. The vehicle's lock protects
+all of it. Times (`now`, `until`) are s, monotonic.
 """
 
 from __future__ import annotations
 
+import errno
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from dtsa_agent.crazyflie.links.delivery import Delivery
 from dtsa_agent.crazyflie.links.link import Link
+from dtsa_agent.crazyflie.settings.config import StationSettings
 from dtsa_agent.crazyflie.state.conversions import Setpoint, Vector, velocity_world
+
+from .limits import landing_s
 
 # A landing is planned as if from rest, and a path to a place swings out by metres if it begins at high speed: before a
 # landing and before holding a place the vehicle is first braked by streamed setpoints of zero velocity.
 SLOW_MPS = 0.25
 BRAKE_LIMIT_S = 1.5
 DOWN_M = 0.04  # m: it stands, by motion capture
-NOWHERE: Vector = (0.0, 0.0, 0.0)
+STANDSTILL: Vector = (0.0, 0.0, 0.0)
+SINK_MPS = 0.3  # of a vehicle that does not know where it is
+SINK_MORE_S = 1.5  # s: it sinks that much longer than its last known height takes
+BLIND_REPEAT_S, BLIND_REPEATS = 0.5, 3  # a landing that may not have been heard is ordered again
+BLIND_LAND_S = 2.0
+
+TAKEOFF, LAND, GO_TO = "take-off", "landing", "go_to"
+KINDS = {7: TAKEOFF, 8: LAND, 4: GO_TO, 12: GO_TO}  # by the first byte of the firmware's packets
+ACCEPTED = (0, 1)  # 1: it takes off or lands already
+REPEAT_S = 0.15
+BUSY = 4  # a take-off is ordered so often while the supervisor lets no motor run: 3 s after a landing it goes through a
+# state in which none may, also where the vehicle arms itself again at once
+ENDS = 2  # the end of a stream of setpoints is not answered: it is sent this often again
+
+Send = Callable[[Any], None]
 
 
 def end_of_stream(cf: Any) -> None:
@@ -27,14 +45,70 @@ def end_of_stream(cf: Any) -> None:
     cf.commander.send_notify_setpoint_stop()
 
 
+@dataclass(slots=True)
+class _Order:
+    kind: str
+    send: Send
+    end: Send | None  # ends the stream of setpoints before it; None: there was none
+    next: float  # s, monotonic, when to send again
+    ends: int
+    answered: bool = False
+    busy: int = 0  # answers that the supervisor lets no motor run
+
+
+class Delivery:
+    """The last high-level order to one Crazyflie: sent again until the firmware has answered."""
+
+    def __init__(self) -> None:
+        self._order: _Order | None = None
+
+    def begin(self, kind: str, send: Send, end: Send | None, now: float) -> None:
+        """An order of a kind was sent; it replaces the one before, and `end` ends the stream before it."""
+        self._order = _Order(kind, send, end, now + REPEAT_S, ENDS if end else 0)
+
+    def cancel(self) -> None:
+        """The order does not count any more."""
+        self._order = None
+
+    @property
+    def landing(self) -> bool:
+        """Whether the firmware has answered that it lands."""
+        return self._order is not None and self._order.kind == LAND and self._order.answered
+
+    def answered(self, code: int, result: int) -> str:
+        """The firmware has answered an order (its first byte) with a result (0, or an errno); why it refuses, or ""."""
+        order = self._order
+        if order is None or KINDS.get(code) != order.kind or order.answered:
+            return ""
+        if result in ACCEPTED:
+            order.answered = True
+            return ""
+        if order.kind == TAKEOFF and result == errno.EBUSY:
+            order.busy += 1
+            if order.busy < BUSY:
+                return ""  # `due` sends it again
+        self._order = None  # it would refuse it again
+        return f"the firmware refuses the {order.kind} (error {result})"
+
+    def due(self, now: float) -> Send | None:
+        """What has to be sent now, if anything."""
+        order = self._order
+        if order is None or now < order.next:
+            return None
+        order.next = now + REPEAT_S
+        if not order.answered:
+            return order.send
+        if order.ends > 0:
+            order.ends -= 1
+            return order.end
+        return None
+
+
 class Controls:
-    """The present stream, path or braking of one Crazyflie.
+    """The present stream, path, braking or landing of one Crazyflie."""
 
-    :param link: sends.
-    """
-
-    def __init__(self, link: Link) -> None:
-        self._link = link
+    def __init__(self, link: Link, station: StationSettings) -> None:
+        self._link, self._station = link, station
         self.delivery = Delivery()
         self.streaming = False  # the firmware follows streamed commands, not the high-level commander
         self.held = False  # the stream of commands broke off and the place is being held
@@ -42,12 +116,14 @@ class Controls:
         self.guard_until = 0.0  # s: a take-off or go-to is flown to its end before streamed commands count again
         self._brake: tuple[float, Callable[[], None]] | None = None  # until when to brake (s), and what comes then
         self._blind: tuple[Vector, float] | None = None  # velocity that needs no place, and until when (s)
+        self._landings: list[float] = []  # s: when to repeat a landing that may not have been heard
 
     def reset(self) -> None:
         """A new connection."""
         self.streaming = self.held = False
         self._command_time = -math.inf
         self._blind = None
+        self._landings.clear()
         self.delivery.cancel()
 
     def stop(self) -> None:
@@ -56,17 +132,11 @@ class Controls:
         self.delivery.cancel()
 
     def command_age(self, now: float) -> float:
-        """Seconds since the last streamed command; infinite before the first one.
-
-        :param now: s, monotonic.
-        """
+        """Seconds since the last streamed command; infinite before the first one."""
         return now - self._command_time
 
-    def led_for(self, now: float) -> float | None:
-        """Seconds since the last of the streamed commands that lead it, or did until they broke off; None: none do.
-
-        :param now: s, monotonic.
-        """
+    def setpoint_age(self, now: float) -> float | None:
+        """Age of the last of the streamed commands that lead it, or did until they broke off; None: none do."""
         if not (self.streaming or self.held) or self._command_time == -math.inf:
             return None
         return now - self._command_time
@@ -79,16 +149,11 @@ class Controls:
         self.streaming, self.held, self._brake = True, False, None
         self._link.outbox.put_setpoint(setpoint)
 
-    def fly(self, kind: str, action: Callable[[Any], None], duration: float, now: float, *, again: bool = True) -> None:
+    def fly(self, kind: str, action: Send, duration: float, now: float, *, again: bool = True) -> None:
         """An order to the high-level commander, and only then the end of the stream of setpoints.
 
         The other way round the high-level commander would have nothing to fly for a moment, and would stop the motors.
-
-        :param kind: `TAKEOFF`, `LAND`, `GO_TO` or `TRAJECTORY`.
-        :param action: gives it.
-        :param duration: s, for which streamed commands do not count.
-        :param now: s, monotonic.
-        :param again: the order may be given more than once: it is, until the firmware has answered.
+        Streamed commands do not count for the duration (s). `again`: the order is repeated until it is answered.
         """
         streaming, self.streaming, self.held = self.streaming, False, False
         self.guard_until = now + duration
@@ -106,21 +171,15 @@ class Controls:
         if again:
             self.delivery.begin(kind, run, end_of_stream if streaming else None, now)
 
-    # -- braking ----------------------------------------------------------------------------------------------------
+    # -- braking and landing ----------------------------------------------------------------------------------------
     def brake_then(self, action: Callable[[], None], speed: float, now: float) -> None:
-        """Slow down, then do something.
-
-        :param speed: m/s. :param now: s, monotonic.
-        """
+        """Slow down from a speed (m/s), then do something."""
         self.delivery.cancel()
         self._brake = (now + BRAKE_LIMIT_S, action)
         self.slow_down(speed, now)
 
     def slow_down(self, speed: float, now: float) -> None:
-        """Go on braking, if it brakes.
-
-        :param speed: m/s. :param now: s, monotonic.
-        """
+        """Go on braking, if it brakes."""
         if self._brake is None:
             return
         end, action = self._brake
@@ -129,7 +188,27 @@ class Controls:
             action()
         else:
             self.streaming = True
-            self._link.outbox.put_setpoint(velocity_world(NOWHERE, 0.0, now))
+            self._link.outbox.put_setpoint(velocity_world(STANDSTILL, 0.0, now))
+
+    def land(self, height: float, way: float, duration: float, now: float) -> None:
+        """Sink straight down to a height (m above the floor), over a way (m), and stop the motors."""
+        seconds = landing_s(way, duration, self._station)
+        self.fly(LAND, lambda cf: cf.high_level_commander.land(height, seconds, yaw=None), math.inf, now)
+
+    def repeat_landing(self, now: float) -> None:
+        """Nothing is heard of it: the landing is ordered some more times."""
+        self._landings = [now + BLIND_REPEAT_S * (i + 1) for i in range(BLIND_REPEATS)]
+
+    def end_repeats(self) -> None:
+        """It is heard: no landing is repeated."""
+        self._landings.clear()
+
+    def land_again(self, height: float, now: float) -> None:
+        """Order the landing from a height (m) once more, when it is time."""
+        if self._landings and now >= self._landings[0]:
+            self._landings.pop(0)
+            self.streaming = True  # it must end a stream that the firmware may still follow
+            self.land(0.0, height, BLIND_LAND_S, now)
 
     # -- without a place --------------------------------------------------------------------------------------------
     @property
@@ -146,11 +225,15 @@ class Controls:
         """Places count again."""
         self._blind = None
 
-    def steer_blindly(self, velocity: Vector, until: float, now: float) -> None:
-        """Stream a velocity, whatever the estimate says, and nothing else.
+    def stand_blindly(self, now: float) -> None:
+        """Zero velocity, whatever the estimate says."""
+        self._steer_blindly(STANDSTILL, math.inf, now)
 
-        :param velocity: m/s, world. :param until: s, monotonic: then the motors stop. :param now: s, monotonic.
-        """
+    def sink_blindly(self, height: float, now: float) -> None:
+        """Sink by velocity alone for as long as the last known height (m) takes, and some more."""
+        self._steer_blindly((0.0, 0.0, -SINK_MPS), now + height / SINK_MPS + SINK_MORE_S, now)
+
+    def _steer_blindly(self, velocity: Vector, until: float, now: float) -> None:
         self._brake, self._blind = None, (velocity, until)
         self.held, self.streaming = False, True
         self.delivery.cancel()
@@ -159,7 +242,7 @@ class Controls:
     def go_on_blindly(self, in_air: bool, seen: Vector | None, now: float) -> None:
         """The next packet of a stream that needs no place; the motors stop once the vehicle must be down.
 
-        :param in_air: whether it still flies. :param seen: m, world, where motion capture sees it. :param now: s.
+        :param seen: m, world, where motion capture sees it; None: not at all.
         """
         if self._blind is None:
             return

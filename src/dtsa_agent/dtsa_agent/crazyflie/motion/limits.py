@@ -1,4 +1,8 @@
-"""What is not flown although it could be: places outside the geofence, speeds that nobody means."""
+"""What is not flown although it could be: places outside the geofence, too fast commands, too short durations.
+
+The firmware's high-level commander flies polynomials of degree 7 from rest to rest, whatever the duration. If it is too
+short, the vehicle lags behind its path, and a landing stops the motors at the end of the path, wherever the vehicle is.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,6 @@ import math
 from dtsa_agent.crazyflie.settings.config import StationSettings
 from dtsa_agent.crazyflie.state.conversions import (
     FULL_STATE,
-    HOVER,
     POSITION,
     VELOCITY_WORLD,
     Setpoint,
@@ -15,16 +18,15 @@ from dtsa_agent.crazyflie.state.conversions import (
     outside_by,
     place_text,
     to_map,
-    to_world,
-)  # fmt: skip
+)
+
+PEAK = 35 / 16  # largest over mean speed of such a polynomial, at its middle
+SHORTEST_S = 0.1  # of any path, however short
+MIN_LAND_S = 1.0
 
 
 def outside_fence(place: Vector, station: StationSettings) -> str:
-    """How a place is outside the geofence; empty if it is not, or if there is no fence.
-
-    :param place: m, world.
-    :param station: fence, tolerance, and where the room is.
-    """
+    """How a place (m, world) is outside the geofence; empty if it is not, or if there is no fence."""
     fence = station.safety
     if not fence.geofence:
         return ""
@@ -35,24 +37,12 @@ def outside_fence(place: Vector, station: StationSettings) -> str:
     return ""
 
 
-def room_of(station: StationSettings) -> tuple[Vector, Vector]:
-    """Lower and upper corner of the room, m, world; infinite without a geofence.
-
-    :param station: fence, and where the room is.
-    """
-    fence, origin = station.safety, station.room_origin_in_world
-    if not fence.geofence:
-        return (-math.inf, -math.inf, -math.inf), (math.inf, math.inf, math.inf)
-    return to_world(fence.geofence_min, origin), to_world(fence.geofence_max, origin)
-
-
 def check_stream(setpoint: Setpoint, station: StationSettings) -> None:
     """Refuse a streamed command that leads out of the room, or is too fast.
 
-    :param setpoint: the command, in the firmware's units.
     :raises ValueError: why it is refused.
     """
-    place, velocity = _place_and_velocity(setpoint, station)
+    place, velocity = _place_and_velocity(setpoint)
     speed, limit = math.hypot(*velocity), station.max_stream_mps
     if speed > limit:
         raise ValueError(f"a command with {speed:.2f} m/s is refused (station.max_stream_mps is {limit:g})")
@@ -60,16 +50,35 @@ def check_stream(setpoint: Setpoint, station: StationSettings) -> None:
         raise ValueError(f"a command to {problem} is refused")
 
 
-def _place_and_velocity(setpoint: Setpoint, station: StationSettings) -> tuple[Vector | None, tuple[float, ...]]:
+def _place_and_velocity(setpoint: Setpoint) -> tuple[Vector | None, tuple[float, ...]]:
     """Where (m, world) and how fast (m/s) a command leads."""
     a = setpoint.arguments
     if setpoint.kind == POSITION:
         return (a[0], a[1], a[2]), ()  # type: ignore[return-value]
     if setpoint.kind == VELOCITY_WORLD:
         return None, (a[0], a[1], a[2])  # type: ignore[return-value]
-    if setpoint.kind == HOVER:
-        x, y, _ = station.room_origin_in_world
-        return (x, y, a[3]), (a[0], a[1])  # type: ignore[return-value]
     if setpoint.kind == FULL_STATE:
         return a[0], a[1]  # type: ignore[return-value]
     return None, ()
+
+
+def shortest_s(distance: float, limit: float) -> float:
+    """Shortest duration (s) of a path (m) from rest to rest with a largest speed of `limit` (m/s)."""
+    return max(SHORTEST_S, PEAK * abs(distance) / limit)
+
+
+def too_short(duration: float, distance: float, limit: float) -> str:
+    """Why a duration (s) is too short for a distance (m) at a largest speed of `limit` (m/s); empty if it is not."""
+    needed = shortest_s(distance, limit)
+    if duration >= needed:
+        return ""
+    return (
+        f"duration {duration:.2f} s is too short for {abs(distance):.2f} m: "
+        f"at least {needed:.2f} s (station.max_speed_mps is {limit:g})"
+    )
+
+
+def landing_s(distance: float, wanted: float, station: StationSettings) -> float:
+    """Duration (s) of a landing over a distance (m): as wanted (0: at the station's speed), or longer if too short."""
+    seconds = wanted if wanted > 0.0 else max(MIN_LAND_S, abs(distance) / station.land_speed_mps)
+    return max(seconds, shortest_s(distance, station.max_speed_mps))

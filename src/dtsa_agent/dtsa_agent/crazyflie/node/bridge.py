@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import os
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_agent.crazyflie.links.board_orders import BoardOrders
 from dtsa_agent.crazyflie.links.emergency_radio import EmergencyRadio
-from dtsa_agent.crazyflie.links.link import require_cflib
-from dtsa_agent.crazyflie.links.ownership import Ownership
-from dtsa_agent.crazyflie.motion.limits import room_of
-from dtsa_agent.crazyflie.safety.landing_places import SINK, Descent, LandingPlaces, Other
+from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO, require_cflib
 from dtsa_agent.crazyflie.safety.rules import Action, SafetyMonitor, Verdict
 from dtsa_agent.crazyflie.settings.config import SwarmSettings
 from dtsa_agent.crazyflie.settings.on_board import key_of, orders, parameters
 from dtsa_agent.crazyflie.settings.radio_budget import WATCHDOG_HZ, check_budget, radio_loads
 from dtsa_agent.crazyflie.state.conversions import VehicleState
-from dtsa_agent.crazyflie.state.state_machine import IN_AIR, State
-from dtsa_agent.crazyflie.vehicle.reports import snapshot, watched
-from dtsa_agent.crazyflie.vehicle.snapshot import Snapshot
+from dtsa_agent.crazyflie.state.state_machine import State
+from dtsa_agent.crazyflie.vehicle.reports import Snapshot, snapshot, watched
 from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
 
 TICK_S = 0.02
@@ -32,11 +33,39 @@ GROUNDED_S = 5.0  # s of silence after which a lost vehicle is on the ground: th
 LAND_WAIT = frozenset({State.ARMED, State.FLYING, State.LANDING})
 
 
+class Ownership:
+    """Locks on the addresses (name, URI) of Crazyflies, among the processes of a machine. They end with the process.
+
+    A Crazyflie belongs to one bridge at a time: two that send to it would both believe to be alone.
+
+    :raises ConfigError: another bridge has one of them.
+    """
+
+    def __init__(self, robots: Iterable[tuple[str, str]]) -> None:
+        self._files: list[int] = []
+        directory = Path(tempfile.gettempdir()) / f"dtsa-crazyflies-{os.getuid()}"
+        with suppress(FileExistsError):
+            directory.mkdir(mode=0o700)
+        for name, uri in robots:
+            air = os.environ.get(SIMULATED_RADIO, "") if uri.startswith("radio://") else ""  # one of several
+            address = air + uri.partition("?")[0].lower()
+            file = os.open(directory / hashlib.sha256(address.encode()).hexdigest(), os.O_CREAT | os.O_RDWR, 0o600)
+            self._files.append(file)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                self.release()
+                raise ConfigError(f"robots.{name}.uri", uri, "a Crazyflie that no other bridge here uses") from None
+
+    def release(self) -> None:
+        """Others may have them."""
+        while self._files:
+            os.close(self._files.pop())
+
+
 class Bridge:
     """The swarm. Its own thread applies the safety rules 50 times a second.
 
-    :param settings: robots and station.
-    :param log: called with a level (info, warn, error) and a line.
     :param on_state: called with a vehicle and each new state of it, in a thread of the link's.
     :param on_event: called with a vehicle's name (empty: all), the rule and the reason when a safety rule acts.
     :raises ConfigError: cflib is missing, or the radios cannot carry the swarm.
@@ -67,8 +96,7 @@ class Bridge:
         )
         cache = cache.expanduser()
         cache.mkdir(parents=True, exist_ok=True)
-        self._landing_places = LandingPlaces(*room_of(station))
-        self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state, self._descent) for r in settings.robots}
+        self.vehicles = {r.name: Vehicle(r, station, cache, log, on_state) for r in settings.robots}
         self._prepare_boards()
         self.emergency = EmergencyRadio([r.uri for r in settings.robots], log)
         self.monitor = SafetyMonitor(station.safety)
@@ -80,11 +108,9 @@ class Bridge:
 
     # -- connection -------------------------------------------------------------------------------------------------
     def connect(self, names: Iterable[str] | None = None, stop: Callable[[], bool] = lambda: False) -> list[str]:
-        """Connect in parallel and wait; one that is missing does not keep the others.
+        """Connect some (None: all) in parallel and wait; the names of those that are not connected.
 
-        :param names: whom; None: all.
         :param stop: asked ten times a second; True ends the wait.
-        :return: names of those that are not connected.
         """
         vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
         waiting = threading.Semaphore(0)
@@ -106,10 +132,7 @@ class Bridge:
             vehicle.link.board = BoardOrders(own, orders(swarm, scenario, key), station.on_board.polls_hz)
 
     def start_agents(self, names: Iterable[str] | None = None) -> str:
-        """Start the agents on board of those that are connected, all at once; why some do not start, or an empty text.
-
-        :param names: whose; None: those of all.
-        """
+        """Start the agents on board of those that are connected, all at once; why some do not start, or ""."""
         vehicles = [self.vehicles[name] for name in (self.vehicles if names is None else names)]
         vehicles = [v for v in vehicles if v.link.connected and v.link.board is not None]
         problems: SimpleQueue[str] = SimpleQueue()
@@ -180,17 +203,6 @@ class Bridge:
             if vehicle.state in (State.ARMED, State.FLYING):
                 vehicle.land(reason)
 
-    def _descent(self, vehicle: Vehicle, down_to: float, since: float) -> Descent:
-        now, places = time.monotonic(), self._landing_places
-        others = []
-        for v in self.vehicles.values():
-            place, state = v.known.whereabouts(now), v.state
-            if v is not vehicle and place is not None:
-                flies = state in IN_AIR or state == State.LOST
-                others.append(Other(v.name, place, flies, state == State.LANDING, places.goal(v.name)))
-        here = vehicle.known.whereabouts(now)
-        return SINK if here is None else places.descent(vehicle.name, here, others, since, now, down_to)
-
     def stop_all(self, reason: str) -> None:
         """Emergency stop of all."""
         self._log("error", f"EMERGENCY STOP of all: {reason}")
@@ -260,10 +272,9 @@ class Bridge:
         ]
 
     def wait_landed(self, stop: Callable[[], bool]) -> list[str]:
-        """Wait until all stand, or the station's time for that is over.
+        """Wait until all stand, or the station's time for that is over; the names of those that still fly.
 
         :param stop: asked 50 times a second; True ends the wait at once.
-        :return: names of those that still fly.
         """
         end = time.monotonic() + self.settings.station.landing_timeout_s
         while True:

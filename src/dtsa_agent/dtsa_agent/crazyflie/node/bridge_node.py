@@ -1,8 +1,7 @@
 """The bridge as a ROS node: `ros2 run dtsa_agent crazyflie_bridge --ros-args -p config:=swarm.yaml`.
 
 Topics and services have the names that Crazyswarm2's users know. The node is a thin shell: its start and end are here,
-what comes in and goes out is in `bridge_inputs` and `bridge_outputs`; everything that decides is in `bridge`, `vehicle`
-and `safety`.
+what comes in and goes out is in `inputs` and `outputs`; everything that decides is in `bridge`, `vehicle` and `safety`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
@@ -36,9 +35,8 @@ from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 
 from .bridge import Bridge
 from .command_thread import CommandThread
-from .inputs import Inputs, helper_node
+from .inputs import Inputs, helper_node, subscribe_positions
 from .outputs import Outputs
-from .position_inputs import subscribe_positions
 from .preflight import FAIL, preflight
 
 DTSA, CRAZYSWARM2 = "dtsa", "crazyswarm2"
@@ -50,29 +48,15 @@ INTERFACES_DESCRIPTOR = ParameterDescriptor(
     description="whose messages, names and units: dtsa or crazyswarm2", read_only=True, dynamic_typing=True
 )
 
-TELEOP_DESCRIPTOR = ParameterDescriptor(
-    description="name of the vehicle that a person steers by cmd_vel; empty: of none", read_only=True
-)
+
+Given = TypeVar("Given", SafetySettings, PositionSettings)
 
 
-def safety_parameters(node: Node, given: SafetySettings) -> SafetySettings:
-    """Declare one parameter a safety setting; a parameter that was set beats the YAML's value.
-
-    :raises ConfigError: a value is out of range.
-    """
-    values = declare_settings(node, SafetySettings, defaults=given.to_dict(), prefix="safety.")
-    with named("safety"):
-        return SafetySettings(**values)
-
-
-def position_parameters(node: Node, given: PositionSettings) -> PositionSettings:
-    """Declare one parameter a setting of motion capture; a parameter that was set beats the YAML's value.
-
-    :raises ConfigError: a value is out of range.
-    """
-    values = declare_settings(node, PositionSettings, defaults=given.to_dict(), prefix="positions.")
-    with named("positions"):
-        return PositionSettings(**values)
+def settings_parameters(node: Node, name: str, given: Given) -> Given:
+    """Declare one parameter a setting; a parameter that was set beats the YAML's value."""
+    values = declare_settings(node, type(given), defaults=given.to_dict(), prefix=f"{name}.")
+    with named(name):
+        return type(given)(**values)
 
 
 def wanted_interfaces(argv: Sequence[str]) -> str:
@@ -92,16 +76,6 @@ def wanted_interfaces(argv: Sequence[str]) -> str:
     return str(value)
 
 
-def _load_crazyswarm2() -> Any:
-    """What offers Crazyswarm2's interfaces.
-
-    :raises ConfigError: its messages are not in the workspace.
-    """
-    from dtsa_agent.crazyflie.node.crazyswarm2.server import server
-
-    return server()
-
-
 class BridgeNode(Node):
     """ROS side of the bridge.
 
@@ -111,7 +85,12 @@ class BridgeNode(Node):
     """
 
     def __init__(self, config: Path | None = None, interfaces: str = DTSA, **node_options: Any) -> None:
-        foreign = _load_crazyswarm2() if interfaces == CRAZYSWARM2 else None
+        outputs, inputs = Outputs, Inputs
+        if interfaces == CRAZYSWARM2:
+            from .crazyswarm2 import Crazyswarm2Inputs, Crazyswarm2Outputs, load_interfaces
+
+            load_interfaces()
+            outputs, inputs = Crazyswarm2Outputs, Crazyswarm2Inputs
         super().__init__(NODES[interfaces], enable_rosout=False, **node_options)
         self.declare_parameter("interfaces", interfaces, INTERFACES_DESCRIPTOR)
         given = self.declare_parameter(
@@ -120,21 +99,15 @@ class BridgeNode(Node):
         if not given:
             raise ConfigError("config", "", "the path of a swarm's YAML file")
         settings = load_swarm(Path(given))
-        teleop = str(self.declare_parameter("teleop", "", TELEOP_DESCRIPTOR).value)
-        if teleop not in ("", *(robot.name for robot in settings.robots)):
-            raise ConfigError("teleop", teleop, "one of " + ", ".join(robot.name for robot in settings.robots))
-        if teleop and settings.station.on_board.on:
-            raise ConfigError("teleop", teleop, "nobody with on_board: the agents on board steer")
-        safety = safety_parameters(self, settings.station.safety)
-        positions = position_parameters(self, settings.station.positions)
+        safety = settings_parameters(self, "safety", settings.station.safety)
+        positions = settings_parameters(self, "positions", settings.station.positions)
         station = dataclasses.replace(settings.station, safety=safety, positions=positions)
         self.settings = SwarmSettings(settings.robots, station)
-        self.outputs = Outputs(self, self.settings) if foreign is None else foreign.outputs(self, self.settings)
+        self.outputs = outputs(self, self.settings)
         self._commands = helper_node(self, "commands")
         self.command_thread = CommandThread(self._commands)
         self.bridge = Bridge(self.settings, self.say, self.outputs.publish_state)
-        self._inputs = (Inputs if foreign is None else foreign.inputs)(self, self.bridge, self.command_thread, self.say)
-        self._inputs.teleop = teleop
+        self._inputs = inputs(self, self.bridge, self.command_thread, self.say)
         self._cameras = helper_node(self, "positions") if positions.on else None
         self.positions = CommandThread(self._cameras) if self._cameras is not None else None
         if self.positions is not None:
@@ -142,7 +115,6 @@ class BridgeNode(Node):
 
     def close(self) -> None:
         """End of what this node added to itself."""
-        self._inputs.close()
         self.command_thread.close()
         self._commands.destroy_node()
         if self.positions is not None and self._cameras is not None:
@@ -215,10 +187,7 @@ class _Interrupts:
         return self.count > 0
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Wait for a signal, unless one has come.
-
-        :param timeout_s: s at most; None: as long as it takes.
-        """
+        """Wait for a signal (s at most; None: as long as it takes), unless one has come."""
         if not self.any():
             with suppress(Empty):
                 self._come.get(timeout=timeout_s)
@@ -289,10 +258,7 @@ def _end(node: BridgeNode, interrupts: _Interrupts) -> int:
 
 
 def main(args: Sequence[str] | None = None, use: Callable[[BridgeNode], int] = run_node) -> int:
-    """Entry point of the executable `crazyflie_bridge`.
-
-    :param use: what is done with the node; returns the exit code.
-    """
+    """Entry point of the executable `crazyflie_bridge`; `use` returns the exit code."""
     argv = list(sys.argv if args is None else args)
     follow_supervisor()
     limit_to_machine(os.environ, shared_memory=False)

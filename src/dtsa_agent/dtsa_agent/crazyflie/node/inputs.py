@@ -1,4 +1,4 @@
-"""What comes in over the graph: streamed commands, services, the ground station's heartbeat."""
+"""What comes in over the graph: streamed commands, services, the ground station's heartbeat, motion capture."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Duration as DurationMsg
-from dtsa_msgs.msg import FullState, Hover, Position, VelocityWorld
+from dtsa_msgs.msg import FullState, Position, VelocityWorld
 from dtsa_msgs.srv import Arm, GoTo, Land, NotifySetpointsStop, Takeoff
-from geometry_msgs.msg import Point, TwistStamped
+from geometry_msgs.msg import Point, PoseStamped
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty as EmptyMsg
 from std_srvs.srv import Empty, SetBool, Trigger
 
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.motion.limits import check_stream
-from dtsa_agent.crazyflie.motion.steering import steered
+from dtsa_agent.crazyflie.positions.motion_capture import NAMED_POSES, PositionSettings
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state.conversions import to_world
-from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
 
 from .bridge import Bridge
@@ -30,6 +30,8 @@ from .command_thread import CommandThread
 
 MAX_CLOCK_S = 0.1
 LATEST_ONLY = QoSProfile(depth=1)
+# Whoever publishes, reliably or not; a pose that is late is worth nothing.
+SENSOR = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def seconds(duration: DurationMsg) -> float:
@@ -47,11 +49,7 @@ def _short(value: Any) -> str:
 
 
 def helper_node(node: Node, name: str) -> Node:
-    """A node beside another one, whose topics or services are taken by a thread of their own.
-
-    :param node: the node.
-    :param name: what is appended to its name.
-    """
+    """A node beside another one, with a longer name, whose topics are read by a thread of their own."""
     return Node(
         f"{node.get_name()}_{name}",
         namespace=node.get_namespace(),
@@ -69,7 +67,6 @@ class Types:
     full_state: Any = FullState
     position: Any = Position
     velocity_world: Any = VelocityWorld
-    hover: Any = Hover
     takeoff: Any = Takeoff
     land: Any = Land
     go_to: Any = GoTo
@@ -80,10 +77,7 @@ class Types:
 class Inputs:
     """Topics and services of all vehicles.
 
-    :param node: offers the services.
-    :param bridge: the swarm.
-    :param commands: takes the streamed commands; not started yet.
-    :param say: called with a level and a line about each order.
+    :param commands: reads the streamed commands; not started yet.
     """
 
     types = Types()
@@ -93,7 +87,6 @@ class Inputs:
         self._node, self._bridge, self._commands = node, bridge, commands
         self._origin = bridge.settings.station.room_origin_in_world
         self._on_board = bridge.settings.station.on_board.on
-        self.teleop = ""  # name of the vehicle that a person steers; empty: of none
 
     def offer(self) -> None:
         """Create everything; `/all/emergency` is last: whoever waits for it knows that everything else is there."""
@@ -101,7 +94,6 @@ class Inputs:
             (self.types.full_state, "cmd_full_state", self._full_state),
             (self.types.position, "cmd_position", self._position),
             (self.types.velocity_world, "cmd_velocity_world", self._velocity_world),
-            (self.types.hover, "cmd_hover", self._hover),
         )
         for vehicle in self._bridge.vehicles.values():
             name = vehicle.name
@@ -111,17 +103,10 @@ class Inputs:
                 )
             self._create_services(name, [name])
             self._node.create_service(Trigger, f"{name}/reconnect", partial(self._reconnect, name))
-        if self.teleop:
-            vehicle = self._bridge.vehicles[self.teleop]
-            callback = partial(self._command, vehicle, partial(self._steer, vehicle))
-            self._commands.subscribe(TwistStamped, f"{vehicle.name}/cmd_vel", callback, LATEST_ONLY)
         self._commands.start()
         self._node.create_subscription(EmptyMsg, "all/heartbeat", lambda _: self._bridge.heartbeat(), LATEST_ONLY)
         self._node.create_service(Trigger, "all/end_heartbeat", self._end_heartbeat)
         self._create_services("all", list(self._bridge.vehicles))
-
-    def close(self) -> None:
-        """End of what this added to the node."""
 
     def _create_services(self, prefix: str, names: list[str]) -> None:
         for kind, service, callback in self._services():
@@ -184,27 +169,13 @@ class Inputs:
     def _velocity_world(self, m: Any, stamp: float) -> conversions.Setpoint:
         return conversions.velocity_world((m.vel.x, m.vel.y, m.vel.z), m.yaw_rate, stamp)
 
-    def _hover(self, m: Any, stamp: float) -> conversions.Setpoint:
-        return conversions.hover(m.vx, m.vy, m.yaw_rate, m.z_distance, stamp)
-
-    @staticmethod
-    def _steer(vehicle: Vehicle, m: TwistStamped, stamp: float) -> conversions.Setpoint:
-        last = vehicle.last
-        if vehicle.state != State.FLYING or last is None:
-            raise ValueError(f"it is {vehicle.state.name.lower()}: it is steered between take-off and landing only")
-        v, w = m.twist.linear, m.twist.angular
-        return steered((v.x, v.y, v.z), w.z, last, vehicle.station, stamp)
-
     # -- services ---------------------------------------------------------------------------------------------------
     def _groups(self, name: str) -> int:
         """The groups that a vehicle belongs to, a bit each."""
         return self._bridge.vehicles[name].robot.group_mask
 
     def _each(self, names: list[str], order: Callable[[Vehicle], str | None], response: Any, group: int = 0) -> Any:
-        """Give an order to those that are addressed.
-
-        :param group: 0: to all of them; else to those in one of these groups.
-        """
+        """Give an order to those that are addressed (group 0: to all of them; else to those in one of these groups)."""
         if group:
             members = [name for name in names if self._groups(name) & group]
             if not members:
@@ -278,3 +249,48 @@ class Inputs:
         self._bridge.end_heartbeat()
         response.success = True
         return response
+
+
+# -- motion capture ---------------------------------------------------------------------------------------------------
+def named_pose_array() -> Any:
+    """The type of the named poses.
+
+    :raises ConfigError: its package is not in the workspace.
+    """
+    try:
+        from motion_capture_tracking_interfaces.msg import NamedPoseArray
+    except ImportError:
+        raise ConfigError(
+            "station.positions.source", NAMED_POSES,
+            "pose, or named_poses with the package motion_capture_tracking_interfaces in the workspace (it is not)",
+        ) from None  # fmt: skip
+    return NamedPoseArray
+
+
+def subscribe_positions(poses: CommandThread, settings: PositionSettings, vehicles: dict[str, Vehicle]) -> None:
+    """Listen to motion capture, if there is one, in a thread that is not started yet.
+
+    :raises ConfigError: the type of the named poses is not there.
+    """
+    if settings.source == NAMED_POSES:
+        for topic in sorted({settings.topic_of(name) for name in vehicles}):
+            poses.subscribe(named_pose_array(), topic, partial(_named, vehicles), SENSOR)
+    elif settings.on:
+        for name, vehicle in vehicles.items():
+            poses.subscribe(PoseStamped, settings.topic_of(name), partial(_one, vehicle), SENSOR)
+
+
+def _one(vehicle: Vehicle, message: PoseStamped, info: Any) -> None:
+    _pass_on(vehicle, message.header, message.pose)
+
+
+def _named(vehicles: dict[str, Vehicle], message: Any, info: Any) -> None:
+    for named in message.poses:
+        if (vehicle := vehicles.get(named.name)) is not None:
+            _pass_on(vehicle, message.header, named.pose)
+
+
+def _pass_on(vehicle: Vehicle, header: Any, pose: Any) -> None:
+    p, q = pose.position, pose.orientation
+    stamp = header.stamp.sec + header.stamp.nanosec * 1e-9
+    vehicle.see((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), header.frame_id, stamp)

@@ -19,8 +19,7 @@ from dtsa_agent.crazyflie.settings.config import SwarmSettings
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state.conversions import VehicleState, to_map
 from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.crazyflie.vehicle.reports import snapshot
-from dtsa_agent.crazyflie.vehicle.snapshot import Snapshot
+from dtsa_agent.crazyflie.vehicle.reports import Snapshot, snapshot
 from dtsa_agent.crazyflie.vehicle.vehicle import Vehicle
 from dtsa_agent.ros.common.wire.covariances import UNKNOWN, diagonal
 
@@ -36,11 +35,7 @@ TWIST_COVARIANCE = diagonal(0.1**2, UNKNOWN)
 
 
 class Outputs:
-    """Publishers of all vehicles.
-
-    :param node: publishes.
-    :param settings: the swarm's.
-    """
+    """Publishers of all vehicles."""
 
     frame = FRAME
     status_type: Any = Status

@@ -11,7 +11,7 @@ from dtsa_agent.crazyflie.settings.config import RobotSettings, SwarmSettings
 from dtsa_agent.crazyflie.settings.radio_budget import radio_loads
 from dtsa_agent.crazyflie.state.conversions import place_text
 from dtsa_agent.crazyflie.state.state_machine import State
-from dtsa_agent.crazyflie.vehicle.snapshot import Snapshot
+from dtsa_agent.crazyflie.vehicle.reports import Snapshot
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 FAR_M = 0.25  # from its initial_position
@@ -41,7 +41,6 @@ def preflight(
 ) -> list[Finding]:
     """The whole list.
 
-    :param settings: the swarm's.
     :param snapshots: of all robots, a second or so after they have connected.
     :param firmware: protocol version and revision of those that are connected.
     :param priority_problem: why there is no real-time priority; empty: there is.

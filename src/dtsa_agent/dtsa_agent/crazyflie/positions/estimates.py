@@ -99,7 +99,6 @@ class EstimateWatch:
     def update(self, state: VehicleState, now: float, seen: Vector | None, *, flying: bool) -> bool:
         """Take in a log packet; True when something is wrong that was not before.
 
-        :param now: s, monotonic.
         :param seen: m, world: where motion capture sees it now; None: not at all.
         """
         last, self._last = self._last, (state, now)

@@ -19,6 +19,7 @@ NORM_TOLERANCE = 0.05  # of a quaternion's length
 DRIFT = 1e-3  # s/s, by which two clocks may drift apart
 MOVED_AGAIN = 20  # poses in a row that agree with each other: on the ground it was carried, or a clock was set
 WINDOW_S = 1.0  # over which the rate is counted
+FRESH_S = 0.3  # a pose that is not older is where the vehicle is
 ROOM_MARGIN_M = 0.3  # outside the geofence a pose or an estimate may be this far and still be meant
 
 Room = tuple[Vector, Vector]  # lower and upper corner, m, frame map
@@ -26,10 +27,7 @@ Room = tuple[Vector, Vector]  # lower and upper corner, m, frame map
 
 @dataclass(frozen=True, slots=True)
 class PositionSettings(Settings):
-    """Positions from motion capture.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """Positions from motion capture."""
 
     source: str = setting(
         NONE,
@@ -102,7 +100,7 @@ class _Candidate:
 
 @dataclass(slots=True)
 class Tracker:
-    """Poses of one Crazyflie.
+    """Poses of one Crazyflie. Times (`now`) are s, monotonic; stamps are s, Unix time, 0: not known.
 
     :param settings: what is believed.
     :param origin: m, where the Crazyflies' world sees the origin of `map`.
@@ -125,14 +123,9 @@ class Tracker:
     def offer(
         self, position: Vector, orientation: Quaternion, frame: str, stamp: float, now: float, *, flying: bool
     ) -> str:
-        """Take in a pose; why it is not believed, or an empty text.
+        """Check a pose (m, in `frame`: `world`, also empty, or `map`); why it is not believed, or an empty text.
 
-        :param position: m, in `frame`.
-        :param orientation: body to world.
-        :param frame: `world` (also empty) or `map`.
-        :param stamp: s, Unix time of the measurement; 0: not said.
-        :param now: s, monotonic.
-        :param flying: in flight nothing that has jumped is believed again.
+        In flight nothing that has jumped is believed again.
         """
         found = self._check(position, orientation, frame, stamp, now, flying=flying)
         if isinstance(found, Seen):
@@ -202,10 +195,7 @@ class Tracker:
         return before.count >= MOVED_AGAIN and not flying
 
     def due(self, now: float) -> bool:
-        """Whether the last pose may be sent, at the rate that is allowed.
-
-        :param now: s, monotonic.
-        """
+        """Whether the last pose may be sent, at the rate that is allowed."""
         if now < self._next_send:
             return False
         # Almost a period of credit: poses at exactly this rate come early and late, and shall all be sent.
@@ -214,26 +204,31 @@ class Tracker:
         return True
 
     def was_sent(self, seen: Seen, wall: float) -> None:
-        """A pose has gone to its Crazyflie.
-
-        :param wall: s, Unix time.
-        """
+        """A pose has gone to its Crazyflie at a Unix time (s)."""
         self.sent += 1
         if seen.stamp:
             self.latencies.append(wall - seen.stamp)
 
     def age(self, now: float) -> float:
-        """Seconds since the last pose that was believed; infinite before the first.
-
-        :param now: s, monotonic.
-        """
+        """Seconds since the last pose that was believed; infinite before the first."""
         return math.inf if self.last is None else now - self.last.time
 
-    def numbers(self, now: float) -> PositionNumbers:
-        """Everything for the diagnostics.
+    def place(self, now: float) -> Vector | None:
+        """Where the vehicle is (m, world); None: it is not seen, or not any more."""
+        return None if self.last is None or self.age(now) > FRESH_S else self.last.position
 
-        :param now: s, monotonic.
-        """
+    def disagrees(self, believed: Vector, now: float) -> str:
+        """Why a vehicle may not start that believes to be there (m, world); empty if it may."""
+        seen = self.place(now)
+        if seen is None:
+            return f"is not seen by motion capture ({self.reason or 'no pose comes'})"
+        away = math.dist(seen, believed)
+        if away <= self.settings.agree_m:
+            return ""
+        return f"is seen {away:.2f} m from where it believes to be (limit {self.settings.agree_m:g} m): reconnect it"
+
+    def numbers(self, now: float) -> PositionNumbers:
+        """Everything for the diagnostics."""
         recent = sum(1 for t in self._times.copy() if now - t <= WINDOW_S)
         delays = sorted(self.latencies.copy())
         return PositionNumbers(
@@ -248,12 +243,7 @@ class Tracker:
 
 
 def outside_room(place: Vector, origin: Vector, room: Room | None) -> str:
-    """How a place is outside a room, with a margin; empty if it is not.
-
-    :param place: m, world.
-    :param origin: m, where the world sees the origin of `map`.
-    :param room: m, map; None: no limits.
-    """
+    """How a place (m, world) is outside a room (m, map; None: no limits), with a margin; empty if it is not."""
     if room is None:
         return ""
     for away, axis in outside_by(to_map(place, origin), *room):

@@ -43,10 +43,7 @@ class Action(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class SafetySettings(Settings):
-    """Limits of all rules.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """Limits of all rules."""
 
     geofence: bool = setting(True, "watch that no vehicle leaves the box")
     geofence_min: Vector = setting((-1.5, -2.3, -0.95), "lower corner of the box, frame map", unit="m")
@@ -147,7 +144,6 @@ class SafetyMonitor:
     def check(self, now: float, vehicles: Sequence[Watched], heartbeat_age: float | None) -> list[Verdict]:
         """What has to be done now.
 
-        :param now: s, monotonic.
         :param heartbeat_age: s since the ground station's last heartbeat; None: it has never been heard.
         """
         found: list[Verdict] = []

@@ -22,7 +22,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting, settings_of
+from dtsa_agent.core.settings.declaration import REQUIRED, Settings, build, check, named, nested, setting
 from dtsa_agent.core.settings.scenario import make_scenario
 from dtsa_agent.crazyflie.positions.motion_capture import NONE, PositionSettings
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
@@ -34,21 +34,16 @@ from .radio_budget import radio_of
 NAME = re.compile(r"^[A-Za-z][A-Za-z0-9_]*?(\d+)$")
 CHANNEL = re.compile(r"radio://[^/]+/(\d+)")
 PORT = re.compile(r"udp://.*:(\d+)$")
-VARIABLE = re.compile(r"^\w+\.\w+$")
 LAST_CHANNEL, LAST_PORT = 125, 65535
 PLACE_M = 0.25  # m: an agent on board may stand this far beside its place
 SECTIONS = ("fileversion", "robots", "robot_types", "all", "station")
 # Keys that Crazyswarm2's files have and that mean nothing here: its files can be used as they are.
-IGNORED = frozenset({"motion_capture", "big_quad", "reference_frame", "broadcasts", "marker"})
-LOGGING = ("enabled", "default_topics", "custom_topics")
+IGNORED = frozenset({"motion_capture", "big_quad", "reference_frame", "broadcasts", "marker", "firmware_logging"})
 
 
 @dataclass(frozen=True, slots=True)
 class BatterySettings(Settings):
-    """Voltages of a battery in flight.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """Voltages of a battery in flight."""
 
     voltage_warning: float = setting(3.4, "warning below this", unit="V", minimum=2.0, maximum=5.0)
     voltage_critical: float = setting(3.2, "landing below this", unit="V", minimum=2.0, maximum=5.0)
@@ -61,20 +56,8 @@ class BatterySettings(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class LogTopic:
-    """Variables of the firmware that are published together."""
-
-    name: str
-    frequency: float  # Hz
-    variables: tuple[str, ...]  # group.name
-
-
-@dataclass(frozen=True, slots=True)
 class RobotSettings(Settings):
-    """One Crazyflie.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """One Crazyflie."""
 
     name: str = setting(REQUIRED, "key of the robot: letters, then the agent's id")
     id: int = setting(REQUIRED, "the agent's id: the digits that end its name", minimum=1, maximum=65534)
@@ -117,13 +100,6 @@ class RobotSettings(Settings):
     firmware_params: Mapping[str, float] = setting(
         {}, "parameters of the firmware, {group: {name: value}}, set after connecting", custom=True
     )
-    firmware_logging: Mapping[str, LogTopic] = setting(
-        {},
-        "topics with variables of the firmware, {custom_topics: {name: {frequency: Hz, vars: [group.name]}}}; "
-        "with Crazyswarm2's interfaces only",
-        custom=True,
-        kind="structure",
-    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -131,32 +107,11 @@ class RobotSettings(Settings):
         radio_of(self.uri)
         _check_numbers(self.uri)
         object.__setattr__(self, "firmware_params", _params(self.firmware_params))
-        object.__setattr__(self, "firmware_logging", _log_topics(self.firmware_logging))
-
-    def to_dict(self) -> dict[str, Any]:
-        """The settings as a swarm's YAML has them under the robot's name, which says the id as well."""
-        result = {spec.name: getattr(self, spec.name) for spec in settings_of(RobotSettings)}
-        del result["name"], result["id"]
-        groups: dict[str, dict[str, float]] = {}
-        for name, value in self.firmware_params.items():
-            group, _, parameter = name.partition(".")
-            groups.setdefault(group, {})[parameter] = value
-        topics = {t.name: {"frequency": t.frequency, "vars": list(t.variables)} for t in self.firmware_logging.values()}
-        return {
-            **result,
-            "initial_position": list(self.initial_position),
-            "battery": self.battery.to_dict(),
-            "firmware_params": groups,
-            "firmware_logging": {"custom_topics": topics},
-        }
 
 
 @dataclass(frozen=True, slots=True)
 class StationSettings(Settings):
-    """The ground station.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """The ground station."""
 
     min_connected: int = setting(
         1,
@@ -216,14 +171,6 @@ class SwarmSettings:
         """Name, URI, packets/s to and log packets/s from each robot: what `radio_loads` counts."""
         positions = self.station.positions.max_rate_hz if self.station.positions.on else 0.0
         return [(r.name, r.uri, r.command_rate_hz + positions, r.log_rate_hz) for r in self.robots]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The contents of a swarm's YAML; :func:`parse_swarm` reads them back."""
-        return {
-            "robots": {robot.name: robot.to_dict() for robot in self.robots},
-            "robot_types": {robot.type: {} for robot in self.robots if robot.type},
-            "station": self.station.to_dict(),
-        }
 
 
 def load_swarm(path: Path) -> SwarmSettings:
@@ -360,27 +307,4 @@ def _params(groups: object) -> dict[str, float]:
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise ConfigError(f"firmware_params.{group}.{name}", value, "a number")
             result[f"{group}.{name}"] = value
-    return result
-
-
-def _log_topics(given: object) -> dict[str, LogTopic]:
-    """The topics in a robot's `firmware_logging`, by their names; its default topics are always there."""
-    logging = _mapping("firmware_logging", given)
-    if logging and all(isinstance(topic, LogTopic) for topic in logging.values()):
-        return logging
-    for key in logging:
-        if key not in LOGGING:
-            raise ConfigError(f"firmware_logging.{key}", logging[key], "one of " + ", ".join(LOGGING))
-    if logging.get("enabled", True) is False:
-        return {}
-    result = {}
-    for name, topic in _mapping("firmware_logging.custom_topics", logging.get("custom_topics")).items():
-        field = f"firmware_logging.custom_topics.{name}"
-        own = _mapping(field, topic)
-        frequency, variables = own.get("frequency"), own.get("vars")
-        if isinstance(frequency, bool) or not isinstance(frequency, (int, float)) or not 0.4 <= frequency <= 100:
-            raise ConfigError(f"{field}.frequency", frequency, "a rate from 0.4 to 100 Hz")
-        if not isinstance(variables, list) or not variables or not all(VARIABLE.match(str(v)) for v in variables):
-            raise ConfigError(f"{field}.vars", variables, "a list of variables, group.name")
-        result[str(name)] = LogTopic(str(name), float(frequency), tuple(map(str, variables)))
     return result

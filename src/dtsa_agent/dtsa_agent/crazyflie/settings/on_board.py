@@ -34,10 +34,7 @@ _MARGIN_M = 0.8  # of the box around all places
 
 @dataclass(frozen=True, slots=True)
 class OnBoardSettings(Settings):
-    """Crazyflies that steer themselves.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """Crazyflies that steer themselves."""
 
     swarm: Mapping[str, Any] = setting(
         {}, "settings of the swarm, as for `dtsa simulate`, without `agents`; empty: nobody steers itself",
@@ -64,7 +61,6 @@ class OnBoardSettings(Settings):
 def check_on_board(swarm: SwarmConfig) -> None:
     """Refuses a swarm that the app cannot be.
 
-    :param swarm: what all agents share.
     :raises ConfigError: if it cannot.
     """
     if swarm.agents > MOST:
@@ -79,7 +75,6 @@ def check_on_board(swarm: SwarmConfig) -> None:
 def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[str, float]:
     """The app's parameters of a swarm, by their full names; it may not steer yet.
 
-    :param swarm: what all agents share.
     :param scenario: starts and goals; the app lands outside of the box around them.
     :param height: m, of the frame map's origin above the floor.
     """
@@ -102,7 +97,6 @@ def parameters(swarm: SwarmConfig, scenario: Scenario, height: float) -> dict[st
 def key_of(swarm: SwarmConfig) -> bytes:
     """The key of frames that are sealed on board, from the environment; none if they are not sealed.
 
-    :param swarm: what all agents share.
     :raises ConfigError: there is no key of 16 bytes, or no session.
     """
     check_session(swarm)
@@ -116,8 +110,6 @@ def key_of(swarm: SwarmConfig) -> bytes:
 def orders(swarm: SwarmConfig, scenario: Scenario, key: bytes = b"") -> list[bytes]:
     """Packets of the app channel before the start: draw of lots, everybody's places, key.
 
-    :param swarm: what all agents share.
-    :param scenario: starts and goals.
     :param key: 16 bytes, where frames are sealed.
     """
     found = [b"D" + struct.pack("<Q", policy_key(swarm.seed))]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
-VELOCITY_WORLD, POSITION, HOVER, FULL_STATE = "velocity_world", "position", "hover", "full_state"
+VELOCITY_WORLD, POSITION, FULL_STATE = "velocity_world", "position", "full_state"
 FULL_STATE_LIMIT = 32.767  # m, m/s, m/s^2, rad/s: 16 bit numbers in thousandths
 
 # One log block of 20 bytes has everything; a block may have 26.
@@ -88,7 +88,7 @@ def yaw_of(q: Quaternion) -> float:
 class Setpoint:
     """One streamed command, ready for the radio: a method of cflib's commander and its arguments."""
 
-    kind: str  # velocity_world, position, hover or full_state
+    kind: str  # velocity_world, position or full_state
     arguments: tuple[object, ...]
     stamp: float  # s, monotonic time at which it came in
 
@@ -106,22 +106,9 @@ def velocity_world(velocity: Vector, yaw_rate: float, stamp: float) -> Setpoint:
 def position(place: Vector, yaw: float, stamp: float) -> Setpoint:
     """Place in m (world), yaw in rad -> the firmware's degrees.
 
-    :param place: (3,) m, world.
     :param stamp: s, monotonic, of the command.
     """
     return Setpoint(POSITION, (*_finite(place), math.degrees(*_finite((yaw,)))), stamp)
-
-
-def hover(vx: float, vy: float, yaw_rate: float, height: float, stamp: float) -> Setpoint:
-    """Velocity in m/s along the body's heading, yaw rate in rad/s -> degrees/s, height in m above the floor.
-
-    :param vx: m/s, forwards.
-    :param vy: m/s, to the left.
-    :param yaw_rate: rad/s.
-    :param stamp: s, monotonic, of the command.
-    """
-    vx, vy, yaw_rate, height = _finite((vx, vy, yaw_rate, height))
-    return Setpoint(HOVER, (vx, vy, math.degrees(yaw_rate), height), stamp)
 
 
 def full_state(
@@ -132,7 +119,6 @@ def full_state(
     Numbers beyond what the packet's 16 bits can say are kept at their limit: an overflow would send the Crazyflie the
     other way. An orientation of length zero (an unset message) means level, heading along x.
 
-    :param place: (3,) m, world.
     :param stamp: s, monotonic, of the command.
     """
     vectors = [tuple(_saturate(v) for v in _finite(vector)) for vector in (place, velocity, acceleration)]
@@ -156,7 +142,7 @@ def _finite(values: tuple[float, ...]) -> tuple[float, ...]:
 def to_world(place: Vector, origin: Vector) -> Vector:
     """From the frame `map` (the room's centre) to the Crazyflies' own world.
 
-    :param place: m, map. :param origin: m, where the world sees the origin of `map`.
+    :param origin: m, where the world sees the origin of `map`.
     """
     return place[0] + origin[0], place[1] + origin[1], place[2] + origin[2]
 
@@ -164,7 +150,6 @@ def to_world(place: Vector, origin: Vector) -> Vector:
 def to_map(place: Vector, origin: Vector) -> Vector:
     """From the Crazyflies' own world to the frame `map`; the inverse of `to_world`.
 
-    :param place: (3,) m, world.
     :param origin: (3,) m, world, where the map's origin is.
     """
     return place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
@@ -173,7 +158,7 @@ def to_map(place: Vector, origin: Vector) -> Vector:
 def outside_by(place: Vector, low: Vector, high: Vector) -> list[tuple[float, str]]:
     """How far a place is outside a box along each axis, m (negative: inside), with the axis's name.
 
-    :param place: m. :param low: lower corner, m, same frame. :param high: m, upper corner.
+    :param low: lower corner, m, same frame. :param high: m, upper corner.
     """
     return [(max(a - p, p - b), axis) for p, a, b, axis in zip(place, low, high, "xyz", strict=True)]
 

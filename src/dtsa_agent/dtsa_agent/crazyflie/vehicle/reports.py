@@ -1,22 +1,43 @@
-"""What is told of one vehicle: to the safety rules, and to those who watch."""
+"""What is reported of one vehicle: to the safety rules, and to status, diagnostics and summaries."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
+from dtsa_agent.crazyflie.positions.motion_capture import PositionNumbers
 from dtsa_agent.crazyflie.safety.rules import Watched
-from dtsa_agent.crazyflie.state.conversions import to_map
+from dtsa_agent.crazyflie.state.conversions import VehicleState, to_map
+from dtsa_agent.crazyflie.state.state_machine import State
 
 from .known_state import QUALITY_WINDOW_S
-from .snapshot import Snapshot
 from .vehicle import Vehicle
 
 
-def watched(vehicle: Vehicle, now: float) -> Watched:
-    """What the safety rules need.
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """State of one vehicle for status and diagnostics."""
 
-    :param now: s, monotonic.
-    """
+    name: str
+    id: int
+    state: State
+    reason: str
+    vehicle: VehicleState | None
+    log_age: float  # s; infinite before the first packet
+    command_age: float  # s; infinite before the first command
+    link_quality: float  # 0..1
+    rssi: int
+    sent: int
+    received: int
+    refused: int  # streamed commands that were not for this state
+    replaced: int  # streamed commands that a newer one overtook
+    latency_p99: float  # s; 0 before the first command
+    command_hz: float
+    positions: PositionNumbers | None = None  # None: there is no motion capture
+
+
+def watched(vehicle: Vehicle, now: float) -> Watched:
+    """What the safety rules need (now: s, monotonic)."""
     with vehicle.lock:
         known, battery, last = vehicle.known, vehicle.robot.battery, vehicle.last
         place = None if last is None else last.position
@@ -30,7 +51,7 @@ def watched(vehicle: Vehicle, now: float) -> Watched:
             battery.voltage_warning,
             battery.voltage_critical,
             vehicle.log_age(now),
-            None if known.wrong else vehicle.controls.led_for(now),
+            None if known.wrong else vehicle.controls.setpoint_age(now),
             known.unseen_s(now),
             known.wrong,
             known.wrong_s(now),
@@ -38,12 +59,9 @@ def watched(vehicle: Vehicle, now: float) -> Watched:
 
 
 def snapshot(vehicle: Vehicle, now: float) -> Snapshot:
-    """Everything for the status.
-
-    :param now: s, monotonic.
-    """
+    """Everything for the status (now: s, monotonic)."""
     with vehicle.lock:
-        link, quality = vehicle.link, vehicle.known.logged(now)
+        link, quality, tracker = vehicle.link, vehicle.known.logged(now), vehicle.known.tracker
         if link.radio_quality is not None:
             quality = min(quality, link.radio_quality)
         delays = sorted(link.latencies.copy())
@@ -64,5 +82,5 @@ def snapshot(vehicle: Vehicle, now: float) -> Snapshot:
             link.outbox.replaced,
             delays[int(0.99 * (len(delays) - 1))] if delays else 0.0,
             len(sends) / QUALITY_WINDOW_S,
-            vehicle.known.captured(now),
+            None if tracker is None else tracker.numbers(now),
         )

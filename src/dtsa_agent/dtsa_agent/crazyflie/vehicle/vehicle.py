@@ -16,7 +16,7 @@ A set-point's way from the graph to the motors, and who may stop it:
    first, then :meth:`Vehicle.land`. Both brake by a stream of zero velocity, then give an order to the firmware's
    high-level commander. The order goes out before the end of the stream, or the motors would stop for a moment.
 
-Orders (take-off, go-to, landing, trajectories) take the same way from step 2 on, by :meth:`Vehicle.fly`.
+Orders (take-off, go-to, landing) take the same way from step 2 on, by :meth:`Vehicle.fly`.
 """
 
 from __future__ import annotations
@@ -28,21 +28,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.crazyflie.links.delivery import GO_TO, TAKEOFF
 from dtsa_agent.crazyflie.links.link import Link
-from dtsa_agent.crazyflie.motion.controls import SLOW_MPS, Controls, end_of_stream
-from dtsa_agent.crazyflie.motion.limits import outside_fence
-from dtsa_agent.crazyflie.motion.paths import too_short
-from dtsa_agent.crazyflie.safety.landing_places import SINK, Descent
+from dtsa_agent.crazyflie.motion.controls import GO_TO, SLOW_MPS, TAKEOFF, Controls, end_of_stream
+from dtsa_agent.crazyflie.motion.limits import landing_s, outside_fence, too_short
 from dtsa_agent.crazyflie.settings.config import RobotSettings, StationSettings
 from dtsa_agent.crazyflie.settings.on_board import ENABLE
 from dtsa_agent.crazyflie.state.conversions import Quaternion, Setpoint, Vector, VehicleState, yaw_of
 from dtsa_agent.crazyflie.state.state_machine import HL_ACTIVE, IN_AIR, State, StateMachine
 
 from .known_state import KnownState
-from .landing import Landing
 from .onboard import Onboard
-from .trajectory_orders import TrajectoryOrders
 
 HOLD_S = 0.5  # s, duration of the path to the place that is held
 FRESH_S = 0.3  # a log packet that was under way for longer says nothing about now
@@ -52,15 +47,10 @@ ACCEPTS_COMMANDS = frozenset({State.ARMED, State.FLYING})
 
 
 class Vehicle:
-    """One Crazyflie.
+    """One Crazyflie. Times (`now`) are s, monotonic; places are m, world. Orders return why not, or an empty text.
 
-    :param robot: its settings.
-    :param station: the ground station's settings.
     :param cache: folder for cflib's tables.
-    :param log: called with a level (info, warn, error) and a line.
     :param on_state: called with this vehicle and each new state of it, in a thread of cflib's.
-    :param descent: what it does once it is at rest to land: called with the vehicle, the height (m) at which it stops,
-        and since when it lands (s, monotonic); does not take the locks of others.
     """
 
     def __init__(
@@ -70,7 +60,6 @@ class Vehicle:
         cache: Path,
         log: Callable[[str, str], None],
         on_state: Callable[[Vehicle, VehicleState], None] | None = None,
-        descent: Callable[[Vehicle, float, float], Descent] = lambda vehicle, down_to, since: SINK,
     ) -> None:
         self.robot = robot
         self.station = station
@@ -95,14 +84,8 @@ class Vehicle:
             self.known.settling,
             lambda: self.known.seen_at(time.monotonic()),
         )
-        self.controls = Controls(self.link)
+        self.controls = Controls(self.link, station)
         self.onboard = Onboard(self.link)
-        self.trajectories = TrajectoryOrders(self)
-
-        def next_step(down_to: float, since: float) -> Descent:
-            return descent(self, down_to, since) if self.state == State.LANDING else SINK
-
-        self.landing = Landing(self.name, station, self.known, self.controls, log, next_step)
 
     # -- what comes in ----------------------------------------------------------------------------------------------
     def _changed(self, before: State, state: State, reason: str) -> None:
@@ -128,7 +111,7 @@ class Vehicle:
 
     def _heard_again(self, state: VehicleState) -> None:
         """The end of a gap: the orders that were given in it may have been lost."""
-        self.landing.heard()
+        self.controls.end_repeats()
         if self.guarded:  # its watchdog has not much time left
             self.link.order(lambda cf: cf.supervisor.send_emergency_stop_watchdog(), background=True)
         if self.state != State.LANDING:
@@ -141,10 +124,9 @@ class Vehicle:
         elif drifts or not self.controls.delivery.landing:
             self._log("info", f"{self.name}: heard again: brakes and lands")
             self.controls.streaming = True
-            self._brake_then(self.landing.come_down)
+            self._brake_then(self._come_down)
 
     def _answered(self, code: int, result: int) -> None:
-        self.onboard.answered(code, result)
         with self.lock:
             problem = self.controls.delivery.answered(code, result)
         if problem:
@@ -155,10 +137,7 @@ class Vehicle:
             self.machine.silent(reason)
 
     def see(self, position: Vector, orientation: Quaternion, frame: str, stamp: float) -> None:
-        """A pose from motion capture: checked, and passed on to the Crazyflie.
-
-        :param position: m, in `frame` (world or map). :param stamp: s, Unix time of the measurement; 0: not said.
-        """
+        """A pose from motion capture (see `Tracker.offer`): checked, and passed on to the Crazyflie."""
         with self.lock:
             packet = self.known.see(position, orientation, frame, stamp)
         if packet is not None:
@@ -170,9 +149,7 @@ class Vehicle:
         with self.lock:
             self.machine.go(State.CONNECTING, f"connecting to {self.robot.uri}")
             self._overruled = self._paused = self.guarded = False
-            self.landing.heard()
             self.controls.reset()
-            self.onboard.forget()
 
         def finished(reason: str) -> None:
             try:
@@ -207,10 +184,7 @@ class Vehicle:
         return self.state.name.lower()
 
     def log_age(self, now: float) -> float:
-        """Seconds since the last log packet; infinite before the first one.
-
-        :param now: s, monotonic.
-        """
+        """Seconds since the last log packet; infinite before the first one."""
         return self.known.log_age(now)
 
     # -- orders -----------------------------------------------------------------------------------------------------
@@ -235,11 +209,10 @@ class Vehicle:
 
     def fly(self, kind: str, action: Callable[[Any], None], duration: float, *, again: bool = True) -> None:
         """Give an order to the high-level commander; parameters as of `Controls.fly`. The lock is held."""
-        self.landing.cancel()
         self.controls.fly(kind, action, duration, time.monotonic(), again=again)
 
     def arm(self, arm: bool) -> str:
-        """Let the motors run, or lock them; why not, or an empty text."""
+        """Let the motors run, or lock them."""
         with self.lock:
             if self.state not in (State.READY, State.ARMED):
                 return f"{self.name} is {self.standing}"
@@ -253,10 +226,7 @@ class Vehicle:
             return ""
 
     def takeoff(self, height: float, duration: float, *, arm: bool = False) -> str:
-        """Climb to a height (m above the floor) within a duration (s); why not, or an empty text.
-
-        :param arm: one that arms itself need not be armed before.
-        """
+        """Climb to a height (m above the floor) within a duration (s); `arm`: one that arms itself is armed, too."""
         with self.lock:
             if arm and self.state == State.READY and self.machine.arms_itself and self.last is not None:
                 if problem := self.arm(True):
@@ -295,7 +265,7 @@ class Vehicle:
             return ""
 
     def enable(self, on: bool) -> str:
-        """Let the agent on board steer, or take the controls back: it then hovers; why not, or an empty text."""
+        """Let the agent on board steer, or take the controls back: it then hovers."""
         with self.lock:
             if on and (problem := self.not_led()):
                 return problem
@@ -306,10 +276,7 @@ class Vehicle:
             return ""
 
     def go_to(self, place: tuple[float, float, float], yaw: float, duration: float, relative: bool) -> str:
-        """Fly to a place (m, world; relative: an offset) within a duration (s); why not, or an empty text.
-
-        :param yaw: rad, world.
-        """
+        """Fly to a place (relative: by an offset) and heading (rad) within a duration (s)."""
         with self.lock:
             if problem := self.not_led():
                 return problem
@@ -346,7 +313,7 @@ class Vehicle:
             self.action = f"hold: {reason}"
             if self.known.wrong:
                 self._overruled = True
-                self.landing.stand_blindly()
+                self.controls.stand_blindly(time.monotonic())
                 return
             self._paused = until_seen
 
@@ -371,13 +338,9 @@ class Vehicle:
     def land(
         self, reason: str, height: float = 0.0, duration: float = 0.0, note: Callable[[str], None] | None = None
     ) -> str:
-        """Sink and stop the motors; why not, or an empty text.
+        """Sink to a height (m above the floor) within a duration (s; 0: at the station's speed) and stop the motors.
 
-        A landing is never refused for its numbers: one that would be too fast takes longer.
-
-        :param height: m above the floor.
-        :param duration: s; 0: at the station's landing speed.
-        :param note: is told when it takes longer than that.
+        A landing is never refused for its numbers: one that would be too fast takes longer, and `note` is told.
         """
         with self.lock:
             height = height if math.isfinite(height) else 0.0
@@ -391,18 +354,25 @@ class Vehicle:
             self.action = f"land: {reason}"
             if self.known.wrong:
                 self.machine.land(self.action)
-                self.landing.sink_blindly()
+                now = time.monotonic()
+                self.controls.sink_blindly(self.known.sinking_height(now), now)
                 return ""
             # A blind landing must end a stream that the firmware may still follow.
             self.controls.streaming |= self.state == State.LOST
             self.machine.land(f"land: {reason}")
-            if longer := self.landing.takes_longer(height, duration):
+            way = self.known.height - height
+            if 0.0 < duration < (seconds := landing_s(way, duration, self.station)):
+                why = too_short(duration, way, self.station.max_speed_mps)
+                longer = f"{self.name}: landing takes {seconds:.2f} s: {why}"
                 self._log("warn", longer)
                 if note is not None:
                     note(longer)
-            self.landing.begin()
-            self._brake_then(lambda: self.landing.come_down(height, duration))
+            self._brake_then(lambda: self._come_down(height, duration))
             return ""
+
+    def _come_down(self, height: float = 0.0, duration: float = 0.0) -> None:
+        """Straight down from where it is now; parameters as of `land`."""
+        self.controls.land(height, self.known.height - height, duration, time.monotonic())
 
     def stop(self, reason: str) -> None:
         """Emergency stop: motors off for good."""
@@ -411,7 +381,6 @@ class Vehicle:
                 return
             self.action = f"emergency stop: {reason}"
             self._overruled = True
-            self.landing.cancel()
             self.controls.stop()
 
             def run(cf: Any) -> None:
@@ -422,10 +391,7 @@ class Vehicle:
             self.machine.emergency(self.action)
 
     def notify_setpoints_stop(self, remain_ms: int) -> str:
-        """End the stream of setpoints and hold; why not, or an empty text.
-
-        :param remain_ms: ms for which the last set-point stays valid.
-        """
+        """End the stream of setpoints and hold; the last one stays valid for `remain_ms`."""
         with self.lock:
             if self.state not in ACCEPTS_COMMANDS:
                 return f"{self.name} is {self.standing}"
@@ -438,10 +404,7 @@ class Vehicle:
             return ""
 
     def lose(self, reason: str, now: float) -> None:
-        """It is silent. Nothing may be heard, but a landing is ordered all the same, unless it is known to land.
-
-        :param now: s, monotonic.
-        """
+        """It is silent. Nothing may be heard, but a landing is ordered all the same, unless it is known to land."""
         with self.lock:
             was_in_air = self.state in IN_AIR
             self.machine.silent(reason)
@@ -449,13 +412,10 @@ class Vehicle:
                 self.controls.delivery.cancel()  # a take-off that comes late takes nobody by surprise
             elif self.link.connected and not self.controls.delivery.landing:
                 self.land(reason)
-                self.landing.repeat_blindly(now)
+                self.controls.repeat_landing(now)
 
     def tick(self, now: float) -> None:
-        """Called 50 times a second: goes on braking, and sends again what has not been answered.
-
-        :param now: s, monotonic.
-        """
+        """Called 50 times a second: goes on braking, and sends again what has not been answered."""
         with self.lock:
             if self._paused and (unseen := self.known.unseen_s(now)) is not None:
                 self._paused = unseen > self.station.safety.position_age_s
@@ -463,19 +423,15 @@ class Vehicle:
                 self.controls.go_on_blindly(self.state in IN_AIR, self.known.seen_at(now), now)
             elif self.last is not None:
                 self.controls.slow_down(self.known.speed, now)
-            self.landing.go_on(now, landing=self.state == State.LANDING)
             if self.state not in (State.DISCONNECTED, State.CONNECTING):
                 self.link.order_log(now)
             if self.state in WATCHED_OVER and (order := self.controls.delivery.due(now)) is not None:
                 self.link.order(order)
 
     def keep_alive(self, now: float, watchdog: bool) -> None:
-        """What has to be sent regularly: the emergency stop watchdog, and blind landings.
-
-        :param now: s, monotonic.
-        """
+        """What has to be sent regularly: the emergency stop watchdog, and blind landings."""
         with self.lock:
-            self.landing.repeat(now)
+            self.controls.land_again(self.known.height, now)
             # From the first arming on: once it has begun, the firmware locks itself when it ends.
             self.guarded |= watchdog and self.state in WATCHED_OVER
             self.link.guarded = self.guarded

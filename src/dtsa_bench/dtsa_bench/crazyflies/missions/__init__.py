@@ -1,1 +1,1 @@
-"""Missions with Crazyflies: their ground station, the way to their places, the record, and a rehearsal."""
+"""Missions with Crazyflies: their ground station, their places, and the record."""

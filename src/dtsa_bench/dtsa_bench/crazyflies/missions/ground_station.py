@@ -6,7 +6,6 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,22 +22,19 @@ from std_msgs.msg import Empty as EmptyMessage
 from std_srvs.srv import Empty, Trigger
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.crazyflie.motion.paths import shortest_s
+from dtsa_agent.crazyflie.motion.limits import shortest_s
 from dtsa_agent.crazyflie.node.agents_node import STOP_HERE
 from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
 from dtsa_agent.crazyflie.settings.config import SwarmSettings
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.serving import Serving
 
-from .mission_log import MissionLog
-from .moves_to_places import plan_moves
-from .places import MissionError, assign_places, check_standing, crossings
+from .mission_record import MissionLog
+from .places import MissionError, assign_places, check_crossings, check_standing
 
 ARRIVED_M = 0.12  # m: at its start when this close
 CLIMB_MPS = 0.4
 SHIFT_MPS = 0.3
-BRING_MPS = 0.8  # of one that is brought to its place, at most
-KEEP_M = 0.3  # nobody comes closer to one that is brought to its place
 BRIDGE_SILENT_S = 3.0
 STOPPING_S = (1.2, 6.0)  # all come to rest within the first time; at the second they land wherever they are
 IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
@@ -60,8 +56,6 @@ class Mission:
     """What the ground station does: it calls the bridge's services, watches the vehicles, and is alive.
 
     :param node: a node of its own.
-    :param settings: the swarm's YAML.
-    :param scenario: where everybody starts.
     :param ended: is told why when something goes wrong.
     :param say: prints a line.
     """
@@ -73,7 +67,6 @@ class Mission:
         self.status: dict[str, Status] = {}
         self.log = MissionLog()
         self.place: dict[str, tuple[float, float, float]] = {}
-        self.crossing: list[str] = []  # whose ways to the starts cross: they are brought there one by one
         self.heard = time.monotonic()  # s, monotonic, the last status of anybody
         self.exchanging = False
         self.bridge_alive: Callable[[], None] = lambda: None
@@ -82,7 +75,7 @@ class Mission:
             node.create_subscription(Status, f"/{robot.name}/status", self._keep_status(robot.name), 10)
             subscription = node.create_subscription(Odometry, f"/{robot.name}/odom", self._keep_place(robot.name), 1)
             self._odometry.append(subscription)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._keep_diagnostics, 10)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self.log.diagnostic, 10)
         node.create_subscription(Log, EVENTS, self.log.event, EVENTS_QOS)
         self._heartbeat = node.create_publisher(EmptyMessage, "/all/heartbeat", 1)
         self._stop_here = node.create_publisher(EmptyMessage, STOP_HERE, 1)
@@ -114,11 +107,6 @@ class Mission:
                 self.ended.reason = f"{name} is {message.state_name} ({message.reason})"
 
         return keep
-
-    def _keep_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name.startswith("crazyflie_bridge: "):
-                self.log.diagnostics[status.hardware_id] = {v.key: _number(v.value) for v in status.values}
 
     def _keep_place(self, name: str) -> Callable[[Odometry], None]:
         def keep(message: Odometry) -> None:
@@ -155,9 +143,8 @@ class Mission:
         self._pulse.join(2.0)
 
     def call(self, name: str, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call a service.
+        """Call a service and wait for its answer (s, at most).
 
-        :param timeout: s, how long it waits.
         :raises MissionError: it does not answer or says no.
         """
         client = self._clients[name]
@@ -174,9 +161,8 @@ class Mission:
         return response
 
     def wait(self, what: str, condition: Callable[[], bool], timeout: float) -> None:
-        """Wait until something is so.
+        """Wait until something is so (s, at most).
 
-        :param timeout: s, how long it waits.
         :raises MissionError: it takes too long, or the user interrupts.
         """
         end = time.monotonic() + timeout
@@ -213,14 +199,11 @@ class Mission:
         """
         vehicles = [robot.name for robot in self.settings.robots]
         measured = np.array([self.place[name] for name in vehicles]).T
-        fence = self.settings.station.safety
-        check_standing(vehicles, measured, fence)
-        found = assign_places(config, measured)
-        self.scenario = make_scenario(found)
-        self.crossing = crossings(self.scenario, vehicles, measured)
-        if self.crossing:  # can it be done? Before motors turn.
-            plan_moves(vehicles, measured * [[1.0], [1.0], [0.0]], self.scenario.start, fence)
-        return found
+        check_standing(vehicles, measured, self.settings.station.safety)
+        assigned = assign_places(config, measured)
+        self.scenario = make_scenario(assigned)
+        check_crossings(self.scenario, vehicles, measured)
+        return assigned
 
     def take_off(self) -> None:
         """Arm, climb to the middle of the room, go to the start."""
@@ -234,8 +217,6 @@ class Mission:
         self.call("/all/takeoff", height=height, duration=_duration(seconds))
         time.sleep(seconds)
         self.wait("the take-off", lambda: self._all(Status.STATE_FLYING), 5.0)
-        if self.crossing:
-            self._bring()
         starts = self.scenario.start.T.tolist()
         way = max(math.dist(start, self.place[r.name]) for r, start in zip(self.settings.robots, starts, strict=True))
         seconds = 1.5 + max(way / SHIFT_MPS, shortest_s(way, limit))  # for all: their ways keep apart if flown together
@@ -247,35 +228,6 @@ class Mission:
         # Not needed any more: the station has better things to do. Only the executor's own thread may take them away.
         self._serving.executor.create_task(self._forget_odometry)
         self.exchanging = True
-
-    def _bring(self) -> None:
-        """One after the other to its place: flown at the same time their straight ways would cross."""
-        vehicles = [robot.name for robot in self.settings.robots]
-        hover = np.array([self.place[name] for name in vehicles]).T
-        moves = plan_moves(vehicles, hover, self.scenario.start, self.settings.station.safety)
-        for number, move in enumerate(moves, 1):
-            name = vehicles[move.index]
-            self.say(f"bringing {name} to its place ({number} of {len(moves)})")
-            for waypoint in move.waypoints:
-                self._lead(name, waypoint)
-
-    def _lead(self, name: str, waypoint: tuple[float, float, float]) -> None:
-        """One flies to a place, all others hover.
-
-        :raises MissionError: it does not arrive, or somebody is in its way.
-        """
-        way = math.dist(self.place[name], waypoint)
-        seconds = 0.3 + max(way / BRING_MPS, shortest_s(way, self.settings.station.max_speed_mps))
-        x, y, z = waypoint
-        self.call(f"/{name}/go_to", goal=Point(x=x, y=y, z=z), duration=_duration(seconds))
-
-        def arrived() -> bool:
-            for other, place in self.place.items():
-                if other != name and (gap := math.dist(self.place[name], place)) < KEEP_M:
-                    raise MissionError(f"{name} comes within {gap:.2f} m of {other} on its way (limit {KEEP_M} m)")
-            return math.dist(self.place[name], waypoint) < ARRIVED_M
-
-        self.wait(f"the way of {name} to its place", arrived, seconds + 10.0)
 
     def _forget_odometry(self) -> None:
         while self._odometry:
@@ -343,14 +295,6 @@ class Mission:
             while not future.done() and time.monotonic() < end:
                 time.sleep(0.01)
         self._beating.clear()
-
-
-def _number(text: str) -> float | str:
-    """A number where it is one that JSON knows."""
-    with suppress(ValueError):
-        if math.isfinite(value := float(text)):
-            return value
-    return text
 
 
 def _duration(seconds: float) -> Duration:

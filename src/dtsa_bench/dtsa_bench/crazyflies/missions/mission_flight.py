@@ -44,10 +44,10 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .ground_station import Ended, Mission
+from .mission_record import MISSION_BAG
 from .places import APART_M, MissionError, check_places
 
 RECORDER_END_S = 10.0
-MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange
 BRIDGE_END_S = 40.0  # s, to land by itself and close the links
 
 
@@ -58,7 +58,6 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
     between two vehicles than in simulation, because they know where they are to a few centimetres only; and the policy
     with which tables agree even where frames are lost.
 
-    :param settings: the swarm's YAML.
     :param given: what the user has set, by name.
     """
     room = {"shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
@@ -66,19 +65,29 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
     return {name: value for name, value in defaults.items() if given.get(name) is None}
 
 
-class _Rest:
-    """True once the exchange has to end and all have come to rest: they avoid each other until then.
+class MissionWatch(ChannelObserver):
+    """Ends the exchange: at once when the bridge has died, else when all have come to rest, apart from each other.
 
-    :param ended: why it has to end.
-    :param mission: tells them.
-    :param channel: knows where they are.
+    Two that are as near as in a crash end it, too: a run that ended by itself would not let all come to rest. True once
+    it is over; until then the agents avoid each other.
+
+    :param metrics: know where all are, by their own estimates; None: no crash ends it.
     """
 
-    def __init__(self, ended: Ended, mission: Mission, channel: RealtimeChannel) -> None:
-        self._ended, self._mission, self._channel = ended, mission, channel
+    def __init__(self, mission: Mission, channel: RealtimeChannel, metrics: FlightMetrics | None) -> None:
+        self._mission, self._channel, self._metrics = mission, channel, metrics
+
+    def idle(self, status: ChannelStatus) -> None:
+        self._mission.bridge_alive()
+        ended, metrics = self._mission.ended, self._metrics
+        if metrics is not None and metrics.collided_pair and not ended.reason:
+            a, b = metrics.collided_pair
+            distance, limit = metrics.closest()[0], metrics.run.limits.collision_m
+            ended.reason = f"cf{a} and cf{b} came within {distance:.2f} m of each other (collision_m is {limit:g})"
 
     def __bool__(self) -> bool:
-        return bool(self._ended) and (self._ended.stop.count > 1 or self._mission.at_rest(self._apart))
+        ended = self._mission.ended
+        return bool(ended) and (ended.stop.count > 1 or self._mission.at_rest(self._apart))
 
     def _apart(self) -> bool:
         places = np.array([self._channel.last_place(agent)[:2] for agent in range(1, self._channel.agents + 1)])
@@ -86,41 +95,10 @@ class _Rest:
         return bool(gaps.min() >= APART_M)
 
 
-class _BridgeWatch(ChannelObserver):
-    """Ends the exchange when the bridge has died."""
-
-    def __init__(self, mission: Mission) -> None:
-        self._mission = mission
-
-    def idle(self, status: ChannelStatus) -> None:
-        self._mission.bridge_alive()
-
-
-class CrashWatch(ChannelObserver):
-    """Ends the exchange when two are as near as in a crash. A run that ended by itself would not let all come to rest.
-
-    :param metrics: know where all are, by their own estimates.
-    :param ended: is told who and how near.
-    """
-
-    def __init__(self, metrics: FlightMetrics, ended: Ended) -> None:
-        self._metrics, self._ended = metrics, ended
-
-    def idle(self, status: ChannelStatus) -> None:
-        if self._metrics.collided_pair and not self._ended.reason:
-            a, b = self._metrics.collided_pair
-            distance, limit = self._metrics.closest()[0], self._metrics.run.limits.collision_m
-            self._ended.reason = (
-                f"cf{a} and cf{b} came within {distance:.2f} m of each other (collision_m is {limit:g})"
-            )
-
-
 class _Station:
     """The processes of a mission, and the one order in which they end.
 
-    :param settings: the swarm's YAML, read.
     :param directory: for the bag of the whole mission and the logs.
-    :param environment: of the processes.
     :param attach: whether a bridge runs already, and goes on running.
     """
 
@@ -131,26 +109,16 @@ class _Station:
         self._mission: Mission | None = None
 
     def start(self, swarm_yaml: Path) -> None:
-        """Starts the recorder, and the bridge unless there is one.
-
-        :param swarm_yaml: path of the swarm's YAML.
-        """
+        """Start the recorder, and the bridge unless there is one."""
         robots = [robot.name for robot in self.settings.robots]
         arguments = ["--bag", str(self._directory / MISSION_BAG), "--names", *robots]
-        self._recorder.start("recorder", [], "dtsa_bench.crazyflies.missions.mission_recorder", arguments)
+        self._recorder.start("recorder", [], "dtsa_bench.crazyflies.missions.mission_record", arguments)
         if not self._attach:
             self.bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
                               ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
 
     def take_off(self, run: RunConfig, scenario: Scenario, domain: int, ended: Ended) -> tuple[RunConfig, Mission]:
-        """Connects all vehicles and brings them into the air, at their places.
-
-        :param run: what is flown.
-        :param scenario: where all begin.
-        :param domain: the ROS domain.
-        :param ended: ends the mission early.
-        :returns: what is flown, with the places that were found, and the mission.
-        """
+        """Connect all vehicles and bring them into the air, at their places; the run with these places, the mission."""
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
         mission = self._mission = Mission(node, self.settings, scenario, ended, self.progress.show)
@@ -162,16 +130,11 @@ class _Station:
         if swarm != run.swarm:
             self.progress.say(f"not where they would begin: exchange of roles, places {swarm.places}")
             run = dataclasses.replace(run, swarm=swarm)
-        if mission.crossing:
-            self.progress.say(f"brought to their places one by one: {', '.join(mission.crossing)} otherwise")
         mission.take_off()
         return run, mission
 
     def end(self, ended: Ended) -> None:
-        """All land, agents before; then the bridge ends, then the recorder closes its bag.
-
-        :param ended: why the mission has ended.
-        """
+        """All land, agents before; then the bridge ends, then the recorder closes its bag."""
         mission = self._mission
         with _second_interrupt() as urgent:
             self.agents.stop()
@@ -208,10 +171,8 @@ def fly_crazyflies(
     """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
 
     :param run: what is flown; the number of agents is that of the robots.
-    :param settings: the swarm's YAML, read.
-    :param swarm_yaml: its path.
+    :param settings: the swarm's YAML, read; `swarm_yaml` is its path.
     :param out: directory for the bag and the results.
-    :param options: domain, pictures.
     :param stop: a flag that ends the mission early.
     :param attach: by the bridge that runs already on this ROS domain, and goes on running.
     :param page: shows the mission in a browser; None: nothing does.
@@ -288,11 +249,10 @@ def _exchange(
         channel, measurement = flight.channel, flight.measurement
         assert isinstance(channel, RealtimeChannel)
         shown = FlightProgress(progress, measurement, channel)
-        channel.observe(_BridgeWatch(mission), RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
-        if stop_on_crash:
-            channel.observe(CrashWatch(measurement.metrics, ended))
+        watch = MissionWatch(mission, channel, measurement.metrics if stop_on_crash else None)
+        channel.observe(watch, RealtimeSupervisor(agents, channel, measurement, progress.say), shown)
         try:
-            channel.run(_Rest(ended, mission, channel))
+            channel.run(watch)
             ended.reason = ended.reason or channel.fell_behind
             shown.show()
         except (NodeError, MissionError) as error:  # the bridge has died: what was flown is there all the same

@@ -15,7 +15,7 @@ from dtsa_agent.crazyflie.settings.config import SwarmSettings
 from dtsa_agent.crazyflie.state.conversions import to_map
 
 PLACE_M = 0.25  # m: a vehicle may stand this far beside its place
-APART_M = 0.35  # m: closer than this to each other nobody takes off or is led to its start
+APART_M = 0.35  # m: closer than this to each other nobody takes off or flies to its start
 
 Array = NDArray[np.float64]
 
@@ -52,14 +52,13 @@ def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
     with which ways that are flown at the same time keep 0.7 times the distance of the starts or goals. Roles that
     `places` gives are kept.
 
-    :param config: the swarm.
     :param measured: (3, N), m, frame map: where they stand.
     """
     start = make_scenario(config).start
     away = np.linalg.norm(measured[:2] - start[:2], axis=0)
     if away.max() <= PLACE_M or config.places:
         return config
-    from scipy.optimize import linear_sum_assignment  # comes with cflib
+    from scipy.optimize import linear_sum_assignment
 
     count = config.agents
     places = make_scenario(dataclasses.replace(config, places=" ".join(map(str, range(1, count + 1))))).start
@@ -69,11 +68,8 @@ def assign_places(config: SwarmConfig, measured: Array) -> SwarmConfig:
 
 
 def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings) -> None:
-    """Whether all can take off where they stand.
+    """Whether all can take off where they stand, (3, N), m, frame map.
 
-    :param names: of the vehicles, by id.
-    :param measured: (3, N), m, frame map: where they stand.
-    :param fence: the room.
     :raises MissionError: with names and distances.
     """
     problems = []
@@ -83,42 +79,31 @@ def check_standing(names: Sequence[str], measured: Array, fence: SafetySettings)
             outside = float(max((low - (x, y)).max(), ((x, y) - high).max()))
             if outside > fence.geofence_tolerance_m:
                 problems.append(f"{name} stands {outside:.2f} m outside the geofence at ({x:.2f}, {y:.2f})")
-    problems += close_pairs(names, measured, "stand")
+    for a in range(len(names)):
+        for b in range(a):
+            distance = float(np.linalg.norm(measured[:2, a] - measured[:2, b]))
+            if distance < APART_M:
+                problems.append(f"{names[b]} and {names[a]} stand {distance:.2f} m apart")
     if problems:
         raise MissionError(f"no take-off (at least {APART_M} m apart): {'; '.join(problems)}")
 
 
-def close_pairs(names: Sequence[str], place: Array, what: str) -> list[str]:
-    """Who is too close to whom, and how close.
+def check_crossings(scenario: Scenario, names: Sequence[str], measured: Array) -> None:
+    """Whether all can fly straight to their starts at the same time from where they are, (3, N), m, frame map.
 
-    :param names: of the vehicles.
-    :param place: (3, N), m.
-    :param what: what they do there.
+    :raises MissionError: with the names and smallest distances of those that would come too close.
     """
-    found = []
-    for a in range(len(names)):
-        for b in range(a):
-            distance = float(np.linalg.norm(place[:2, a] - place[:2, b]))
-            if distance < APART_M:
-                found.append(f"{names[b]} and {names[a]} {what} {distance:.2f} m apart")
-    return found
-
-
-def crossings(scenario: Scenario, names: Sequence[str], measured: Array) -> list[str]:
-    """Who would come too close if all flew straight to their starts at the same time.
-
-    :param scenario: where they begin.
-    :param names: of the vehicles, by id.
-    :param measured: (3, N), m, frame map: where they are.
-    """
-    goal = scenario.start[:2]
-    found = []
+    goal, close = scenario.start[:2], []
     for a in range(len(names)):
         for b in range(a):
             closest = _closest(measured[:2, a] - measured[:2, b], goal[:, a] - goal[:, b])
             if closest < APART_M:
-                found.append(f"{names[b]} and {names[a]} at {closest:.2f} m")
-    return found
+                close.append(f"{names[b]} and {names[a]} would come within {closest:.2f} m")
+    if close:
+        raise MissionError(
+            f"on the way to where they begin {'; '.join(close)}: put each on its place, or leave out --places, with "
+            "which they exchange roles"
+        )
 
 
 def _closest(begin: Array, end: Array) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.crazyflie.motion.paths import PEAK, shortest_s, too_short
+from dtsa_agent.crazyflie.motion.limits import PEAK, shortest_s, too_short
 
 
 def test_the_shortest_duration_keeps_the_speed_of_the_firmwares_path() -> None:

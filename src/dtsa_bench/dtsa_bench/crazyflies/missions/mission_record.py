@@ -1,0 +1,197 @@
+"""What happened in a mission: `mission.json`, as its ground station heard it, and a bag beside that of the flight.
+
+The bag is recorded by a process of its own, which gives way to all others: status, diagnostics and events whole; of
+commands, estimates and poses the latest one, 20 times a second. Times are the station's clock.
+`python -m dtsa_bench.crazyflies.missions.mission_record --bag DIR --names cf1 cf2`
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import signal
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from dtsa_msgs.msg import Status, VelocityWorld
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
+from dtsa_agent.ros.common.process.node_process import follow_supervisor, init_ros
+from dtsa_agent.ros.common.process.priority import give_way_by
+from dtsa_bench.recordings.bag.writer import BagWriter
+
+MISSION_BAG = "mission_bag"  # the whole mission's bag, beside that of the exchange
+MOST_EVENTS = 5000
+QUIET = ["--ros-args", "--disable-rosout-logs"]
+PERIOD_S = 0.05
+NICE = 10
+ALL = QoSProfile(depth=50)
+LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+_LEVELS = {10: "debug", 20: "info", 30: "warn", 40: "error", 50: "fatal"}
+_IN_FLIGHT = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
+
+
+@dataclass(slots=True)
+class VehicleLog:
+    """One vehicle's part."""
+
+    battery_first_v: float | None = None
+    battery_last_v: float | None = None
+    battery_least_v: float | None = None
+    link_quality_least: float = 1.0  # from arming on
+    log_age_most_s: float = 0.0
+    latency_most_ms: float = 0.0  # of a command, 99th percentile
+    states: list[dict[str, Any]] = field(default_factory=list)  # t_s, state, reason: each change
+
+
+class MissionLog:
+    """Collects. For one thread, the executor's."""
+
+    def __init__(self) -> None:
+        self.began = time.time()
+        self.vehicles: dict[str, VehicleLog] = {}
+        self.events: list[dict[str, Any]] = []
+        self.diagnostics: dict[str, dict[str, float | str]] = {}  # what the bridge said last about each
+        self.dropped = 0
+
+    def status(self, name: str, message: Status) -> None:
+        """A vehicle's status."""
+        log = self.vehicles.setdefault(name, VehicleLog())
+        volts = round(float(message.battery_voltage), 3)
+        if volts > 0.0:
+            log.battery_first_v = volts if log.battery_first_v is None else log.battery_first_v
+            log.battery_least_v = volts if log.battery_least_v is None else min(volts, log.battery_least_v)
+            log.battery_last_v = volts
+        if message.state in _IN_FLIGHT:
+            log.link_quality_least = min(log.link_quality_least, round(float(message.link_quality), 3))
+            log.log_age_most_s = max(log.log_age_most_s, round(float(message.log_age), 3))
+            log.latency_most_ms = max(log.latency_most_ms, round(float(message.latency_ms), 2))
+        if not log.states or log.states[-1]["state"] != message.state_name:
+            when = round(time.time() - self.began, 3)
+            log.states.append({"t_s": when, "state": message.state_name, "reason": message.reason})
+
+    def diagnostic(self, message: DiagnosticArray) -> None:
+        """Diagnostics; only the bridge's count."""
+        for status in message.status:
+            if status.name.startswith("crazyflie_bridge: "):
+                self.diagnostics[status.hardware_id] = {v.key: _number(v.value) for v in status.values}
+
+    def event(self, message: Log) -> None:
+        """Something that the bridge did, or was ordered to do."""
+        if len(self.events) < MOST_EVENTS:
+            level = _LEVELS.get(int(message.level), str(message.level))
+            when = message.stamp.sec + message.stamp.nanosec * 1e-9 - self.began
+            self.events.append({"t_s": round(when, 3), "level": level, "text": message.msg})
+        else:
+            self.dropped += 1
+
+    def write(self, directory: Path, reason: str) -> None:
+        """Write `mission.json` in the flight's directory; `reason`: why the mission was cut short, or ""."""
+        logs = sorted(self.vehicles.items())
+        content = {
+            "began_unix_s": round(self.began, 3),
+            "duration_s": round(time.time() - self.began, 3),
+            "cut_short": reason,
+            "vehicles": {name: asdict(log) | {"last": self.diagnostics.get(name, {})} for name, log in logs},
+            "events": sorted(self.events, key=lambda event: event["t_s"]),
+            "events_left_out": self.dropped,
+        }
+        path = directory / "mission.json.part"
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        path.replace(directory / "mission.json")
+
+
+def _number(text: str) -> float | str:
+    """A number where it is one that JSON knows."""
+    try:
+        value = float(text)
+    except ValueError:
+        return text
+    return value if math.isfinite(value) else text
+
+
+# -- the bag ----------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class RecordedTopic:
+    """One topic that is recorded."""
+
+    handle: Any  # subscription
+    kind: type
+    channel: int
+    most: int  # messages read at once
+
+
+def subscribe_topics(node: Any, bag: BagWriter, names: list[str]) -> list[RecordedTopic]:
+    """Subscribe to everything that is recorded of these vehicles."""
+    wanted: list[tuple[type, str, str, QoSProfile]] = [
+        (Log, EVENTS, "rcl_interfaces/msg/Log", EVENTS_QOS),
+        (DiagnosticArray, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", ALL),
+    ]
+    for name in names:
+        wanted += [
+            (Status, f"/{name}/status", "dtsa_msgs/msg/Status", ALL),
+            (Odometry, f"/{name}/odom", "nav_msgs/msg/Odometry", LATEST),
+            (VelocityWorld, f"/{name}/cmd_velocity_world", "dtsa_msgs/msg/VelocityWorld", LATEST),
+            (PoseStamped, f"/{name}/pose", "geometry_msgs/msg/PoseStamped", LATEST),
+        ]
+    topics = []
+    for kind, topic, text, qos in wanted:
+        subscription = node.create_subscription(kind, topic, lambda message: None, qos)
+        topics.append(RecordedTopic(subscription.handle, kind, bag.add_topic(topic, text), qos.depth))
+    return topics
+
+
+def record(topics: list[RecordedTopic], bag: BagWriter, over: list[int]) -> None:
+    """Record until a signal has come (its number is in `over`), and then what is left."""
+    last = False
+    while not last:
+        time.sleep(PERIOD_S)
+        last = bool(over)
+        for topic in topics:
+            with topic.handle:
+                for _ in range(topic.most):
+                    received = topic.handle.take_message(topic.kind, True)
+                    if received is None:
+                        break
+                    data, info = received
+                    bag.write(topic.channel, bytes(data), time.time_ns(), int(info["source_timestamp"]))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Record until SIGTERM or SIGINT."""
+    parser = argparse.ArgumentParser(prog="mission_record", description=__doc__, allow_abbrev=False)
+    parser.add_argument("--bag", type=Path, required=True, help="directory that is made")
+    parser.add_argument("--names", nargs="+", required=True, help="of the vehicles")
+    args = parser.parse_args(argv)
+    over: list[int] = []  # no `threading.Event`: two signals at once would make its `set` wait for itself
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: over.append(number))
+    follow_supervisor()
+    give_way_by(NICE)
+    init_ros(QUIET)
+    node = rclpy.create_node("mission_recorder", enable_rosout=False, start_parameter_services=False)
+    try:
+        with BagWriter(args.bag, None, custom_data={"mission": "the station's clock"}) as bag:
+            record(subscribe_topics(node, bag, args.names), bag, over)
+    except DtsaError as error:
+        print(f"mission_recorder: {error}", file=sys.stderr)
+        return 1
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
