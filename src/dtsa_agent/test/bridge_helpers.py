@@ -21,7 +21,7 @@ from dtsa_agent.crazyflie.settings.config import parse_swarm
 from dtsa_agent.crazyflie.state import conversions
 from dtsa_agent.crazyflie.state.state_machine import State
 from dtsa_bench.crazyflies.simulated import send_fault
-from dtsa_bench.crazyflies.simulated.ports import free_base_port
+from dtsa_bench.crazyflies.simulated.process import free_base_port
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 
@@ -58,20 +58,13 @@ class FakeFleet:
 
 @contextlib.contextmanager
 def fake_fleet(
-    folder: Path, count: int, *options: str, environment: dict[str, str] | None = None
-) -> Iterator[FakeFleet]:
+    folder: Path, count: int, *options: str, environment: dict[str, str] | None = None,
+    module: str = "dtsa_bench.crazyflies.simulated.cli",
+) -> Iterator[FakeFleet]:  # fmt: skip
     """Simulated Crazyflies in a process of their own."""
     base = free_base_port(count)
     truth = folder / f"truth-{base}.jsonl"
-    command = [
-        sys.executable,
-        "-m",
-        "dtsa_bench.crazyflies.simulated.cli",
-        "--count",
-        str(count),
-        "--base-port",
-        str(base),
-    ]
+    command = [sys.executable, "-m", module, "--count", str(count), "--base-port", str(base)]
     command += ["--truth", str(truth), "--quiet", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:

@@ -62,7 +62,7 @@ def measure(
     :param loss: share of packets lost on the air of three simulated dongles; None: over UDP.
     :raises BenchmarkError: the bridge, or somebody in its care, does not get as far as that.
     """
-    from dtsa_bench.crazyflies.simulated.ports import free_base_port
+    from dtsa_bench.crazyflies.simulated.process import free_base_port
     from dtsa_bench.flights.children import Children
     from dtsa_bench.flights.domain import ros_domain
 

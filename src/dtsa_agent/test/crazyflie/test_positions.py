@@ -237,7 +237,9 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
     with ros_domain() as domain:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
-        with fake_fleet(tmp_path, 4, "--motion-capture", environment=environment) as fleet:
+        helpers = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])}
+        tracked = {"module": "motion_capture_helper", "environment": environment | helpers}
+        with fake_fleet(tmp_path, 4, **tracked) as fleet:  # type: ignore[arg-type]
             station = {
                 "positions": {"source": "pose"},
                 "safety": {"link_age_s": 3.0, "command_age_s": 0, "estimate_error_m": 0},

@@ -108,8 +108,7 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     import yaml
 
     from dtsa_agent.crazyflie.settings.config import load_swarm
-    from dtsa_bench.crazyflies.simulated.ports import FIRST, free_base_port
-    from dtsa_bench.crazyflies.simulated.process import FleetError, running_fleet
+    from dtsa_bench.crazyflies.simulated.process import FIRST, FleetError, free_base_port, running_fleet
 
     data = yaml.safe_load(config.read_text(encoding="utf-8"))
     robots = load_swarm(config).robots

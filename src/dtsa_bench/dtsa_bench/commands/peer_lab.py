@@ -6,7 +6,10 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dtsa_agent.core import SwarmConfig
 
 DESCRIPTION = """\
 Flies copies of a Crazyflie app (C, a function appMain) on this machine, in virtual time, on simulated Crazyflies over
@@ -43,25 +46,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--flag", action="append", default=[], metavar="F", help="a flag for the compiler: --flag=-O0")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=X", help="a parameter of the app")
     parser.add_argument("--out", metavar="DIR", help="directory for summary.json, packets.jsonl and truth.jsonl")
-    parser.add_argument(
-        "--simulated-radio", type=Path, metavar="SOCKET",
-        help="real time, with simulated Crazyradios for `bridge`, `sniff` and others with --simulated-radio SOCKET",
-    )  # fmt: skip
-    parser.add_argument(
-        "--no-ground", action="store_true",
-        help=f"with {PROTOCOL} and --simulated-radio: `bridge` or another program prepares, takes off and enables",
-    )  # fmt: skip
-    parser.add_argument("--dongles", type=int, default=2, metavar="X", help="number of these [2]")
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
 
 
 def run(args: argparse.Namespace) -> int:
     """Fly and print what came of it."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.crazyflies.peer_lab.live import stations
     from dtsa_bench.crazyflies.peer_lab.process import fly
     from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
-    from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
     from dtsa_bench.runs.options import new_directory
 
     if not 0.0 < args.seconds <= 1e6:
@@ -77,18 +69,9 @@ def run(args: argparse.Namespace) -> int:
     elif of_protocol:
         name, value = next(iter(of_protocol.items()))
         raise ConfigError(name, value, f"only with {PROTOCOL}")
-    live = None
-    if args.no_ground and (swarm is None or args.simulated_radio is None):
-        raise ConfigError("no_ground", True, f"only with {PROTOCOL} and --simulated-radio")
-    if args.simulated_radio is not None:
-        live = RadioSettings(dongles=args.dongles, path=args.simulated_radio)
-        for station in stations(settings):
-            print(station.uri)
-        print(f"{settings.agents} simulated Crazyflies in real time; Ctrl-C ends", flush=True)
     summary = fly(
         place, args.seconds, settings, sources=tuple(args.source), include=tuple(args.include),
-        flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm, live=live,
-        ground=not args.no_ground,
+        flags=tuple(args.flag), parameters=parameters, out=out, swarm=swarm,
     )  # fmt: skip
     console, warnings, logs = (summary.pop(key) for key in ("console", "warnings", "logs"))
     if out is not None:
@@ -99,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _swarm(given: dict[str, str], settings: Any) -> dict[str, Any]:
+def _swarm(given: dict[str, str], settings: Any) -> SwarmConfig:
     """Settings of the swarm that flies the protocol."""
     from dtsa_agent.core import SwarmConfig
     from dtsa_agent.core.settings.declaration import settings_of
@@ -111,7 +94,7 @@ def _swarm(given: dict[str, str], settings: Any) -> dict[str, Any]:
     swarm = SwarmConfig.from_dict(values)
     check_on_board(swarm)
     key_of(swarm)
-    return swarm.to_dict()
+    return swarm
 
 
 def _folder() -> str:
@@ -151,7 +134,4 @@ def _lines(summary: dict[str, Any], printed: int) -> str:
         ("printed", f"{printed} lines"),
         ("digest", summary["digest"]),
     )  # fmt: skip
-    if "lost_s" in summary:
-        late = f"{summary['lost_s']:.3f} s were lost: the machine was too busy" if summary["lost_s"] else "kept"
-        rows = (*rows, ("real time", late))
     return "\n".join(f"{name:<9} {text}" for name, text in rows)

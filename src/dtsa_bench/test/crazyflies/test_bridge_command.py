@@ -38,7 +38,7 @@ from waiting import wait_for
 from dtsa_agent.crazyflie.settings.config import load_swarm
 from dtsa_bench.commands.bridge import simulated
 from dtsa_bench.crazyflies.simulated import ports
-from dtsa_bench.crazyflies.simulated.ports import free_base_port
+from dtsa_bench.crazyflies.simulated.process import free_base_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 NAMES = ("cf1", "cf2")

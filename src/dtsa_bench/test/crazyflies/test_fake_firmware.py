@@ -11,10 +11,10 @@ from craft import Craft
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dtsa_agent.crazyflie.state.conversions import decompress_quaternion, yaw_of
 from dtsa_bench.crazyflies.simulated import crtp, planner, toc
-from dtsa_bench.crazyflies.simulated.battery import Battery
 from dtsa_bench.crazyflies.simulated.estimate import attitude, compress, quaternion
-from dtsa_bench.crazyflies.simulated.firmware import FLY, LEVEL, OFF, yaw_of
+from dtsa_bench.crazyflies.simulated.firmware import FLY, LEVEL, OFF, Battery
 
 finite = st.floats(-5, 5, width=32)  # as the firmware counts; the half of the smallest double is not exact
 
@@ -43,47 +43,6 @@ def test_a_flight_by_high_level_commands() -> None:
     assert craft.state == "landed"
     craft.fly(3.1)
     assert not craft.firmware.supervisor.armed
-
-
-def upload(craft: Craft, number: int, kind: int, pieces: int, data: bytes) -> None:
-    """Write a trajectory to the memory, and define it."""
-    for k in range(0, len(data), 24):
-        craft.ask(crtp.MEMORY, 2, struct.pack("<BI", 0, k) + data[k : k + 24])
-    craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<BBBBIB", 6, number, 1, kind, 0, pieces))
-
-
-def start(craft: Craft, number: int, timescale: float, *, reverse: bool = False, relative: bool = True) -> int:
-    """The firmware's answer to the order to start it."""
-    answer = craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<BB???Bf", 13, 0, relative, False, reverse, number, timescale))
-    assert answer is not None
-    return answer[3]
-
-
-def test_trajectories_are_flown_from_here_or_where_they_are_at_their_pace_or_another_and_backwards() -> None:
-    ramp = [0.0, 0.5, 0, 0, 0, 0, 0, 0], [0.0] * 8, [1.0] + [0.0] * 7, [0.0] * 8  # x = t/2 for two seconds
-    data = struct.pack("<33f", *(c for axis in ramp for c in axis), 2.0)
-    for timescale, reverse, relative, begin, end in (
-        (1.0, False, True, 0.0, 1.0),
-        (2.0, False, False, 0.0, 1.0),
-        (1.0, True, False, 1.0, 0.0),
-    ):
-        craft = Craft()
-        upload(craft, 4, 0, 1, data)
-        assert start(craft, 4, 1.0) == errno.EBUSY
-        craft.take_off()
-        assert start(craft, 3, 1.0) == 0  # never defined: nothing happens, and nobody is told
-        craft.fly(0.1)
-        assert craft.command[0] == 0.0
-        craft.estimate.position = (begin, 0.0, 1.0)
-        assert start(craft, 4, timescale, reverse=reverse, relative=relative) == 0
-        if relative:  # it is moved to where the last path had led
-            assert craft.firmware.planner.goal(craft.t).position == pytest.approx((0.0, 0.0, 1.0))  # type: ignore[union-attr]
-        craft.fly(timescale)
-        assert craft.estimate.position[0] == pytest.approx(0.5, abs=0.05)
-        assert craft.command[0] == pytest.approx((end - begin) / 2 / timescale, abs=0.01)
-        craft.fly(timescale + 1.0)
-        assert craft.estimate.position == pytest.approx((end, 0.0, 1.0), abs=0.02)
-    assert ("trajectory", {"id": 4, "duration": 2.0}) in craft.events
 
 
 def test_orders_to_groups_that_it_is_not_in_are_nothing_to_it() -> None:
@@ -260,7 +219,7 @@ def test_full_state_setpoints_and_yaw() -> None:
 @settings(deadline=None)
 @given(st.floats(-3.1, 3.1))
 def test_heading_survives_compression(yaw: float) -> None:
-    assert yaw_of(compress(quaternion(0.1, -0.2, yaw))) == pytest.approx(yaw, abs=0.01)
+    assert yaw_of(decompress_quaternion(compress(quaternion(0.1, -0.2, yaw)))) == pytest.approx(yaw, abs=0.01)
 
 
 def test_a_quadcopter_leans_where_it_accelerates() -> None:

@@ -12,9 +12,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.peer_lab import Laboratory, LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import ENGINE, FIRMWARE, CompileError, compiler
 from dtsa_bench.crazyflies.peer_lab.engine import AppError
-from dtsa_bench.crazyflies.peer_lab.packet import Packet
 from dtsa_bench.crazyflies.peer_lab.process import fly
-from dtsa_bench.crazyflies.peer_lab.record import Observer
+from dtsa_bench.crazyflies.peer_lab.record import Observer, Packet
 from dtsa_channel_sim.model.airtime import RADIOS
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
@@ -340,15 +339,12 @@ def test_the_ground_gives_orders_at_instants(write) -> None:
     place = write(
         "static uint8_t go; void appMain(void) { for (;;) vTaskDelay(100); }\n"
         "PARAM_GROUP_START(own)\nPARAM_ADD(PARAM_UINT8, go, &go)\nPARAM_GROUP_STOP(own)",
-        settings="""
-parameters: {own.go: 1}
-orders:
-- {at: 0.5, order: takeoff, height: 1, duration: 1}
-- {at: 2, order: parameter, name: own.go, value: 7, agents: 2}
-- {at: 2, order: "off", agents: [1]}
-""",
+        settings="parameters: {own.go: 1}",
     )
     with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.0)) as lab:
+        lab.at(0.5, lambda: [lab.take_off(agent, 1.0, 1.0) for agent in (1, 2)] and None)
+        lab.at(2.0, lambda: lab.set_parameter(2, "own.go", 7))
+        lab.at(2.0, lambda: lab.switch_off(1))
         lab.run(1.9)
         assert [lab.parameter(agent, "own.go") for agent in (1, 2)] == [1, 1]
         assert (lab.world.vehicles.position[2] > 0.8).all()
@@ -384,8 +380,8 @@ def test_bad_input_is_said_in_a_line(write, tmp_path: Path) -> None:
         fly(write("void eventQueueSend(void); void appMain(void) { eventQueueSend(); }", "e"), 1.0)
     with pytest.raises(AppError, match="appMain"):
         fly(write("int other;", "b"), 1.5)
-    with pytest.raises(ConfigError, match="orders"):
-        read_app(write("", "c", "orders: [{at: 1, order: fly}]"))
+    with pytest.raises(ConfigError, match="parameters"):
+        read_app(write("", "c", "parameters: {own.go: fast}"))
     with pytest.raises(ConfigError, match="sorces"):
         read_app(write("", "d", "sorces: [x.c]"))
 

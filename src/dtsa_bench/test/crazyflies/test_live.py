@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -13,16 +12,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from live_helpers import LiveLaboratory, live_laboratory
 
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
-from dtsa_bench.crazyflies.peer_lab import Laboratory, LabSettings, read_app
+from dtsa_bench.crazyflies.peer_lab import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
-from dtsa_bench.crazyflies.peer_lab.live import Live
 from dtsa_bench.crazyflies.simulated import crtp, toc
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.dongle import Dongle
-from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 
@@ -58,19 +57,16 @@ LOG_GROUP_STOP(own)
 
 
 @pytest.fixture
-def live(tmp_path: Path) -> Iterator[Live]:
+def live(tmp_path: Path) -> Iterator[LiveLaboratory]:
     directory = tmp_path / "echo"
     directory.mkdir()
     (directory / "app.c").write_text(APP)
     settings = LabSettings(agents=2, boot_s=0.05)
-    made = Live(settings, RadioSettings(path=tmp_path / "radio"))
-    with Laboratory(read_app(directory), settings, radio=made.side) as lab:
-        made.attach(lab)
-        yield made
-    made.close()
+    with LiveLaboratory(tmp_path / "radio", 4, read_app(directory), settings) as lab:
+        yield lab
 
 
-def sniff(live: Live) -> list[bytes]:
+def sniff(live: LiveLaboratory) -> list[bytes]:
     """The first dongle in sniffer mode; what it hears."""
     dongle, heard = live.side.dongles[0], []
 
@@ -87,33 +83,33 @@ def sniff(live: Live) -> list[bytes]:
     return heard
 
 
-def exchange(live: Live, dongle: Dongle, packet: bytes) -> bytes:
+def exchange(live: LiveLaboratory, dongle: Dongle, packet: bytes) -> bytes:
     """A packet to the vehicle; what came with its acknowledgement."""
     answers: list[bytes] = []
     while not answers or not answers[-1][0] & 1:  # what collides is sent again
         start = len(answers)
-        dongle.transfer(packet, live.lab.now_ns, answers.append)
+        dongle.transfer(packet, live.now_ns, answers.append)
         while len(answers) == start:
-            live.lab.run(live.lab.time + 0.001)
+            live.run(live.time + 0.001)
     return answers[-1][1:]
 
 
-def test_a_dongle_in_sniffer_mode_hears_apps_and_they_hear_it(live: Live) -> None:
+def test_a_dongle_in_sniffer_mode_hears_apps_and_they_hear_it(live: LiveLaboratory) -> None:
     heard = sniff(live)
-    live.lab.run(0.5)
+    live.run(0.5)
     assert {packet[:3] for packet in heard} == {b"\xff\x85\x01", b"\xff\x85\x02"}
     assert all(len(packet) == 6 for packet in heard)
-    live.side.dongles[0].transfer(esb.BROADCAST + b"\xff\x83hello", live.lab.now_ns, lambda data: None)
-    live.lab.run(0.6)
-    assert {live.lab.log(agent, "own.heard") for agent in (1, 2)} == {5.0}
+    live.side.dongles[0].transfer(esb.BROADCAST + b"\xff\x83hello", live.now_ns, lambda data: None)
+    live.run(0.6)
+    assert {live.log(agent, "own.heard") for agent in (1, 2)} == {5.0}
 
 
-def test_ground_sets_parameters_and_reads_logs_of_an_app_and_talks_to_it(live: Live) -> None:
+def test_ground_sets_parameters_and_reads_logs_of_an_app_and_talks_to_it(live: LiveLaboratory) -> None:
     dongle = live.side.dongles[1]
     dongle.request(requests.SET_CHANNEL, 80, 0, b"", 0)
     dongle.request(requests.SET_RATE, 2, 0, b"", 0)
     dongle.request(requests.SET_ADDRESS, 0, 0, b"\xe7\xe7\xe7\xe7\x02", 0)
-    live.lab.run(0.1)
+    live.run(0.1)
     index = len(toc.PARAM_ENTRIES)
     number, log = index.to_bytes(2, "little"), len(toc.LOG_ENTRIES).to_bytes(2, "little")
     packets = [
@@ -124,51 +120,21 @@ def test_ground_sets_parameters_and_reads_logs_of_an_app_and_talks_to_it(live: L
         crtp.pack(crtp.LOG, 1, b"\x03\x01\x05"),  # every 50 ms
     ]
     said = [exchange(live, dongle, packet) for packet in packets + 60 * [b"\xff"]]
-    assert [live.lab.parameter(agent, "own.go") for agent in (1, 2)] == [1.0, 7.0]
+    assert [live.parameter(agent, "own.go") for agent in (1, 2)] == [1.0, 7.0]
     assert crtp.pack(crtp.PLATFORM, 2, b"echo") in said
     assert any(packet.endswith(b"own\0go\0") for packet in said)
     assert any(packet[:1] == crtp.pack(crtp.LOG, 2, b"") and len(packet) == 1 + 4 + 2 for packet in said)
 
 
-def test_a_live_flight_ends_by_ctrl_c_with_its_summary(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "dtsa_bench", "peer-lab", "beacons", "--agents", "2", "--simulated-radio"]
-    place = tmp_path / "radio"
-    process = subprocess.Popen(
-        [*command, str(place)], stdout=subprocess.PIPE, text=True, start_new_session=True, env={**os.environ}
-    )
-    try:
-        while not place.exists():
-            assert process.poll() is None
-            time.sleep(0.05)
-        time.sleep(2.0)  # the app is compiled, and flies for a while
-        os.killpg(process.pid, signal.SIGINT)
-        said, _ = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert "radio://0/80/2M/E7E7E7E701" in said
-    assert "digest" in said
-    assert process.returncode == 0
-
-
 def test_sniff_judges_the_protocol_on_board_by_a_dongle(tmp_path: Path) -> None:
     pytest.importorskip("usb")
-    dtsa = [sys.executable, "-m", "dtsa_bench"]
-    swarm = ["--agents", "2", "--slot-ms", "20", "--policy", "lease"]
-    place = str(tmp_path / "radio")
-    lab = subprocess.Popen(
-        [*dtsa, "peer-lab", "protocol", *swarm, "--seconds", "600", "--simulated-radio", place],
-        stdout=subprocess.DEVNULL, start_new_session=True,
-    )  # fmt: skip
-    try:
-        while not Path(place).exists():
-            assert lab.poll() is None
-            time.sleep(0.05)
-        radio = ["--air", "crazyradio", "--uri", "radio://0/80/2M", "--simulated-radio", place]
-        sniff = [*dtsa, "sniff", *radio, *swarm, "--no-seal", "--duration-s", "10", "--json"]
-        said = subprocess.run(sniff, capture_output=True, text=True, check=False)
-    finally:
-        os.killpg(lab.pid, signal.SIGINT)
-        lab.wait(timeout=60)
+    swarm = tmp_path / "swarm.json"
+    swarm.write_text(json.dumps(SwarmConfig(agents=2, slot_ms=20.0, policy="lease").to_dict()))
+    radio = ["--air", "crazyradio", "--uri", "radio://0/80/2M", "--simulated-radio", str(tmp_path / "radio")]
+    options = ["--agents", "2", "--slot-ms", "20", "--policy", "lease", "--no-seal", "--duration-s", "10", "--json"]
+    with live_laboratory(tmp_path, str(swarm), "ground"):
+        command = [sys.executable, "-m", "dtsa_bench", "sniff", *radio, *options]
+        said = subprocess.run(command, capture_output=True, text=True, check=False)
     assert said.returncode == 0, said.stderr
     summary = json.loads(said.stdout)
     assert all(summary["heard"][f"cf{agent}"] > 0 for agent in (1, 2))
@@ -177,6 +143,7 @@ def test_sniff_judges_the_protocol_on_board_by_a_dongle(tmp_path: Path) -> None:
 
 CFLIB = """
 import sys, time
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.crazyflie.links.link import require_cflib
 require_cflib()
 from cflib.crazyflie import Crazyflie
@@ -199,20 +166,9 @@ with SyncCrazyflie("radio://0/80/2M/E7E7E7E702", cf=Crazyflie(rw_cache=sys.argv[
 
 def test_unmodified_cflib_finds_an_apps_variables_and_flies_its_vehicle(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
-    place = str(tmp_path / "radio")
-    lab = subprocess.Popen(
-        [sys.executable, "-m", "dtsa_bench", "peer-lab", "beacons", "--agents", "2", "--seconds", "600",
-         "--simulated-radio", place], stdout=subprocess.DEVNULL, start_new_session=True,
-    )  # fmt: skip
-    try:
-        while not Path(place).exists():
-            assert lab.poll() is None
-            time.sleep(0.05)
+    with live_laboratory(tmp_path, "beacons", "2"):
         time.sleep(1.5)  # both are switched on
         command = [sys.executable, "-c", CFLIB, str(tmp_path / "cache")]
-        environment = {**os.environ, SIMULATED_RADIO: place}
+        environment = {**os.environ, SIMULATED_RADIO: str(tmp_path / "radio")}
         said = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=120)
-    finally:
-        os.killpg(lab.pid, signal.SIGINT)
-        lab.wait(timeout=60)
     assert said.stdout.split() == ["77"], said.stderr

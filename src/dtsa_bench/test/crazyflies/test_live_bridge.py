@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ pytest.importorskip("dtsa_msgs.srv")
 from builtin_interfaces.msg import Duration
 from dtsa_msgs.msg import Status
 from dtsa_msgs.srv import Arm, Takeoff
+from live_helpers import live_laboratory
 from node_helpers import Graph, ros_graph
 from std_srvs.srv import Empty, SetBool
 from waiting import wait_for
@@ -76,27 +77,11 @@ def swarm_yaml(folder: Path) -> Path:
     return path
 
 
-@contextmanager
-def laboratory(folder: Path) -> Iterator[subprocess.Popen[str]]:
+def laboratory(folder: Path) -> AbstractContextManager[subprocess.Popen[str]]:
     """Three vehicles on the floor, each with the app, and dongles; nobody plays the ground."""
-    place = folder / "radio"
-    request = {
-        "place": "beacons", "sources": [], "include": [], "flags": [], "parameters": {}, "out": str(folder),
-        "seconds": 600.0, "settings": {"agents": len(NAMES), "boot_s": 0.1}, "swarm": CONFIG.to_dict(),
-        "live": {"path": str(place), "dongles": 3}, "ground": False,
-    }  # fmt: skip
-    command = [sys.executable, "-m", "dtsa_bench.crazyflies.peer_lab.process"]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | KEY)
-    assert process.stdin is not None
-    try:
-        process.stdin.write(json.dumps(request))
-        process.stdin.close()
-        process.stdin = None
-        wait_for(lambda: place.exists() or process.poll() is not None)
-        yield process
-    finally:
-        process.kill()
-        process.wait()
+    swarm = folder / "swarm.json"
+    swarm.write_text(json.dumps(CONFIG.to_dict()))
+    return live_laboratory(folder, str(swarm), **KEY)
 
 
 class Operator:

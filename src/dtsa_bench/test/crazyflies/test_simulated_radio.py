@@ -8,11 +8,9 @@ import pytest
 
 from dtsa_agent.crazyflie.settings import radio_budget as budget
 from dtsa_bench.crazyflies.simulated.radio import esb
-from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
-from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
+from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import (
     ACK_ENABLE,
-    SCAN_CHANNELS,
     SET_ADDRESS,
     SET_CHANNEL,
     SET_RADIO_MODE,
@@ -188,8 +186,6 @@ def test_what_the_devices_cannot_do() -> None:
         room = Room(RadioSettings(dongles=1, device=device), (station(1, channel, rate),))
         room.tune(0, room.stations[0])
         assert (room.exchange(PACKET)[0][1] != b"\0") is there, (device, rate, channel)
-        room.dongles[0].request(SCAN_CHANNELS, 0, 125, NULL, 0)
-        assert room.dongles[0].scanned == (bytes((channel,)) if there else b"")
 
 
 # -- sniffer mode ----------------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 from dtsa_bench.experiments.batch.task import Row
-from dtsa_bench.flights.domain import ros_domain
 from dtsa_dev.soak.checks import met
 from dtsa_dev.soak.flights import dtsa
 from dtsa_dev.soak.item import Item
@@ -24,8 +22,7 @@ COUNT = 12
 EACH = 5
 CLOSEST_M = 0.25
 FLYING_M = 0.1  # above the floor
-CAMERAS = "udp, motion capture at 100 Hz"
-_LOSSES: dict[str, float | None] = {"udp": None, "radio 1 %": 0.01, "radio 5 %": 0.05, CAMERAS: None}
+_LOSSES: dict[str, float | None] = {"udp": None, "radio 1 %": 0.01, "radio 5 %": 0.05}
 _PATIENCE_S = 180.0
 
 
@@ -50,12 +47,7 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
     options = ["--arming", str(item.settings["arming"]), "--seed", str(item.seed), "--radio-seed", str(item.seed)]
     # What follows each other without a restart of the Crazyflies must not be locked by the first one's end.
     station: dict[str, Any] = {"toc_cache": str(directory / "cache"), "safety": {"emergency_watchdog": flights == 1}}
-    completed, latencies = [], []
-    if over == CAMERAS:
-        station["positions"] = {"source": "pose"}
-        options.append("--motion-capture")
-        with ros_domain() as domain:  # free: the cameras' and the mission's now
-            os.environ |= {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    completed = []
     with busy_machine(1), running(directory, COUNT, _LOSSES[over], options, station) as fleet:
         for number in range(flights):
             out = directory / f"out{number}"
@@ -67,11 +59,9 @@ def run(item: Item, directory: Path) -> dict[str, Any]:
             met(result.returncode == 0, f"flight {number + 1}: exit code {result.returncode}: {said}")
             summary = json.loads((out / "summary.json").read_text())
             completed.append(summary["completion_time_s"])
-            latencies += [values.get("position latency, median [ms]", 0.0) for values in summary["vehicles"].values()]
     closest = closest_m(fleet.truth)
     met(closest >= CLOSEST_M, f"two came to {closest:.3f} m")
-    latency = round(float(np.max(latencies, initial=0.0)), 1)
-    return {**item.settings, "closest_m": round(closest, 3), "completion_s": completed, "position_latency_ms": latency}
+    return {**item.settings, "closest_m": round(closest, 3), "completion_s": completed}
 
 
 def closest_m(path: Path) -> float:
@@ -99,6 +89,5 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
             "completed": sum(len(row["completion_s"]) for row in mine),
             "closest_m": min(row["closest_m"] for row in mine),
             "completion_s": [min(times), max(times)],
-            "position_latency_ms": max(row["position_latency_ms"] for row in mine),  # median, of the slowest vehicle
         }
     return found

@@ -120,11 +120,7 @@ class Dongle:
         self._release(self._device)
 
 
-def _devices(settings: CrazyradioSettings) -> list[Any]:
-    if settings.simulated_radio:
-        from .simulated import simulated_dongles
-
-        return simulated_dongles(Path(settings.simulated_radio))
+def _real_devices() -> list[Any]:
     import usb.core
 
     backend = None  # pyusb looks for a libusb of the system
@@ -142,9 +138,13 @@ def _found(settings: CrazyradioSettings) -> Any:
     """
     import usb.core
 
-    radio = settings.place.radio
+    radio, simulated = settings.place.radio, None
+    if settings.simulated_radio:
+        from .simulated import simulated_dongles
+
+        simulated = simulated_dongles(Path(settings.simulated_radio))
     try:
-        found = _devices(settings)
+        found: list[Any] = _real_devices() if simulated is None else simulated
         if len(radio) <= _BY_NUMBER and radio.isdigit():
             chosen = found[int(radio) : int(radio) + 1]
         else:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import math
+import struct
+from collections.abc import Callable, Mapping
 from ctypes import POINTER, Structure, c_char_p, c_double, c_int, c_int32, c_int64, c_uint8, c_uint64
 from enum import IntEnum
 from pathlib import Path
@@ -11,6 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import DtsaError
+from dtsa_bench.crazyflies.simulated.firmware import Setpoint
+from dtsa_bench.crazyflies.simulated.toc import LOG_TYPES, PARAM_TYPES, READ_ONLY, Entry
+
+_PARAM_NAMES = {code: name for name, (code, _) in PARAM_TYPES.items()}
+_LOG_NAMES = {code: name for name, (code, _) in LOG_TYPES.items()}
+_SETPOINT = struct.Struct("<9i13f")  # native/crazyflie.c
+_ABSOLUTE, _VELOCITY = 1, 2  # modes of an axis
 
 
 class Event(IntEnum):
@@ -52,6 +62,36 @@ _SIGNATURES = {
     "lab_set": (None, [c_int, c_int64, c_int, c_double]),
     "lab_end": (None, []),
 }
+
+
+def decode_setpoint(data: bytes, t: float, yaw: float) -> tuple[int, Setpoint]:
+    """Priority and set-point that an app gave at t (s), with its heading (rad) then.
+
+    Thrust and attitude alone mean level flight, or stopped motors without thrust: no more of them is simulated.
+    """
+    priority, x, _, z, _, _, yaw_mode, _, body, *values = _SETPOINT.unpack(data)
+    place, speed, heading, rate = values[:3], values[3:6], values[8], values[11]
+    setpoint = Setpoint(t)
+    if yaw_mode == _ABSOLUTE:
+        setpoint.yaw = math.radians(heading)
+    elif yaw_mode == _VELOCITY:
+        setpoint.yaw_rate = math.radians(rate)
+    vx, vy, vz = speed
+    if z == _ABSOLUTE:
+        setpoint.height, vz = place[2], 0.0
+    elif z != _VELOCITY:
+        vz = 0.0
+    if x == _ABSOLUTE:
+        setpoint.position = (place[0], place[1], place[2])
+    elif x == _VELOCITY:
+        if body:
+            c, s = math.cos(yaw), math.sin(yaw)
+            vx, vy = c * vx - s * vy, s * vx + c * vy
+        setpoint.velocity = (vx, vy, vz)
+    else:
+        setpoint.velocity = (0.0, 0.0, vz)
+        setpoint.motors = z in (_ABSOLUTE, _VELOCITY) or values[12] > 0.0
+    return priority, setpoint
 
 
 class Engine:
@@ -99,21 +139,16 @@ class Engine:
         self._library.lab_end()
 
     def run(self, until_ns: int) -> _Told:
-        """Run the apps until a time, or until one asks or tells something: then `kind` is not NONE.
-
-        :param until_ns: ns; not before what was told last.
-        """
+        """Run the apps until a time, or until one asks or tells something: then `kind` is not NONE."""
         self._told = self._run(until_ns).contents
         return self._told
 
     def boot(
         self, vehicle: int, app: Path, now_ns: int, drift_ppb: int, address: int, channel: int, speed: int
     ) -> None:
-        """Switch a vehicle on.
+        """Switch a vehicle on, with a copy of the app that no other one has; address, channel and speed of its radio.
 
-        :param vehicle: its number. :param app: a copy of the app that no other vehicle has. :param now_ns: ns.
-        :param drift_ppb: by so much its clock is fast. :param address: of its radio. :param channel: likewise.
-        :param speed: likewise, 0 to 2.
+        :param drift_ppb: by so much its clock is fast.
         :raises AppError: the app cannot be loaded.
         """
         wrong = self._library.lab_boot(vehicle, str(app).encode(), now_ns, 0, drift_ppb, address, channel, speed)
@@ -159,3 +194,37 @@ class Engine:
         :raises KeyError: it has none of that name, or is switched off.
         """
         self._library.lab_set(vehicle, now_ns, self._variables[vehicle, 1][name], value)
+
+
+class AppVariables:
+    """Parameters, log variables and app channel of one vehicle's app, as a ground station sees them.
+
+    :param now: gives the time, ns. :param receive: gets a packet of the app channel.
+    """
+
+    def __init__(
+        self, vehicle: int, engine: Engine, now: Callable[[], int], receive: Callable[[bytes], object]
+    ) -> None:
+        self._vehicle, self._engine, self._now, self.receive = vehicle, engine, now, receive
+        self.parameters = [self._entry(name, True) for name in engine.names(vehicle, parameters=True)]
+        self.logs = [self._entry(name, False) for name in engine.names(vehicle, parameters=False)]
+
+    def _entry(self, name: str, parameter: bool) -> Entry:
+        group, _, rest = name.partition(".")
+        code = self._engine.type(self._vehicle, name, parameter=parameter)
+        text = (_PARAM_NAMES if parameter else _LOG_NAMES)[code & 15]
+        value = self.parameter(name) if parameter else 0.0
+        return Entry(group, rest, text, value, read_only=parameter and bool(code & READ_ONLY))
+
+    def parameter(self, name: str) -> float:
+        """Value of one of its parameters."""
+        return self._engine.get(self._vehicle, name, parameter=True)
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set one."""
+        self._engine.set(self._vehicle, self._now(), name, value)
+
+    def log_values(self) -> Mapping[str, float]:
+        """Values of its log variables, by their full names."""
+        names = self._engine.names(self._vehicle, parameters=False)
+        return {name: self._engine.get(self._vehicle, name, parameter=False) for name in names}

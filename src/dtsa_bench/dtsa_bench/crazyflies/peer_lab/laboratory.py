@@ -19,9 +19,7 @@ from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
 from dtsa_bench.crazyflies.simulated.peer import Peer
 from dtsa_bench.crazyflies.simulated.planner import DISABLED, FLYING, IDLE, LANDING
 from dtsa_bench.crazyflies.simulated.radio import esb
-from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
-from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
-from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
+from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
 from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
 from dtsa_bench.crazyflies.simulated.world import TICK_S, World
@@ -29,15 +27,12 @@ from dtsa_channel_sim.model.air import Lines
 from dtsa_channel_sim.model.airtime import HEADER_BYTES, airtime_of
 from dtsa_channel_sim.model.medium import Mask, OnAir
 
-from .app import App, Order
+from .app import App
 from .compiling import compile_app, engine_library, private_copy
-from .engine import AppError, Command, Engine, Event
-from .packet import Packet
+from .engine import AppError, AppVariables, Command, Engine, Event, decode_setpoint
 from .polling import Polling
-from .record import Observer, Record
-from .setpoints import setpoint_of
+from .record import Observer, Packet, Record
 from .settings import LabSettings
-from .variables import AppVariables
 
 TICK_NS = round(TICK_S * 1e9)
 ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the id
@@ -56,7 +51,6 @@ class Laboratory:
     :param settings: vehicles, air and ground.
     :param out: directory for files; None: none are written.
     :param observers: look on beside the record.
-    :param radio: dongles that are on the air, too; None: none.
     :raises CompileError: the app does not compile.
     """
 
@@ -66,7 +60,6 @@ class Laboratory:
         settings: LabSettings | None = None,
         out: Path | None = None,
         observers: Sequence[Observer] = (),
-        radio: RadioSide | None = None,
     ) -> None:
         self.settings = settings = settings or LabSettings()
         self.app = app
@@ -82,7 +75,7 @@ class Laboratory:
             engine_library(), count, [*_NAMES, *_OWN_NAMES], _KNOWN, line.to_fixed_ns, line.to_byte_ns,
             round(settings.spin_ms * 1e6),
         )  # fmt: skip
-        self.record = Record(count, app.state, out)
+        self.record = Record(count, app.carries_state, out)
         self._observers: tuple[Observer, ...] = (self.record, *observers)
         config = FleetConfig(
             count=count, start=settings.start, seed=settings.seed, noise=settings.noise, arming=settings.arming
@@ -91,12 +84,8 @@ class Laboratory:
         self._truth = TruthLog(out / "truth.jsonl" if out else None, header)
         self.world = World(config, self._report)
         self.peers = [Peer(*both) for both in zip(self.world.firmware, self.world.estimates, strict=True)]
-        self.agenda = Agenda() if radio is None else radio.agenda
-        self._dongle = None if radio is None else radio.dongles[0]
-        self._first = 1 if radio is None else radio.first  # id on the air of the first vehicle
         streams = np.random.SeedSequence(settings.seed).spawn(2)
-        own = RadioAir(count + 2, settings.loss, int(streams[0].generate_state(1)[0]))
-        self.air = own if radio is None else radio.air
+        self._open_air(int(streams[0].generate_state(1)[0]))
         self._lines = Lines(airtime, count)
         self.overflows = [0] * count  # receptions that found a radio's queue full
         self._handed: list[deque[Packet]] = [deque() for _ in range(count)]  # to the processor, not to the app yet
@@ -105,17 +94,19 @@ class Laboratory:
         self._on = [False] * count
         self._lives = [0] * count  # how often each was switched off
         self._parameters: list[dict[str, float]] = [dict(app.parameters) for _ in range(count)]
-        polls = settings.polls and radio is None  # else the dongles' hosts do that
-        self.polling = Polling(self.air, self.agenda, settings, self.polled) if polls else None
+        self.polling = Polling(self.air, self.agenda, settings, self.polled) if settings.polls else None
         generator = np.random.default_rng(streams[1])
         starts = (generator.random(count) * settings.boot_s * 1e9).astype(np.int64).tolist()
         drifts = np.rint(generator.uniform(-1.0, 1.0, count) * settings.drift_ppm * 1000).astype(np.int64)
         self._drifts: list[int] = drifts.tolist()
         for k, start in enumerate(starts):
             self.at(start / 1e9, lambda k=k: self.switch_on(k + 1))  # type: ignore[misc]
-        for order in app.orders:
-            self.at(order.at, lambda order=order: self._obey(order))  # type: ignore[misc]
         self.agenda.at(TICK_NS, self._tick)
+
+    def _open_air(self, seed: int) -> None:
+        """Make the time line, and the air with all vehicles, a ground station and a foreign radio."""
+        self.agenda, self._first = Agenda(), 1  # id on the air of the first vehicle
+        self.air = RadioAir(self.settings.agents + 2, self.settings.loss, seed)
 
     def __enter__(self) -> Laboratory:
         return self
@@ -217,7 +208,7 @@ class Laboratory:
     def _command(self, k: int, command: Command, data: bytes) -> int:
         firmware, t = self.world.firmware[k], self.time
         if command is Command.SETPOINT:
-            priority, setpoint = setpoint_of(data, t, firmware.yaw)
+            priority, setpoint = decode_setpoint(data, t, firmware.yaw)
             self.record.setpoints += 1
             firmware.offer(setpoint, priority)
             return 0
@@ -262,10 +253,7 @@ class Laboratory:
         self.agenda.at(self.now_ns + TICK_NS, self._tick)
 
     def show(self, k: int) -> None:
-        """Tell a vehicle's app what its firmware knows.
-
-        :param k: its index.
-        """
+        """Tell a vehicle's app (by its index) what its firmware knows."""
         firmware = self.world.firmware[k]
         values = log_values(self.world.estimates[k], firmware, self.time)
         own = firmware.priority, _PLANNER[firmware.planner.state]
@@ -289,19 +277,10 @@ class Laboratory:
     def _left(self, packet: Packet, frame: OnAir) -> None:
         """A packet has left the air: who has it?"""
         self.record.on_air_ns += frame.end_ns - frame.air_ns
-        channel, rate = self.settings.channel, self.settings.rate
-        heard = self.air.heard(channel, frame)
-        if self._dongle is not None:  # dongles in sniffer mode have it, too
-            payload = bytes((0xFF, esb.PEER_PORT | packet.raw[0])) + packet.data
-            self._dongle.overheard(heard, esb.BROADCAST, payload, channel, rate, frame)
-        self.hear(packet, heard, frame)
+        self.hear(packet, self.air.heard(self.settings.channel, frame), frame)
 
     def hear(self, packet: Packet, heard: set[int], frame: OnAir) -> None:
-        """A packet has left the air.
-
-        :param heard: ids on the air of those that can have it.
-        :param frame: its transmission.
-        """
+        """A packet has left the air; `heard` has the ids on the air of the radios that can decode it."""
         received = np.array([on and k in heard for k, on in enumerate(self._on, self._first)])
         for agent in self._take_in(frame.end_ns, len(packet.data), received):
             done_ns, life = self._lines.handed_ns(agent), self._lives[agent - 1]
@@ -431,10 +410,7 @@ class Laboratory:
         """A foreign radio on the channel sends a peer-to-peer packet now, whoever else does.
 
         :param data: at most 60 bytes.
-        :raises ConfigError: there are dongles, which do that.
         """
-        if self._dongle is not None:
-            raise ConfigError("transmit", data, "in a laboratory without dongles")
         packet, settings = Packet(0, bytes((port,)) + data, self.now_ns), self.settings
         radio = settings.agents + 2
         frame = self.air.send(settings.channel, settings.rate, radio, self.now_ns, HEADER_BYTES + len(data))
@@ -468,28 +444,6 @@ class Laboratory:
     def _then_show(self, agent: int, done: bool) -> bool:
         self.show(agent - 1)
         return done
-
-    def _obey(self, order: Order) -> None:
-        values = order.values
-        for agent in order.agents or range(1, self.settings.agents + 1):
-            if order.order in ("arm", "disarm"):
-                self.arm(agent, order.order == "arm")
-            elif order.order == "takeoff":
-                self.take_off(agent, values["height"], values["duration"])
-            elif order.order == "land":
-                self.land(agent, values["height"], values["duration"])
-            elif order.order == "goto":
-                self.go_to(agent, values["x"], values["y"], values["z"], values["duration"])
-            elif order.order == "parameter":
-                self.set_parameter(agent, values["name"], values["value"])
-            elif order.order == "send":
-                self.send(agent, bytes.fromhex(values["data"]))
-            elif order.order == "emergency":
-                self.emergency(agent)
-            elif order.order == "off":
-                self.switch_off(agent)
-            else:
-                self.switch_on(agent)
 
 
 __all__ = ["AppError", "Laboratory"]

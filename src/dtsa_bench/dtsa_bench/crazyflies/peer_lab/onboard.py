@@ -16,10 +16,9 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.settings.on_board import KEY_BYTES, PORT, START, check_on_board, orders, parameters
-from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
 from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 
-from .app import read_app
+from .app import App, read_app
 from .laboratory import Laboratory
 from .record import Observer
 from .settings import LabSettings
@@ -105,9 +104,7 @@ class OnBoard(Observer):
     :param lab: vehicles, air and ground.
     :param out: directory for bags; None: none are made.
     :param key: 16 bytes, of sealed frames.
-    :param enable_s: s, when the agents may steer.
-    :param radio: dongles that are on the air, too; None: none.
-    :param ground: it is played here; else a program on the air tells the apps what to do.
+    :param enable_s: s, when the agents may steer; None: the ground is not played here.
     :param flags: more of the compiler's, for the app.
     :raises ConfigError: for a swarm that the app cannot be.
     """
@@ -118,9 +115,7 @@ class OnBoard(Observer):
         lab: LabSettings,
         out: Path | None = None,
         key: bytes = b"",
-        enable_s: float = 8.0,
-        radio: RadioSide | None = None,
-        ground: bool = True,
+        enable_s: float | None = 8.0,
         flags: Sequence[str] = (),
     ) -> None:
         check_on_board(swarm)
@@ -132,16 +127,21 @@ class OnBoard(Observer):
         settings = dataclasses.replace(lab, agents=swarm.agents, start=start)
         app = read_app(APP)
         app = dataclasses.replace(app, flags=(*app.flags, *flags))
-        self.lab = Laboratory(app, settings, out, [self], radio)
+        self.lab = self._make_laboratory(app, settings, out)
         self._flights = [
             None if out is None else _Flight(k + 1, swarm, out / f"cf{k + 1}.mcap") for k in range(swarm.agents)
         ]
         self._key = key
-        for agent in range(1, swarm.agents + 1) if ground else ():
+        if enable_s is None:
+            return
+        for agent in range(1, swarm.agents + 1):
             self.lab.at(settings.boot_s + 0.1, lambda agent=agent: self.prepare(agent))  # type: ignore[misc]
             height = HEIGHT_M + float(self.scenario.start[2, agent - 1])
             self._at(enable_s - _CLIMB_S - 0.5, self.lab.take_off, agent, height, _CLIMB_S)
             self._at(enable_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
+
+    def _make_laboratory(self, app: App, settings: LabSettings, out: Path | None) -> Laboratory:
+        return Laboratory(app, settings, out, [self])
 
     def _at(self, time_s: float, action: Callable[..., object], *given: Any) -> None:
         self.lab.at(time_s, lambda: action(*given) and None)

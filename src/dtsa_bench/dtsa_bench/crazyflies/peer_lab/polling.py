@@ -7,8 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from dtsa_bench.crazyflies.simulated.radio.agenda import Agenda
-from dtsa_bench.crazyflies.simulated.radio.air import RadioAir
+from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
 from dtsa_bench.crazyflies.simulated.radio.dongle import SET_ADDRESS, SET_CHANNEL, SET_RATE, Dongle
 from dtsa_bench.crazyflies.simulated.radio.esb import RATE_NAMES
 from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, Receiver
@@ -21,11 +20,7 @@ _STREAM = 0x706F6C6C  # of random numbers, besides those of losses and starts
 
 
 class Polling:
-    """One dongle that polls all vehicles in turn.
-
-    :param air: the air. :param agenda: what happens when. :param settings: how often.
-    :param taken: called with an id and the time (s) when a vehicle's radio has a packet.
-    """
+    """One dongle that polls all vehicles in turn; `taken` gets an id and the time (s) when its radio has a packet."""
 
     def __init__(
         self, air: RadioAir, agenda: Agenda, settings: LabSettings, taken: Callable[[int, float], None]

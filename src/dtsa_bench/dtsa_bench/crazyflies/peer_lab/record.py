@@ -5,23 +5,33 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .app import StateRule
-from .packet import Packet
-
 _FLYING_M = 0.05  # higher than that it is in the air
 
 
-class Ages:
-    """How old what each vehicle knows of each other one is, from the first packet that it heard of it on.
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """A peer-to-peer packet on its way."""
 
-    :param agents: number of vehicles.
-    """
+    sender: int  # id; 0: a foreign one
+    raw: bytes  # port and data
+    ordered_ns: int  # when the app ordered to send it
+
+    @property
+    def data(self) -> bytes:
+        """Without the port."""
+        return self.raw[1:]
+
+
+class Ages:
+    """How old what each vehicle knows of each other one is, from the first packet that it heard of it on."""
 
     def __init__(self, agents: int) -> None:
         shape = (agents, agents)  # receiver, sender
@@ -32,10 +42,7 @@ class Ages:
         self._worst = np.zeros(shape, dtype=np.int64)
 
     def heard(self, receiver: int, sender: int, stamp_ns: int, now_ns: int) -> None:
-        """A state has come.
-
-        :param receiver: id. :param sender: id. :param stamp_ns: ns, its time. :param now_ns: ns.
-        """
+        """A state of a sender (id) has come to a receiver (id)."""
         pair = receiver - 1, sender - 1
         if stamp_ns <= self._stamp[pair]:
             return
@@ -51,10 +58,7 @@ class Ages:
         self._worst[pair] = max(int(self._worst[pair]), last)
 
     def summary(self, now_ns: int) -> dict[str, Any]:
-        """Mean and largest age in ms, and the share of pairs that know each other.
-
-        :param now_ns: ns, the end.
-        """
+        """Mean and largest age in ms until the end, and the share of pairs that know each other."""
         known = list(zip(*(index.tolist() for index in np.nonzero(self._stamp >= 0)), strict=True))
         for pair in known:
             self._add(pair, now_ns)
@@ -93,25 +97,20 @@ class Observer:
         """Something happened to a vehicle."""
 
     def on_positions(self, now_ns: int, position: NDArray[np.float64]) -> None:
-        """True places, every 10 ms.
-
-        :param position: (3, N), m, world.
-        """
+        """True places, every 10 ms, (3, N), m, world."""
 
 
 class Record(Observer):
     """Counts, ages, distances, and the digest of all of it.
 
-    :param agents: number of vehicles.
-    :param rule: which packets carry a state.
+    :param carries_state: as of an app.
     :param directory: where files are written; None: nowhere.
     """
 
-    def __init__(self, agents: int, rule: StateRule, directory: Path | None = None) -> None:
-        self._rule, self._ages, self._digest = rule, Ages(agents), hashlib.sha256()
+    def __init__(self, agents: int, carries_state: Callable[[bytes, int], bool], directory: Path | None = None) -> None:
+        self._carries_state, self._ages, self._digest = carries_state, Ages(agents), hashlib.sha256()
         self.agents = agents
         self.sent, self.heard = [0] * agents, [0] * agents
-        self.collided = 0  # receptions that another packet, or the receiver's own, destroyed or noise took
         self.setpoints = 0
         self.on_air_ns = 0
         self.nearest: tuple[float, float, int, int] | None = None  # m, s, ids
@@ -138,7 +137,7 @@ class Record(Observer):
         self.heard[agent - 1] += 1
         self._note(1, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
-        if packet.sender and self._rule.counts(packet.data, agent):
+        if packet.sender and self._carries_state(packet.data, agent):
             self._ages.heard(agent, packet.sender, packet.ordered_ns, now_ns)
 
     def on_command(self, agent: int, now_ns: int, code: int, data: bytes) -> None:
@@ -177,10 +176,7 @@ class Record(Observer):
             self._file = None
 
     def summary(self, now_ns: int) -> dict[str, Any]:
-        """What came of it.
-
-        :param now_ns: ns, the end.
-        """
+        """What came of it until the end."""
         near = self.nearest
         return {
             "agents": self.agents,

@@ -7,7 +7,7 @@ from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
-from dtsa_bench.crazyflies.simulated import layout
+from dtsa_bench.crazyflies.simulated.fleet_config import start_positions
 from dtsa_bench.crazyflies.simulated.radio.esb import BITRATES
 
 
@@ -52,7 +52,7 @@ class LabSettings(Settings):
     def __post_init__(self) -> None:
         check(self)
         if self.start is None and self.radius_m:
-            circle = layout.positions("ellipse", self.agents, (self.radius_m, self.radius_m))
+            circle = start_positions("ellipse", self.agents, (self.radius_m, self.radius_m))
             object.__setattr__(self, "start", circle)
         if self.polls * self.agents > 5000:
             raise ConfigError("polls", self.polls, f"at most {5000 / self.agents:g} for {self.agents} vehicles")

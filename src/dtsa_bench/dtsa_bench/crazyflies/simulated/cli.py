@@ -6,23 +6,21 @@ import argparse
 import dataclasses
 import os
 import signal
-import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.process.priority import take_priority
-from dtsa_bench.crazyflies.simulated.radio.dongles import Dongles
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+from dtsa_bench.crazyflies.simulated.radio.side import Dongles
 from dtsa_bench.runs.options import add_options, given, whole_number
 
-from . import layout
 from .control import FAULTS, send_fault
 from .fleet import NUMBERS, Fleet
-from .fleet_config import FleetConfig
-from .ports import free_port
+from .fleet_config import LAYOUTS, FleetConfig, start_positions
 
 DESCRIPTION = """\
 Simulated Crazyflies over UDP: cflib, its client and the Crazyflie bridge connect to them as to real ones.
@@ -32,14 +30,8 @@ They fly, drain their batteries and fail on command; Ctrl-C ends them."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     add_options(parser, FleetConfig, "fleet", skip=("host", "collision_m", "crash_m"))
-    parser.add_argument(
-        "--motion-capture",
-        action="store_true",
-        help="a process beside it publishes /cfN/pose at 100 Hz, as a motion capture system does, and they know no "
-        "other positions (--positions host)",
-    )
     parser.add_argument("--config", type=Path, help="swarm.yaml: count, ports and start positions come from its robots")
-    parser.add_argument("--layout", choices=layout.LAYOUTS, default="ellipse", help="start positions (%(default)s)")
+    parser.add_argument("--layout", choices=LAYOUTS, default="ellipse", help="start positions (%(default)s)")
     parser.add_argument(
         "--half-axes", type=float, nargs=2, default=(1.2, 2.0), metavar=("X", "Y"), help="m, of the layout (1.2 2.0)"
     )
@@ -84,15 +76,13 @@ def fleet_config(args: argparse.Namespace) -> FleetConfig:
     """
     radio = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
     options = {**given(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
-    if args.motion_capture:
-        options = {"positions": "host", "tracking_port": free_port()} | options
     if args.config is not None:
         return _from_swarm(args.config, options)
     if radio.path is not None:
         allowed = "--config FILE with --simulated-radio: its URIs say where they listen; or --dongles-only"
         raise ConfigError("config", None, allowed)
     config = FleetConfig(**options)
-    start = layout.positions(args.layout, config.count, tuple(args.half_axes))
+    start = start_positions(args.layout, config.count, tuple(args.half_axes))
     return dataclasses.replace(config, start=start)
 
 
@@ -137,20 +127,6 @@ def request_fault(args: argparse.Namespace) -> None:
     print(f"{args.fault}: cf {args.cf}")
 
 
-def start_cameras(config: FleetConfig) -> subprocess.Popen[bytes]:
-    """The motion capture of a fleet: a process of its own, as in a laboratory. It ends with this one."""
-    from dtsa_agent.ros.common.process.node_process import SUPERVISOR  # the fleet itself needs no ROS
-
-    command = [
-        sys.executable,
-        "-m",
-        "dtsa_bench.crazyflies.simulated.motion_capture",
-        "--port",
-        str(config.tracking_port),
-    ]
-    return subprocess.Popen(command, env=os.environ | {SUPERVISOR: str(os.getpid())}, start_new_session=True)
-
-
 def status_line(fleet: Fleet) -> str:
     """One line about the fleet."""
     states: dict[str, int] = {}
@@ -174,12 +150,8 @@ def run(args: argparse.Namespace) -> int:
     if args.dongles_only:
         return _run_dongles(args, priority)
     fleet = Fleet(fleet_config(args))
-    cameras = start_cameras(fleet.config) if args.motion_capture else None
     take_priority(priority)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: fleet.stop())
-    if args.ignore_interrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_by_signals(fleet.stop, args.ignore_interrupt)
     for uri in fleet.config.uris:
         print(uri)
     print(
@@ -189,15 +161,17 @@ def run(args: argparse.Namespace) -> int:
     )
     if not args.quiet:
         _show_status(fleet)
-    try:
-        fleet.run()
-    finally:
-        if cameras is not None:
-            cameras.terminate()
-            cameras.wait()
+    fleet.run()
     if not args.quiet:
         print(status_line(fleet))
     return 0
+
+
+def _end_by_signals(stop: Callable[[], None], ignore_interrupt: bool) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop())
+    if ignore_interrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _run_dongles(args: argparse.Namespace, priority: int) -> int:
@@ -207,10 +181,7 @@ def _run_dongles(args: argparse.Namespace, priority: int) -> int:
     settings = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
     dongles = Dongles(settings)
     take_priority(priority)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: dongles.stop())
-    if args.ignore_interrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_by_signals(dongles.stop, args.ignore_interrupt)
     print(f"{settings.dongles} simulated Crazyradios at {settings.path}; Ctrl-C ends", flush=True)
     dongles.run()
     return 0
@@ -219,20 +190,17 @@ def _run_dongles(args: argparse.Namespace, priority: int) -> int:
 def _show_status(fleet: Fleet) -> None:
     """Refresh the status line every half second on a terminal, every ten seconds in a file."""
     terminal = sys.stdout.isatty()
-    period = 0.5 if terminal else 10.0
-    last = [time.monotonic()]
-    step = fleet.step
+    period, end = (0.5, "") if terminal else (10.0, "\n")
+    last = time.monotonic()
 
-    def step_and_show() -> None:
-        step()
-        if time.monotonic() - last[0] >= period:
-            last[0] = time.monotonic()
-            print(
-                "\r" + status_line(fleet) + " " * 10 if terminal else status_line(fleet), end="" if terminal else "\n"
-            )
-            sys.stdout.flush()
+    def show() -> None:
+        nonlocal last
+        if time.monotonic() - last >= period:
+            last = time.monotonic()
+            line = status_line(fleet)
+            print(f"\r{line}          " if terminal else line, end=end, flush=True)
 
-    fleet.step = step_and_show  # type: ignore[method-assign]
+    fleet.shown = show
 
 
 def main(argv: list[str] | None = None) -> int:

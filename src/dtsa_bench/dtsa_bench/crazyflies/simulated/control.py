@@ -16,7 +16,6 @@ FAULTS = {
     "tumble": "turn over in the air: it falls",
     "estimate_jump": "the estimate is this far (distance, m, default 2) from the truth along x",
     "estimate_freeze": "the estimate does not change any more",
-    "unseen": "motion capture does not see it",
     "battery": "show this voltage (V, default 3.0)",
     "heal": "all of the above is over; a fallen Crazyflie is put upright",
     "reboot": "power off and on: everything is forgotten, also an emergency stop",

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from .firmware import Firmware
 from .planner import IDLE, Triple
-from .position_filter import PositionFilter
 
 GRAVITY = 9.81
 VARIANCE_RESET = 1.0  # m^2, right after the estimator was reset
@@ -17,40 +16,35 @@ CONVERGE_S = 0.08  # s, time constant
 
 @dataclass(slots=True)
 class Estimate:
-    """One vehicle's state as its own estimator sees it."""
+    """One vehicle's state as its own estimator sees it: decks measure its position. Times (`t`) are s, the fleet's."""
 
     position: Triple = (0.0, 0.0, 0.0)  # m, world (z = 0 is the floor)
     velocity: Triple = (0.0, 0.0, 0.0)  # m/s
     acceleration: Triple = (0.0, 0.0, 0.0)  # m/s^2
     reset_time: float = -1e9  # s, when the estimator was reset
-    filter: PositionFilter | None = None  # None: decks measure the position
     offset: Triple = (0.0, 0.0, 0.0)  # m: a fault, so far it is from the truth
     frozen: bool = False  # a fault: it does not change any more
 
-    def tell(self, position: Triple, velocity: Triple, acceleration: Triple) -> None:
-        """What the filter says now, unless a fault is in the way.
-
-        :param position: m, world. :param velocity: m/s. :param acceleration: m/s^2.
-        """
+    def update(self, position: Triple, velocity: Triple, acceleration: Triple) -> None:
+        """The filter's new state (m, m/s, m/s^2, world), unless a fault is in the way."""
         if not self.frozen:
             x, y, z = (p + o for p, o in zip(position, self.offset, strict=True))
             self.position, self.velocity, self.acceleration = (x, y, z), velocity, acceleration
 
-    def variance(self, t: float) -> float:
-        """Variance of the position in m^2: large after a reset, then small.
+    def correct(self, place: Triple, deviation: float) -> None:
+        """A position from outside (m, world, with its standard deviation): decks know better."""
 
-        :param t: s, the fleet's clock.
-        """
-        if self.filter is not None:
-            return self.filter.variance
+    def reset(self, t: float, place: Triple) -> None:
+        """The estimator is restarted at a place (m, world)."""
+        self.reset_time = t
+
+    def variance(self, t: float) -> float:
+        """Variance of the position in m^2: large after a reset, then small."""
         return VARIANCE_REST + VARIANCE_RESET * math.exp(-(t - self.reset_time) / CONVERGE_S)
 
 
 def attitude(acceleration: Triple, yaw: float) -> tuple[float, float]:
-    """Roll and pitch (rad, REP-103) of a quadcopter that accelerates so.
-
-    :param acceleration: m/s^2, world. :param yaw: rad.
-    """
+    """Roll and pitch (rad, REP-103) of a quadcopter with this acceleration (m/s^2, world) and heading (rad)."""
     ax, ay, az = acceleration
     c, s = math.cos(yaw), math.sin(yaw)
     forward, left, up = c * ax + s * ay, -s * ax + c * ay, max(az + GRAVITY, 1.0)

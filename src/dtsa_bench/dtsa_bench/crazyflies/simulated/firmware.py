@@ -14,10 +14,10 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from .battery import Battery
+from dtsa_agent.crazyflie.state.conversions import decompress_quaternion, yaw_of
+
 from .planner import DISABLED, Goal, Planner, Triple
 from .supervisor import LEVEL_OUT, Supervisor
-from .trajectories import Trajectory, TrajectoryMemory
 
 # What the vehicle does during a step.
 OFF = "off"  # motors stopped: it falls, or stands
@@ -26,6 +26,33 @@ LEVEL = "level"  # attitude level: drifts on, only drag slows it down; height is
 
 POSITION_GAIN = 2.0  # 1/s
 PRIORITY_NONE, PRIORITY_LOWEST, PRIORITY_HIGH_LEVEL, PRIORITY_STREAM = 0, 1, 1, 2  # an app's may be higher
+
+# Of the battery, a single lithium cell.
+FULL_V = 4.15
+EMPTY_V = 3.25
+SAG_V = 0.15  # while the motors run
+FLIGHT_S = 420.0  # a full cell's time in the air
+IDLE_S = 7200.0
+
+
+class Battery:
+    """Charge of one cell, and the voltage that it shows under load."""
+
+    def __init__(self, charge: float = 1.0) -> None:
+        self.charge = charge  # 1 full; may go below 0 by force, to show what the firmware makes of it
+        self.voltage = FULL_V
+        self.update(0.0, motors=False)
+
+    def update(self, dt: float, *, motors: bool) -> None:
+        """Use energy for dt seconds."""
+        if dt and self.charge > 0:
+            self.charge = max(0.0, self.charge - dt / (FLIGHT_S if motors else IDLE_S))
+        self.voltage = EMPTY_V + (FULL_V - EMPTY_V) * self.charge - (SAG_V if motors else 0.0)
+
+    def force(self, voltage: float, *, motors: bool) -> None:
+        """Set the charge so that this voltage (V) is shown at the present load."""
+        self.charge = (voltage + (SAG_V if motors else 0.0) - EMPTY_V) / (FULL_V - EMPTY_V)
+        self.update(0.0, motors=motors)
 
 
 @dataclass(slots=True)
@@ -63,23 +90,8 @@ def _decode_full_state(data: bytes, t: float) -> Setpoint:
     position, velocity, acceleration = (
         (values[i] / 1000, values[i + 1] / 1000, values[i + 2] / 1000) for i in (0, 3, 6)
     )
-    return Setpoint(t, position, velocity, acceleration, yaw=yaw_of(values[9]), yaw_rate=values[12] / 1000)
-
-
-def yaw_of(compressed: int) -> float:
-    """Heading (rad) of a quaternion in the firmware's 32 bits: index of the largest component, then the others."""
-    largest = compressed >> 30
-    q = [0.0] * 4
-    rest = 1.0
-    for i in (3, 2, 1, 0):
-        if i != largest:
-            size = (compressed & 511) / 511 / math.sqrt(2)
-            q[i] = -size if compressed & 512 else size
-            rest -= q[i] * q[i]
-            compressed >>= 10
-    q[largest] = math.sqrt(max(rest, 0.0))
-    x, y, z, w = q
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    yaw = yaw_of(decompress_quaternion(values[9]))
+    return Setpoint(t, position, velocity, acceleration, yaw=yaw, yaw_rate=values[12] / 1000)
 
 
 # Type byte of a packet on the generic commander's port -> decoder. 8 and 10 count yaw rates as everybody does; the
@@ -93,7 +105,7 @@ DECODERS: dict[int, tuple[int, Callable[[bytes, float], Setpoint]]] = {
 
 
 class Firmware:
-    """Commander, high-level commander, supervisor and battery of one Crazyflie.
+    """Commander, high-level commander, supervisor and battery of one Crazyflie. Times (`t`) are s, the fleet's clock.
 
     :param report: called with the name of each event and details, for the record.
     :param tau: s, lag of the vehicle's velocity, which wanted accelerations make up for.
@@ -110,7 +122,6 @@ class Firmware:
         """Power on."""
         self.supervisor = Supervisor(self._report, auto_arming=self._auto_arming)
         self.planner = Planner()
-        self.trajectories = TrajectoryMemory()
         self.groups = 0  # a bit each
         self.battery = Battery()
         self.setpoint: Setpoint | None = None
@@ -121,10 +132,7 @@ class Firmware:
 
     # -- commands from the radio ------------------------------------------------------------------------------------
     def stream(self, data: bytes, t: float) -> None:
-        """A packet of the generic commander: a streamed setpoint.
-
-        :param t: s, the fleet's clock.
-        """
+        """A packet of the generic commander: a streamed setpoint."""
         kind = data[0] if data else -1
         if kind == 0:
             self._accept(Setpoint(t, motors=False))
@@ -132,10 +140,7 @@ class Firmware:
             self._accept(DECODERS[kind][1](data[1:], t))
 
     def manual(self, data: bytes, t: float) -> None:
-        """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled.
-
-        :param t: s, the fleet's clock.
-        """
+        """Roll, pitch, yaw rate, thrust: only thrust 0 (stop) and level flight are modelled."""
         if len(data) < 14:
             return
         *_, thrust = struct.unpack_from("<3fH", data)
@@ -150,10 +155,7 @@ class Firmware:
         self.offer(setpoint, PRIORITY_STREAM)
 
     def offer(self, setpoint: Setpoint, priority: int) -> bool:
-        """Take a setpoint from a source; False: one of a higher priority counts.
-
-        :param priority: of the source.
-        """
+        """Accept a setpoint from a source of this priority; False: one of a higher priority counts."""
         if priority < self._priority:
             return False
         self._priority = priority
@@ -173,16 +175,11 @@ class Firmware:
             self._report("stream ended")
 
     def high_level(self, data: bytes, t: float) -> int:
-        """A packet of the high-level commander; 0, or an error number of the firmware's.
-
-        :param t: s, the fleet's clock.
-        """
+        """A packet of the high-level commander; 0, or an error number of the firmware's. There are no trajectories."""
         kind = data[0] if data else -1
-        lengths = {3: 2, 6: 9, 7: 15, 8: 15, 12: 24, 13: 10}
+        lengths = {3: 2, 7: 15, 8: 15, 12: 24}
         if len(data) < lengths.get(kind, math.inf):
             return errno.ENOEXEC
-        if kind == 6:
-            return self.trajectories.define(data[1:])
         if kind != 3 and not self.supervisor.motors_allowed:
             return errno.EBUSY
         if data[1] and not data[1] & self.groups:
@@ -192,8 +189,6 @@ class Firmware:
             self._report("high-level stop")
             return 0
         here = self._here
-        if kind == 13:
-            return self._start_trajectory(data, t, here)
         if kind == 12:
             _, relative, _, x, y, z, yaw, duration = struct.unpack_from("<B??5f", data, 1)
             if relative:
@@ -207,22 +202,6 @@ class Firmware:
         if not order(t, here, height, self.yaw if keep_yaw else yaw, duration):
             return 1
         self._report(name, height=round(height, 3))
-        return 0
-
-    def _start_trajectory(self, data: bytes, t: float, here: Goal) -> int:
-        """Fly an uploaded trajectory; as in the firmware nothing happens, and nobody is told, if there is none."""
-        _, relative, _, reverse, number, timescale = struct.unpack_from("<B???Bf", data, 1)
-        if self.trajectories.compressed(number) and (reverse or timescale != 1.0):
-            return errno.ENOEXEC
-        pieces = self.trajectories.pieces(number)
-        if pieces is None or not timescale > 0.0:
-            return 0
-        way = Trajectory(t, pieces, timescale, reverse)
-        if relative:
-            x, y, z = (a - b for a, b in zip(here.position, way.goal(t).position, strict=True))
-            way = Trajectory(t, pieces, timescale, reverse, (x, y, z))
-        self.planner.follow(way)
-        self._report("trajectory", id=number, duration=round(way.duration, 3))
         return 0
 
     # -- one step of control ----------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import json
 import selectors
 import socket
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,6 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated.radio.side import Host, RadioSide
 
-from .cameras import Cameras
 from .control import check_fault
 from .fleet_config import FleetConfig
 from .peer import Peer
@@ -42,7 +42,7 @@ class _Link:
 
 
 class Fleet:
-    """The fleet. `run()` flies it until `stop()` is called from anywhere.
+    """The fleet. `run()` flies it until `stop()` is called from anywhere; `shown` is called after each step.
 
     :raises ConfigError: a port is in use.
     """
@@ -75,9 +75,9 @@ class Fleet:
             Peer(f, e, config.protocol, k)
             for k, (f, e) in enumerate(zip(self.firmware, self.estimates, strict=True), 1)
         ]
-        self.cameras = Cameras(config.tracking_port, config.count) if config.tracking_port else None
         self._loss = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(3)[1])
         self._running = True
+        self.shown: Callable[[], None] = lambda: None
 
     # -- life cycle -------------------------------------------------------------------------------------------------
     def _bind(self, port: int) -> socket.socket:
@@ -112,8 +112,6 @@ class Fleet:
         if self._control is not None:
             self._control.close()
             self._control = None
-        if getattr(self, "cameras", None) is not None:
-            self.cameras.close()
         if self.radio is not None:
             self.radio.close()
             self.radio = None
@@ -139,6 +137,7 @@ class Fleet:
                     origin += skipped
                     self.truth.event(self.time, 0, "machine too slow", skipped_s=round(skipped, 3))
                 self.step()
+                self.shown()
         finally:
             self.close()
 
@@ -152,8 +151,6 @@ class Fleet:
         """Fly for one tick of 10 ms and send what is due."""
         self.world.step(self.time, self._tick)
         self.truth.positions(self.time, self.vehicles.position)
-        if self.cameras is not None:
-            self.cameras.look(self.vehicles.position, [f.yaw for f in self.firmware])
         self._send_logs()
         for k, link in enumerate(self._links):
             if link.heal_at is not None and self.time >= link.heal_at:
@@ -257,9 +254,8 @@ class Fleet:
             self._control.sendto(json.dumps(answer, default=str).encode(), host)
 
     def fault(self, request: dict[str, Any]) -> None:
-        """Let vehicles fail.
+        """Let vehicles fail (see `check_fault`).
 
-        :param request: see `dtsa_bench.crazyflies.simulated.control.check_fault`.
         :raises ConfigError: it is not understood.
         """
         name, indices = check_fault(request, self.config.count)
@@ -292,8 +288,6 @@ class Fleet:
             self.estimates[index].offset = (request.get("distance", 2.0), 0.0, 0.0)
         elif name == "estimate_freeze":
             self.estimates[index].frozen = True
-        elif name == "unseen" and self.cameras is not None:
-            self.cameras.unseen.add(index)
         elif name == "battery":
             motors = firmware.supervisor.motors_allowed and firmware.supervisor.flying
             firmware.battery.force(request.get("voltage", 3.0), motors=motors)
@@ -314,7 +308,5 @@ class Fleet:
             link.socket = self._bind(self.config.base_port + index)
             self._selector.register(link.socket, selectors.EVENT_READ, index)
         self.estimates[index].offset, self.estimates[index].frozen = (0.0, 0.0, 0.0), False
-        if self.cameras is not None:
-            self.cameras.unseen.discard(index)
         self.firmware[index].supervisor.refuse_arming = False
         self.firmware[index].supervisor.tumbled = False

@@ -1,22 +1,54 @@
-"""What a fleet of simulated Crazyflies is made of."""
+"""What a fleet of simulated Crazyflies is made of, and where they stand at the start."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_agent.core.settings.flight_models import AVOIDERS, flight_model
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
 
-from . import layout
 from .peer import PROTOCOLS
 
 MAX_COUNT = 200
+LAYOUTS = ("ellipse", "grid", "line")
+
+
+def start_positions(layout: str, count: int, half_axes: tuple[float, float] = (1.2, 2.0)) -> NDArray[np.float64]:
+    """Start positions on the floor, (3, count), m, world.
+
+    :param layout: `ellipse` (in the order of their ids, counter-clockwise from the x axis), `grid` or `line`.
+    :param half_axes: m, along x and y.
+    :raises ConfigError: unknown layout.
+    """
+    a, b = half_axes
+    result = np.zeros((3, count))
+    index = np.arange(count)
+    if layout == "ellipse":
+        angle = 2 * math.pi * index / count
+        result[0], result[1] = a * np.cos(angle), b * np.sin(angle)
+    elif layout == "grid":
+        columns = max(1, math.ceil(math.sqrt(count * a / b)))
+        result[0] = _spread(index % columns, columns, a)
+        result[1] = _spread(index // columns, math.ceil(count / columns), b)
+    elif layout == "line":
+        result[1] = _spread(index, count, b)
+    else:
+        raise ConfigError("layout", layout, "one of " + ", ".join(LAYOUTS))
+    return result
+
+
+def _spread(index: NDArray[np.int64], number: int, half: float) -> NDArray[np.float64]:
+    if number == 1:
+        return np.zeros(len(index))
+    return np.asarray(half * (2 * index / (number - 1) - 1), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +75,6 @@ class FleetConfig(Settings):
         "Bolt), or every second one so",
         choices=("auto", "required", "mixed"),
     )
-    positions: str = setting(
-        "decks", "source of their positions: decks of their own, or positions that the host sends",
-        choices=("decks", "host"),
-    )  # fmt: skip
-    tracking_port: int = setting(
-        0, "UDP port on this machine that gets the positions of all 100 times a second; 0: none",
-        minimum=0, maximum=65535,
-    )  # fmt: skip
     noise: bool = setting(True, "sensors have noise")
     model: str = setting("orca", "flight model that has their vehicle", choices=AVOIDERS.names, open_choices=True)
     collision_m: float = setting(
@@ -66,7 +90,7 @@ class FleetConfig(Settings):
             raise ConfigError("base_port", self.base_port, f"1024 to {65536 - self.count} for {self.count} vehicles")
         flight_model(self.model)
         if self.start is None:
-            object.__setattr__(self, "start", layout.positions("ellipse", self.count))
+            object.__setattr__(self, "start", start_positions("ellipse", self.count))
         elif np.shape(self.start) != (3, self.count):
             raise ConfigError("start", np.shape(self.start), f"an array of shape (3, {self.count})")
         if not self.control_port:

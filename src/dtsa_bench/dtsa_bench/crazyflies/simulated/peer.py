@@ -54,10 +54,8 @@ class OnBoard(Protocol):
 
 
 class Peer:
-    """Protocol state of one simulated Crazyflie: log blocks and parameter values.
+    """Protocol state of one simulated Crazyflie: log blocks and parameter values. Times (`t`) are s, the fleet's clock.
 
-    :param firmware: whom the commands go to.
-    :param estimate: where the log values come from.
     :param protocol: version that is told to the host, 10 or 12.
     :param number: last byte of its address, by which packets to several name it.
     """
@@ -86,9 +84,7 @@ class Peer:
             (crtp.PARAM, 1): self._param_read,
             (crtp.PARAM, 2): self._param_write,
             (crtp.PARAM, 3): self._param_misc,
-            (crtp.MEMORY, 0): lambda data, t: self.firmware.trajectories.info(data),
-            (crtp.MEMORY, 1): lambda data, t: self.firmware.trajectories.read(data),
-            (crtp.MEMORY, 2): lambda data, t: self.firmware.trajectories.write(data),
+            (crtp.MEMORY, 0): lambda data, t: b"\x01\0" if data[:1] == b"\x01" else None,  # there are none
             (crtp.COMMANDER, 0): self._manual,
             (crtp.LOCALIZATION, 0): self._ext_position,
             (crtp.LOCALIZATION, 1): self._localization,
@@ -130,10 +126,7 @@ class Peer:
         return None if reply is None else crtp.pack(port, channel, reply)
 
     def log_packets(self, tick: int, t: float) -> Iterator[bytes]:
-        """Log data that is due in this tick of 10 ms.
-
-        :param t: s, the fleet's clock.
-        """
+        """Log data that is due in this tick of 10 ms."""
         due = [(i, b) for i, b in self.blocks.items() if b.period and (tick - b.phase) % b.period == 0]
         if due:
             values = log_values(self.estimate, self.firmware, t)
@@ -188,9 +181,8 @@ class Peer:
 
     def _positioned(self, place: tuple[float, float, float]) -> None:
         self.positions_received += 1
-        if self.estimate.filter is not None and all(map(math.isfinite, place)):
-            deviation = self.values[toc.PARAM_ID["locSrv.extPosStdDev"]]
-            self.estimate.filter.correct(place, max(deviation, 1e-4))
+        if all(map(math.isfinite, place)):
+            self.estimate.correct(place, max(self.values[toc.PARAM_ID["locSrv.extPosStdDev"]], 1e-4))
 
     def _localization(self, data: bytes, t: float) -> bytes | None:
         if data[:1] == b"\x08":
@@ -305,10 +297,7 @@ class Peer:
         return head + b"\0"
 
     def set_parameter(self, index: int, value: float, t: float) -> None:
-        """Set one of the firmware's parameters, unless it can only be read.
-
-        :param index: in `toc.PARAM_ENTRIES`. :param value: what it is set to. :param t: s, the fleet's clock.
-        """
+        """Set a parameter (its index in the table), unless it can only be read."""
         entry = self._params[index]
         if entry.read_only:
             return
@@ -316,10 +305,8 @@ class Peer:
         if self._app is not None and index >= len(toc.PARAM_ENTRIES):
             self._app.set_parameter(entry.full_name, value)
         if entry.full_name == "kalman.resetEstimation" and value:
-            self.estimate.reset_time = t
-            if self.estimate.filter is not None:
-                x, y, z = (self.values[toc.PARAM_ID[f"kalman.initial{axis}"]] for axis in "XYZ")
-                self.estimate.filter.reset((x, y, z))
+            x, y, z = (self.values[toc.PARAM_ID[f"kalman.initial{axis}"]] for axis in "XYZ")
+            self.estimate.reset(t, (x, y, z))
         elif entry.full_name == "hlCommander.groupmask":
             self.firmware.groups = int(value)
         elif entry.full_name == "stabilizer.stop" and value:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 Triple = tuple[float, float, float]
 
@@ -25,12 +24,9 @@ class Goal:
 
 
 def septic(p0: float, v0: float, a0: float, p1: float, duration: float) -> tuple[float, ...]:
-    """Coefficients (constant first) of the polynomial of degree 7 from (p0, v0, a0) to rest at p1.
+    """Coefficients (constant first) of the polynomial of degree 7 from (p0, v0, a0) to rest at p1 within a duration.
 
-    Jerk is zero at both ends, acceleration at the end.
-
-    :param p0: start, m. :param v0: speed at the start, m/s. :param a0: acceleration there, m/s^2. :param p1: end, m.
-    :param duration: s; without one the end is reached at once.
+    Jerk is zero at both ends, acceleration at the end. Without a duration the end is reached at once.
     """
     t = duration
     if t <= 0.0:
@@ -75,24 +71,12 @@ class Path:
         return Goal((x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2]), self.end.yaw)
 
 
-class Way(Protocol):
-    """Anything that the planner can follow."""
-
-    @property
-    def start(self) -> float: ...
-
-    @property
-    def duration(self) -> float: ...
-
-    def goal(self, t: float) -> Goal: ...
-
-
 class Planner:
-    """Paths between high-level commands. Time is an argument."""
+    """Paths between high-level commands. Times (`t`) are s by the fleet's clock; yaw is in rad, world."""
 
     def __init__(self) -> None:
         self.state = IDLE
-        self.path: Way | None = None
+        self.path: Path | None = None
 
     def stop(self) -> None:
         """Motors off, and the path is forgotten."""
@@ -103,11 +87,7 @@ class Planner:
         self.state = DISABLED
 
     def takeoff(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
-        """Climb to `height` (m above the floor) within `duration` (s), from rest; False: only an idle planner does.
-
-        :param t: s, the fleet's clock.
-        :param yaw: rad, world.
-        """
+        """Climb to `height` (m above the floor) within `duration` (s), from rest; False: only an idle planner does."""
         if self.state != IDLE:
             return False
         self._from_rest(t, here, height, yaw, duration)
@@ -115,11 +95,7 @@ class Planner:
         return True
 
     def land(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> bool:
-        """Sink to `height` within `duration`, from rest, then stop the motors; False: it is landing already.
-
-        :param t: s, the fleet's clock.
-        :param yaw: rad, world.
-        """
+        """Sink to `height` within `duration`, from rest, then stop the motors; False: it is landing already."""
         if self.state == LANDING:
             return False
         self._from_rest(t, here, height, yaw, duration)
@@ -127,17 +103,8 @@ class Planner:
         return True
 
     def go_to(self, t: float, here: Goal, place: Triple, yaw: float, duration: float) -> None:
-        """Fly to a place within `duration` and hold it, beginning with speed and acceleration as they are.
-
-        :param t: s, the fleet's clock.
-        :param yaw: rad, world.
-        """
+        """Fly to a place within `duration` and hold it, beginning with speed and acceleration as they are."""
         self._plan(t, here, place, yaw, duration)
-        self.state = FLYING
-
-    def follow(self, way: Way) -> None:
-        """Fly a trajectory, and hold its end."""
-        self.path = way
         self.state = FLYING
 
     def _from_rest(self, t: float, here: Goal, height: float, yaw: float, duration: float) -> None:
@@ -150,17 +117,11 @@ class Planner:
         self.path = Path(t, duration, axes, Goal(place, yaw=yaw))
 
     def finished(self, t: float) -> bool:
-        """True once the last path has been flown (or there is none).
-
-        :param t: s, the fleet's clock.
-        """
+        """True once the last path has been flown (or there is none)."""
         return self.path is None or t >= self.path.start + self.path.duration
 
     def goal(self, t: float) -> Goal | None:
-        """What to hold now; None while idle, which a landing that is over makes it.
-
-        :param t: s, the fleet's clock.
-        """
+        """What to hold now; None while idle, which a landing that is over makes it."""
         if self.state == LANDING and self.finished(t):
             self.state = IDLE
         if self.state in (IDLE, DISABLED) or self.path is None:

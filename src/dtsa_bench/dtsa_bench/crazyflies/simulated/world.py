@@ -9,24 +9,61 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.settings.flight_models import flight_model
+from dtsa_agent.core.settings.flight_models import VehicleParams, flight_model
 
-from .estimate import Estimate
-from .firmware import OFF, Firmware
+from .estimate import GRAVITY, Estimate
+from .firmware import LEVEL, OFF, Firmware
 from .fleet_config import FleetConfig
-from .position_filter import PositionFilter
-from .vehicles import Vehicles
 
 TICK_S = 0.01
 POSITION_NOISE_M = 0.002
 VELOCITY_NOISE_MPS = 0.01
-IMU_NOISE_MPS2 = 0.2  # with vibrations
+DRAG_S = 1.5  # s, time constant of a level quadcopter's drift
+HARD_LANDING = 1.5  # m/s: faster than that onto the floor turns it over
+
+
+class Vehicles:
+    """The bodies: true states of a fleet, in the air, falling and on the floor.
+
+    :param start: (3, N), m, world; z = 0 is the floor.
+    :param model: how they answer a velocity command.
+    """
+
+    def __init__(self, start: NDArray[np.float64], model: VehicleParams) -> None:
+        self.model = model
+        self.position = np.array(start, dtype=np.float64, order="C")
+        self.velocity = np.zeros_like(self.position)
+        self.acceleration = np.zeros_like(self.position)
+
+    def step(self, dt: float, modes: list[str], command: NDArray[np.float64]) -> list[int]:
+        """Move all for dt seconds by velocity commands, (3, N), m/s; the indices of those that hit the floor hard.
+
+        :param modes: OFF, FLY or LEVEL for each vehicle.
+        """
+        p, v = self.position, self.velocity
+        before = v.copy()
+        off = np.array([mode == OFF for mode in modes])
+        level = np.array([mode == LEVEL for mode in modes])
+        # Level: a = -v / DRAG_S in the plane, written as the command that makes the vehicle model do so.
+        command[:2, level] = v[:2, level] * (1.0 - self.model.tau / DRAG_S)
+        fallen_p = p[:, off] + v[:, off] * dt
+        fallen_v = v[:, off]
+        fallen_p[2] -= 0.5 * GRAVITY * dt * dt
+        fallen_v[2] -= GRAVITY * dt
+        self.model.step(dt, p, v, command)
+        p[:, off], v[:, off] = fallen_p, fallen_v
+        down = p[2] <= 0.0
+        hard: list[int] = np.flatnonzero(down & (v[2] < -HARD_LANDING)).tolist()
+        p[2, down] = 0.0
+        v[:2, down] = 0.0
+        v[2, down] = np.maximum(v[2, down], 0.0)
+        self.acceleration = (v - before) / dt
+        return hard
 
 
 class World:
     """Vehicles that fly by what their firmware says.
 
-    :param config: how many, where they stand, what they are.
     :param report: takes an index, the name of an event and details, for the record.
     """
 
@@ -38,18 +75,14 @@ class World:
         self.firmware = [
             Firmware(partial(report, k), vehicle.tau, auto_arming=config.arms_itself(k)) for k in range(config.count)
         ]
-        host = config.positions == "host"
-        self.estimates = [Estimate(filter=PositionFilter() if host else None) for _ in range(config.count)]
-        streams = np.random.SeedSequence(config.seed).spawn(3)  # the second one is the links'
-        self._noise = np.random.default_rng(streams[0])
-        self._imu = np.random.default_rng(streams[2])
+        self.estimates = [Estimate() for _ in range(config.count)]
+        self._noise = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(1)[0])
         self._close_pairs: set[tuple[int, int]] = set()
         self._estimate()
 
     def step(self, t: float, moved: Callable[[], Any] = lambda: None) -> None:
-        """Fly for one tick of 10 ms.
+        """Fly for one tick of 10 ms that begins at t (s).
 
-        :param t: s, when it begins.
         :param moved: called when the bodies have moved, before anything is reported of their new places.
         """
         modes, command = [], np.zeros_like(self.vehicles.position)
@@ -70,19 +103,9 @@ class World:
             noise = self._noise.standard_normal(state.shape)
             state[:3] += POSITION_NOISE_M * noise[:3]
             state[3:] += VELOCITY_NOISE_MPS * noise[3:]
-        acceleration = self.vehicles.acceleration.T.tolist()
-        if self._config.positions == "host":
-            noise = self._imu.standard_normal((3, self._config.count))
-            measured = self.vehicles.acceleration + IMU_NOISE_MPS2 * noise
-            for estimate, row in zip(self.estimates, measured.T.tolist(), strict=True):
-                assert estimate.filter is not None
-                estimate.filter.predict(TICK_S, (row[0], row[1], row[2]))
-        for k, (row, a) in enumerate(zip(state.T.tolist(), acceleration, strict=True)):
-            estimate = self.estimates[k]
-            position, velocity = (row[0], row[1], row[2]), (row[3], row[4], row[5])
-            if estimate.filter is not None:
-                position, velocity = estimate.filter.position, estimate.filter.velocity
-            estimate.tell(position, velocity, (a[0], a[1], a[2]))
+        rows = zip(self.estimates, state.T.tolist(), self.vehicles.acceleration.T.tolist(), strict=True)
+        for estimate, (x, y, z, vx, vy, vz), (ax, ay, az) in rows:
+            estimate.update((x, y, z), (vx, vy, vz), (ax, ay, az))
 
     def _proximity(self, modes: list[str]) -> None:
         """Two flying vehicles that come too close, and what that does to them."""

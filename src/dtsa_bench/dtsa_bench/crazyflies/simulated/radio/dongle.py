@@ -13,19 +13,17 @@ from dataclasses import dataclass
 from dtsa_channel_sim.model.medium import OnAir
 
 from . import esb
-from .agenda import Agenda
-from .air import RadioAir
+from .air import Agenda, RadioAir
 from .receiver import Receiver
 from .settings import DEVICES, RadioSettings
 from .sniffer_mode import FIRST_FIRMWARE, SnifferMode, Tuned
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_POWER, SET_ARD, SET_ARC = range(1, 7)
-ACK_ENABLE, SET_CARRIER, SCAN_CHANNELS = 0x10, 0x20, 0x21
+ACK_ENABLE, SET_CARRIER = 0x10, 0x20
 SET_RADIO_MODE, SET_SNIFFER_ADDRESS = 0x24, 0x25
 ACKNOWLEDGED, POWER_DETECTED = 0x01, 0x02
 ACK_TIMEOUT_NS = 500_000  # of a Crazyradio 2.0, from the end of the packet to the address of the acknowledgement
 HIGHEST_CHANNEL = {"pa": 125, "2": 100}
-SCAN_RESULTS = 63
 
 
 @dataclass(slots=True)
@@ -42,9 +40,6 @@ class Dongle:
     """One Crazyradio.
 
     :param radio: its id on the air.
-    :param settings: its kind and times.
-    :param air: where it sends.
-    :param agenda: what happens when.
     :param receivers: the Crazyflies by their ids on the air.
     :param passes: says whether a packet to (True) or from a Crazyflie passes the faults of its link.
     :param sniffers: of all dongles on the air; this one adds its own.
@@ -64,7 +59,6 @@ class Dongle:
         self._receivers, self._passes = receivers, passes
         self.packets = 0  # transfers since the start
         self._busy_ns = 0
-        self._scanned = b""
         self.sniffer = SnifferMode(radio, air, agenda, round(settings.usb_ms * 0.5e6), settings.seed)
         self.sniffer.arrived = self._broadcast
         sniffers[radio] = self.sniffer
@@ -81,10 +75,7 @@ class Dongle:
         self.sniffer.stop()
 
     def request(self, number: int, value: int, index: int, data: bytes, now: int) -> None:
-        """A vendor request from the host; what is not known is ignored.
-
-        :param now: ns, the time.
-        """
+        """A vendor request from the host; what is not known is ignored."""
         self._busy_ns = max(now, self._busy_ns) + round(self._settings.request_ms * 1e6)
         if number == SET_CHANNEL and value <= 125:
             self._channel = value
@@ -100,8 +91,6 @@ class Dongle:
             self._ack = bool(value)
         elif number == SET_CARRIER:
             self._carrier = bool(value)
-        elif number == SCAN_CHANNELS:
-            self._scan(value, index, bytes(data))
         elif number == SET_SNIFFER_ADDRESS and len(data) == 5:
             if value == 0:
                 self._address = bytes(data)
@@ -122,24 +111,6 @@ class Dongle:
         elif mode == 1 and self.sniffer.tuned is None:
             self.sniffer.start(now, self._tuned)
 
-    def _scan(self, first: int, last: int, packet: bytes) -> None:
-        """Which channels answer: without the air, at once."""
-        step = 2 if self._rate == "2M" and self._settings.device == "pa" else 1
-        there = {r.station.channel for r in self._receivers.values() if self._hears(r) and packet}
-        found = []
-        for self._channel in range(first, last + 1, step):
-            if self._can_send and self._channel in there:
-                found.append(self._channel)
-        self._scanned = bytes(found)
-
-    def _hears(self, receiver: Receiver) -> bool:
-        return receiver.station.rate == self._rate and receiver.station.address == self._address
-
-    @property
-    def scanned(self) -> bytes:
-        """Result of the last scan."""
-        return self._scanned[:SCAN_RESULTS]
-
     @property
     def _can_send(self) -> bool:
         device = self._settings.device
@@ -151,8 +122,6 @@ class Dongle:
         """Send a packet; `answer` gets what the host reads. Without acknowledgements there is nothing to read.
 
         In sniffer mode a packet begins with the address to which it goes.
-
-        :param now: ns, the time.
         """
         self.packets += 1
         if self.sniffer.tuned is not None:

@@ -17,11 +17,7 @@ _ARD_STEP_NS = 250_000
 
 
 def on_air_ns(length: int, rate: str) -> int:
-    """Time that a packet's bits are on air, ns.
-
-    :param length: bytes of payload, 0 to 63.
-    :param rate: a key of BITRATES.
-    """
+    """Time that the bits of a packet (0 to 63 bytes of payload) are on air, ns; the rate is a key of BITRATES."""
     return (OVERHEAD_BITS + 8 * length) * 1_000_000_000 // BITRATES[rate]
 
 
@@ -39,8 +35,5 @@ def retry_delay_ns(ard: int, rate: str) -> int:
 
 
 def between_crazyflies(packet: bytes) -> bool:
-    """Whether a packet is one of peer-to-peer communication: the radio chip does not take it for the ground station's.
-
-    :param packet: the payload.
-    """
+    """Whether a packet is peer-to-peer: the radio chip does not take it for the ground station's."""
     return len(packet) > 1 and packet[0] & PEER_HEAD == PEER_HEAD and packet[1] & 0xF0 == PEER_PORT

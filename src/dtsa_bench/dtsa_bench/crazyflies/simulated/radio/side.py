@@ -8,9 +8,8 @@ A host connects with one socket a dongle. Messages are whole (SOCK_SEQPACKET); t
 | 1 claim | number of the dongle | 1, or 0: it is in use |
 | 2 request | number, value (2), index (2), data | |
 | 3 packet | the packet | status and payload; nothing without acknowledgements |
-| 4 scanned | | channels that answered |
-| 5 read | | in sniffer mode: 3 and the next packet that was heard, as soon as there is one |
-| 6 dropped | | 6 and the number of packets that were heard and lost, 4 bytes |
+| 4 read | | in sniffer mode: 3 and the next packet that was heard, as soon as there is one |
+| 5 dropped | | 5 and the number of packets that were heard and lost, 4 bytes |
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
 
-from .agenda import Agenda
-from .air import RadioAir
+from .air import Agenda, RadioAir
 from .dongle import Dongle
 from .receiver import Receiver
 from .settings import DEVICES, RadioSettings
 from .sniffer_mode import SnifferMode
 
-LIST, CLAIM, REQUEST, PACKET, SCANNED, READ, DROPPED = range(7)
+LIST, CLAIM, REQUEST, PACKET, READ, DROPPED = range(6)
 _REQUEST = struct.Struct("<BBHH")
 _LONGEST = 128
+_PATIENCE_S = 0.05
 
 
 @dataclass(slots=True)
@@ -49,7 +48,6 @@ class Host:
 class RadioSide:
     """Dongles, air and receivers.
 
-    :param settings: what they are made of.
     :param deliver: takes a vehicle's index, a packet for it and the time (s).
     :param passes: index and direction (True: up): whether a packet passes the faults of a vehicle's link.
     :param listen: hosts may connect at once; else after `listen`.
@@ -99,11 +97,7 @@ class RadioSide:
         return time.monotonic_ns() - self.origin_ns
 
     def take(self, host: Host | None, selector: selectors.BaseSelector) -> None:
-        """Take what has come.
-
-        :param host: whose connection is readable; None: the listener is.
-        :param selector: learns of hosts that come and go.
-        """
+        """Receive what has come from a host (None: a new one); the selector learns of hosts that come and go."""
         if host is None:
             assert self.listener is not None
             with contextlib.suppress(OSError):
@@ -149,8 +143,6 @@ class RadioSide:
             dongle.request(number, value, index, message[_REQUEST.size :], self.now_ns())
         elif kind == PACKET and len(message) > 1:
             dongle.transfer(message[1:], self.now_ns(), lambda data: _send(host, data))
-        elif kind == SCANNED:
-            _send(host, dongle.scanned or b"\xff")
         elif kind == READ:
             dongle.sniffer.give = lambda data: _send(host, bytes((PACKET,)) + data)
             dongle.sniffer.read()
@@ -205,3 +197,34 @@ def _listen(path: Path | None) -> socket.socket:
 def _send(host: Host, data: bytes) -> None:
     with contextlib.suppress(OSError):  # a host that has gone
         host.socket.send(data)
+
+
+class Dongles:
+    """Simulated Crazyradios on an air of their own, without Crazyflies: serves the hosts that connect to the socket.
+
+    :raises ConfigError: the socket cannot be made.
+    """
+
+    def __init__(self, settings: RadioSettings) -> None:
+        self.side = RadioSide(settings, lambda index, packet, t: None, lambda index, up: True)
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End :meth:`run`; also from a signal's handler."""
+        self._stopped = True
+
+    def run(self) -> None:
+        """Serve until it is stopped."""
+        selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
+        selector.register(self.side.listener, selectors.EVENT_READ, None)
+        try:
+            while not self._stopped:
+                due = self.side.wait_s()
+                for key, _ in selector.select(_PATIENCE_S if due is None else min(due, _PATIENCE_S)):
+                    self.side.take(key.data, selector)
+                self.side.run()
+        finally:
+            for key in list(selector.get_map().values()):
+                if key.data is not None:
+                    self.side.leave(key.data)
+            self.side.close()

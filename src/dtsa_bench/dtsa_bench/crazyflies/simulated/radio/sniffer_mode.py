@@ -16,8 +16,7 @@ from typing import NamedTuple
 from dtsa_channel_sim.model.medium import OnAir
 
 from . import esb
-from .agenda import Agenda
-from .air import RadioAir
+from .air import Agenda, RadioAir
 
 FIRST_FIRMWARE = 0x0504  # that has this mode
 ADDRESS = 5  # bytes before the payload of a packet that is to be sent
@@ -41,11 +40,9 @@ class Tuned(NamedTuple):
 
 
 class SnifferMode:
-    """A dongle in this mode.
+    """A dongle in this mode. Times (`now`) are ns.
 
     :param radio: its id on the air.
-    :param air: where it sends.
-    :param agenda: what happens when.
     :param half_ns: ns, a packet on USB, one way.
     :param seed: of its clock and its waits.
     """
@@ -71,21 +68,13 @@ class SnifferMode:
         self._wanted = False  # the host reads
 
     def start(self, now: int, tuned: Tuned) -> None:
-        """Begins to listen.
-
-        :param now: ns, the time.
-        :param tuned: to what.
-        """
+        """Begin to listen."""
         self.stop()
         self._began_ns, self.tuned = now, tuned
 
     # -- sending ----------------------------------------------------------------------------------------------------
     def order(self, transfer: bytes, now: int) -> None:
-        """The host has written.
-
-        :param transfer: address and payload.
-        :param now: ns, the time.
-        """
+        """The host has written: address and payload."""
         if len(transfer) <= ADDRESS or len(self._orders) == _ORDERS:
             return
         self._orders.append(transfer)
@@ -113,10 +102,7 @@ class SnifferMode:
 
     # -- hearing ----------------------------------------------------------------------------------------------------
     def hear(self, address: bytes, packet: bytes, frame: OnAir) -> None:
-        """A packet has left the air, and nothing has disturbed it here.
-
-        :param frame: its transmission.
-        """
+        """A packet has left the air, and nothing has disturbed it here."""
         if self.tuned is None or address not in self.tuned.addresses or frame.air_ns < self._deaf_ns:
             return
         now = frame.end_ns

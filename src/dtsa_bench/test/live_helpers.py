@@ -1,0 +1,192 @@
+"""The laboratory in real time: programs of the ground connect to its simulated Crazyradios.
+
+The bridge and every other program with cflib talks to the vehicles by CRTP, with the app's parameters, log variables
+and app channel. Dongles in sniffer mode hear what the apps send to each other, and take part. Times on the air are as
+exact as in virtual time; only the programs see them as late as this machine is. On a machine that is too busy the
+laboratory is slower than real time: caught up at once, the lost time would be a gap of all links.
+
+    python -m live_helpers SOCKET OUT APP AGENTS|SWARM.json [ground]    # until SIGINT; prints the summary as JSON
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from waiting import wait_for
+
+from dtsa_agent.core import SwarmConfig
+from dtsa_agent.crazyflie.settings.on_board import key_of
+from dtsa_bench.crazyflies.peer_lab import App, Laboratory, LabSettings, read_app
+from dtsa_bench.crazyflies.peer_lab.laboratory import ADDRESS, TICK_NS
+from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
+from dtsa_bench.crazyflies.peer_lab.record import Observer, Packet
+from dtsa_bench.crazyflies.simulated import crtp
+from dtsa_bench.crazyflies.simulated.radio import esb
+from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
+from dtsa_bench.crazyflies.simulated.radio.side import RadioSide
+from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import Tuned
+from dtsa_channel_sim.model.medium import OnAir
+
+WAIT_S = 0.001
+BEHIND_NS = 20_000_000  # caught up at once; what is more is lost
+APP_CHANNEL = 2  # of CRTP's platform port
+
+
+def station(settings: LabSettings, agent: int) -> Station:
+    """Where a vehicle listens."""
+    address = (ADDRESS + agent).to_bytes(5, "big")
+    uri = f"radio://0/{settings.channel}/{settings.rate}/{address.hex().upper()}"
+    return Station(uri, settings.channel, settings.rate, address)
+
+
+class LiveLaboratory(Laboratory, Observer):
+    """A laboratory with dongles on its air.
+
+    :param path: of the dongles' socket. :param dongles: their number.
+    """
+
+    def __init__(
+        self, path: Path, dongles: int, app: App, settings: LabSettings, out: Path | None = None, *observers: Observer
+    ) -> None:
+        stations = tuple(station(settings, agent) for agent in range(1, settings.agents + 1))
+        radio = RadioSettings(
+            dongles=dongles, path=path, stations=stations, loss=settings.loss, seed=settings.seed
+        )  # fmt: skip
+        self.side = RadioSide(radio, self._hear_ground, lambda index, up: self.is_on(index + 1), listen=False)
+        self._ticks = 0
+        self._stopped = False
+        super().__init__(app, settings, out, observers)
+        self.observe(self)
+        for agent, receiver in enumerate(self.side.receivers, 1):
+            receiver.taken = partial(self.polled, agent)
+        for dongle in self.side.dongles:
+            dongle.between = self._between
+        self.agenda.at(TICK_NS, self._log)
+
+    def _open_air(self, seed: int) -> None:
+        self.agenda, self.air, self._first = self.side.agenda, self.side.air, self.side.first
+
+    def stop(self) -> None:
+        """End :meth:`fly`; also from a signal's handler."""
+        self._stopped = True
+
+    def fly(self, seconds: float) -> None:
+        """Fly in real time."""
+        self.side.listen()  # not before: the app has been compiled
+        selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
+        selector.register(self.side.listener, selectors.EVENT_READ, None)
+        try:
+            while not self._stopped and self.time < seconds:
+                for key, _ in selector.select(WAIT_S):
+                    self.side.take(key.data, selector)
+                self.side.origin_ns += max(0, self.side.now_ns() - self.now_ns - BEHIND_NS)
+                self.run(min(seconds, self.side.now_ns() / 1e9))
+        finally:
+            for key in list(selector.get_map().values()):
+                if key.data is not None:
+                    self.side.leave(key.data)
+            selector.close()
+
+    def close(self) -> None:
+        super().close()
+        self.side.close()
+
+    # -- between ground and apps ------------------------------------------------------------------------------------
+    def _hear_ground(self, index: int, packet: bytes, t: float) -> None:
+        reply = self.peers[index].receive(packet, t)
+        if reply is not None:
+            self.side.receivers[index].push(reply)
+        self.show(index)
+
+    def hear(self, packet: Packet, heard: set[int], frame: OnAir) -> None:
+        if packet.sender:  # dongles in sniffer mode have it, too
+            payload = bytes((0xFF, esb.PEER_PORT | packet.raw[0])) + packet.data
+            tuned = self.settings.channel, self.settings.rate
+            self.side.dongles[0].overheard(heard, esb.BROADCAST, payload, *tuned, frame)
+        super().hear(packet, heard, frame)
+
+    def _between(self, packet: bytes, heard: set[int], tuned: Tuned, frame: OnAir) -> None:
+        if (tuned.channel, tuned.rate) == (self.settings.channel, self.settings.rate):
+            self.hear(Packet(0, bytes((packet[1] & 0x0F,)) + packet[2:], 0), heard, frame)
+
+    def on_app_channel(self, agent: int, now_ns: int, data: bytes) -> None:
+        self.side.receivers[agent - 1].push(crtp.pack(crtp.PLATFORM, APP_CHANNEL, data))
+
+    def on_print(self, agent: int, now_ns: int, text: str) -> None:
+        data = text.encode()
+        for first in range(0, len(data), crtp.MAX_DATA):
+            self.side.receivers[agent - 1].push(crtp.pack(crtp.CONSOLE, 0, data[first : first + crtp.MAX_DATA]))
+
+    def _log(self) -> None:
+        self._ticks += 1
+        now = self._ticks * TICK_NS
+        self.agenda.at(now + TICK_NS, self._log)
+        for index, (peer, receiver) in enumerate(zip(self.peers, self.side.receivers, strict=True)):
+            if not peer.blocks or not self.is_on(index + 1):
+                continue
+            if not receiver.connected(now / 1e9):  # nobody is there: the log ends
+                peer.blocks.clear()
+                receiver.silent()
+                continue
+            for packet in peer.log_packets(self._ticks, now / 1e9):
+                receiver.push(packet)
+
+
+class LiveOnBoard(OnBoard):
+    """The protocol on board, with dongles on its air; the ground is played here, or by a program there."""
+
+    def __init__(self, path: Path, dongles: int, swarm: SwarmConfig, out: Path, ground: bool) -> None:
+        self._path, self._dongles = path, dongles
+        super().__init__(swarm, LabSettings(boot_s=0.1), out, key_of(swarm), enable_s=8.0 if ground else None)
+
+    def _make_laboratory(self, app: App, settings: LabSettings, out: Path | None) -> Laboratory:
+        return LiveLaboratory(self._path, self._dongles, app, settings, out, self)
+
+
+def main() -> int:
+    """Fly until SIGINT."""
+    place, out, what, *more = sys.argv[1:]
+    lab: Any
+    if what.endswith(".json"):
+        swarm = SwarmConfig.from_dict(json.loads(Path(what).read_text(encoding="utf-8")))
+        flight = LiveOnBoard(Path(place), 3, swarm, Path(out), bool(more))
+        lab, finish = flight.lab, flight.finish
+    else:
+        lab = LiveLaboratory(Path(place), 3, read_app(what), LabSettings(agents=int(more[0])))
+        finish = lab.summary
+    signal.signal(signal.SIGINT, lambda *_: lab.stop())
+    with lab:
+        lab.fly(600.0)
+        print(json.dumps(finish()))
+    return 0
+
+
+@contextmanager
+def live_laboratory(folder: Path, *what: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    """The laboratory in a process of its own; its socket is `radio` in the folder, which gets its files, too."""
+    place, tests = folder / "radio", str(Path(__file__).parent)
+    more = {**environment, "PYTHONPATH": os.pathsep.join([*sys.path, tests])}
+    command = [sys.executable, "-m", "live_helpers", str(place), str(folder), *what]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | more)
+    try:
+        wait_for(lambda: place.exists() or process.poll() is not None)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
