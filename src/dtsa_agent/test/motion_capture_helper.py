@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped
 
 from dtsa_agent.ros.common.process.node_process import init_ros
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
-from dtsa_bench.crazyflies.simulated import cli, control, world
+from dtsa_bench.crazyflies.simulated import cli, process, world
 from dtsa_bench.crazyflies.simulated.estimate import Estimate
 from dtsa_bench.crazyflies.simulated.fleet import Fleet
 from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
@@ -130,7 +130,7 @@ def main() -> int:
     """Fly the fleet until Ctrl-C."""
     world.Estimate = HostEstimate  # type: ignore[misc]
     cli.Fleet = TrackedFleet  # type: ignore[misc]
-    control.FAULTS["unseen"] = "motion capture does not see it"
+    process.FAULTS["unseen"] = "motion capture does not see it"
     code = cli.main(sys.argv[1:])
     rclpy.try_shutdown()
     return code

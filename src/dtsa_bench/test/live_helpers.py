@@ -49,7 +49,7 @@ def station(settings: LabSettings, agent: int) -> Station:
     return Station(uri, settings.channel, settings.rate, address)
 
 
-class LiveLaboratory(Laboratory, Observer):
+class LiveLaboratory(Laboratory):
     """A laboratory with dongles on its air.
 
     :param path: of the dongles' socket. :param dongles: their number.
@@ -65,8 +65,7 @@ class LiveLaboratory(Laboratory, Observer):
         self.side = RadioSide(radio, self._hear_ground, lambda index, up: self.is_on(index + 1), listen=False)
         self._ticks = 0
         self._stopped = False
-        super().__init__(app, settings, out, observers)
-        self.observe(self)
+        super().__init__(app, settings, out, [*observers, self._answer_ground])
         for agent, receiver in enumerate(self.side.receivers, 1):
             receiver.taken = partial(self.polled, agent)
         for dongle in self.side.dongles:
@@ -119,13 +118,13 @@ class LiveLaboratory(Laboratory, Observer):
         if (tuned.channel, tuned.rate) == (self.settings.channel, self.settings.rate):
             self.hear(Packet(0, bytes((packet[1] & 0x0F,)) + packet[2:], 0), heard, frame)
 
-    def on_app_channel(self, agent: int, now_ns: int, data: bytes) -> None:
-        self.side.receivers[agent - 1].push(crtp.pack(crtp.PLATFORM, APP_CHANNEL, data))
-
-    def on_print(self, agent: int, now_ns: int, text: str) -> None:
-        data = text.encode()
-        for first in range(0, len(data), crtp.MAX_DATA):
-            self.side.receivers[agent - 1].push(crtp.pack(crtp.CONSOLE, 0, data[first : first + crtp.MAX_DATA]))
+    def _answer_ground(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
+        if kind == "app_channel":
+            self.side.receivers[agent - 1].push(crtp.pack(crtp.PLATFORM, APP_CHANNEL, content))
+        elif kind == "print":
+            data = content.encode()
+            for first in range(0, len(data), crtp.MAX_DATA):
+                self.side.receivers[agent - 1].push(crtp.pack(crtp.CONSOLE, 0, data[first : first + crtp.MAX_DATA]))
 
     def _log(self) -> None:
         self._ticks += 1
@@ -150,7 +149,7 @@ class LiveOnBoard(OnBoard):
         super().__init__(swarm, LabSettings(boot_s=0.1), out, key_of(swarm), enable_s=8.0 if ground else None)
 
     def _make_laboratory(self, app: App, settings: LabSettings, out: Path | None) -> Laboratory:
-        return LiveLaboratory(self._path, self._dongles, app, settings, out, self)
+        return LiveLaboratory(self._path, self._dongles, app, settings, out, self.observe)
 
 
 def main() -> int:

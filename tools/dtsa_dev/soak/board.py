@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_bench.crazyflies.peer_lab.app import read_app
+from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import sanitizer_environment
 from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
-from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.experiments.batch.task import Row
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge

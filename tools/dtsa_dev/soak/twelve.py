@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 from dtsa_bench.crazyflies.peer_lab.onboard import HEIGHT_M, OnBoard
-from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.experiments.batch.task import Row
 from dtsa_bench.experiments.statistics import wilson
 from dtsa_bench.recordings.bag.run import load_run

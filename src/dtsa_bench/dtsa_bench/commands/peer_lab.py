@@ -25,7 +25,7 @@ _SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming",
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Register the command."""
     from dtsa_agent.core.settings.declaration import settings_of
-    from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
+    from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 
     text = "copies of a Crazyflie app on this machine, in virtual time"
     parser = subparsers.add_parser("peer-lab", help=text, description=DESCRIPTION)
@@ -52,8 +52,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Fly and print what came of it."""
     from dtsa_agent.core.errors import ConfigError
+    from dtsa_bench.crazyflies.peer_lab.app import LabSettings
     from dtsa_bench.crazyflies.peer_lab.process import fly
-    from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
     from dtsa_bench.runs.options import new_directory
 
     if not 0.0 < args.seconds <= 1e6:

@@ -37,7 +37,7 @@ from waiting import wait_for
 
 from dtsa_agent.crazyflie.settings.config import load_swarm
 from dtsa_bench.commands.bridge import simulated
-from dtsa_bench.crazyflies.simulated import ports
+from dtsa_bench.crazyflies.simulated import process as simulated_process
 from dtsa_bench.crazyflies.simulated.process import free_base_port
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
@@ -345,7 +345,7 @@ def test_simulated_ones_take_other_ports_where_others_have_just_taken_theirs(
 ) -> None:
     taken = free_base_port(3)
     found = iter((taken, taken + 1, taken + 1))  # free, not free any more, others
-    monkeypatch.setattr(ports, "free_base_port", lambda count, first=None: next(found))
+    monkeypatch.setattr(simulated_process, "free_base_port", lambda count, first=None: next(found))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other, ExitStack() as stack:
         other.bind(("127.0.0.1", taken - 1))
         path = simulated(swarm_yaml(tmp_path, "usb://{}"), stack)

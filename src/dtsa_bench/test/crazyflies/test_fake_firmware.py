@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.crazyflie.state.conversions import decompress_quaternion, yaw_of
-from dtsa_bench.crazyflies.simulated import crtp, planner, toc
+from dtsa_bench.crazyflies.simulated import crtp, planner
 from dtsa_bench.crazyflies.simulated.estimate import attitude, compress, quaternion
 from dtsa_bench.crazyflies.simulated.firmware import FLY, LEVEL, OFF, Battery
 
@@ -48,7 +48,7 @@ def test_a_flight_by_high_level_commands() -> None:
 def test_orders_to_groups_that_it_is_not_in_are_nothing_to_it() -> None:
     craft = Craft()
     craft.take_off()
-    index = toc.PARAM_ID["hlCommander.groupmask"]
+    index = crtp.PARAM_ID["hlCommander.groupmask"]
     for mask, lands in ((0b01, False), (0b10, True)):
         craft.ask(crtp.PARAM, 2, struct.pack("<HB", index, mask))
         assert craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<BBff?f", 8, 0b10, 0.0, 0.0, True, 1.0))[3] == 0  # type: ignore[index]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,6 @@ from dtsa_bench.crazyflies.peer_lab import Laboratory, LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import ENGINE, FIRMWARE, CompileError, compiler
 from dtsa_bench.crazyflies.peer_lab.engine import AppError
 from dtsa_bench.crazyflies.peer_lab.process import fly
-from dtsa_bench.crazyflies.peer_lab.record import Observer, Packet
 from dtsa_channel_sim.model.airtime import RADIOS
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
@@ -400,28 +400,25 @@ def test_a_ground_station_that_polls_takes_air_and_frames_survive_between_its_pa
 def test_a_foreign_radio_is_heard_and_disturbs_and_losses_change_in_flight(write) -> None:
     place = write(SENDER.replace("BODY", "for (;;) { radiolinkSendP2PPacketBroadcast(&packet); vTaskDelay(50); }"))
 
-    class Heard(Observer):
-        def __init__(self) -> None:
-            self.senders: list[int] = []
-            self.recorded: list[bytes] = []
+    senders: list[int] = []
+    recorded: list[bytes] = []
 
-        def on_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
-            self.senders.append(packet.sender)
+    def observe(kind: str, agent: int, now_ns: int, content: Any) -> None:
+        if kind == "heard":
+            senders.append(content.sender)
+        elif kind == "record":
+            recorded.append(content)
 
-        def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
-            self.recorded.append(data)
-
-    heard = Heard()
-    with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.05), observers=[heard]) as lab:
+    with Laboratory(read_app(place), LabSettings(agents=2, boot_s=0.05), observers=[observe]) as lab:
         for k in range(5):
             lab.at(0.3 + 0.1 * k, lambda: lab.transmit(b"hello", port=3))
         lab.run(1.0)
-        assert heard.senders.count(0) == heard.recorded.count(b"hello") > 5
-        assert len(heard.recorded) == len(heard.senders)
-        before = len(heard.senders)
+        assert senders.count(0) == recorded.count(b"hello") > 5
+        assert len(recorded) == len(senders)
+        before = len(senders)
         lab.set_loss(1.0)
         lab.run(2.0)
-        assert len(heard.senders) == before
+        assert len(senders) == before
 
 
 def test_sanitizers_find_what_an_app_does(write) -> None:

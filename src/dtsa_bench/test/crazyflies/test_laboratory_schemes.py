@@ -7,9 +7,9 @@ import shutil
 import pytest
 
 from dtsa_agent.core import SwarmConfig
+from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.peer_lab.process import fly
-from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import ChannelConfig

@@ -1,4 +1,4 @@
-"""The laboratory's dongles: the ground's programs talk to apps, and hear what they say to each other."""
+"""Integration: the laboratory's dongles: the ground's programs talk to apps, and hear what they say to each other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
 from dtsa_bench.crazyflies.peer_lab import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
-from dtsa_bench.crazyflies.simulated import crtp, toc
+from dtsa_bench.crazyflies.simulated import crtp
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.dongle import Dongle
@@ -110,8 +110,8 @@ def test_ground_sets_parameters_and_reads_logs_of_an_app_and_talks_to_it(live: L
     dongle.request(requests.SET_RATE, 2, 0, b"", 0)
     dongle.request(requests.SET_ADDRESS, 0, 0, b"\xe7\xe7\xe7\xe7\x02", 0)
     live.run(0.1)
-    index = len(toc.PARAM_ENTRIES)
-    number, log = index.to_bytes(2, "little"), len(toc.LOG_ENTRIES).to_bytes(2, "little")
+    index = len(crtp.PARAM_ENTRIES)
+    number, log = index.to_bytes(2, "little"), len(crtp.LOG_ENTRIES).to_bytes(2, "little")
     packets = [
         crtp.pack(crtp.PARAM, 0, b"\x02" + number),
         crtp.pack(crtp.PARAM, 2, number + b"\x07"),

@@ -14,10 +14,9 @@ import pytest
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.commands.cli import main
-from dtsa_bench.crazyflies.peer_lab.app import read_app
+from dtsa_bench.crazyflies.peer_lab.app import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import FIRMWARE, compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import APP, OnBoard
-from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge, verified
 

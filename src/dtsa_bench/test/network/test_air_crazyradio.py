@@ -26,9 +26,9 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.keys import authenticator
 from dtsa_bench.commands.cli import main
+from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
-from dtsa_bench.crazyflies.peer_lab.settings import LabSettings
 from dtsa_bench.crazyflies.simulated.process import running_fleet
 from dtsa_bench.pages.view.network_listener import NetworkListener
 from dtsa_bench.pages.view.track import MOST_MOMENTS, Track

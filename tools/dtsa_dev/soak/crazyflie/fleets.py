@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.ros.common.process.priority import take_priority
-from dtsa_bench.crazyflies.simulated.control import send_fault
-from dtsa_bench.crazyflies.simulated.process import FleetError, free_base_port, running_fleet
+from dtsa_bench.crazyflies.simulated.process import FleetError, free_base_port, running_fleet, send_fault
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 from dtsa_dev.soak.item import NotMet
 

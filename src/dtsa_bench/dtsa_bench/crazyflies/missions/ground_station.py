@@ -53,12 +53,7 @@ class Ended:
 
 
 class Mission:
-    """What the ground station does: it calls the bridge's services, watches the vehicles, and is alive.
-
-    :param node: a node of its own.
-    :param ended: is told why when something goes wrong.
-    :param say: prints a line.
-    """
+    """The ground station's part: it calls the bridge's services, watches the vehicles, and sends its heartbeat."""
 
     def __init__(
         self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: Ended, say: Callable[[str], None]
@@ -246,10 +241,7 @@ class Mission:
         return [name for name, s in sorted(self.status.items()) if s.state in IN_AIR]
 
     def at_rest(self, apart: Callable[[], bool]) -> bool:
-        """Tell all that fly to come to rest, nobody above another one; True once they have, or time is up.
-
-        :param apart: whether all are where they can land straight down.
-        """
+        """Tell all that fly to come to rest, none above another one; True once they are apart, or time is up."""
         now = time.monotonic()
         if self._stopping is None:
             self._stopping = now
@@ -266,10 +258,7 @@ class Mission:
             self._landing = self._clients["/all/land"].call_async(request)
 
     def land(self, urgent: Sequence[int]) -> None:
-        """Land whoever is in the air and wait until all stand.
-
-        :param urgent: numbers of signals; once it is not empty, all motors are stopped at once.
-        """
+        """Land all that are in the air and wait until they stand; once `urgent` has a signal, all motors stop."""
         self.exchanging = False
         flying = (Status.STATE_ARMED, Status.STATE_FLYING, Status.STATE_LANDING)
         if any(s.state in flying for s in self.status.values()):

@@ -26,7 +26,7 @@ from dtsa_agent.ros.common.graph.parameters import to_parameters
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import init_ros
 from dtsa_agent.ros.common.process.priority import give_way, take_priority
-from dtsa_bench.flights.children import Child, Children, NodeError, describe_end
+from dtsa_bench.flights.children import Children, NodeError, describe_end
 from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
 from dtsa_bench.flights.flight import END_S, QUIET, Flight, run_environment
 from dtsa_bench.flights.options import FlightOptions
@@ -57,8 +57,6 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
     The paper's room: an ellipse of half axes 1.2 m and 2.0 m, ids in order, so that everyone finds its place. More room
     between two vehicles than in simulation, because they know where they are to a few centimetres only; and the policy
     with which tables agree even where frames are lost.
-
-    :param given: what the user has set, by name.
     """
     room = {"shape": "ellipse", "axis_x_m": 1.2, "axis_y_m": 2.0, "permute": False}
     defaults = {"agents": len(settings.robots), "avoider": "crazyflie", "policy": "lease"} | room
@@ -68,10 +66,8 @@ def mission_defaults(settings: SwarmSettings, given: Mapping[str, Any]) -> dict[
 class MissionWatch(ChannelObserver):
     """Ends the exchange: at once when the bridge has died, else when all have come to rest, apart from each other.
 
-    Two that are as near as in a crash end it, too: a run that ended by itself would not let all come to rest. True once
-    it is over; until then the agents avoid each other.
-
-    :param metrics: know where all are, by their own estimates; None: no crash ends it.
+    Two that are as near as in a crash end it, too, if there are metrics: a run that ended by itself would not let all
+    come to rest. True once it is over; until then the agents avoid each other.
     """
 
     def __init__(self, mission: Mission, channel: RealtimeChannel, metrics: FlightMetrics | None) -> None:
@@ -96,11 +92,7 @@ class MissionWatch(ChannelObserver):
 
 
 class _Station:
-    """The processes of a mission, and the one order in which they end.
-
-    :param directory: for the bag of the whole mission and the logs.
-    :param attach: whether a bridge runs already, and goes on running.
-    """
+    """The processes of a mission, and the one order in which they end; `attach`: a bridge runs already, and goes on."""
 
     def __init__(self, settings: SwarmSettings, directory: Path, environment: dict[str, str], attach: bool) -> None:
         self.settings, self._directory, self._attach = settings, directory, attach
@@ -143,7 +135,9 @@ class _Station:
                 mission.close()
             try:
                 if not self._attach:
-                    _end_bridge(self.bridge.all[0])
+                    child = self.bridge.all[0]  # it lands all that may still fly, then closes its links
+                    if not end_process(child.process, BRIDGE_END_S):
+                        raise MissionError(f"{describe_end(child)}: it did not end by itself")
             finally:
                 end_process(self._recorder.all[0].process, RECORDER_END_S)
                 bag = self._directory / MISSION_BAG
@@ -170,10 +164,7 @@ def fly_crazyflies(
 ) -> tuple[Flight, str]:
     """One mission. When this returns or raises, all have landed (or were stopped) and no process is left.
 
-    :param run: what is flown; the number of agents is that of the robots.
     :param settings: the swarm's YAML, read; `swarm_yaml` is its path.
-    :param out: directory for the bag and the results.
-    :param stop: a flag that ends the mission early.
     :param attach: by the bridge that runs already on this ROS domain, and goes on running.
     :param page: shows the mission in a browser; None: nothing does.
     :returns: the results, and why the exchange was cut short (empty: it was not).
@@ -280,9 +271,3 @@ def _exchange(
         return Flight(summary, flight.scenario, measurement.positions.array(), directory / BAG)
     finally:
         node.destroy_node()
-
-
-def _end_bridge(child: Child) -> None:
-    """The bridge lands whoever may still fly, then closes its links: it gets the time for that."""
-    if not end_process(child.process, BRIDGE_END_S):
-        raise MissionError(f"{describe_end(child)}: it did not end by itself")

@@ -5,8 +5,7 @@ documented functions (`firmware`), and each vehicle loads a private copy. The en
 the simulated Crazyflie is their world, the simulated radio their air. The same seed gives the same bits.
 """
 
-from .app import App, read_app
+from .app import App, LabSettings, read_app
 from .laboratory import Laboratory
-from .settings import LabSettings
 
 __all__ = ["App", "LabSettings", "Laboratory", "read_app"]

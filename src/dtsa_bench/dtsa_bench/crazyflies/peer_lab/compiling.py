@@ -65,11 +65,8 @@ def engine_library() -> Path:
 
 
 def compile_app(app: App, library: Path) -> str:
-    """Compile an app.
+    """Compile an app into a library; the compiler's warnings.
 
-    :param app: the app.
-    :param library: file that is made.
-    :return: the compiler's warnings.
     :raises CompileError: it does not compile.
     """
     command = [*compiler(), *FLAGS, "-O1", "-DPEER_LAB", *app.flags]
@@ -82,21 +79,10 @@ def compile_app(app: App, library: Path) -> str:
 
 
 def sanitizer_environment(app: App) -> dict[str, str]:
-    """What the environment of a process needs that flies an app compiled with `-fsanitize=address`; else nothing.
-
-    :param app: the app.
-    """
+    """What the environment of a process needs that flies an app compiled with `-fsanitize=address`; else nothing."""
     if not any(flag.startswith("-fsanitize") and "address" in flag for flag in app.flags):
         return {}
     asked = [*compiler(), "-print-file-name=libasan.so"]
     library = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
     # Python leaks, and the apps' stacks are not the process's.
     return {"LD_PRELOAD": library, "ASAN_OPTIONS": "detect_leaks=0:detect_stack_use_after_return=0:handle_segv=0"}
-
-
-def private_copy(library: Path, directory: Path, name: str) -> Path:
-    """A copy of a compiled app: what is loaded from it has variables of its own.
-
-    :param library: the app. :param directory: where. :param name: of the copy.
-    """
-    return Path(shutil.copyfile(library, directory / f"{name}.so"))

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import DtsaError
+from dtsa_bench.crazyflies.simulated.crtp import LOG_TYPES, PARAM_TYPES, READ_ONLY, Entry
 from dtsa_bench.crazyflies.simulated.firmware import Setpoint
-from dtsa_bench.crazyflies.simulated.toc import LOG_TYPES, PARAM_TYPES, READ_ONLY, Entry
 
 _PARAM_NAMES = {code: name for name, (code, _) in PARAM_TYPES.items()}
 _LOG_NAMES = {code: name for name, (code, _) in LOG_TYPES.items()}
@@ -97,8 +97,6 @@ def decode_setpoint(data: bytes, t: float, yaw: float) -> tuple[int, Setpoint]:
 class Engine:
     """Apps of many vehicles in virtual time. Vehicles are numbered from 0, times are ns.
 
-    :param library: the compiled engine.
-    :param count: number of vehicles.
     :param names: of the firmware's own log variables. :param parameters: of its own parameters.
     :param line_fixed_ns: ns that any packet takes on the line to the radio. :param line_byte_ns: ns that a byte adds.
     :param spin_ns: ns after which a task that does not wait is an error.
@@ -197,10 +195,7 @@ class Engine:
 
 
 class AppVariables:
-    """Parameters, log variables and app channel of one vehicle's app, as a ground station sees them.
-
-    :param now: gives the time, ns. :param receive: gets a packet of the app channel.
-    """
+    """Parameters, log variables and app channel of one vehicle's app, as a ground station sees them."""
 
     def __init__(
         self, vehicle: int, engine: Engine, now: Callable[[], int], receive: Callable[[bytes], object]

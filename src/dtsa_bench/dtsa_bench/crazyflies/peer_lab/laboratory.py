@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import struct
 import tempfile
 from collections import deque
@@ -14,25 +15,24 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_bench.crazyflies.simulated.crtp import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.estimate import log_values
 from dtsa_bench.crazyflies.simulated.fleet_config import FleetConfig
 from dtsa_bench.crazyflies.simulated.peer import Peer
 from dtsa_bench.crazyflies.simulated.planner import DISABLED, FLYING, IDLE, LANDING
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
-from dtsa_bench.crazyflies.simulated.toc import LOG_ENTRIES, PARAM_ENTRIES
 from dtsa_bench.crazyflies.simulated.truth import TruthLog
 from dtsa_bench.crazyflies.simulated.world import TICK_S, World
 from dtsa_channel_sim.model.air import Lines
 from dtsa_channel_sim.model.airtime import HEADER_BYTES, airtime_of
 from dtsa_channel_sim.model.medium import Mask, OnAir
 
-from .app import App
-from .compiling import compile_app, engine_library, private_copy
+from .app import App, LabSettings
+from .compiling import compile_app, engine_library
 from .engine import AppError, AppVariables, Command, Engine, Event, decode_setpoint
 from .polling import Polling
 from .record import Observer, Packet, Record
-from .settings import LabSettings
 
 TICK_NS = round(TICK_S * 1e9)
 ADDRESS = 0xE7E7E7E700  # of the radios, but for their last byte, which is the id
@@ -47,7 +47,6 @@ _FOREIGN_RSSI = 60
 class Laboratory:
     """Apps that fly. One process has one at a time; a crash of an app ends the process with a line that names it.
 
-    :param app: the app.
     :param settings: vehicles, air and ground.
     :param out: directory for files; None: none are written.
     :param observers: look on beside the record.
@@ -138,7 +137,6 @@ class Laboratory:
     def run(self, until_s: float) -> None:
         """Fly on.
 
-        :param until_s: s, virtual time.
         :raises AppError: an app did what no app may do.
         """
         until_ns = round(until_s * 1e9)
@@ -171,24 +169,24 @@ class Laboratory:
         kind = Event(told.kind)
         if kind is Event.SEND:
             packet = Packet(k + 1, data, now)
-            self._tell("on_sent", k + 1, now, packet)
+            self._notify("sent", k + 1, now, packet)
             at_ns = told.other_ns
             self.agenda.at(at_ns, lambda: self._order_to_send(packet, at_ns))
         elif kind is Event.HEARD:
             packet = self._handed[k].popleft()
             if told.code >= 0:
-                self._tell("on_heard", k + 1, now, packet)
+                self._notify("heard", k + 1, now, packet)
         elif kind is Event.COMMAND:
             told.answer = self._command(k, Command(told.code), data)
-            self._tell("on_command", k + 1, now, told.code, data)
+            self._notify("command", k + 1, now, (told.code, data))
             self.show(k)
         elif kind is Event.PRINT:
-            self._tell("on_print", k + 1, now, data.decode("utf-8", "replace"))
+            self._notify("print", k + 1, now, data.decode("utf-8", "replace"))
         elif kind is Event.RECORD:
-            self._tell("on_record", k + 1, now, data)
+            self._notify("record", k + 1, now, data)
         elif kind is Event.APP_CHANNEL:
             self.from_apps.append((now / 1e9, k + 1, data))
-            self._tell("on_app_channel", k + 1, now, data)
+            self._notify("app_channel", k + 1, now, data)
         elif kind is not Event.ENDED:
             text = data.decode("utf-8", "replace")
             reason = {
@@ -197,13 +195,9 @@ class Laboratory:
             }.get(kind, f"it used {text}")
             raise AppError(f"app of agent {k + 1} at {now / 1e9:.6f} s: {reason}")
 
-    def observe(self, observer: Observer) -> None:
-        """From now on somebody else looks on, too."""
-        self._observers = (*self._observers, observer)
-
-    def _tell(self, what: str, *values: Any) -> None:
+    def _notify(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
         for observer in self._observers:
-            getattr(observer, what)(*values)
+            observer(kind, agent, now_ns, content)
 
     def _command(self, k: int, command: Command, data: bytes) -> int:
         firmware, t = self.world.firmware[k], self.time
@@ -245,7 +239,7 @@ class Laboratory:
     def _tick(self) -> None:
         self.world.step((self.now_ns - TICK_NS) / 1e9)
         position = self.world.vehicles.position
-        self._tell("on_positions", self.now_ns, position)
+        self._notify("positions", 0, self.now_ns, position)
         self._truth.positions(self.time, position)
         for k, on in enumerate(self._on):
             if on:
@@ -261,7 +255,7 @@ class Laboratory:
         self._engine.known[k][:] = self.peers[k].values[: len(_KNOWN)]
 
     def _report(self, index: int, name: str, **details: Any) -> None:
-        self._tell("on_event", index + 1, self.now_ns, name)
+        self._notify("event", index + 1, self.now_ns, name)
         self._truth.event(self.time, index + 1, name, **details)
 
     # -- air --------------------------------------------------------------------------------------------------------
@@ -330,7 +324,8 @@ class Laboratory:
         if self._on[k]:
             return
         self._copies += 1
-        copy = private_copy(self._library, Path(self._directory.name), f"agent_{agent}_{self._copies}")
+        # What is loaded from a copy of its own has variables of its own.
+        copy = Path(shutil.copyfile(self._library, Path(self._directory.name) / f"agent_{agent}_{self._copies}.so"))
         self.show(k)
         speed = esb.RATE_NAMES.index(self.settings.rate)
         self._engine.boot(k, copy, self.now_ns, self._drifts[k], ADDRESS + agent, self.settings.channel, speed)
@@ -444,6 +439,3 @@ class Laboratory:
     def _then_show(self, agent: int, done: bool) -> bool:
         self.show(agent - 1)
         return done
-
-
-__all__ = ["AppError", "Laboratory"]

@@ -18,10 +18,8 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.settings.on_board import KEY_BYTES, PORT, START, check_on_board, orders, parameters
 from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
 
-from .app import App, read_app
+from .app import App, LabSettings, read_app
 from .laboratory import Laboratory
-from .record import Observer
-from .settings import LabSettings
 
 APP = Path(dtsa_agent.__file__).parent / "onboard"
 _OPENED, _HEARD = struct.Struct("<4B3q2HI13d60s"), struct.Struct("<4B2q60s")  # onboard/watch.c
@@ -49,7 +47,6 @@ class _Flight:
         self._record: SlotRecord | None = None
         self._before: list[Heard] = []
         self._slots = config.steps
-        self.last = -1
 
     def note(self, data: bytes) -> None:
         """Takes in what the app has noted."""
@@ -58,14 +55,14 @@ class _Flight:
             return
         kind, accepted, sender, length, slot, at_ns, frame = _HEARD.unpack(data)
         if kind == ord("S"):
-            self._sent(frame[:length], at_ns)
-            return
-        if kind == ord("A"):
+            if self._record is not None:
+                self._record.sent_ns, self._record.datagram = at_ns, frame[:length]
+        elif kind == ord("A"):
             self.close_slot()
             self._before.clear()
-            return
-        heard = Heard(sender, slot, at_ns, frame[:length], bool(accepted))
-        (self._before if self._record is None else self._record.heard).append(heard)
+        else:
+            heard = Heard(sender, slot, at_ns, frame[:length], bool(accepted))
+            (self._before if self._record is None else self._record.heard).append(heard)
 
     def _open(self, data: bytes) -> None:
         _, anew, reason, length, slot, start, opened, present, chosen, digest, score, *rest = _OPENED.unpack(data)
@@ -79,14 +76,9 @@ class _Flight:
             frame, before=before,
         )  # fmt: skip
 
-    def _sent(self, datagram: bytes, now_ns: int) -> None:
-        if self._record is not None:
-            self._record.sent_ns, self._record.datagram = now_ns, datagram
-
     def close_slot(self) -> None:
         """The present slot is over."""
         if self._record is not None:
-            self.last = self._record.slot
             self._recorder.slot(self._record)
             self._record = None
 
@@ -97,7 +89,7 @@ class _Flight:
         self._recorder.__exit__()
 
 
-class OnBoard(Observer):
+class OnBoard:
     """A swarm that flies the protocol on board, and its ground.
 
     :param swarm: what all agents share; the app has the defaults of the rest.
@@ -136,21 +128,20 @@ class OnBoard(Observer):
             return
         for agent in range(1, swarm.agents + 1):
             self.lab.at(settings.boot_s + 0.1, lambda agent=agent: self.prepare(agent))  # type: ignore[misc]
-            height = HEIGHT_M + float(self.scenario.start[2, agent - 1])
-            self._at(enable_s - _CLIMB_S - 0.5, self.lab.take_off, agent, height, _CLIMB_S)
-            self._at(enable_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
+            self._climb(agent, HEIGHT_M + float(self.scenario.start[2, agent - 1]), enable_s)
 
     def _make_laboratory(self, app: App, settings: LabSettings, out: Path | None) -> Laboratory:
-        return Laboratory(app, settings, out, [self])
+        return Laboratory(app, settings, out, [self.observe])
 
     def _at(self, time_s: float, action: Callable[..., object], *given: Any) -> None:
         self.lab.at(time_s, lambda: action(*given) and None)
 
-    def prepare(self, agent: int) -> None:
-        """Now, and in the time that follows: its settings, everybody's places, and the start.
+    def _climb(self, agent: int, height: float, enable_s: float) -> None:
+        self._at(enable_s - _CLIMB_S - 0.5, self.lab.take_off, agent, height, _CLIMB_S)
+        self._at(enable_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
 
-        :param agent: id of one that has just been switched on.
-        """
+    def prepare(self, agent: int) -> None:
+        """Tell one that has just been switched on its settings and everybody's places, and start it."""
         lab, now = self.lab, self.lab.time
         for name, value in parameters(self.swarm, self.scenario, HEIGHT_M).items():
             lab.set_parameter(agent, name, value)
@@ -158,37 +149,23 @@ class OnBoard(Observer):
             self._at(now + 0.1 + i * _ORDER_S, lab.send, agent, order)
 
     def come_back(self, agent: int, after_s: float) -> None:
-        """One that was switched off is switched on, told all, and takes off.
-
-        :param agent: id.
-        :param after_s: s from now, when it may steer.
-        """
-        now = self.lab.time
+        """One that was switched off is switched on, told all, and takes off; it may steer so many s from now on."""
         self.lab.switch_on(agent)
-        self._at(now + 0.5, self.prepare, agent)
-        self._at(now + after_s - _CLIMB_S - 0.5, self.lab.take_off, agent, HEIGHT_M, _CLIMB_S)
-        self._at(now + after_s, self.lab.set_parameter, agent, "dtsa.enable", 1)
+        self._at(self.lab.time + 0.5, self.prepare, agent)
+        self._climb(agent, HEIGHT_M, self.lab.time + after_s)
 
     def send_goal(self, agent: int, goal: Any) -> None:
-        """An agent's new goal, of which the others hear nothing.
-
-        :param agent: id.
-        :param goal: (3,) m, frame map.
-        """
+        """An agent's new goal, (3,) m, frame map, of which the others hear nothing."""
         self.lab.send(agent, b"T" + struct.pack("<B3d", agent, *map(float, goal)))
 
     def mute(self, agent: int) -> None:
-        """No frame of an agent gets on the air any more.
-
-        :param agent: id.
-        """
+        """No frame of an agent gets on the air any more."""
         self.lab.set_parameter(agent, "dtsa.mute", 1)
 
-    def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
-        """What an app has noted."""
-        flight = self._flights[agent - 1]
-        if flight is not None:
-            flight.note(data)
+    def observe(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
+        """What an app has noted goes into its bag."""
+        if kind == "record" and (flight := self._flights[agent - 1]) is not None:
+            flight.note(content)
 
     def __enter__(self) -> OnBoard:
         return self

@@ -13,7 +13,7 @@ from dtsa_bench.crazyflies.simulated.radio.esb import RATE_NAMES
 from dtsa_bench.crazyflies.simulated.radio.receiver import NULL, Receiver
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
 
-from .settings import LabSettings
+from .app import LabSettings
 
 _POLL = bytes((NULL | 0x0C,))  # an empty packet
 _STREAM = 0x706F6C6C  # of random numbers, besides those of losses and starts
@@ -26,7 +26,7 @@ class Polling:
         self, air: RadioAir, agenda: Agenda, settings: LabSettings, taken: Callable[[int, float], None]
     ) -> None:
         count = settings.agents
-        self.answered = self.unanswered = 0
+        self.answered = 0
         self._agenda = agenda
         self._stations = [
             Station("", settings.channel, settings.rate, bytes((0xE7, 0xE7, 0xE7, 0xE7, k + 1))) for k in range(count)
@@ -63,7 +63,4 @@ class Polling:
 
     def _answer(self, data: bytes) -> None:
         self._busy = False
-        if data and data[0] & 1:
-            self.answered += 1
-        else:
-            self.unanswered += 1
+        self.answered += bool(data and data[0] & 1)

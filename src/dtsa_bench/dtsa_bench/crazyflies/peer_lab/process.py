@@ -15,11 +15,10 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.crazyflie.settings.on_board import key_of
 
-from .app import App, read_app
+from .app import App, LabSettings, read_app
 from .compiling import CompileError, sanitizer_environment
 from .engine import AppError
 from .laboratory import Laboratory
-from .settings import LabSettings
 
 _CRASHED = 70  # native/crash.c
 _HEAD = "peer-lab: "
@@ -39,10 +38,8 @@ def fly(
 ) -> dict[str, Any]:
     """Fly an app; the summary, with `console` (what the apps printed), `warnings` (compiler, sanitizers), `logs`.
 
-    :param place: directory of the app, or the name of one that comes with the laboratory.
+    :param place: of the app, with `sources`, `include` and `flags`: as for `read_app`.
     :param seconds: s, virtual time.
-    :param settings: vehicles, air and ground.
-    :param sources: further C files. :param include: further directories. :param flags: further ones of the compiler.
     :param parameters: values of the app's parameters, beside those of app.yaml.
     :param out: directory for files.
     :param swarm: flies the protocol on board; None: the app is another one.

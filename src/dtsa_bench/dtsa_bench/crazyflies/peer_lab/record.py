@@ -72,40 +72,15 @@ class Ages:
         }
 
 
-class Observer:
-    """What may look on. Times are ns; agents are ids; each method may be left out."""
-
-    def on_sent(self, agent: int, now_ns: int, packet: Packet) -> None:
-        """An app has ordered a packet."""
-
-    def on_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
-        """An app's callback gets a packet."""
-
-    def on_command(self, agent: int, now_ns: int, code: int, data: bytes) -> None:
-        """An app has commanded its vehicle (engine.Command)."""
-
-    def on_print(self, agent: int, now_ns: int, text: str) -> None:
-        """An app has printed."""
-
-    def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
-        """An app has handed something over (peerLabRecord)."""
-
-    def on_app_channel(self, agent: int, now_ns: int, data: bytes) -> None:
-        """An app has sent a packet of the app channel to the ground."""
-
-    def on_event(self, agent: int, now_ns: int, name: str) -> None:
-        """Something happened to a vehicle."""
-
-    def on_positions(self, now_ns: int, position: NDArray[np.float64]) -> None:
-        """True places, every 10 ms, (3, N), m, world."""
+#: Gets what happens: kind, id of the agent (0: all), time (ns), content. The kinds: `sent` and `heard` (a packet, as
+#: an app has ordered it, or its callback gets it), `command` (number as of engine.Command, and its bytes), `print`
+#: (text), `record` (bytes of peerLabRecord), `app_channel` (bytes to the ground), `event` (name of what happened to a
+#: vehicle), and `positions` (true places every 10 ms, (3, N), m, world).
+Observer = Callable[[str, int, int, Any], None]
 
 
-class Record(Observer):
-    """Counts, ages, distances, and the digest of all of it.
-
-    :param carries_state: as of an app.
-    :param directory: where files are written; None: nowhere.
-    """
+class Record:
+    """Counts, ages, distances, and the digest of all of it; with a directory, a file of all packets."""
 
     def __init__(self, agents: int, carries_state: Callable[[bytes, int], bool], directory: Path | None = None) -> None:
         self._carries_state, self._ages, self._digest = carries_state, Ages(agents), hashlib.sha256()
@@ -121,44 +96,49 @@ class Record(Observer):
         if directory is not None:
             self._file = (directory / "packets.jsonl").open("w", encoding="utf-8")
 
-    def _note(self, kind: int, agent: int, now_ns: int, data: bytes) -> None:
+    def __call__(self, kind: str, agent: int, now_ns: int, content: Any) -> None:
+        """See `Observer`."""
+        if (note := getattr(self, f"_note_{kind}", None)) is not None:
+            note(agent, now_ns, content)
+
+    def _digest_update(self, kind: int, agent: int, now_ns: int, data: bytes) -> None:
         self._digest.update(struct.pack("<BHqI", kind, agent, now_ns, len(data)) + data)
 
     def _line(self, **entry: Any) -> None:
         if self._file is not None:
             self._file.write(json.dumps(entry) + "\n")
 
-    def on_sent(self, agent: int, now_ns: int, packet: Packet) -> None:
+    def _note_sent(self, agent: int, now_ns: int, packet: Packet) -> None:
         self.sent[agent - 1] += 1
-        self._note(0, agent, now_ns, packet.raw)
+        self._digest_update(0, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, sent=agent, port=packet.raw[0], data=packet.data.hex())
 
-    def on_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
+    def _note_heard(self, agent: int, now_ns: int, packet: Packet) -> None:
         self.heard[agent - 1] += 1
-        self._note(1, agent, now_ns, packet.raw)
+        self._digest_update(1, agent, now_ns, packet.raw)
         self._line(t_ns=now_ns, heard=agent, sender=packet.sender, port=packet.raw[0], data=packet.data.hex())
         if packet.sender and self._carries_state(packet.data, agent):
             self._ages.heard(agent, packet.sender, packet.ordered_ns, now_ns)
 
-    def on_command(self, agent: int, now_ns: int, code: int, data: bytes) -> None:
-        self._note(2 + code, agent, now_ns, data)
+    def _note_command(self, agent: int, now_ns: int, command: tuple[int, bytes]) -> None:
+        self._digest_update(2 + command[0], agent, now_ns, command[1])
 
-    def on_print(self, agent: int, now_ns: int, text: str) -> None:
-        self._note(20, agent, now_ns, text.encode())
+    def _note_print(self, agent: int, now_ns: int, text: str) -> None:
+        self._digest_update(20, agent, now_ns, text.encode())
         *lines, rest = (self._lines.get(agent, "") + text).split("\n")
         self._lines[agent] = rest
         self.console += [(now_ns / 1e9, agent, line) for line in lines]
 
-    def on_record(self, agent: int, now_ns: int, data: bytes) -> None:
-        self._note(23, agent, now_ns, data)
+    def _note_record(self, agent: int, now_ns: int, data: bytes) -> None:
+        self._digest_update(23, agent, now_ns, data)
 
-    def on_event(self, agent: int, now_ns: int, name: str) -> None:
-        self._note(21, agent, now_ns, name.encode())
+    def _note_event(self, agent: int, now_ns: int, name: str) -> None:
+        self._digest_update(21, agent, now_ns, name.encode())
         if name in ("crash", "hard landing"):
             self.crashed.setdefault(agent, now_ns / 1e9)
 
-    def on_positions(self, now_ns: int, position: NDArray[np.float64]) -> None:
-        self._note(22, 0, now_ns, np.ascontiguousarray(position).tobytes())
+    def _note_positions(self, agent: int, now_ns: int, position: NDArray[np.float64]) -> None:
+        self._digest_update(22, 0, now_ns, np.ascontiguousarray(position).tobytes())
         flying = np.flatnonzero(position[2] > _FLYING_M)
         if len(flying) > 1:
             p = position[:, flying]

@@ -4,8 +4,8 @@ They fly the project's own vehicle model behind the firmware's commander, high-l
 watchdogs, and fail on command. For tests of the bridge, and a training ground for its users.
 """
 
-from .control import send_fault
 from .fleet import Fleet
 from .fleet_config import FleetConfig
+from .process import send_fault
 
 __all__ = ["Fleet", "FleetConfig", "send_fault"]

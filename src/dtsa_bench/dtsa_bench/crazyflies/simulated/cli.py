@@ -18,9 +18,9 @@ from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Statio
 from dtsa_bench.crazyflies.simulated.radio.side import Dongles
 from dtsa_bench.runs.options import add_options, given, whole_number
 
-from .control import FAULTS, send_fault
 from .fleet import NUMBERS, Fleet
 from .fleet_config import LAYOUTS, FleetConfig, start_positions
+from .process import FAULTS, send_fault
 
 DESCRIPTION = """\
 Simulated Crazyflies over UDP: cflib, its client and the Crazyflie bridge connect to them as to real ones.
@@ -29,7 +29,7 @@ They fly, drain their batteries and fail on command; Ctrl-C ends them."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    add_options(parser, FleetConfig, "fleet", skip=("host", "collision_m", "crash_m"))
+    add_options(parser, FleetConfig, "fleet")
     parser.add_argument("--config", type=Path, help="swarm.yaml: count, ports and start positions come from its robots")
     parser.add_argument("--layout", choices=LAYOUTS, default="ellipse", help="start positions (%(default)s)")
     parser.add_argument(
@@ -70,10 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def fleet_config(args: argparse.Namespace) -> FleetConfig:
-    """Configuration from the command line.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """Configuration from the command line."""
     radio = RadioSettings(**given(args, RadioSettings, "radio"), path=args.simulated_radio)
     options = {**given(args, FleetConfig, "fleet"), "truth": args.truth, "radio": radio}
     if args.config is not None:
@@ -120,8 +117,7 @@ def request_fault(args: argparse.Namespace) -> None:
             cf = int(args.cf)
         except ValueError:
             raise ConfigError("cf", args.cf, "an id, or all") from None
-    names = NUMBERS
-    numbers = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    numbers = {name: getattr(args, name) for name in NUMBERS if getattr(args, name) is not None}
     port = FleetConfig(**given(args, FleetConfig, "fleet")).control_port
     send_fault(("127.0.0.1", port), fault=args.fault, cf=cf, **numbers)
     print(f"{args.fault}: cf {args.cf}")

@@ -107,9 +107,8 @@ DECODERS: dict[int, tuple[int, Callable[[bytes, float], Setpoint]]] = {
 class Firmware:
     """Commander, high-level commander, supervisor and battery of one Crazyflie. Times (`t`) are s, the fleet's clock.
 
-    :param report: called with the name of each event and details, for the record.
-    :param tau: s, lag of the vehicle's velocity, which wanted accelerations make up for.
-    :param auto_arming: it arms itself.
+    `report` is called with the name of each event and details. Wanted accelerations make up for `tau`, the lag (s) of
+    the vehicle's velocity.
     """
 
     def __init__(self, report: Callable[..., None], tau: float, *, auto_arming: bool = False) -> None:
@@ -206,11 +205,7 @@ class Firmware:
 
     # -- one step of control ----------------------------------------------------------------------------------------
     def step(self, t: float, dt: float, position: Triple, velocity: Triple) -> tuple[str, Triple]:
-        """What the vehicle does from t to t + dt.
-
-        :param position: m, what the estimator says. :param velocity: m/s, the same.
-        :return: OFF, FLY or LEVEL, and the velocity command in m/s.
-        """
+        """What the vehicle does from t to t + dt by its estimate: OFF, FLY or LEVEL, and the velocity command, m/s."""
         allowed = self.supervisor.motors_allowed
         if not allowed:
             self.planner.stop()

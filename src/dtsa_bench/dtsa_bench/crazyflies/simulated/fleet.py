@@ -19,9 +19,9 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.crazyflies.simulated.radio.side import Host, RadioSide
 
-from .control import check_fault
-from .fleet_config import FleetConfig
+from .fleet_config import HOST, FleetConfig
 from .peer import Peer
+from .process import check_fault
 from .truth import TruthLog
 from .world import TICK_S, World
 
@@ -84,7 +84,7 @@ class Fleet:
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         sock.setblocking(False)
         try:
-            sock.bind((self.config.host, port))
+            sock.bind((HOST, port))
         except OSError as error:
             sock.close()
             self.close()

@@ -18,14 +18,13 @@ from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings
 from .peer import PROTOCOLS
 
 MAX_COUNT = 200
+HOST = "127.0.0.1"
 LAYOUTS = ("ellipse", "grid", "line")
 
 
 def start_positions(layout: str, count: int, half_axes: tuple[float, float] = (1.2, 2.0)) -> NDArray[np.float64]:
-    """Start positions on the floor, (3, count), m, world.
+    """Start positions on the floor, (3, count), m, world; an ellipse counter-clockwise from the x axis, by ids.
 
-    :param layout: `ellipse` (in the order of their ids, counter-clockwise from the x axis), `grid` or `line`.
-    :param half_axes: m, along x and y.
     :raises ConfigError: unknown layout.
     """
     a, b = half_axes
@@ -58,14 +57,12 @@ class FleetConfig(Settings):
     :param start: start positions, (3, count), m, world; None: an ellipse.
     :param truth: file for the record of what really happened; None: no record.
     :param radio: simulated radios in place of UDP; without a path: UDP.
-    :raises ConfigError: a value is out of range.
     """
 
     count: int = setting(12, "number of vehicles", minimum=1, maximum=MAX_COUNT)
     base_port: int = setting(19850, "UDP port of the first; vehicle k listens on base_port + k - 1", minimum=1024,
                              maximum=65535)  # fmt: skip
     control_port: int = setting(0, "UDP port for faults; 0: base_port - 1", minimum=0, maximum=65535)
-    host: str = setting("127.0.0.1", "address on which they listen")
     start: Any = field(default=None, compare=False)
     seed: int = setting(1, "seed of noise and loss", minimum=0, maximum=2**63 - 1)
     protocol: int = setting(12, "version of the protocol told to the host", choices=PROTOCOLS)
@@ -77,10 +74,6 @@ class FleetConfig(Settings):
     )
     noise: bool = setting(True, "sensors have noise")
     model: str = setting("orca", "flight model that has their vehicle", choices=AVOIDERS.names, open_choices=True)
-    collision_m: float = setting(
-        0.2, "the record notes two flying vehicles closer than this", unit="m", minimum=0, maximum=10
-    )
-    crash_m: float = setting(0.12, "two flying vehicles closer than this fall", unit="m", minimum=0, maximum=10)
     truth: Path | None = None
     radio: RadioSettings = field(default_factory=RadioSettings)
 
@@ -107,4 +100,4 @@ class FleetConfig(Settings):
         """Where cflib finds them."""
         if self.radio.path is not None:
             return [station.uri for station in self.radio.stations]
-        return [f"udp://{self.host}:{self.base_port + k}" for k in range(self.count)]
+        return [f"udp://{HOST}:{self.base_port + k}" for k in range(self.count)]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from . import crtp, toc
+from . import crtp
 from .estimate import Estimate, log_values
 from .firmware import Firmware
 
@@ -31,33 +31,27 @@ class Block:
         return struct.calcsize("<" + "".join(form for _, form in self.variables))
 
     def data(self, values: dict[str, float]) -> bytes:
-        return b"".join(struct.pack("<" + form, toc.saturate(values[name], form)) for name, form in self.variables)
+        return b"".join(struct.pack("<" + form, crtp.saturate(values[name], form)) for name, form in self.variables)
 
 
 class OnBoard(Protocol):
-    """An app on board: it adds parameters and log variables, and takes packets of its own."""
+    """An app on board: it adds parameters and log variables, and gets packets of the app channel."""
 
-    parameters: Sequence[toc.Entry]
-    logs: Sequence[toc.Entry]
+    parameters: Sequence[crtp.Entry]
+    logs: Sequence[crtp.Entry]
+    receive: Callable[[bytes], object]
 
-    def parameter(self, name: str) -> float:
-        """Value of one of its parameters."""
+    def parameter(self, name: str) -> float: ...
 
-    def set_parameter(self, name: str, value: float) -> None:
-        """Set one."""
+    def set_parameter(self, name: str, value: float) -> None: ...
 
-    def log_values(self) -> Mapping[str, float]:
-        """Values of its log variables, by their full names."""
-
-    def receive(self, data: bytes) -> None:
-        """A packet of the app channel."""
+    def log_values(self) -> Mapping[str, float]: ...
 
 
 class Peer:
     """Protocol state of one simulated Crazyflie: log blocks and parameter values. Times (`t`) are s, the fleet's clock.
 
-    :param protocol: version that is told to the host, 10 or 12.
-    :param number: last byte of its address, by which packets to several name it.
+    The last byte of its address is its number, by which packets to several name it.
     """
 
     def __init__(self, firmware: Firmware, estimate: Estimate, protocol: int = 12, number: int = 1) -> None:
@@ -68,8 +62,8 @@ class Peer:
         self.positions_received = 0
         self.blocks: dict[int, Block] = {}
         self._app: OnBoard | None = None
-        self._params, self._logs = toc.PARAM_ENTRIES, toc.LOG_ENTRIES
-        self._param_table, self._log_table = toc.PARAM_TABLE, toc.LOG_TABLE
+        self._params, self._logs = crtp.PARAM_ENTRIES, crtp.LOG_ENTRIES
+        self._param_table, self._log_table = crtp.PARAM_TABLE, crtp.LOG_TABLE
         self.values = [entry.value for entry in self._params]
         self._handlers: dict[tuple[int, int], Handler] = {
             (crtp.LINK, 0): lambda data, t: data,
@@ -105,10 +99,10 @@ class Peer:
     def adopt(self, app: OnBoard) -> None:
         """An app has started on board: its variables are in the tables of contents."""
         self._app = app
-        self._params = (*toc.PARAM_ENTRIES, *app.parameters)
-        self._logs = (*toc.LOG_ENTRIES, *app.logs)
-        self._param_table, self._log_table = toc.Table(self._params, log=False), toc.Table(self._logs, log=True)
-        self.values[len(toc.PARAM_ENTRIES) :] = [entry.value for entry in app.parameters]
+        self._params = (*crtp.PARAM_ENTRIES, *app.parameters)
+        self._logs = (*crtp.LOG_ENTRIES, *app.logs)
+        self._param_table, self._log_table = crtp.Table(self._params, log=False), crtp.Table(self._logs, log=True)
+        self.values[len(crtp.PARAM_ENTRIES) :] = [entry.value for entry in app.parameters]
 
     def receive(self, datagram: bytes, t: float) -> bytes | None:
         """Handle one datagram at time t (s); the reply, or None."""
@@ -182,7 +176,7 @@ class Peer:
     def _positioned(self, place: tuple[float, float, float]) -> None:
         self.positions_received += 1
         if all(map(math.isfinite, place)):
-            self.estimate.correct(place, max(self.values[toc.PARAM_ID["locSrv.extPosStdDev"]], 1e-4))
+            self.estimate.correct(place, max(self.values[crtp.PARAM_ID["locSrv.extPosStdDev"]], 1e-4))
 
     def _localization(self, data: bytes, t: float) -> bytes | None:
         if data[:1] == b"\x08":
@@ -243,7 +237,7 @@ class Peer:
         block = Block() if create else self.blocks[number]
         variables = list(block.variables)
         for kind, index in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
-            form = toc.LOG_FORMAT_BY_CODE.get(kind & 15)
+            form = crtp.LOG_FORMAT_BY_CODE.get(kind & 15)
             if form is None or index >= len(self._logs):
                 return errno.ENOENT
             variables.append((self._logs[index].full_name, form))
@@ -254,7 +248,7 @@ class Peer:
         return 0
 
     def _param_format(self, index: int) -> str:
-        return "<" + toc.PARAM_TYPES[self._params[index].type][1]
+        return "<" + crtp.PARAM_TYPES[self._params[index].type][1]
 
     def _param_read(self, data: bytes, t: float) -> bytes:
         (index,) = struct.unpack_from("<H", data)
@@ -264,9 +258,9 @@ class Peer:
 
     def _packed(self, index: int) -> bytes:
         form = self._param_format(index)
-        if self._app is not None and index >= len(toc.PARAM_ENTRIES):
+        if self._app is not None and index >= len(crtp.PARAM_ENTRIES):
             self.values[index] = self._app.parameter(self._params[index].full_name)
-        return struct.pack(form, toc.saturate(self.values[index], form[1]))
+        return struct.pack(form, crtp.saturate(self.values[index], form[1]))
 
     def _param_write(self, data: bytes, t: float) -> bytes:
         (index,) = struct.unpack_from("<H", data)
@@ -281,20 +275,9 @@ class Peer:
             if index >= len(self.values):
                 return data[:3] + bytes((errno.ENOENT,))
             form = self._param_format(index)
-            default = struct.pack(form, toc.saturate(self._params[index].value, form[1]))
+            default = struct.pack(form, crtp.saturate(self._params[index].value, form[1]))
             return data[:3] + (b"\0" if data[:1] == b"\x08" else b"") + default
-        if data[:1] != b"\0":
-            return None
-        parts = data[1:].split(b"\0", 2)  # set by name: group, name, type and value
-        if len(parts) != 3:
-            return None
-        name = b".".join(parts[:2]).decode("ascii", "replace")
-        index = next((i for i, entry in enumerate(self._params) if entry.full_name == name), -1)
-        head = b"\0" + parts[0] + b"\0" + parts[1] + b"\0"
-        if index < 0:
-            return head + bytes((errno.ENOENT,))
-        self.set_parameter(index, struct.unpack_from(self._param_format(index), parts[2], 1)[0], t)
-        return head + b"\0"
+        return None
 
     def set_parameter(self, index: int, value: float, t: float) -> None:
         """Set a parameter (its index in the table), unless it can only be read."""
@@ -302,10 +285,10 @@ class Peer:
         if entry.read_only:
             return
         self.values[index] = value
-        if self._app is not None and index >= len(toc.PARAM_ENTRIES):
+        if self._app is not None and index >= len(crtp.PARAM_ENTRIES):
             self._app.set_parameter(entry.full_name, value)
         if entry.full_name == "kalman.resetEstimation" and value:
-            x, y, z = (self.values[toc.PARAM_ID[f"kalman.initial{axis}"]] for axis in "XYZ")
+            x, y, z = (self.values[crtp.PARAM_ID[f"kalman.initial{axis}"]] for axis in "XYZ")
             self.estimate.reset(t, (x, y, z))
         elif entry.full_name == "hlCommander.groupmask":
             self.firmware.groups = int(value)

@@ -33,11 +33,7 @@ HL_ACTIVE, HL_FINISHED = 256, 512
 
 
 class Supervisor:
-    """State machine of one Crazyflie.
-
-    :param report: called with the name of each event and details, for the record.
-    :param auto_arming: it arms itself, as a Crazyflie 2.1 or 2.1+ does; a 2.1 brushless or a Bolt waits to be told.
-    """
+    """State machine of one Crazyflie; `auto_arming`: a 2.1 or 2.1+, a 2.1 brushless or a Bolt waits to be armed."""
 
     def __init__(self, report: Callable[..., None], *, auto_arming: bool = False) -> None:
         self._report = report
@@ -85,18 +81,11 @@ class Supervisor:
             self.emergency = reason
 
     def watchdog(self, t: float) -> None:
-        """A packet of the emergency stop watchdog came.
-
-        :param t: s, the fleet's clock.
-        """
+        """A packet of the emergency stop watchdog came."""
         self._watchdog = t
 
     def update(self, t: float, *, setpoint_age: float, thrust: bool) -> None:
-        """One step.
-
-        :param t: s. :param setpoint_age: s since the last setpoint of any source.
-        :param thrust: the motors turn faster than idle.
-        """
+        """One step; `setpoint_age`: s, of any source; `thrust`: the motors turn faster than idle."""
         if thrust:
             self._thrust = t
         if self._watchdog is not None and t >= self._watchdog + EMERGENCY_WATCHDOG_S:

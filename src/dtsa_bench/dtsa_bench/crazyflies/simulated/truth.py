@@ -37,10 +37,7 @@ class TruthLog:
             self._file.flush()
 
     def positions(self, t: float, position: NDArray[np.float64]) -> None:
-        """True positions (3, N) at t.
-
-        :param position: (3, N) m, world.
-        """
+        """True positions at t (s), (3, N) m, world."""
         if self._file is None:
             return
         rows = ",".join("[" + ",".join(f"{v:.4f}" for v in row) + "]" for row in position.tolist())

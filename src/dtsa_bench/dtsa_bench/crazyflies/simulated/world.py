@@ -18,16 +18,14 @@ from .fleet_config import FleetConfig
 TICK_S = 0.01
 POSITION_NOISE_M = 0.002
 VELOCITY_NOISE_MPS = 0.01
+COLLISION_M = 0.2  # the record notes two flying vehicles closer than this
+CRASH_M = 0.12  # two flying vehicles closer than this fall
 DRAG_S = 1.5  # s, time constant of a level quadcopter's drift
 HARD_LANDING = 1.5  # m/s: faster than that onto the floor turns it over
 
 
 class Vehicles:
-    """The bodies: true states of a fleet, in the air, falling and on the floor.
-
-    :param start: (3, N), m, world; z = 0 is the floor.
-    :param model: how they answer a velocity command.
-    """
+    """The bodies: true states of a fleet, (3, N), world, in the air, falling and on the floor (z = 0)."""
 
     def __init__(self, start: NDArray[np.float64], model: VehicleParams) -> None:
         self.model = model
@@ -36,10 +34,7 @@ class Vehicles:
         self.acceleration = np.zeros_like(self.position)
 
     def step(self, dt: float, modes: list[str], command: NDArray[np.float64]) -> list[int]:
-        """Move all for dt seconds by velocity commands, (3, N), m/s; the indices of those that hit the floor hard.
-
-        :param modes: OFF, FLY or LEVEL for each vehicle.
-        """
+        """Move all for dt seconds by modes and velocity commands, m/s; the indices of those that hit the floor hard."""
         p, v = self.position, self.velocity
         before = v.copy()
         off = np.array([mode == OFF for mode in modes])
@@ -62,10 +57,7 @@ class Vehicles:
 
 
 class World:
-    """Vehicles that fly by what their firmware says.
-
-    :param report: takes an index, the name of an event and details, for the record.
-    """
+    """Vehicles that fly by their firmware; `report` gets an index, the name of an event and details."""
 
     def __init__(self, config: FleetConfig, report: Callable[..., None]) -> None:
         self._config = config
@@ -81,10 +73,7 @@ class World:
         self._estimate()
 
     def step(self, t: float, moved: Callable[[], Any] = lambda: None) -> None:
-        """Fly for one tick of 10 ms that begins at t (s).
-
-        :param moved: called when the bodies have moved, before anything is reported of their new places.
-        """
+        """Fly for one tick of 10 ms from t (s); `moved` is called between the motion and the report of new places."""
         modes, command = [], np.zeros_like(self.vehicles.position)
         for k, firmware in enumerate(self.firmware):
             mode, wanted = firmware.step(t, TICK_S, self.estimates[k].position, self.estimates[k].velocity)
@@ -114,12 +103,12 @@ class World:
         gap: NDArray[np.float64] = p[:, :, None] - p[:, None, :]
         distance = np.sqrt((gap * gap).sum(axis=0))
         near = set()
-        for i, j in np.argwhere(np.triu(distance < self._config.collision_m, 1)):
+        for i, j in np.argwhere(np.triu(distance < COLLISION_M, 1)):
             a, b, d = flying[i], flying[j], float(distance[i, j])
             near.add((a, b))
             if (a, b) not in self._close_pairs:
                 self._report(a, "collision", other=b + 1, distance=round(d, 3))
-            if d < self._config.crash_m:
+            if d < CRASH_M:
                 for k in (a, b):
                     self._report(k, "crash")
                     self.firmware[k].supervisor.tumbled = True

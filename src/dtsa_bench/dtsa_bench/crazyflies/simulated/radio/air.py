@@ -37,10 +37,9 @@ class Agenda:
 
 
 class RadioAir:
-    """Transmissions on all channels (0 to 125), and who hears them. Channels do not disturb each other.
+    """Transmissions on all channels (0 to 125), which do not disturb each other, and the radios that hear them.
 
-    :param radios: dongles and Crazyflies; their ids are 1 to this number.
-    :param loss: share of packets that a receiver loses to noise, drawn from a seed.
+    Ids of radios (dongles and Crazyflies) are 1 to their number. A receiver loses a share of packets to noise.
     """
 
     def __init__(self, radios: int, loss: float, seed: int) -> None:

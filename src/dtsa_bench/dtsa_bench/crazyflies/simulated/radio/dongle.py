@@ -19,7 +19,7 @@ from .settings import DEVICES, RadioSettings
 from .sniffer_mode import FIRST_FIRMWARE, SnifferMode, Tuned
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_POWER, SET_ARD, SET_ARC = range(1, 7)
-ACK_ENABLE, SET_CARRIER = 0x10, 0x20
+ACK_ENABLE = 0x10
 SET_RADIO_MODE, SET_SNIFFER_ADDRESS = 0x24, 0x25
 ACKNOWLEDGED, POWER_DETECTED = 0x01, 0x02
 ACK_TIMEOUT_NS = 500_000  # of a Crazyradio 2.0, from the end of the packet to the address of the acknowledgement
@@ -37,12 +37,9 @@ class _Transfer:
 
 
 class Dongle:
-    """One Crazyradio.
+    """One Crazyradio; radios are named by their ids on the air. It adds its own sniffer to those of all dongles.
 
-    :param radio: its id on the air.
-    :param receivers: the Crazyflies by their ids on the air.
     :param passes: says whether a packet to (True) or from a Crazyflie passes the faults of its link.
-    :param sniffers: of all dongles on the air; this one adds its own.
     """
 
     def __init__(
@@ -71,7 +68,7 @@ class Dongle:
         """As after plugging in."""
         self._channel, self._rate, self._address = 2, "2M", b"\xe7" * 5
         self._second = b"\xc2" * 5  # address of the second pipe in sniffer mode
-        self._ard, self._arc, self._ack, self._carrier = 0xA0, 3, True, False
+        self._ard, self._arc, self._ack = 0xA0, 3, True
         self.sniffer.stop()
 
     def request(self, number: int, value: int, index: int, data: bytes, now: int) -> None:
@@ -89,8 +86,6 @@ class Dongle:
             self._arc = value & 0x0F
         elif number == ACK_ENABLE:
             self._ack = bool(value)
-        elif number == SET_CARRIER:
-            self._carrier = bool(value)
         elif number == SET_SNIFFER_ADDRESS and len(data) == 5:
             if value == 0:
                 self._address = bytes(data)
@@ -115,7 +110,7 @@ class Dongle:
     def _can_send(self) -> bool:
         device = self._settings.device
         slow = self._rate == "250K" and device == "2"  # a Crazyradio 2.0 cannot
-        return not (self._carrier or slow or self._channel > HIGHEST_CHANNEL[device])
+        return not (slow or self._channel > HIGHEST_CHANNEL[device])
 
     # -- a packet ---------------------------------------------------------------------------------------------------
     def transfer(self, packet: bytes, now: int, answer: Callable[[bytes], None]) -> None:

@@ -25,7 +25,6 @@ def retry_delay_ns(ard: int, rate: str) -> int:
     """How long a Crazyradio PA waits for an acknowledgement, ns from the end of its packet.
 
     :param ard: value of the request SET_RADIO_ARD: steps of 250 us, or with bit 7 the bytes of an acknowledgement.
-    :param rate: a key of BITRATES.
     """
     if not ard & 0x80:
         return _ARD_STEP_NS * ((ard & 0x0F) + 1)

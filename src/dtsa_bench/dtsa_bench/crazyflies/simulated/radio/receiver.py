@@ -21,11 +21,7 @@ UP, DOWN = 0x08, 0x04
 
 
 class Receiver:
-    """Radio link of one Crazyflie.
-
-    :param station: where it listens.
-    :param deliver: takes a packet that is new, and the time (s).
-    """
+    """Radio link of one Crazyflie; `deliver` gets each new packet, and the time (s)."""
 
     def __init__(self, station: Station, deliver: Callable[[bytes, float], None]) -> None:
         self.station = station

@@ -8,29 +8,17 @@ from pathlib import Path
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Settings, check, setting
 
-from .esb import BITRATES
-
 DEVICES = {"pa": 0x0301, "2": 0x0504}  # Crazyradio PA, Crazyradio 2.0: version of the firmware as USB says it
-FASTEST_CHANNEL = 125
 
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """Where one Crazyflie listens.
-
-    :raises ConfigError: a value is out of range.
-    """
+    """Where one Crazyflie listens."""
 
     uri: str = "radio://0/80/2M"
     channel: int = 80
     rate: str = "2M"
     address: bytes = b"\xe7\xe7\xe7\xe7\xe7"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.channel <= FASTEST_CHANNEL:
-            raise ConfigError("uri", self.channel, f"a channel from 0 to {FASTEST_CHANNEL}")
-        if self.rate not in BITRATES:
-            raise ConfigError("uri", self.rate, "a data rate: " + ", ".join(BITRATES))
 
     @classmethod
     def of(cls, uri: str) -> Station:
@@ -48,9 +36,8 @@ class Station:
 class RadioSettings(Settings):
     """Dongles and air.
 
-    :param path: the Unix socket to which pyusb's simulated backend connects; None: no radios.
+    :param path: the Unix socket to which hosts connect; None: no radios.
     :param stations: where each Crazyflie listens.
-    :raises ConfigError: a value is out of range.
     """
 
     dongles: int = setting(4, "number of simulated Crazyradios", minimum=1, maximum=16)

@@ -46,11 +46,10 @@ class Host:
 
 
 class RadioSide:
-    """Dongles, air and receivers.
+    """Dongles, air and receivers. Hosts may connect at once, or after `listen`.
 
-    :param deliver: takes a vehicle's index, a packet for it and the time (s).
+    :param deliver: gets a vehicle's index, a packet for it and the time (s).
     :param passes: index and direction (True: up): whether a packet passes the faults of a vehicle's link.
-    :param listen: hosts may connect at once; else after `listen`.
     :raises ConfigError: the socket cannot be made.
     """
 

@@ -40,12 +40,7 @@ class Tuned(NamedTuple):
 
 
 class SnifferMode:
-    """A dongle in this mode. Times (`now`) are ns.
-
-    :param radio: its id on the air.
-    :param half_ns: ns, a packet on USB, one way.
-    :param seed: of its clock and its waits.
-    """
+    """A dongle in this mode. Times (`now`) are ns; a packet takes `half_ns` on USB, one way."""
 
     def __init__(self, radio: int, air: RadioAir, agenda: Agenda, half_ns: int, seed: int) -> None:
         self._radio, self._air, self._agenda, self._half_ns = radio, air, agenda, half_ns
