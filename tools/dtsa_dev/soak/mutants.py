@@ -83,12 +83,8 @@ MODULES = {
         ),
     ),
     "safety": Module(
-        tuple(
-            f"dtsa_agent/dtsa_agent/crazyflie/{name}.py"
-            for name in ("safety/rules", "motion/limits", "motion/steering")
-        ),
+        tuple(f"dtsa_agent/dtsa_agent/crazyflie/{name}.py" for name in ("safety/rules", "motion/limits")),
         (
-            f"{_AGENT}/crazyflie/test_steering.py",
             f"{_AGENT}/crazyflie/test_bridge_rules.py",
             f"{_BENCH}/integration/test_settings.py",
         ),
