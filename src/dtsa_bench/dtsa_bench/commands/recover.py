@@ -5,25 +5,19 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import sys
 
 from .registry import RECORDED_RUN
 
 DESCRIPTION = """\
-Makes a full bag of what a killed recorder, a full disk or a damaged file left, and says what was saved.
-The original is only read."""
+Makes a full bag of what a killed recorder, a full disk or a damaged file left: all up to the first damaged place. It
+says what was saved, and what is lost. The original is only read."""
+EXAMPLES = (("runs/a", "into runs/a/bag_recovered"),)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("recover", help="make a full bag of a damaged one", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("bag", help=RECORDED_RUN)
     parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_recovered beside the old one)")
-    parser.add_argument(
-        "--keep-damaged",
-        action="store_true",
-        help="keep what can be read of chunks with a wrong checksum, too",
-    )
     parser.add_argument("--json", action="store_true", help="print what was saved as JSON")
 
 
@@ -31,14 +25,7 @@ def run(args: argparse.Namespace) -> int:
     """Recover the bag."""
     from dtsa_bench.recordings.bag.recover import recover
 
-    def progress(count: int) -> None:
-        sys.stderr.write(f"\r{count} messages")
-        sys.stderr.flush()
-
-    live = sys.stderr.isatty()
-    result = recover(args.bag, args.out, args.keep_damaged, progress if live else None)
-    if live:
-        sys.stderr.write("\r")
+    result = recover(args.bag, args.out)
     if args.json:
         print(json.dumps(dataclasses.asdict(result), indent=2, default=str))
         return 0

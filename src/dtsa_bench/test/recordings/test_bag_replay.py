@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import pty
@@ -17,10 +16,10 @@ import pytest
 from bag_helpers import SECOND, SyntheticRun, ros_environment, synthetic_bag
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.recordings.bag import replay, schema
+from dtsa_bench.recordings.bag import schema
 from dtsa_bench.recordings.bag.errors import BagError, UnusableBag
 from dtsa_bench.recordings.bag.reader import Bag, Message
-from dtsa_bench.recordings.bag.replay import Player, ros_profile, steady_timing
+from dtsa_bench.recordings.bag.replay import Player, ros_profile
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +59,7 @@ def test_everything_is_played_once_in_order(run: SyntheticRun) -> None:
     listener, player = play(run)
     with Bag(run.writer.directory) as bag:
         assert listener.messages == list(bag.messages())
-    assert player.progress.messages == len(listener.messages)
+    assert player.message_count == len(listener.messages)
 
 
 def test_the_clock_reaches_each_moment_before_its_messages_and_never_runs_back(run: SyntheticRun) -> None:
@@ -106,7 +105,7 @@ def test_topics_start_and_loop(run: SyntheticRun) -> None:
     listener = Listener()
     with Bag(run.writer.directory) as bag:
         player = Player(bag, listener, rate=100.0, loop=True, topics=["/swarm/slot"])
-        player.play(lambda playing: playing.stop() if playing.progress.rounds >= 2 else None)
+        player.play(lambda playing: setattr(playing, "stopped", playing.round_count >= 2))
     slots = [message.log_time_ns for message in listener.messages]
     assert slots[:200] == 2 * [SECOND + k * 10_000_000 for k in range(100)]
 
@@ -115,8 +114,7 @@ def test_topics_start_and_loop(run: SyntheticRun) -> None:
 @pytest.mark.realtime
 @pytest.mark.parametrize("rate", [1.0, 4.0])
 def test_messages_keep_their_time(run: SyntheticRun, rate: float) -> None:
-    with steady_timing():
-        listener, _ = play(run, rate=rate, topics=["/swarm/slot"])
+    listener, _ = play(run, rate=rate, topics=["/swarm/slot"])
     offsets = [
         (wall - listener.walls[0]) - (message.log_time_ns - SECOND) / rate
         for wall, message in zip(listener.walls, listener.messages, strict=True)
@@ -124,26 +122,16 @@ def test_messages_keep_their_time(run: SyntheticRun, rate: float) -> None:
     assert statistics.median(abs(offset - statistics.median(offsets)) for offset in offsets) < 1_000_000
 
 
-def test_timing_is_steady_within_and_as_before_afterwards() -> None:
-    interval = sys.getswitchinterval()
-    assert gc.isenabled()
-    with steady_timing():
-        assert not gc.isenabled()
-        assert sys.getswitchinterval() == pytest.approx(1e-4)
-    assert gc.isenabled()
-    assert sys.getswitchinterval() == interval
-
-
 def test_a_pause_stops_messages_and_the_rest_keeps_its_distance(run: SyntheticRun) -> None:
     listener = Listener()
     paused: list[int] = []
 
     def poll(player: Player) -> None:
-        begins = not paused and player.progress.messages > 200
-        ends = player.progress.paused and time.monotonic_ns() > paused[0] + 300_000_000
+        begins = not paused and player.message_count > 200
+        ends = player.paused and time.monotonic_ns() > paused[0] + 300_000_000
         if begins or ends:
             paused.append(time.monotonic_ns())
-            player.toggle_pause()
+            player.paused = not player.paused
 
     with Bag(run.writer.directory) as bag:
         Player(bag, listener, rate=1.0).play(poll)
@@ -178,32 +166,6 @@ def test_a_damaged_chunk_ends_the_playing_with_an_error(run: SyntheticRun, tmp_p
     (tmp_path / "bad.mcap").write_bytes(data)
     with Bag(tmp_path / "bad.mcap") as bag, pytest.raises(UnusableBag, match="recover"):
         Player(bag, Listener(), rate=100.0).play()
-
-
-def test_reading_ahead_is_bounded(run: SyntheticRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay, "AHEAD", 2)
-    monkeypatch.setattr(replay, "BATCH", 10)
-    read = 0
-    listener = Listener()
-    with Bag(run.writer.directory) as bag:
-        original = bag.messages
-
-        def counted(*arguments: object) -> object:
-            nonlocal read
-            for message in original(*arguments):  # type: ignore[arg-type]
-                read += 1
-                yield message
-
-        monkeypatch.setattr(bag, "messages", counted)
-        most = 0
-
-        def poll(player: Player) -> None:
-            nonlocal most
-            most = max(most, read - player.progress.messages)
-
-        Player(bag, listener, rate=2.0).play(poll)
-    assert len(listener.messages) == run.writer.message_count
-    assert 0 < most <= 10 * (2 + 3)
 
 
 # ---- with ROS ----

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.recordings.bag import schema, workarounds
+from dtsa_bench.recordings.bag import schema
 from dtsa_bench.recordings.bag.errors import BagError
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.recover import recover
@@ -317,16 +317,3 @@ def test_kill_9_loses_at_most_the_last_second(tmp_path: Path, alive_s: float) ->
     assert saved[0] < began + SECOND // 10
     assert saved[-1] > killed - SECOND
     assert all(later - earlier < SECOND // 2 for earlier, later in pairwise(saved))
-
-
-def test_indexes_kept_in_little_memory_and_records_written_in_one_go_are_the_same_in_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = synthetic_bag(tmp_path / "small" / "bag", slots=40, chunk_size=5_000).writer
-    assert isinstance(getattr(small._mcap, workarounds._INDEXES), workarounds.ChunkIndexes)
-    assert "add_message" in vars(getattr(small._mcap, workarounds._BUILDER))
-    monkeypatch.setattr(workarounds, "_INDEXES", "not there")
-    monkeypatch.setattr(workarounds, "_BUILDER", "not there")
-    large = synthetic_bag(tmp_path / "large" / "bag", slots=40, chunk_size=5_000).writer
-    assert len(large._mcap._Writer__chunk_indices) > 5
-    assert small.path.read_bytes() == large.path.read_bytes()

@@ -16,8 +16,8 @@ import lz4.frame
 import zstandard
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
-METADATA, DATA_END = 0x0C, 0x0F
+HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 3, 4, 5, 6, 7
+ATTACHMENT, METADATA, DATA_END = 9, 0x0C, 0x0F
 PREFIX = struct.Struct("<BQ")  # opcode and length of every record
 _MESSAGE = struct.Struct("<BQHIQQ")  # a message record up to its data
 _CHUNK = struct.Struct("<QQQII")  # a chunk's times, size, checksum, length of its compression's name
@@ -87,29 +87,6 @@ def decompress(head: ChunkHead, data: bytes | memoryview) -> bytes:
     if len(records) != head.size or (head.crc and zlib.crc32(records) != head.crc):
         raise ValueError("damaged chunk: its checksum does not fit")
     return records
-
-
-def decompress_part(head: ChunkHead, data: bytes) -> bytes:
-    """As much of a chunk's records as can be had from the part of it that is there; unchecked."""
-    parts: list[bytes] = []
-    size = 0
-    try:
-        if head.compression == "":
-            return data
-        stream = (
-            zstandard.ZstdDecompressor().decompressobj()
-            if head.compression == "zstd"
-            else lz4.frame.LZ4FrameDecompressor()
-        )
-        for start in range(0, len(data), 1024):  # in small steps: what came before a damaged place is kept
-            part = stream.decompress(data[start : start + 1024])
-            size += len(part)
-            parts.append(part)
-            if size > MAX_CHUNK:
-                break
-    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
-        pass
-    return b"".join(parts)
 
 
 def records(buffer: bytes) -> Iterator[tuple[int, int, int]]:

@@ -28,7 +28,6 @@ from . import metadata, schema
 from .digest import KEY, BagDigest
 from .errors import BagError
 from .qos import Profile, dump, resolve
-from .workarounds import keep_small, write_quickly
 
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
@@ -105,9 +104,7 @@ class BagWriter:
             raise BagError(f"cannot record to {self.directory}: {error.strerror or error}") from error
         size = _UNLIMITED if marked else chunk_size
         self._mcap = Writer(self._stream, chunk_size=size, compression=COMPRESSIONS[compression])
-        write_quickly(self._mcap)
         try:
-            keep_small(self._mcap, self.directory)
             self._mcap.start(profile="ros2", library=f"dtsa {__version__}")
             self._add_metadata_record()
             self._stream.flush()

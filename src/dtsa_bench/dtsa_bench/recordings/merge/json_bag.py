@@ -12,7 +12,6 @@ from mcap.writer import CompressionType, Writer
 
 from dtsa_bench import __version__
 from dtsa_bench.recordings.bag.errors import BagError
-from dtsa_bench.recordings.bag.workarounds import keep_small
 
 _FLUSH_S = 0.5
 _CHUNK = 1 << 18  # bytes
@@ -47,7 +46,6 @@ class JsonBag:
         try:
             self._stream = path.open("xb")
             self._mcap = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
-            keep_small(self._mcap, path.parent)
         except OSError as error:
             raise BagError(f"cannot record to {path}: {error.strerror or error}") from error
         self._mcap.start(profile="", library=f"dtsa {__version__}")
