@@ -90,7 +90,7 @@ def bench_commands() -> dict[str, str]:
 
 def _hint(word: str, words: list[str]) -> str:
     """What may have been meant; nothing has to be installed for that."""
-    from dtsa_bench.commands.spelling import hint  # type: ignore[import-not-found, unused-ignore]
+    from dtsa_bench.commands.registry import hint  # type: ignore[import-not-found, unused-ignore]
 
     return str(hint(word, words))
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dtsa_dev.network.fake_modems import FakeModemSettings
 from dtsa_dev.network.serial_flight import SerialFlight, SerialTrial, fly
 from dtsa_dev.network.trial import WHOLE
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_bench.network.fake_modems import FakeModemSettings
 from dtsa_bench.recordings.merge.merge import verified
 from dtsa_bench.recordings.verify import verify_bag
 

@@ -12,12 +12,12 @@ DESCRIPTION = """\
 Measures kernels, whole slots, whole flights, environments for learning, nodes in lockstep and the Crazyflie bridge
 (with cflib), and beside them, in the same run, pyrvo's ORCA step and RotorPy's multirotor. Times depend on the
 machine and on what else runs on it; the ratios much less."""
+EXAMPLES = (("--json", "all parts, as JSON"),)
 PARTS = ("kernels", "avoidance", "slots", "flights", "environments", "cost", "nodes", "crazyflie")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("benchmark", help="how fast everything is here", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument(
         "--parts",
         metavar="NAME[,NAME...]",

@@ -11,13 +11,16 @@ from pathlib import Path
 DESCRIPTION = """\
 Builds the documentation as a site that needs no network. A dead link, a link to a heading that is not there, and a page
 that the navigation does not name end the build with code 1."""
+EXAMPLES = (
+    ("", "into runs/site"),
+    ("--serve", "on http://127.0.0.1:8000, built again after each change"),
+)
 SITE = "runs/site"
 HOST = "127.0.0.1"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("docs", help="the documentation as a site", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("--out", metavar="DIR", default=SITE, help=f"where the site is put [{SITE}]")
     parser.add_argument(
         "--serve", action="store_true", help=f"serve it on {HOST} instead, and build it again after each change"

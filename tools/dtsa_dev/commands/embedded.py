@@ -10,12 +10,14 @@ DESCRIPTION = """\
 Compiles libdtsa for a Cortex-M4F, flies 200 slots of tdma, dtsa and lease with 12 and 18 agents and loss on it (in
 QEMU) and on this machine, compares every bit, and prints what memory, stack, code and calls cost. With --board the app
 of docs/how-to/on-board.md runs there instead, with 12 and 20 agents: what a slot costs it."""
+EXAMPLES = (
+    ("", "needs a cross compiler and QEMU, see docs/evidence/embedded.md"),
+    ("--board", "what a slot costs the app of Crazyflies"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    text = "the protocol on a simulated microcontroller"
-    parser = subparsers.add_parser("embedded", help=text, description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("--board", action="store_true", help="the app of Crazyflies, instead of libdtsa alone")
     parser.add_argument("--out", metavar="FILE", help="with --board: its record, as docs/evidence/board-cost.json")
 

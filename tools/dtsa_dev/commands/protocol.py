@@ -9,11 +9,14 @@ DESCRIPTION = """\
 Runs the slot protocols without flight: ages, waking, joins, deaths, jams, partitions. Writes results.json and the
 tables of docs/evidence/protocol.md, long.md and protocol.md. Interrupted, it goes on where it stopped
 when the same command is given again."""
+EXAMPLES = (
+    ("", "all tables, into runs/protocol"),
+    ("--seeds 3 --slots 6000", "fewer and shorter runs"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("protocol", help="the slot protocols alone, without flight", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("--show", action="store_true", help="print what is run, as YAML")
     parser.add_argument("--out", metavar="DIR", help="directory for the results [runs/protocol]")
     parser.add_argument("--seeds", metavar="N", help="number of seeds [each row's own]")

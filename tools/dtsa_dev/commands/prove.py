@@ -7,11 +7,14 @@ import argparse
 DESCRIPTION = """\
 Runs libdtsa's own code for policy lease through the states that two or three agents can reach, for all patterns of
 loss, and checks the protocol's invariants in each; then breaks one rule at a time and sees that the search finds it."""
+EXAMPLES = (
+    ("", "all worlds, then the broken rules"),
+    ("--mutants", "the broken rules only"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("prove", help="policy lease explored state by state", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("--mutants", action="store_true", help="the broken rules only")
 
 

@@ -8,13 +8,16 @@ DESCRIPTION = """\
 Makes the source distribution and the wheels (x86_64 and aarch64) of this checkout, installs each in fresh environments
 of Python 3.10 to 3.13 (aarch64: Debian's Python in QEMU), tries every command there, compares the digests of flights,
 and checks metadata, sizes and times. The files, release.json and release.log are then in DIR. Nothing is uploaded."""
+EXAMPLES = (
+    ("--out dist", "everything"),
+    ("--out dist --skip 3.12 --skip aarch64", "on a machine without that Python and without a cross compiler"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     from dtsa_dev.release.parts import PARTS
 
-    parser = subparsers.add_parser("release", help="the distribution, made and tried", description=DESCRIPTION)
     parser.add_argument("--out", metavar="DIR", required=True, help="new directory for the files")
     parser.add_argument(
         "--skip",

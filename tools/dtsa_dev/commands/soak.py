@@ -9,14 +9,15 @@ from pathlib import Path
 DESCRIPTION = """\
 Runs a named soak: flights and faults against real processes for up to 90 minutes. It can be interrupted at any time;
 the same command goes on where it stopped. What was found is written to docs/evidence/NAME.json."""
+EXAMPLES = (
+    ("--list", "what there is"),
+    ("kill --sample", "a few minutes' part of one"),
+)
 _MINUTES = 90.0
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser(
-        "soak", help="what is too long for the tests: kills, faults, load and memory", description=DESCRIPTION
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("name", nargs="?", help="name of the soak")
     parser.add_argument("--list", action="store_true", help="names of all soaks, and what each promises")
     parser.add_argument("--sample", action="store_true", help="a few minutes' part of it only")

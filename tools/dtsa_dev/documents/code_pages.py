@@ -9,7 +9,7 @@ from pathlib import Path
 
 import dtsa
 from dtsa_agent.core.plugins import kinds
-from dtsa_bench.commands import cli, examples, registry
+from dtsa_bench.commands import cli, registry
 
 from .. import registry as developers
 from .markdown import table
@@ -47,10 +47,10 @@ def commands() -> str:
 
 
 def _command(name: str, text: str) -> str:
-    whole, _ = cli.build_parser(name)
-    parser = cli.command_parser(whole, name)
+    whole, module = cli.build_parser(name)
+    parser = whole.commands[name]
     parts = [f"## {name}\n\n{parser.description or text}\n\n"]
-    lines = [f"dtsa {name} {words}".rstrip() + f"    # {what}\n" for words, what in examples.EXAMPLES.get(name, ())]
+    lines = [f"dtsa {name} {words}".rstrip() + f"    # {what}\n" for words, what in module.EXAMPLES]
     parts += ["```sh\n", *lines, "```\n\n"] if lines else []
     for group in parser._action_groups:
         rows = [_argument(parser, action) for action in group._group_actions if action.help != argparse.SUPPRESS]

@@ -17,11 +17,11 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.keys import VARIABLE
-from dtsa_bench.network.fake_modems import FakeModems, FakeModemSettings
 from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge
 from dtsa_bench.recordings.merge.merged_run import lay
 from dtsa_bench.recordings.merge.merged_writer import write
+from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
 
 from .trial import WHOLE, NotFlown, swarm_words
 

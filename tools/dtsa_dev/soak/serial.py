@@ -8,12 +8,12 @@ from typing import Any
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.experiments.batch.task import Row
-from dtsa_bench.network.fake_modems import FakeModemSettings
 from dtsa_bench.recordings.merge.merge import verified
 from dtsa_bench.recordings.verify import verify_bag
 from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import ChannelConfig
+from dtsa_dev.network.fake_modems import FakeModemSettings
 from dtsa_dev.network.serial_flight import SerialFlight, SerialTrial, fly
 from dtsa_dev.network.trial import WHOLE, NotFlown
 

@@ -31,7 +31,6 @@ from .hearing import OF_OWN_NAME, REASONS, STATES, make_hearing
 from .outage import Outage
 from .port import DatagramPort
 from .precision import give_back_memory, going_first, wake_precisely
-from .prepared import Prepared
 from .quorum import Hold, Quorum
 from .record import Heard, SlotRecord, Watcher
 from .settings import AgentSettings
@@ -62,7 +61,6 @@ class AirAgent:
     :param port: what carries its datagrams; the caller keeps it open while the agent flies.
     :param watcher: is told what happens; None: nobody is.
     :param vehicle: what it flies; None: a simulated one.
-    :param prepared: what follows from ``config``, if it is known already.
     :param say: is told in flight, a line at a time, what its user should know; None: nobody is.
     :raises ConfigError: for an id or a policy that cannot fly here, or a missing key or session.
     """
@@ -74,7 +72,6 @@ class AirAgent:
         port: DatagramPort,
         watcher: Watcher | None = None,
         vehicle: Vehicle | None = None,
-        prepared: Prepared | None = None,
         say: Callable[[str], None] | None = None,
     ) -> None:
         if own.id > config.agents:
@@ -82,10 +79,9 @@ class AirAgent:
         check_joinable(config.policy)
         check_session(config)
         self.own, self.config, self._port = own, config, port
-        scenario, header = (None, b"") if prepared is None else (prepared.scenario, prepared.header)
         check_fits(config, port.properties)
-        wrapping = Wrapping(config, authenticator(config), header, port.properties)
-        self.swarm: AbstractSwarm = make_swarm(config, scenario, local=[own.id])
+        wrapping = Wrapping(config, authenticator(config), port=port.properties)
+        self.swarm: AbstractSwarm = make_swarm(config, local=[own.id])
         self._group = AgentGroup(self.swarm)
         self._present, self._chosen = self.swarm.present.data, self.swarm.chosen.data
         self._active = self.swarm.active.data

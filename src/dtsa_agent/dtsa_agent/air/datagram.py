@@ -147,7 +147,6 @@ class Wrapping:
 
     :param config: what all agents share.
     :param authenticator: seals and opens frames; None: they are not sealed.
-    :param header: with which all datagrams of the swarm begin, if it is known already.
     :param port: what carries them.
     """
 
@@ -155,10 +154,9 @@ class Wrapping:
         self,
         config: SwarmConfig,
         authenticator: Authenticator | None,
-        header: bytes = b"",
         port: PortProperties = NETWORK,
     ) -> None:
-        self.header = header or header_of(config, port)
+        self.header = header_of(config, port)
         self.layout = port.header(config.auth)
         self.peers = self.layout.peers // 4  # of those that it hears a datagram names so many
         self._before = self.layout.size

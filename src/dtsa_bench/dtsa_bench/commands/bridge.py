@@ -12,15 +12,14 @@ FILE, ALL = "file", "all"
 DESCRIPTION = """\
 The bridge to the Crazyflies of a swarm.yaml: topics /cfN/..., services /cfN/... and /all/..., as in Crazyswarm2.
 The first Ctrl-C lands all, the second stops all motors."""
+EXAMPLES = (
+    ("--config swarm.yaml --check", "is everything there that a flight needs?"),
+    ("--config swarm.yaml --backend sim", "simulated Crazyflies in place of real ones"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser(
-        "bridge",
-        help="connect the swarm to real or simulated Crazyflies",
-        description=DESCRIPTION,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("--config", type=Path, required=True, help="swarm.yaml: robots, types, defaults, station")
     parser.add_argument(
         "--backend",

@@ -1,6 +1,7 @@
 """The command line: finds the module of a command, imports that one alone, and turns errors into one line.
 
-A command is a module `dtsa_bench.commands.<name>` with `add_parser(subparsers)` and `run(args) -> int`.
+A command is a module `dtsa_bench.commands.<name>` with all that concerns it: `DESCRIPTION`, `EXAMPLES` (words, and what
+they do), `add_arguments(parser)` and `run(args) -> int`.
 """
 
 from __future__ import annotations
@@ -17,10 +18,8 @@ from typing import Any, NoReturn
 from dtsa_bench import __version__
 from dtsa_bench.runs.program import program
 
-from .examples import epilog
 from .missing_packages import say_missing
-from .registry import COMMANDS, module_of
-from .spelling import hint, words_of
+from .registry import COMMANDS, hint, module_of
 
 PROGRAM = "dtsa"
 INTERRUPTED = 128 + signal.SIGINT
@@ -36,46 +35,30 @@ class HelpText(argparse.HelpFormatter):
 class OneLineParser(argparse.ArgumentParser):
     """Says what is wrong in one line, without the usage text around it; takes no abbreviations."""
 
-    def __init__(self, *args: Any, **more: Any) -> None:
-        super().__init__(*args, **{"allow_abbrev": False, "formatter_class": HelpText, **more})
-
-        self._words: list[str] = []
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does; keeps the words for what `error` says."""
-        self._words = [] if args is None else list(args)
-        return super().parse_known_args(args, namespace)
+    def __init__(self, **more: Any) -> None:
+        super().__init__(allow_abbrev=False, formatter_class=HelpText, **more)
+        self.commands: dict[str, OneLineParser] = {}  # parsers of the commands, of the whole command line's parser
 
     def error(self, message: str) -> NoReturn:
-        if message.startswith("the following arguments are required"):
-            known = {option for action in self._actions for option in action.option_strings}
-            wrong = [word for word in self._words if word.startswith("--") and word.partition("=")[0] not in known]
-            message += "".join(f"; {_unknown([word], self)}" for word in wrong[:1])
-        self.exit(2, f"{PROGRAM}: error: {message}{_meant(message)}\n")
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        near = hint(wrong[1], re.findall(r"[\w.-]+", wrong[2])) if wrong else ""
+        self.exit(2, f"{PROGRAM}: error: {message}{near}\n")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does; an option that there is not is named before one that is missing."""
+        known = self._option_string_actions
+        for word in () if self.commands else args or ():
+            option = word.partition("=")[0]
+            if option.startswith("--") and option not in (*known, "--"):
+                self.error(f"option {word}: unknown{hint(option, known)}")
+        return super().parse_known_args(args, namespace)
 
 
-def _meant(message: str) -> str:
-    """What may have been meant where argparse refuses a word."""
-    found = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
-    return hint(found[1], re.findall(r"[\w.-]+", found[2])) if found else ""
-
-
-def _unknown(words: Sequence[str], parser: argparse.ArgumentParser) -> str:
-    """What to say about words that a command does not know.
-
-    :param words: the words.
-    :param parser: the command's parser.
-    """
-    options = [option for action in parser._actions for option in action.option_strings]
-    wrong = next((word for word in words if word.startswith("-")), words[0])
-    what = "option" if wrong.startswith("-") else "argument"
-    return f"{what} {wrong}: unknown{hint(wrong.partition('=')[0], options)}"
-
-
-def build_parser(command: str | None) -> tuple[argparse.ArgumentParser, object | None]:
+def build_parser(command: str | None, others: Sequence[str] = ()) -> tuple[OneLineParser, Any]:
     """Parser of the whole command line; only the chosen command's module is imported.
 
     :param command: first word of the command line, None if there is none.
+    :param others: further commands, of which nothing is known but their names.
     :returns: the parser, and the chosen command's module or None.
     """
     parser = OneLineParser(prog=PROGRAM, description="Channel access in quadcopter swarms.")
@@ -84,32 +67,20 @@ def build_parser(command: str | None) -> tuple[argparse.ArgumentParser, object |
         dest="command", metavar="COMMAND", required=True, parser_class=OneLineParser, title="commands"
     )
     chosen = None
-    for name, text in COMMANDS.items():
+    for name, text in {**COMMANDS, **dict.fromkeys(others, "")}.items():
+        parser.commands[name] = subparsers.add_parser(name, help=text)
         if name == command:
             chosen = importlib.import_module(module_of(name))
-            chosen.add_parser(subparsers)
-            subparsers.choices[name].epilog = epilog(name, program())
-        else:
-            subparsers.add_parser(name, help=text)
+            declare(chosen, parser.commands[name], name)
     return parser, chosen
 
 
-def raise_wrong_command(parser: argparse.ArgumentParser, command: str, known: Sequence[str]) -> NoReturn:
-    """Ends with one line about a command that does not exist."""
-    parser.error(f"command: got {command!r}; allowed: {', '.join(known)}{hint(command, known)}")
-
-
-def command_parser(parser: argparse.ArgumentParser, command: str | None) -> argparse.ArgumentParser:
-    """The parser of one command.
-
-    :param parser: of the whole command line.
-    :param command: its name; None: the parser of the whole command line.
-    """
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction) and command in action.choices:
-            found: argparse.ArgumentParser = action.choices[command]
-            return found
-    return parser
+def declare(module: Any, parser: OneLineParser, name: str) -> None:
+    """Fills the parser of a command with what its module says."""
+    parser.description = module.DESCRIPTION
+    lines = [f"  {program()} {name} {words}".rstrip() + f"\n      {text}" for words, text in module.EXAMPLES]
+    parser.epilog = "\n".join(["examples:", *lines])
+    module.add_arguments(parser)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -118,41 +89,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: command line without the program's name; None: this process's.
     :returns: exit code: 0 done, 1 the command failed, 2 wrong input, 130 interrupted.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        command = words[0] if words and not words[0].startswith("-") else None
-        parser, chosen = build_parser(command)
-        if command is not None and chosen is None:
-            raise_wrong_command(parser, command, list(COMMANDS))
-        args, unknown = parser.parse_known_args(words)
-        if unknown:
-            parser.error(_unknown(unknown, command_parser(parser, command)))
-        args.own_process = arguments is None
-        return int(chosen.run(args) or 0)  # type: ignore[union-attr, attr-defined]
+        try:
+            return _run(list(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            sys.stdout.flush()  # now, so that an error of that can be told
     except KeyboardInterrupt:
         return INTERRUPTED
-    except BrokenPipeError:
-        # The reader (`| head`) has gone; nothing more may be written, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
     except Exception as error:
         return report(error)
 
 
+def _run(words: Sequence[str]) -> int:
+    command = words[0] if words and not words[0].startswith("-") else None
+    parser, chosen = build_parser(command)
+    if command is not None and chosen is None:
+        parser.error(f"command: got {command!r}; allowed: {', '.join(COMMANDS)}{hint(command, COMMANDS)}")
+    args, surplus = parser.parse_known_args(words)
+    if surplus:
+        parser.error(f"argument {surplus[0]}: unknown")
+    return int(chosen.run(args) or 0)
+
+
 def report(error: Exception) -> int:
-    """Print an error that was raised on purpose as one line; pass on all others.
+    """Print an error that was raised on purpose, or by the system, as one line; pass on all others.
 
     :returns: exit code.
     """
     if isinstance(error, ImportError):
         return say_missing(PROGRAM, error)
+    if isinstance(error, OSError):
+        return _report_system(error)
     from dtsa_agent.core.errors import ConfigError, DtsaError
 
-    if isinstance(error, DtsaError):
-        near = hint(str(error.value), words_of(error.allowed)) if isinstance(error, ConfigError) else ""
-        print(f"{PROGRAM}: error: {' '.join(str(error).split())}{near}", file=sys.stderr)
-        return 2 if isinstance(error, ConfigError) else 1
-    raise error
+    if not isinstance(error, DtsaError):
+        raise error
+    near = ""
+    if isinstance(error, ConfigError):
+        words = re.split(r"\s*[,;]\s*|\s+or\s+", error.allowed)
+        near = hint(str(error.value), [word for word in words if re.fullmatch(r"[A-Za-z][\w.-]*", word)])
+    print(f"{PROGRAM}: error: {' '.join(str(error).split())}{near}", file=sys.stderr)
+    return 2 if isinstance(error, ConfigError) else 1
+
+
+def _report_system(error: OSError) -> int:
+    """Says what the system refused; where standard output takes nothing more, not even the exit writes to it again."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        error.filename = error.filename or "standard output"
+    if isinstance(error, BrokenPipeError):  # the reader (`| head`) has gone
+        return 128 + signal.SIGPIPE
+    place = f"{error.filename}: " if error.filename else ""
+    print(f"{PROGRAM}: error: {place}{error.strerror or error}", file=sys.stderr)
+    return 1
 
 
 if __name__ == "__main__":

@@ -24,16 +24,18 @@ NUMBERS = "demo.json"
 _REMOTE = ("SSH_CONNECTION", "SSH_CLIENT", "SSH_TTY", "CI")
 
 
-def add_parser(subparsers: Any) -> None:
-    """Adds the command's parser."""
-    parser = subparsers.add_parser(
-        "demo",
-        help="nine recorded flights that show who sends next, a page and a picture; under a minute",
-        description="Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a "
-        "channel that quadcopters share, and what goes wrong when messages are lost. One picture shows them all. The "
-        "first eight, which are the same on every machine, stand side by side on a page; in the last one, in real "
-        "time, a process is killed and comes back.",
-    )
+DESCRIPTION = """\
+Nine flights of ROS 2 nodes, recorded and verified, tell in four steps who speaks next on a channel that quadcopters
+share, and what goes wrong when messages are lost. One picture shows them all. The first eight, which are the same on
+every machine, stand side by side on a page; in the last one, in real time, a process is killed and comes back."""
+EXAMPLES = (
+    ("", "everything, into runs/demo-1, and the page in a browser"),
+    ("--animation --no-open --out story", "with a moving picture; no browser"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument(
         "--out", metavar="DIR", default=None, help="new directory for everything [runs/demo-1, -2, ...]"
     )
@@ -48,7 +50,6 @@ def add_parser(subparsers: Any) -> None:
         default=None,
         help="open the page in a browser [where there is a display, but not over ssh or in CI]",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,11 +13,14 @@ DESCRIPTION = """\
 Writes a recorded run as tables for pandas and polars: slots, frames, who received them, decisions, states, ages and
 errors (of each agent; of each agent in the eyes of each observer), one file each, and columns.md, which says what each
 column holds and in which unit."""
+EXAMPLES = (
+    ("runs/a", "all tables as Parquet"),
+    ("runs/a --to csv --tables slots frames --out tables", "two of them as CSV"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("export", help="tables of a recorded run: Parquet or CSV", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("bag", help=RECORDED_RUN)
     parser.add_argument("--to", default="parquet", metavar="FORMAT", help="parquet (default) or csv")
     parser.add_argument("--out", metavar="DIR", help="where to (default: <bag>_tables beside the bag)")

@@ -25,14 +25,19 @@ INTERRUPTED = 130
 LONGEST_END_S = 60.0  # after a signal, and of the middleware without one; it takes a second
 _LATER = ("respawn",)  # options of a flight that concern real time alone
 
+DESCRIPTION = """\
+Starts the channel and the agents as ROS 2 nodes, records the flight, and ends them all."""
+EXAMPLES = (
+    ("--out runs/a", "twelve agents, a process each, as in the paper"),
+    ("--out runs/b --agents 18 --policy lease --loss 0.1 --processes 2", "lost frames, two processes"),
+    ("--out runs/c --mode realtime --policy lease --respawn 1", "clocks of their own; the dead come back"),
+    ("--out runs/e --mode realtime --policy lease --view --control", "in a browser, which may kill agents and jam"),
+    ("--out runs/d --backend cflib --config swarm.yaml", "Crazyflies"),
+)
 
-def add_parser(subparsers: Any) -> None:
-    """Adds the command's parser."""
-    parser = subparsers.add_parser(
-        "fly",
-        help="one flight with real ROS 2 nodes, recorded to a bag",
-        description="Starts the channel and the agents as ROS 2 nodes, records the flight, and ends them all.",
-    )
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.usage = "%(prog)s --out DIR [OPTIONS]"
     group = parser.add_argument_group("the flight")
     group.add_argument(
@@ -68,7 +73,6 @@ def add_parser(subparsers: Any) -> None:
         default=None,
         help="real time: agents whose processes are started S seconds after slot 0 only [none]",
     )
-    parser.set_defaults(run=run)
 
 
 def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:

@@ -21,6 +21,13 @@ DESCRIPTION = """\
 this program, a policy or distribution that is installed, or a folder or wheel with one. `check ENTRY` flies a sample of
 its flights again and says what differs. `table ENTRY...` compares entries: a page, figures, CSV and LaTeX. `cells`
 lists what is flown, and the schemes that come with this program. What an entry is: docs/how-to/league.md."""
+EXAMPLES = (
+    ("cells", "what is flown, and the schemes that come with the package"),
+    ("enter lease --sample 2", "two practice seeds of each cell, to try it out"),
+    ("enter examples/dtsa_plugins --jobs 2", "the policy of a folder, all cells"),
+    ("check runs/league-1/lease", "flies a sample of its flights again"),
+    ("table runs/league-1/lease runs/league-1/tdma --out runs/table", "a page, figures, CSV and LaTeX"),
+)
 
 SAMPLE = 24  # flights that `check` flies again
 _OPTIONS = {
@@ -31,10 +38,8 @@ _OPTIONS = {
 }
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    text = "cells that any policy flies, entries that anybody can check, and their table"
-    parser = subparsers.add_parser("league", help=text, description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("action", choices=tuple(_OPTIONS), help="what is to be done")
     parser.add_argument(
         "what", nargs="*", metavar="PACKAGE|ENTRY", help="who enters; the file or directory of an entry"

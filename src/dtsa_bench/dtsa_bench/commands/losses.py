@@ -10,14 +10,12 @@ from typing import Any
 DESCRIPTION = """\
 Learns from recorded or merged flights what each directed link lost: its rate, and a two-state chain where losses come
 in bursts. --out writes a file that simulate, sweep and fly take as --losses."""
+EXAMPLES = (("runs/a --out hall.json", "for simulate, sweep and fly, as --losses hall.json"),)
 _SHOWN = 8  # links that lose most
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser(
-        "losses", help="what each link lost, as a channel to fly in", description=DESCRIPTION
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument(
         "runs", nargs="+", metavar="RUN", help="run directory, bag directory or .mcap file, also of merge"
     )

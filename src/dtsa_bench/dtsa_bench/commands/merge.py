@@ -14,11 +14,15 @@ whether all decisions follow from what each agent heard, made again by the core.
 agents did not hear each other, or if frames do not go both ways between groups of them: offsets of clocks are not
 determined then. --out keeps the whole flight as one bag, which report, export, verify, replay and ros2
 bag take like any other."""
+EXAMPLES = (
+    ("runs/cf1 runs/cf2 runs/cf3", "three agents' bags"),
+    ("runs/cf* --json", "all of them, as JSON"),
+    ("runs/cf* --out flight_1", "kept as one bag, for report, export and verify"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("merge", help="the bags of several agents as one flight", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help="directory of `agent --out`, or its .mcap file")
     parser.add_argument(
         "--air-us", metavar="X", default="0", help="a frame is on the air for so long: count overlaps [0]"
@@ -29,9 +33,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Merge, and print what came of it."""
-    from dtsa_agent.core.settings.declaration import Setting
     from dtsa_bench.recordings.merge.agent_bag import read_all
     from dtsa_bench.recordings.merge.merge import Merge, clocks_apart, verified
+    from dtsa_bench.runs.options import number
 
     out = Path(args.out) if args.out else None
     if out is not None:
@@ -39,8 +43,7 @@ def run(args: argparse.Namespace) -> int:
         from dtsa_bench.recordings.merge.merged_writer import check_free, write
 
         check_free(out)
-    air_us = Setting("air_us", "float", 0.0, "time of a frame on the air", unit="us", minimum=0, maximum=1e6)
-    air_ns = round(air_us.read(args.air_us) * 1e3)
+    air_ns = round(number(args.air_us, "air_us", 0, 1e6, "us") * 1e3)
     merged = Merge(*read_all(args.bags))
     summary = merged.judge(air_ns)
     if out is not None:

@@ -9,7 +9,7 @@ _WORKSPACE = "build the workspace and source it: colcon build && . install/setup
 _ROS = "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout on x86_64"
 _HOW = {
     **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
-    **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard"), "pip install {}"),
+    **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard", "shtab"), "pip install {}"),
     **dict.fromkeys(("pyarrow", "pandas"), "pip install 'dtsa[tables]', or {}"),
     "distributed": "pip install 'dtsa[cluster]', or {}",
     "aiohttp": "pip install 'dtsa[view]', or {}",

@@ -9,12 +9,11 @@ DESCRIPTION = """\
 Writes a package with a policy of your own that works: the policy, a test, a sweep that sets it against the league's
 best and the bound, and the lines that install and run it. What a policy is given and what it
 returns: docs/reference/plug-ins.md."""
+EXAMPLES = (("my-policy --out plugins/my-policy", "then as its README.md says"),)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    text = "a package to begin with: a policy of your own, its test and a sweep"
-    parser = subparsers.add_parser("new-plugin", help=text, description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("name", metavar="NAME", help="what the policy will be called, as in my-policy")
     parser.add_argument("--out", metavar="DIR", help="where the package goes (default: a directory of that name here)")
 

@@ -16,19 +16,22 @@ Flies copies of a Crazyflie app (C, a function appMain) on this machine, in virt
 one medium with the radio's true times. The app is compiled against own declarations of the firmware's documented
 functions. The same seed gives the same bits: the digest says so. Apps that come with it: beacons, dtr, and `protocol`:
 policies tdma, dtsa, age, aloha and lease on board, with a bag for each agent in --out, for `dtsa merge`."""
+EXAMPLES = (
+    ("beacons --agents 12 --seconds 20", "twelve vehicles that broadcast their states"),
+    ("dtr --loss 0.1 --polls 10", "a token ring with lost frames, beside a ground station that polls"),
+    ("my_app --source lib/more.c --include lib --out runs/lab", "an app of your own, with files"),
+)
 PROTOCOL = "protocol"
 _OF_PROTOCOL = ("policy", "slot_ms", "moving", "auth_session")
 
 _SETTINGS = ("agents", "seed", "loss", "boot_s", "drift_ppm", "polls", "arming", "radius_m", "channel", "rate")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     from dtsa_agent.core.settings.declaration import settings_of
     from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 
-    text = "copies of a Crazyflie app on this machine, in virtual time"
-    parser = subparsers.add_parser("peer-lab", help=text, description=DESCRIPTION)
     parser.add_argument("app", metavar="APP", help="directory of the app, or the name of one that comes with it")
     for name in _OF_PROTOCOL:
         text = "frames are sealed, the key is in DTSA_AUTH_KEY" if name == "auth_session" else "as for `dtsa simulate`"

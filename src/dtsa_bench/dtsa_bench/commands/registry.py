@@ -1,8 +1,9 @@
-"""Names of the commands. A module of its own: `tools/dtsa` reads it before anything is installed."""
+"""Names of the commands. `tools/dtsa` reads this before anything is installed: it imports nothing but Python's own."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Iterable, Mapping
 
 COMMANDS = {
     "demo": "who speaks next, in nine recorded flights, a page and a picture; under a minute",
@@ -23,32 +24,27 @@ COMMANDS = {
     "export": "a bag's contents as CSV or Parquet",
     "bridge": "connect the swarm to real or simulated Crazyflie quadcopters",
     "fake-crazyflie": "simulated Crazyflie quadcopters that the official library connects to",
-    "fake-modem": "simulated serial modems on pseudo terminals that agents and other programs open",
     "peer-lab": "copies of a Crazyflie app (C) on this machine: peer to peer, in virtual time",
     "completion": "a script that completes commands, options and their values in bash or zsh",
 }
 
 RECORDED_RUN = "run directory, bag directory or .mcap file"  # what commands take that read one
 
-
 _MODULES: dict[str, str] = {}  # of commands that do not belong to this package
 
 
 def add(package: str, commands: Mapping[str, str]) -> None:
-    """Adds commands of another package, for the command line of a checkout.
-
-    :param package: where their modules are.
-    :param commands: what each does, by name.
-    """
+    """Adds the commands of another package, for the command line of a checkout."""
     COMMANDS.update(commands)
-    _MODULES.update({name: f"{package}.{module_name(name)}" for name in commands})
-
-
-def module_name(command: str) -> str:
-    """Last part of the name of a command's module."""
-    return command.replace("-", "_")
+    _MODULES.update({name: f"{package}.{name.replace('-', '_')}" for name in commands})
 
 
 def module_of(command: str) -> str:
     """Name of the module of a command."""
-    return _MODULES.get(command, f"dtsa_bench.commands.{module_name(command)}")
+    return _MODULES.get(command, f"dtsa_bench.commands.{command.replace('-', '_')}")
+
+
+def hint(word: str, words: Iterable[str]) -> str:
+    """A question that names the nearest of the words that would have been right; empty if none is near."""
+    near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
+    return f"; did you mean {near[0]}?" if near and near[0] != word else ""

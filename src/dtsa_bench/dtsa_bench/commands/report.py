@@ -13,15 +13,14 @@ Writes one self-contained HTML page about one recorded run, or several side by s
 slots,
 distances, ages, estimate errors, channel use, decisions and the configuration. It opens without a network
 and prints."""
+EXAMPLES = (
+    ("runs/a", "one run"),
+    ("runs/a runs/b --out compared.html", "two side by side"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser(
-        "report",
-        help="HTML page about one recorded run, or several side by side",
-        description=DESCRIPTION,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("bags", nargs="+", metavar="BAG", help=f"{RECORDED_RUN}; up to 8")
     parser.add_argument("--out", metavar="FILE", help="the page (default: report.html beside the first bag)")
 

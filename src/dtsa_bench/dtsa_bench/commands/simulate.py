@@ -15,13 +15,17 @@ DESCRIPTION = """\
 Flies one run without ROS, as fast as this machine allows, over the same core as the nodes. For equal options
 and seed
 every slot has the same sender and every quadcopter the same positions as with `fly`, bit for bit."""
+EXAMPLES = (
+    ("--agents 18 --policy dtsa --loss 0.01", "one flight, its results as lines"),
+    ("--moving 2 --policy lease --json", "the same as JSON"),
+    ("--agents 12 --picture flight.png", "with a picture of the paths"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     from dtsa_bench.runs.options import add_run_options
 
-    parser = subparsers.add_parser("simulate", help="one flight without ROS", description=DESCRIPTION)
     parser.usage = "%(prog)s [OPTIONS]"
     parser.add_argument(
         "--out", metavar="DIR", help="directory for summary.json and config.json; default: only printed"

@@ -19,11 +19,17 @@ DESCRIPTION = """\
 Flies every combination of a sweep's axes with every seed, without ROS, on all cores or on a Dask cluster, and
 writes results.csv, results.json, figures (PNG and SVG) and report.html. Interrupted, it goes on where it
 stopped when the same command is given again. Sweeps of your own: docs/how-to/sweep.md."""
+EXAMPLES = (
+    ("--list", "what comes with the package"),
+    ("--preset paper-12,paper-18 --seeds 30", "the paper's experiments"),
+    ("--preset loss --set slot_ms=20 --out runs/slow", "with a setting changed"),
+    ("--file own.yaml --json", "a sweep of your own, its groups as JSON"),
+    ("--preset loss --paper pdf", "with figures and tables for a paper"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser("sweep", help="many flights without ROS, and a report", description=DESCRIPTION)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--preset", metavar="NAME[,NAME...]", help="sweeps that come with the package; see --list")
     what.add_argument("--file", metavar="FILE", help="a sweep of your own, in YAML")

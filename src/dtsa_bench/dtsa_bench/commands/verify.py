@@ -11,15 +11,14 @@ from .registry import RECORDED_RUN
 DESCRIPTION = """\
 Rebuilds every agent and the channel from the recorded configuration, feeds them what they heard, and compares
 every message of the bag, byte by byte. Exit code 0: all equal; 1: a difference, which is shown."""
+EXAMPLES = (
+    ("runs/a", "one run"),
+    ("runs/a runs/b --json", "several, as JSON"),
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser(
-        "verify",
-        help="check a bag: was every decision what the protocol says?",
-        description=DESCRIPTION,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.add_argument("bag", nargs="+", help=RECORDED_RUN)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
-from .swarm_file import add_swarm_file, take_swarm_file
+from .network_options import add_network_options, read_network_options
 
 if TYPE_CHECKING:
     from dtsa_bench.pages.view.orders import Order
@@ -20,6 +20,10 @@ DESCRIPTION = """\
 Shows a swarm on a page that this machine alone can open: the swarm on the ROS graph, or (--air) agents on a network or
 a radio, with their settings as for `dtsa sniff`. The address that is printed holds a random token; whoever does not
 know it gets nothing. A recorded run has a page of its own: `dtsa report`."""
+EXAMPLES = (
+    ("--domain 7", "the swarm on a ROS domain"),
+    ("--air udp --interface eth0 --auth-session 41", "agents on a network; the key is in DTSA_AUTH_KEY"),
+)
 _ROS = "ros"
 _LAST_S = 2.0  # for the source to end, and for pages to receive the end of a flight
 
@@ -33,13 +37,8 @@ class Source(Protocol):
         """Follow it until it is over, or ``stopped`` is set."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    parser = subparsers.add_parser(
-        "view",
-        help="a swarm in the browser",
-        description=DESCRIPTION,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     parser.usage = "%(prog)s [OPTIONS]"
     parser.add_argument("bags", nargs="*", help=argparse.SUPPRESS)
     from dtsa_agent.air.ports import AIRS
@@ -56,16 +55,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--listen", metavar="ADDRESS", default=None, help="an address of this machine that others reach [127.0.0.1]"
     )
-    from .agent import add_ports, add_swarm
-
-    add_swarm_file(parser)
-    add_ports(parser)
-    add_swarm(parser)
+    add_network_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until a signal comes."""
-    from dtsa_agent.air.ports import AIRS
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.pages.view.process import give_way
     from dtsa_bench.pages.view.server import ViewServer, new_token
@@ -76,44 +70,19 @@ def run(args: argparse.Namespace) -> int:
         bags = " ".join(args.bags)
         raise ConfigError("bag", bags, f"none; a recorded run is shown by `{program()} report {bags}`")
     port = whole_number(args.port, "port", 0, 65535)
-    take_swarm_file(args, _ROS if args.swarm_file is None else AIRS[0])
-    _check_source(args)
     if args.listen is not None and not _plain_address(args.listen):
         raise ConfigError("listen", args.listen, "one address of this machine, in numbers")
     give_way()
-    track, source, order = _graph(args) if args.air == _ROS else _air(args)
+    track, source, order = _network(args) if args.swarm_file or args.air not in (None, _ROS) else _graph(args)
     asyncio.run(_serve(ViewServer(track, new_token(), order), source, port, args.listen))
     return 0
 
 
-def _check_source(args: argparse.Namespace) -> None:
-    """Refuses options of another source than the one that is shown."""
-    from dtsa_agent.air.ports import AIRS, settings_class
-    from dtsa_agent.core import SwarmConfig
-    from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.runs.options import given
-
-    for name in ("domain", "namespace", "control"):
-        if getattr(args, name) and args.air != _ROS:
-            raise ConfigError(name, getattr(args, name), "only with --air ros")
-    if args.air != _ROS:
-        return
-    own = {"policy": args.policy, "seal": args.seal}
-    for air in AIRS:
-        own |= given(args, settings_class(air), "port")
-    for name, value in {**own, **given(args, SwarmConfig, "swarm")}.items():
-        if value is not None:
-            raise ConfigError(name, value, f"only with --air {' or '.join(AIRS)}")
-
-
-def _air(args: argparse.Namespace) -> tuple[Track, Source, None]:
+def _network(args: argparse.Namespace) -> tuple[Track, Source, None]:
     from dtsa_bench.pages.view.network_listener import NetworkListener
     from dtsa_bench.pages.view.track import Track
 
-    from .agent import port_of, swarm_of
-
-    port = port_of(args)
-    config = swarm_of(args)
+    port, config = read_network_options(args)
     track = Track(port.where)
     return track, NetworkListener(track, config, port), None
 

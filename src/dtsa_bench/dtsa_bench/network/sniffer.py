@@ -10,19 +10,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.crazyradio import CrazyradioSettings
 from dtsa_agent.air.datagram import Wrapping, frame_in
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_listener
-from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 from dtsa_bench.recordings.merge.agent_recorder import about_port
 from dtsa_bench.recordings.merge.json_bag import JsonBag, described
 from dtsa_bench.recordings.rules.judge import Judge
-
-from .pcap import PacketFile
 
 FRAME, METADATA = "frame", "dtsa_sniffer"  # topic of the frames in its bag, name of the metadata record
 FRAME_SCHEMA = described(
@@ -45,10 +42,9 @@ class Sniffer:
     :param config: the settings that all agents share.
     :param port: what carries the frames.
     :param path: file for what was heard; None: it is only judged.
-    :param pcap: file for all packets that a Crazyradio hears; None: there is none.
     :param say: is told a line when the port fails or is back; None: nobody is.
     :raises ConfigError: for a port that cannot be used, or without the key of sealed frames.
-    :raises BagError: if a file cannot be made.
+    :raises BagError: if the file cannot be made.
     """
 
     def __init__(
@@ -56,11 +52,8 @@ class Sniffer:
         config: SwarmConfig,
         port: PortSettings,
         path: Path | None = None,
-        pcap: Path | None = None,
         say: Callable[[str], None] | None = None,
     ) -> None:
-        if pcap is not None and not isinstance(port, CrazyradioSettings):
-            raise ConfigError("pcap", str(pcap), "only with --air crazyradio")
         self._config, self._judge = config, Judge(config)
         self._wrapping = Wrapping(config, authenticator(config), port=port.properties)
         self._slots: dict[int, dict[int, bytes]] = {}  # not judged yet
@@ -70,12 +63,8 @@ class Sniffer:
         self._kept = 0  # refused datagrams since the last flush
         self._listener: Any = open_listener(port)
         self._listener.say = say
-        self.packets: PacketFile | None = None
         about = {"swarm": json.dumps(config.to_dict(), sort_keys=True), **about_port(port)}
         try:
-            if isinstance(port, CrazyradioSettings) and pcap is not None:
-                self.packets = PacketFile(pcap, port)
-                self._listener.heard = self.packets.write
             self.bag = None if path is None else JsonBag(path, {FRAME: FRAME_SCHEMA}, METADATA, about)
         except DtsaError:
             self._listener.__exit__()
@@ -134,8 +123,6 @@ class Sniffer:
     def close(self) -> None:
         """Ends the record, and leaves the air."""
         self._listener.__exit__()
-        if self.packets is not None:
-            self.packets.close()
         if self.bag is not None:
             self.bag.__exit__()
 

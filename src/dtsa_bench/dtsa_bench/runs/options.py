@@ -138,6 +138,14 @@ def whole_number(text: str, name: str, minimum: int, maximum: int) -> int:
     return int(Setting(name, "int", None, name, minimum=minimum, maximum=maximum).read(text))
 
 
+def number(text: str, name: str, minimum: float, maximum: float, unit: str = "s") -> float:
+    """A number with a unit given to an option of a single command.
+
+    :raises ConfigError: if it is none, or out of range.
+    """
+    return float(Setting(name, "float", None, name, unit=unit, minimum=minimum, maximum=maximum).read(text))
+
+
 def processes(text: str | None) -> int | None:
     """The number of processes that an option says; None: one a core.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 from types import ModuleType
@@ -18,10 +19,10 @@ def fake_command(monkeypatch: pytest.MonkeyPatch, action: object) -> None:
     """Register one command `probe` that does what the action says."""
     module = ModuleType("dtsa_bench.commands.probe")
 
-    def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-        subparsers.add_parser("probe").add_argument("--slots", type=int, default=0)
+    def add_arguments(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--slots", type=int, default=0)
 
-    module.add_parser = add_parser  # type: ignore[attr-defined]
+    module.DESCRIPTION, module.EXAMPLES, module.add_arguments = "", (), add_arguments  # type: ignore[attr-defined]
     module.run = action  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "dtsa_bench.commands.probe", module)
     monkeypatch.setattr(cli, "COMMANDS", {"probe": "does what the test says"})
@@ -79,6 +80,16 @@ sys.exit(entry.dtsa())
     assert (done.returncode, done.stdout, done.stderr) == (130, "said at the end\n", "")
 
 
+@pytest.mark.parametrize("words", [["simulate", "--agents", "3", "--timeout-s", "1"], ["sweep", "--list"], ["--help"]])
+def test_a_full_disk_behind_standard_output_is_one_line(words: list[str]) -> None:
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-m", "dtsa_bench", *words]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=buffered, check=False)
+    said = "dtsa: error: standard output: No space left on device\n"
+    assert (done.returncode, done.stderr) == (1, said)
+
+
 def test_interrupt_is_exit_130_without_traceback(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -120,7 +131,7 @@ def test_no_command_module_is_forgotten(package: str) -> None:
     found = {
         f"{package}.{file.name.removesuffix('.py')}"
         for file in files(package).iterdir()
-        if file.name.endswith(".py") and "def add_parser(" in file.read_text()
+        if file.name.endswith(".py") and "EXAMPLES = (" in file.read_text()
     }
     assert found == {name for name in map(registry.module_of, registry.COMMANDS) if name.startswith(package)}
 

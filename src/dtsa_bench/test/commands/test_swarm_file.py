@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands import agent, sniff, view
 from dtsa_bench.commands.cli import main
-from dtsa_bench.commands.swarm_file import take_swarm_file
+from dtsa_bench.commands.network_options import read_network_options
 from dtsa_bench.runs.options import given
 
 SHARED = """\
@@ -28,38 +30,34 @@ priority: 0
 IN_ROS = "/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in SHARED.splitlines())
 
 
-def parsed(words: list[str], air: str = "udp", module: object = agent) -> argparse.Namespace:
-    """Options as a command sees them, its file taken in."""
+def parsed(words: list[str], module: Any = agent) -> tuple[argparse.Namespace, PortSettings, SwarmConfig]:
+    """Options as a command sees them, and what they and the file say."""
     parser = argparse.ArgumentParser()
-    module.add_parser(parser.add_subparsers())  # type: ignore[attr-defined]
-    name = str(getattr(module, "__name__", "")).rpartition(".")[2]
-    args = parser.parse_args([name, *words])
-    take_swarm_file(args, air)
-    return args
+    module.add_arguments(parser)
+    args = parser.parse_args(words)
+    return args, *read_network_options(args)
 
 
 @pytest.mark.parametrize("text", [SHARED, IN_ROS])
 def test_settings_of_a_file_stand_for_options_and_options_go_before_them(tmp_path: Path, text: str) -> None:
     path = tmp_path / "swarm.yaml"
     path.write_text(text)
-    args = parsed(["--swarm", str(path), "--slot-ms", "30", "--group", "239.1.2.3:9", "--id", "3"])
-    swarm, port = agent.swarm_of(args), agent.port_of(args)
+    args, port, swarm = parsed(["--swarm", str(path), "--slot-ms", "30", "--group", "239.1.2.3:9", "--id", "3"])
     wanted = SwarmConfig(agents=12, policy="tdma", slot_ms=30.0, epsilon=0.3, auth=False)
     assert swarm == wanted
     assert (port.to_dict()["group"], port.to_dict()["interface"]) == ("239.1.2.3:9", "lo")
     assert given(args, AgentSettings, "own") == {"id": 3, "priority": 0}
     for module in (sniff, view):
-        args = parsed(["--swarm", str(path)], module=module)
-        assert agent.swarm_of(args).slot_ms == 20.0
-        assert agent.port_of(args).to_dict()["group"] == "239.1.2.3:4567"
+        _, port, swarm = parsed(["--swarm", str(path)], module)
+        assert swarm.slot_ms == 20.0
+        assert port.to_dict()["group"] == "239.1.2.3:4567"
 
 
 def test_without_a_file_all_is_as_the_options_say(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DTSA_AUTH_KEY", "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4")
-    args = parsed(["--interface", "lo", "--auth-session", "4"])
+    args, _, swarm = parsed(["--interface", "lo", "--auth-session", "4"])
     assert args.air == "udp"
-    assert agent.swarm_of(args) == SwarmConfig(policy="lease", auth=True, auth_session=4)
-    assert parsed([], air="ros", module=view).air == "ros"
+    assert swarm == SwarmConfig(policy="lease", auth=True, auth_session=4)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,7 @@
-"""Integration: agents over simulated Crazyradios on one air: bags merged and judged, a listener, its packets."""
+"""Integration: agents over simulated Crazyradios on one air: bags merged and judged, and a listener."""
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shutil
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import air_helpers as helpers
-import dpkt
 import pytest
 from waiting import wait_for
 
@@ -74,7 +72,6 @@ class Flight:
     whole: Path  # directory with the merged bag
     sniffed: dict[str, Any]
     heard: Path  # bag of the listener
-    packets: Path  # its packets
     told: list[dict[str, Any]]  # what a page gets of one who listens
 
 
@@ -82,7 +79,7 @@ class Flight:
 def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
     """Agents start one after the other, with clocks that differ."""
     directory = tmp_path_factory.mktemp("crazyradio")
-    radio, heard, packets = (directory / name for name in ("radio", "sniffed.mcap", "packets.pcap"))
+    radio, heard = directory / "radio", directory / "sniffed.mcap"
     paths = [directory / f"cf{agent}.mcap" for agent in AGENTS]
     flying: list[helpers.Flying] = []
     with dongles(radio, "--radio-dongles", "6"):
@@ -90,7 +87,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
         source = NetworkListener(track, CONFIG, settings(radio, 5))
         listening = threading.Thread(target=source.run)
         listening.start()
-        sniffing = helpers.Sniffing(CONFIG, settings(radio, 4), heard, packets)
+        sniffing = helpers.Sniffing(CONFIG, settings(radio, 4), heard)
         sniffing.start()
         try:
             for agent, path in zip(AGENTS, paths, strict=True):
@@ -111,7 +108,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
     summaries = {one.agent.own.id: one.agent.summary() for one in flying}
     said = [line for one in flying for line in one.said]
     told = [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
-    return Flight(paths, summaries, said, merged, whole, sniffed, heard, packets, told)
+    return Flight(paths, summaries, said, merged, whole, sniffed, heard, told)
 
 
 def test_agents_become_one_group_and_hear_each_other(flight: Flight) -> None:
@@ -161,20 +158,6 @@ def test_who_only_listens_finds_that_all_keep_the_rules(flight: Flight) -> None:
 def test_a_page_is_told_who_is_heard(flight: Flight) -> None:
     words = "\n".join(event[2] for moment in flight.told for event in moment["events"])
     assert all(f"cf{agent} is heard" in words for agent in AGENTS)
-
-
-def test_another_program_reads_the_packets(flight: Flight) -> None:
-    """All frames that the listener has heard, in this order, as broadcasts on the port of the swarm."""
-    reader = dpkt.pcap.Reader(io.BytesIO(flight.packets.read_bytes()))
-    assert reader.datalink() == 162
-    packets = list(reader)
-    times = [time for time, _ in packets]
-    assert times == sorted(times)
-    assert {data[:11] for _, data in packets} == {bytes.fromhex("0101 ffe7e7e7e7 50 04 ff87")}
-    assert {len(data) for _, data in packets} == {11 + CONFIG.frame_length}
-    assert len(packets) == sum(flight.sniffed["heard"].values()) + sum(flight.sniffed["not_taken_in"].values())
-    sent = {record.datagram for path in flight.bags for record in read(path).slots if record.datagram}
-    assert {data[11:] for _, data in packets} <= sent
 
 
 @pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
@@ -232,7 +215,7 @@ def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> 
         (["--uri", "radio://0/80/2M", "--slot-ms", "8"], "slot_ms"),
         (["--uri", "radio://0/80/250K"], "rate 1M or 2M"),
         ([], "uri"),
-        (["--uri", "radio://0/80/2M", "--interface", "lo"], "only with --air udp"),
+        (["--uri", "radio://0/80/2M", "--interface", "lo"], "interface: got 'lo'; allowed: one of the settings"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -258,9 +241,7 @@ def test_a_dongle_in_use_and_an_old_one_are_one_line(tmp_path: Path, capsys: pyt
             assert "no other program" in capsys.readouterr().err
         finally:
             sniffing.end()
-        assert main([*command, "--pcap", str(tmp_path / "packets")]) == 0
-        assert main([*command, "--pcap", str(tmp_path / "packets")]) == 2
-        assert "a new file" in capsys.readouterr().err
+        assert main(command) == 0
     with dongles(radio, "--radio-dongles", "1", "--radio-device", "pa"):
         assert main(command) == 2
         assert "firmware 5.4 or later" in capsys.readouterr().err

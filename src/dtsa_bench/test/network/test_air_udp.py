@@ -424,16 +424,12 @@ def test_the_command_flies_until_a_signal_and_merges(tmp_path: Path) -> None:
     words = ["agent", "--id", "2", "--agents", "2", "--interface", "lo", "--group", helpers.own_group(), "--no-seal"]
     with subprocess.Popen(_command(*words, "--json", "--out", str(out)), stdout=subprocess.PIPE, text=True) as process:
         wait_for(lambda: (out / "cf2.mcap").exists() and (out / "cf2.mcap").stat().st_size > 4000)
-        maps = Path(f"/proc/{process.pid}/maps").read_text()
         process.send_signal(signal.SIGTERM)
         said, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     summary = json.loads(said)
     assert summary == json.loads((out / "summary.json").read_text())
     assert (summary["state"], summary["sealed"], summary["heard_of"]) == ("alone", False, [])
-    # In flight it has no memory for what its command line needed: random numbers, hashes.
-    assert "_hearing" in maps
-    assert not any(name in maps for name in ("numpy/random", "libcrypto"))
     merged = subprocess.run(_command("merge", str(out), "--json"), capture_output=True, text=True, timeout=60)
     assert merged.returncode == 0, merged.stderr
     found = json.loads(merged.stdout)

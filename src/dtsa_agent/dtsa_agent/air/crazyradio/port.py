@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 from dtsa_agent.air import _queue
 from dtsa_agent.air.device_port import DevicePort
@@ -27,8 +26,6 @@ class CrazyradioPort(DevicePort[Dongle]):
 
     def __init__(self, settings: CrazyradioSettings) -> None:
         super().__init__(f"dongle {settings.uri}", "dongle", settings.properties, Dongle(settings))
-        #: Is told each packet that the dongle has heard and when (ns, CLOCK_MONOTONIC), by the thread that reads.
-        self.heard: Callable[[Packet, int], None] | None = None
         self._settings = settings
         self._others = self._dropped = self._dropped_before = self._garbled = self._strange = 0
         self.begin()
@@ -70,8 +67,6 @@ class CrazyradioPort(DevicePort[Dongle]):
                 self._garbled, self._strange = garbled + reader.garbled, strange + clock.strange
 
     def _take(self, packet: Packet, arrival_ns: int) -> None:
-        if self.heard is not None:
-            self.heard(packet, arrival_ns)
         datagram = datagram_in(packet.payload, self._settings.p2p_port)
         if datagram is None:
             self._others += 1

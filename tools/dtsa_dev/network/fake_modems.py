@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from dtsa_agent.air.serial.modems import MODEMS, Modem
-from dtsa_agent.core.settings.declaration import Settings, check, setting
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.medium import OnAir
 
@@ -34,24 +33,16 @@ _SEND, _END, _OUT = range(3)  # kinds of event
 
 
 @dataclass(frozen=True, slots=True)
-class FakeModemSettings(Settings):
-    """Simulated modems.
+class FakeModemSettings:
+    """Simulated modems."""
 
-    :raises ConfigError: at creation, naming the field, the value and what is allowed.
-    """
-
-    modem: str = setting("sik-64k", "the modem that they are", choices=tuple(MODEMS))
-    count: int = setting(2, "number of modems", minimum=1, maximum=200)
-    baud: int | None = setting(
-        None, "speed of their lines; default: as of their kind", unit="bit/s", minimum=1200, maximum=4_000_000
-    )
-    latency_ms: float = setting(0.0, "for how long a USB adapter keeps bytes", unit="ms", minimum=0, maximum=1000)
-    jitter_ms: float = setting(0.0, "and up to so much longer, anew each time", unit="ms", minimum=0, maximum=1000)
-    garbage: float = setting(0.0, "share of packets before which other bytes come out", minimum=0, maximum=1)
-    echo: bool = setting(False, "modems give back what they are given")
-
-    def __post_init__(self) -> None:
-        check(self)
+    modem: str = "sik-64k"  # which of MODEMS they are
+    count: int = 2
+    baud: int | None = None  # bit/s of their lines; None: as of their kind
+    latency_ms: float = 0.0  # for how long a USB adapter keeps bytes,
+    jitter_ms: float = 0.0  # and up to so much longer, anew each time
+    garbage: float = 0.0  # share of packets before which other bytes come out
+    echo: bool = False  # modems give back what they are given
 
     @property
     def kind(self) -> Modem:
@@ -110,28 +101,18 @@ class FakeModems:
 
     @staticmethod
     def channel(count: int, **values: Any) -> ChannelConfig:
-        """Settings of the channel of so many modems.
-
-        :param count: number of modems.
-        :param values: settings by name: ``loss``, ``partition``, ``seed`` and others.
-        """
+        """Settings of the channel of so many modems: ``loss``, ``partition``, ``seed`` and others by name."""
         return ChannelConfig.from_dict({"agents": count, "slot_ns": _SLOT_NS, **values})
 
     # -- from outside -----------------------------------------------------------------------------------------------
     def set(self, **values: Any) -> None:
-        """Changes the channel from now on.
-
-        :param values: settings that may change: ``loss``, ``partition`` and others.
-        """
+        """Changes the channel from now on: ``loss``, ``partition`` and others by name."""
         with self._lock:
             self._channel.advance(self._slot(time.monotonic_ns()))
             self._channel.set(**values)
 
     def unplug(self, number: int) -> None:
-        """Takes a modem away from its computer; what it holds is lost.
-
-        :param number: from 1.
-        """
+        """Takes a modem away from its computer; what it holds is lost."""
         with self._lock:
             one = self._ones[number - 1]
             self.devices[number - 1].unlink()
@@ -142,20 +123,13 @@ class FakeModems:
         self._wake()
 
     def plug(self, number: int) -> None:
-        """Puts a modem back, as another device.
-
-        :param number: from 1.
-        """
+        """Puts a modem back, as another device."""
         with self._lock:
             self._plug(number - 1)
         self._wake()
 
     def inject(self, number: int, data: bytes) -> None:
-        """Lets other bytes come out of a modem.
-
-        :param number: from 1.
-        :param data: the bytes.
-        """
+        """Lets other bytes come out of a modem."""
         with self._lock:
             self._write(number - 1, data)
 
