@@ -17,7 +17,7 @@ from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.keys import with_key
 from dtsa_agent.plugin_watch import watched
 from dtsa_agent.ros.common.graph import names
-from dtsa_agent.ros.common.graph.parameters import declare_settings
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.priority import PrioritySettings, give_way_by
 
@@ -112,6 +112,7 @@ def _run_agents(
         agents.offer_odometry(spaces)
     logger = node.get_logger()
     try:
+        check_parameters(node)
         agents.run(stop)
         logger.info(f"ends after slot {agents.slot}: {'stopped by a signal' if stop else 'the run is over'}")
     except DtsaError as error:

@@ -18,7 +18,7 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.settings.declaration import Setting, settings_of
-from dtsa_agent.ros.common.graph.parameters import declare_setting, declare_settings
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings
 from dtsa_agent.stop import Stop
 
 from .odometry_vehicle import ODOMETRY, OdometryVehicle, VehicleSettings
@@ -46,6 +46,7 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     settings = VehicleSettings.from_dict(declare_settings(node, VehicleSettings))
     vehicle = OdometryVehicle(node, settings, config.slot_s) if settings.vehicle == ODOMETRY else None
     out = str(declare_setting(node, _OUT))
+    check_parameters(node)
     record = _recorder(out) if out else None
     logger = node.get_logger()
     try:

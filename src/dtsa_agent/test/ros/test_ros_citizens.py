@@ -6,6 +6,7 @@ import signal
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from node_helpers import Graph, end_of, ros_graph
@@ -18,8 +19,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.core.errors import ConfigError, LocalProtocolError
 from dtsa_agent.ros.common.graph import names
+from dtsa_agent.ros.common.graph.parameters import check_parameters
+from dtsa_agent.ros.common.process.node_process import log_where_possible
 from dtsa_agent.ros.common.process.waiting import Waiting
 from dtsa_agent.ros.swarm_node import SwarmNode
 
@@ -63,6 +66,51 @@ def test_waiting_is_said_at_once_and_then_ever_more_seldom(monkeypatch: pytest.M
     assert max(gaps) <= 61
     waiting.tell("waiting for cf4")
     assert logger.lines[-1] == ("info", "waiting for cf4")
+
+
+class GivenNode:
+    """Has one parameter, and was given others."""
+
+    def __init__(self, **given: object) -> None:
+        self._parameter_overrides = {name: SimpleNamespace(value=value) for name, value in given.items()}
+        self.log = Recorder()
+
+    def get_parameters_by_prefix(self, prefix: str) -> dict[str, object]:
+        return {"policy": "dtsa"}
+
+    def get_logger(self) -> Recorder:
+        return self.log
+
+
+def test_a_misspelt_parameter_is_refused_or_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["agent", "--ros-args", "-p", "polcy:=lease"])
+    with pytest.raises(ConfigError, match=r"polcy: got 'lease'; allowed: .*; did you mean policy\?"):
+        check_parameters(GivenNode(polcy="lease"))  # type: ignore[arg-type]
+    path = tmp_path / "other.yaml"
+    path.write_text("/nobody:\n  ros__parameters:\n    policy: lease\n")
+    monkeypatch.setattr("sys.argv", ["agent", "--ros-args", "--params-file", str(path)])
+    node = GivenNode(polcy="lease")  # from a file, which may be for others as well
+    check_parameters(node)  # type: ignore[arg-type]
+    assert node.log.lines == [
+        ("warning", "parameter polcy: this node has none of this name; did you mean policy?"),
+        ("warning", f"{path}: nothing in it is for this node; it is for /nobody"),
+    ]
+    node = GivenNode(policy="lease")
+    check_parameters(node)  # type: ignore[arg-type]
+    assert node.log.lines == []
+
+
+def test_logs_go_where_they_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    home = {"HOME": "/", "ROS_HOME": str(tmp_path / "home")}
+    log_where_possible(home)
+    assert "ROS_LOG_DIR" not in home
+    assert (tmp_path / "home" / "log").is_dir()
+    refused = {"ROS_LOG_DIR": "/dev/null/log"}
+    log_where_possible(refused)
+    made = Path(refused["ROS_LOG_DIR"])
+    assert made.is_dir()
+    assert capsys.readouterr().err == f"/dev/null/log: Not a directory: logs are in {made}\n"
+    made.rmdir()
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from dtsa_agent.core.settings.declaration import Setting, settings_of
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.graph.parameters import declare_setting, declare_settings
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_setting, declare_settings
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import run_node
 from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
@@ -165,6 +165,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         directory = new_directory(declare_setting(node, Setting("out", "text", "flight", "directory for the results")))
         wait = AnswerLimits(**declare_settings(node, AnswerLimits))
         first = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
+        check_parameters(node)
         flight = RecordedFlight(node, run, directory, wait.startup_s, wait.answer_s, space=space)
         try:
             if run.mode != LOCKSTEP:

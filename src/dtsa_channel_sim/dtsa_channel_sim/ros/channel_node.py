@@ -20,7 +20,7 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import setting, settings_of
 from dtsa_agent.ros.common.graph.names import MODES
 from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
-from dtsa_agent.ros.common.graph.parameters import declare_settings, from_parameter
+from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings, from_parameter
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import run_node
 from dtsa_agent.ros.common.process.priority import PrioritySettings, take_priority
@@ -101,6 +101,7 @@ def _body(stop: Stop, supervised: bool) -> None:
         run = ChannelNodeSettings(**declare_settings(node, ChannelNodeSettings))
         config = ChannelConfig.from_dict(values)
         first = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
+        check_parameters(node)
         medium, referee = Channel(config), SlotLimit(run.slots)
         kind = LockstepChannel if run.mode == MODES[0] else RealtimeChannel
         channel = kind(

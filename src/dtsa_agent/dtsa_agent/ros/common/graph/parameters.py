@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+import difflib
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -11,6 +15,7 @@ from rclpy.node import Node
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import Setting, Settings, format_values, settings_of
+from dtsa_agent.yaml_file import read_yaml
 
 _UNBOUNDED = 2.0**62
 _NOTHING = -1  # stands for None in a parameter that may be left open
@@ -87,6 +92,42 @@ def declare_setting(node: Node, setting: Setting, prefix: str = "", read_only: b
         value = given.value if given is not None else default
         raise ConfigError(name, value, setting.allowed) from error
     return from_parameter(setting, parameter.value)
+
+
+def check_parameters(node: Node) -> None:
+    """Checks that the node has all parameters that it was given; called when it has declared them.
+
+    One in a file may be meant for other nodes: it is only warned of, as is a file with nothing for this node.
+
+    :raises ConfigError: for one on the command line that it does not have.
+    """
+    given, logger = node._parameter_overrides, node.get_logger()
+    known = list(node.get_parameters_by_prefix(""))
+    options = list(pairwise(sys.argv))
+    typed = {word.partition(":=")[0].rpartition(":")[2] for option, word in options if option in ("-p", "--param")}
+    for name in sorted(given.keys() - set(known)):
+        if name.startswith("qos_overrides."):
+            continue
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        if name in typed:
+            raise ConfigError(name, given[name].value, f"a parameter of this node{hint}")
+        logger.warning(f"parameter {name}: this node has none of this name{hint}")
+    for path in [word for option, word in options if option == "--params-file"]:
+        with suppress(ConfigError):  # rclpy has said what is wrong with it
+            sections = dict(_sections(read_yaml(path, "parameters")))
+            names = {name for section in sections.values() for name in section}
+            if names and not any(full.partition(".")[0] in names or full in names for full in given):
+                logger.warning(f"{path}: nothing in it is for this node; it is for {', '.join(sections)}")
+
+
+def _sections(content: Any, place: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The parts of a file of parameters, by the nodes that they are for."""
+    for name, value in content.items() if isinstance(content, Mapping) else ():
+        if name == "ros__parameters":
+            yield place, value if isinstance(value, Mapping) else {}
+        else:
+            yield from _sections(value, f"{place}/{str(name).strip('/')}")
 
 
 def from_parameter(setting: Setting, value: Any) -> Any:

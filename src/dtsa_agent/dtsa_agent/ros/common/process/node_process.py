@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, MutableMapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -80,8 +82,22 @@ def init_ros(args: list[str] | None, context: Context | None = None, domain_id: 
     :param context: what is initialized; None: the process's own.
     :param domain_id: ROS domain; None: the environment's.
     """
+    log_where_possible(os.environ)
     rclpy.init(args=args, context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
     mend(_MIDDLEWARE)
+
+
+def log_where_possible(environment: MutableMapping[str, str]) -> None:
+    """Lets ROS write its logs to a temporary directory if its own cannot be made or written to, and says so."""
+    home = environment.get("ROS_HOME") or os.path.join(os.path.expanduser("~"), ".ros")
+    directory = Path(environment.get("ROS_LOG_DIR") or os.path.join(home, "log"))
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if not os.access(directory, os.W_OK):
+            raise PermissionError(errno.EACCES, "it may not be written to")
+    except OSError as error:
+        environment["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="dtsa-log-")
+        print(f"{directory}: {error.strerror}: logs are in {environment['ROS_LOG_DIR']}", file=sys.stderr, flush=True)
 
 
 def run_node(
