@@ -138,13 +138,11 @@ def environments(record: Row) -> str:
             f"{row['limit_per_s']:,}",
             _us(row["slot_us"]),
             f"{row['over_simulate']:.1f}",
-            f"{row['over_dictionaries']:.1f}" if "over_dictionaries" in row else "",
         ]
         for row in record["environments"]
     ]
     heads = (
         "form", "flights", "loss", "agent-steps/s", "target", "a slot of a flight", "over that of `simulate`",
-        "agent-steps over those of dictionaries",
     )  # fmt: skip
     machine, agents = record["machine"], record["environments"][0]["agents"]
     return (

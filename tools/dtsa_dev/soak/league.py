@@ -11,7 +11,6 @@ from typing import Any
 from dtsa_bench.experiments.batch.task import Row
 from dtsa_bench.experiments.league.cells import PRACTICE, League, league
 from dtsa_bench.experiments.league.check import check_entry
-from dtsa_bench.experiments.league.entrant import install
 from dtsa_bench.experiments.league.entry import FIELDS, digest_of, read_entry
 from dtsa_bench.experiments.league.scores import summary_of
 
@@ -19,13 +18,13 @@ from .item import Item, NotMet, Soak
 
 _ROOT = Path(__file__).resolve().parents[3]
 _ENTRIES = _ROOT / "docs" / "evidence" / "league-1"
-_EXAMPLES = {"learned": _ROOT / "examples" / "dtsa_learned"}  # policies that are not installed, by entry
+_ARCHIVED = ("learned",)  # its package is not part of the repository any more
 _FORGED = 10  # entries with one number changed, of each entry
 _SAMPLE = ("lease", "tdma")
 
 
 def _items() -> tuple[Item, ...]:
-    names = sorted(path.stem for path in _ENTRIES.glob("*.json"))
+    names = sorted(path.stem for path in _ENTRIES.glob("*.json") if path.stem not in _ARCHIVED)
     return tuple(Item(name, {}, number, 60.0, sample=name in _SAMPLE) for number, name in enumerate(names, 1))
 
 
@@ -33,8 +32,6 @@ def _run(item: Item, directory: Path) -> dict[str, Any]:
     entry = read_entry(_ENTRIES / f"{item.name}.json")
     there = league(entry["league"])
     word = there.practice if entry["seeds"] == PRACTICE else there.published()
-    if item.name in _EXAMPLES:
-        install(_EXAMPLES[item.name], directory / "package")
     found = check_entry(there, entry, word=word, sample=None, seed=0, jobs=None)
     if found.differences:
         raise NotMet(f"{len(found.differences)} differences, the first: {found.differences[0]}")

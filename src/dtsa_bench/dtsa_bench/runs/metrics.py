@@ -186,21 +186,12 @@ class FlightMetrics:
             here = [agent not in self.lost for agent in range(1, len(digests) + 1)]
             digests, chosen = digests[here], chosen[here]
         if len(digests):
-            self.compared(slot, bool((chosen != chosen[0]).any()), bool((digests != digests[0]).any()))
-
-    def compared(self, slot: int, torn: bool, split: bool) -> None:
-        """The same, where somebody else has compared.
-
-        :param slot: its number.
-        :param torn: whether two agents take different ones for the slot's sender.
-        :param split: whether two of their tables differ.
-        """
-        self._compared += 1
-        self._torn += torn
-        if split:
-            self._split += 1
-            if self.split_slot < 0:
-                self.split_slot = slot
+            self._compared += 1
+            self._torn += bool((chosen != chosen[0]).any())
+            if (digests != digests[0]).any():
+                self._split += 1
+                if self.split_slot < 0:
+                    self.split_slot = slot
 
     @property
     def agreed(self) -> tuple[int, int]:

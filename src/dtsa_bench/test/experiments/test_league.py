@@ -322,7 +322,7 @@ def test_the_published_word_is_the_one_of_the_commitment_and_of_the_judged_entri
     assert len(paths) >= 18
     for path in paths:
         entry = read_entry(path)
-        if path.stem != "learned":  # an example, which is not installed
+        if path.stem != "learned":  # its package is gone
             assert not check_entry(LEAGUE, entry, word=word, sample=0, seed=1, jobs=1).differences, path.name
         assert sums(LEAGUE, entry) == [], path.name
         assert all(

@@ -1,0 +1,299 @@
+"""A flight whose agents send as somebody else says: an environment for learning (docs/how-to/learning.md).
+
+An observation is made of an agent's table and of its own state alone: a policy that flies as a plug-in has the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig, make_scenario
+from dtsa_agent.core.plugins.entry_points import PluginSwarm
+from dtsa_agent.core.plugins.table import Table
+from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS
+from dtsa_agent.core.settings.flight_models import AVOIDERS
+from dtsa_agent.core.swarms.swarm import Swarm
+from dtsa_agent.keys import with_key
+from dtsa_bench.runs.config import RunConfig
+from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
+from dtsa_channel_sim import OUTCOMES, Channel
+
+from .slotted import SlottedTraffic
+
+try:
+    from gymnasium.spaces import Box, Discrete
+    from pettingzoo import ParallelEnv
+except ModuleNotFoundError:  # what a plug-in needs is here without them
+    ParallelEnv = object
+
+POLICY = "actions"  # what the setting `policy` says in an environment
+#: Numbers about the agent itself, by name: first position and count.
+OWN = {"slot": (0, 1), "turn_in": (1, 1), "frame": (2, 1), "far": (3, 1), "goal": (4, 3), "velocity": (7, 3)}
+#: Planes of N numbers, one an agent, by name: first plane and count.
+PLANES = {"age": (0, 1), "silence": (1, 1), "moves": (2, 1), "position": (3, 3), "relative_velocity": (6, 3)}
+_OWN_SIZE, _PLANE_COUNT = 10, 9
+
+
+def fields(observations: NDArray[np.float32], agents: int) -> dict[str, NDArray[np.float32]]:
+    """Windows on the parts of observations, by name.
+
+    :param observations: (..., F), any number of them.
+    :param agents: number of agents N.
+    :returns: ``slot``, ``turn_in``, ``frame``, ``far`` (...), ``goal``, ``velocity`` (..., 3), ``age``, ``silence``,
+        ``moves`` (..., N), ``position``, ``relative_velocity`` (..., 3, N).
+    """
+    planes = observations[..., _OWN_SIZE:].reshape(*observations.shape[:-1], _PLANE_COUNT, agents)
+    own = {name: observations[..., at] if n == 1 else observations[..., at : at + n] for name, (at, n) in OWN.items()}
+    return own | {
+        name: planes[..., at, :] if n == 1 else planes[..., at : at + n, :] for name, (at, n) in PLANES.items()
+    }
+
+
+class Observer:
+    """Observations of one agent that flies as a plug-in: what the environment gives to that agent, bit for bit.
+
+    :param config: what the plug-in's factory was given.
+    :param agent: id, as its factory was given it.
+    """
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        self._config, self._index = config, np.array([agent - 1])
+
+    def __call__(self, table: Table, slot: int) -> NDArray[np.float32]:
+        """(F,) what the agent has heard before a slot.
+
+        :param table: what ``choose`` was given.
+        :param slot: the slot that begins.
+        """
+        tables = (table.sent_slot, table.last_turn, table.in_ap, table.sent_position, table.sent_velocity)
+        own = (table.own_position, table.own_velocity, table.goal)
+        heard = [known[None] for known in tables], [np.asarray(state)[:, None] for state in own]
+        return observe(self._config, self._index, slot, *heard)[0]
+
+
+def observe(
+    config: SwarmConfig, index: NDArray[np.intp], slot: int, tables: list[NDArray[Any]], states: list[NDArray[Any]]
+) -> NDArray[np.float32]:
+    """(V, F) observations of V observers.
+
+    :param index: (V,) their ids less one.
+    :param slot: the slot that begins.
+    :param tables: sent_slot, last_turn, in_ap (V, N), sent_position and sent_velocity (V, 3, N).
+    :param states: own position, velocity and goal (3, V).
+    """
+    agents = config.agents
+    order = (index[:, None] + np.arange(agents)) % agents  # each has itself first, then those with the next ids
+    sent, turn, in_ap, place, speed = (
+        np.take_along_axis(known, order if known.ndim == 2 else order[:, None], axis=-1) for known in tables
+    )
+    position, velocity, goal = (state.T for state in states)
+    ago = np.where(sent < 0, 0, slot - sent)  # an agent that was never heard has not moved
+    observations = np.empty((len(index), _OWN_SIZE + _PLANE_COUNT * agents), dtype=np.float32)
+    out = fields(observations, agents)
+    out["slot"][...] = slot
+    out["turn_in"][...] = (index - slot) % agents
+    out["frame"][...] = (sent == slot - 1).any(axis=1) & (slot > 0)
+    out["goal"][...] = way = goal - position
+    out["far"][...] = np.sqrt((way * way).sum(axis=1)) > config.r_min
+    out["velocity"][...] = velocity
+    out["age"][...] = ago - 1
+    out["silence"][...] = slot - 1 - turn
+    out["moves"][...] = in_ap
+    out["position"][...] = place + speed * (ago * config.slot_s)[:, None] - position[..., None]
+    out["relative_velocity"][...] = speed - velocity[..., None]
+    return observations
+
+
+@dataclass(frozen=True, slots=True)
+class SlotResults:
+    """What the last slot of a flight of N agents brought; read only."""
+
+    slot: int
+    sent: NDArray[np.bool_]  # (N,) who sent
+    outcome: str  # of OUTCOMES: idle, success, collision
+    ages: NDArray[np.int64]  # (N, N) age from waking on, slots, of what [observer] knows of [agent]; -1: none counts
+    crashed: bool  # two agents came too close
+    completed: bool  # all had arrived, and the tail is over
+    position: NDArray[np.float64]  # (3, N) m, frame map, true, at the slot's end
+
+
+Reward = Callable[[SlotResults], ArrayLike]
+
+
+class MeanAge:
+    """The default: minus the mean age from waking on, over pairs, in slots; a crash costs a penalty on top.
+
+    In slots in which nobody flies it is 0. `waking_age_mean_slots` is the mean of the same ages over all pairs of all
+    slots.
+
+    :param crash: penalty. It has to exceed what the rest of a flight may cost: a crash ends the flight.
+    """
+
+    def __init__(self, crash: float = 10_000.0) -> None:
+        self.crash = crash
+
+    def __call__(self, results: SlotResults) -> float:
+        """The same for all agents."""
+        counted = results.ages[results.ages >= 0]
+        return -float(counted.mean() if len(counted) else 0.0) - self.crash * results.crashed
+
+
+class Actions:
+    """The policy of agents in an environment: the kernel counts for them what it counts for a plug-in."""
+
+    may_join = True
+
+    def __init__(self, config: SwarmConfig, agent: int) -> None:
+        del config, agent
+
+    def choose(self, table: Table, slot: int) -> int:
+        """Never called: the environment says who sends.
+
+        :raises ConfigError: outside of one.
+        """
+        raise ConfigError("policy", POLICY, "another one: this one flies in dtsa.env only")
+
+
+class SwarmEnv(ParallelEnv):  # type: ignore[misc]
+    """A swarm whose agents say in each slot whether they send: 1, or 0. All of them are there until the flight is over.
+
+    :param run: what is flown; its policy does not count, its seed is that of the first flight.
+    :param reward: what a slot was worth: (N,), or one number for all agents, of :class:`SlotResults`.
+    :param slots: a flight that is not over after so many slots is truncated; None: at its ``timeout_s``.
+    :param render_mode: ``ansi``: `render` gives a line on the last slot; ``human``: it prints that line.
+    :raises ConfigError: for a value that is not usable, or if PettingZoo is not installed.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "dtsa_v0", "render_modes": ["ansi", "human"], "is_parallelizable": True,
+    }  # fmt: skip
+
+    def __init__(
+        self,
+        run: RunConfig,
+        *,
+        reward: Reward | None = None,
+        slots: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if ParallelEnv is object:
+            raise ConfigError("pettingzoo", None, "an installed PettingZoo (pip install pettingzoo)")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError("render_mode", render_mode, "None, ansi, human")
+        if slots is not None and (isinstance(slots, bool) or not isinstance(slots, int) or slots < 1):
+            raise ConfigError("slots", slots, "a whole number from 1 on")
+        if POLICY not in POLICIES.registered:
+            POLICIES.register(POLICY, Actions)
+        self.run, self.render_mode = replace(run, swarm=replace(run.swarm, policy=POLICY)), render_mode
+        self._reward: Reward = MeanAge() if reward is None else reward
+        self._limit, self._next_seed, count = slots, run.swarm.seed, run.swarm.agents
+        self.possible_agents = [f"agent_{agent}" for agent in range(1, count + 1)]
+        self.agents: list[str] = []
+        low, high = (np.full(_OWN_SIZE + _PLANE_COUNT * count, limit, np.float32) for limit in (-np.inf, np.inf))
+        for name, least, most in (
+            ("slot", 0, np.inf), ("turn_in", 0, count - 1), ("frame", 0, 1), ("far", 0, 1), ("age", -1, np.inf),
+            ("silence", 0, np.inf), ("moves", 0, 1),
+        ):  # fmt: skip
+            fields(low, count)[name][...], fields(high, count)[name][...] = least, most
+        self.observation_spaces = {name: Box(low, high, dtype=np.float32) for name in self.possible_agents}
+        self.action_spaces = {name: Discrete(2) for name in self.possible_agents}
+
+    def observation_space(self, agent: str) -> Any:
+        """What an agent has heard, as numbers."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """1: it sends, 0: it is silent."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Begins a flight.
+
+        :param seed: its seed, as in `simulate`; None: the one after that of the last flight.
+        :returns: observations and (empty) infos by agent.
+        """
+        seed = self._next_seed if seed is None else seed
+        swarm_config = replace(self.run.swarm, seed=seed)
+        self.run = run = replace(self.run, swarm=swarm_config, channel=replace(self.run.air, seed=seed))
+        self._next_seed = seed + 1
+        #: What no agent knows, to look at: the scenario, the swarm, the metrics of the flight under way.
+        self.scenario = make_scenario(run.swarm)
+        swarm: AbstractSwarm = Swarm(run.swarm, self.scenario)
+        if run.swarm.estimator not in ESTIMATORS.rows or run.swarm.avoider not in AVOIDERS.rows:
+            swarm = PluginSwarm(swarm)
+        swarm.reason[:] = REASONS.index("plugin")
+        self.swarm, self.metrics = with_key(swarm), FlightMetrics(run, self.scenario)
+        self.slot = 0  # the one that begins
+        self.senders: tuple[int, ...] = ()  # ids, of the last slot
+        self.outcome = 0  # of the last slot, index into OUTCOMES
+        self._carry = SlottedTraffic(self.swarm, Channel(run.air)).slot
+        self.scenario.advance(0, self.swarm)
+        self.agents = self.possible_agents[:]
+        return self._observations(), {agent: {} for agent in self.agents}
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
+        """Flies one slot.
+
+        :param actions: 1 or 0 by agent; one of those that send must be there for each.
+        :returns: observations, rewards, terminations (crashed or complete), truncations (not over within the limit) and
+            infos by agent; with the last slot each info has the flight's ``summary``.
+        :raises ConfigError: for an action that is missing or another one, or a reward of another shape.
+        """
+        names, slot, swarm = self.agents, self.slot, self.swarm
+        if not names:
+            return {}, {}, {}, {}, {}
+        for agent in names:
+            if agent not in actions or actions[agent] not in (0, 1):
+                raise ConfigError(f"actions of {agent}", actions.get(agent), "0 or 1")
+        sent = np.array([actions[agent] for agent in names], dtype=np.bool_) & (swarm.present > 0)
+        swarm.sends[...] = sent
+        swarm.chosen[...] = np.where(sent, swarm.ids, 0)  # a silent agent says nothing of whom it takes for the sender
+        senders, woken = swarm.emit(slot), self.metrics.woken.copy()
+        self.metrics.compare_tables(slot, swarm.table_hash, swarm.chosen)
+        verdict, lengths = self._carry(slot, senders)
+        over = self.metrics.update(slot, swarm.track, swarm, verdict.outcome, lengths)
+        self.slot, self.senders, self.outcome = slot + 1, verdict.senders, verdict.outcome
+        known = np.where(swarm.sent_slot >= woken, swarm.sent_slot, woken - 1)
+        counts = self.scenario.moving & (woken >= 0) & ~np.eye(len(names), dtype=np.bool_)
+        results = SlotResults(
+            slot, sent, OUTCOMES[verdict.outcome], np.where(counts, slot - known, -1),
+            self.metrics.crash_slot == self.slot, over == COMPLETED, swarm.position,
+        )  # fmt: skip
+        worth = np.asarray(self._reward(results), dtype=np.float64)
+        if worth.shape not in ((), (len(names),)):
+            raise ConfigError("reward", f"an array of shape {worth.shape}", f"a number, or {len(names)} of them")
+        rewards = dict(zip(names, np.broadcast_to(worth, len(names)).tolist(), strict=True))
+        terminated = over in (CRASHED, COMPLETED)
+        truncated = not terminated and (bool(over) or self.slot == self._limit)
+        info: dict[str, Any] = {}
+        if terminated or truncated:
+            counted = {"malformed": swarm.malformed, "foreign": swarm.foreign}
+            info, self.agents = {"summary": self.metrics.summary(None) | counted}, []
+        if not over:
+            self.scenario.advance(slot + 1, swarm)
+        flags = dict.fromkeys(names, terminated), dict.fromkeys(names, truncated)
+        return self._observations(), rewards, *flags, {agent: dict(info) for agent in names}
+
+    def _observations(self) -> dict[str, NDArray[np.float32]]:
+        swarm, index = self.swarm, np.arange(len(self.possible_agents))
+        tables = [swarm.sent_slot, swarm.last_turn, swarm.in_ap, swarm.sent_position, swarm.sent_velocity]
+        states = [swarm.position, swarm.velocity, swarm.goal]
+        return dict(zip(self.possible_agents, observe(self.run.swarm, index, self.slot, tables, states), strict=True))
+
+    def render(self) -> str | None:
+        """A line on the last slot, which mode ``human`` prints."""
+        senders = ", ".join(map(str, self.senders)) or "no agent"
+        line = f"slot {self.slot - 1}: {OUTCOMES[self.outcome]}, sent by {senders}" if self.slot else "slot 0 begins"
+        if self.render_mode == "human":
+            print(line)
+        return line if self.render_mode == "ansi" else None
+
+    def close(self) -> None:
+        """There is nothing to close."""
