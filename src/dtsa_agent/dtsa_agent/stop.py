@@ -5,7 +5,7 @@ from __future__ import annotations
 import faulthandler
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any
@@ -89,3 +89,20 @@ class Stop:
         if self._raises:
             self._raises = False
             raise KeyboardInterrupt
+
+
+class StopToken:
+    """True once something has to end: because of a signal, or for a reason that is given or found.
+
+    :param stop: the signal flag.
+    :param find_reason: gives the reason, as when a deadline has passed; empty: there is none yet.
+    """
+
+    def __init__(self, stop: Stop, find_reason: Callable[[], str] = str) -> None:
+        self.stop, self.reason = stop, ""
+        self._find_reason = find_reason
+
+    def __bool__(self) -> bool:
+        if not self.stop and not self.reason:
+            self.reason = self._find_reason()
+        return bool(self.stop) or bool(self.reason)

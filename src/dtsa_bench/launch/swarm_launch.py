@@ -17,10 +17,9 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.ros.common.graph import names
-from dtsa_bench.flights.agent_parameters import clock_parameters
+from dtsa_bench.flights.agents import agent_processes, process_count
 from dtsa_bench.flights.options import FlightOptions
 from dtsa_bench.runs.config import FROM_SWARM, MODES, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.options import whole_number
@@ -92,35 +91,17 @@ def _nodes(context: LaunchContext) -> list[Node]:
             on_exit=Shutdown(reason="the flight is over"),
         )
     ]
-    shared = {**swarm, "mode": run.mode, "swarm_namespace": space}
-    if processes == "per-agent":
-        nodes += [
-            Node(
-                package="dtsa_agent",
-                executable="agent",
-                namespace=names.agent_namespace(agent, space),
-                name="agent",
-                parameters=[{**shared, "id": agent, **clock_parameters(run, [agent], priority)}],
-                output="screen",
-            )
-            for agent in range(1, config.agents + 1)
-        ]
-        return nodes
-    if not processes.isdecimal() or not 1 <= int(processes) <= config.agents:
-        raise ConfigError("processes", processes, f"per-agent, or 1 to {config.agents}, the number of agents")
-    count = int(processes)
-    bounds = [config.agents * index // count for index in range(count + 1)]
-    for index in range(count):
-        ids = list(range(bounds[index] + 1, bounds[index + 1] + 1))
-        host = Node(
+    nodes += [
+        Node(
             package="dtsa_agent",
-            executable="swarm_host",
-            namespace=space,
-            name=f"swarm_host_{index + 1}",
-            parameters=[{**shared, "ids": ids, **clock_parameters(run, ids, priority)}],
+            executable=process.executable,
+            namespace=process.namespace,
+            name=process.node,
+            parameters=[{**swarm, "mode": run.mode, "swarm_namespace": space, **process.parameters}],
             output="screen",
         )
-        nodes.append(host)
+        for process in agent_processes(run, process_count(processes, config.agents), priority, space)
+    ]
     return nodes
 
 

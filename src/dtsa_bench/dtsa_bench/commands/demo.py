@@ -73,6 +73,9 @@ def _run(args: argparse.Namespace) -> tuple[int, Path]:
         number += 1
     directory = new_directory(args.out or f"runs/demo-{number}")
 
+    from dtsa_bench.flights.domain import clear_hindrances
+
+    clear_hindrances(os.environ)
     from dtsa_agent.ros.common.process.loop import Stop
     from dtsa_bench.pages.demo.flights import HEAD, demo_steps, fly_all, table_rows
     from dtsa_bench.pages.report.page import write_report

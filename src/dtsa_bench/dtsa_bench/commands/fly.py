@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import sys
 import time
@@ -110,20 +111,18 @@ def run(args: argparse.Namespace) -> int:
     if args.attach:
         raise ConfigError("attach", True, "a mission, --backend cflib")
 
-    processes = None
-    if args.processes != "per-agent":
-        try:
-            processes = whole_number(args.processes, "processes", 1, config.swarm.agents)
-        except ConfigError as error:
-            raise ConfigError("processes", args.processes, f"per-agent, or {error.allowed}") from None
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     directory = Path(args.out)
 
+    from dtsa_bench.flights.domain import clear_hindrances
+
+    clear_hindrances(os.environ)
     from dtsa_agent.ros.common.process.loop import Stop
+    from dtsa_bench.flights.agents import process_count
     from dtsa_bench.flights.flight import fly
 
     options = FlightOptions(
-        processes=processes,
+        processes=process_count(args.processes, config.swarm.agents),
         domain=domain,
         pictures=args.picture,
         late=late_agents(args.late),

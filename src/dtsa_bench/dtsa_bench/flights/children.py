@@ -17,6 +17,9 @@ from dtsa_agent.ros.common.process.node_process import SUPERVISOR
 
 # A process group of its own; Python 3.10 cannot say so without a function that runs in the child.
 _OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
+# As `-m`, which would put the current folder first where modules are looked for: a numpy.py there is not NumPy.
+_RUN = """import sys; sys.path[:] = [place for place in sys.path if place]; import runpy; del sys.argv[0]
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)"""
 _LEAVE_S = 3.0  # to end by themselves once the run is over; many on few cores take their time
 _TERM_S = 1.0  # and then after SIGTERM
 _HURRY_S = 0.3  # both, when the user has ended it
@@ -52,7 +55,7 @@ class Children:
         self._told: list[Child] = []
 
     def start(self, name: str, agents: Sequence[int], module: str, arguments: Sequence[str]) -> None:
-        """Starts `python -m module arguments`.
+        """Starts a module with arguments, as `python -m` does.
 
         It becomes a process group of its own, so that Ctrl-C in the terminal reaches the supervisor alone, which then
         ends all in good order. It stays in the supervisor's session: Linux gives each session as much of the processor
@@ -64,7 +67,7 @@ class Children:
         log = self._logs / f"{name.replace(' ', '')}.log"
         with log.open("ab") as output:
             process = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments],
+                [sys.executable, "-c", _RUN, module, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,

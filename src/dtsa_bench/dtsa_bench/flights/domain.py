@@ -1,23 +1,43 @@
-"""A ROS domain for one run alone: two runs on one machine never hear each other."""
+"""A ROS domain for one run alone: two runs on one machine never hear each other, whatever the user's shell says."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import socket
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.ros.common.workarounds.dds import clean_shared_memory
+from dtsa_agent.ros.common.workarounds.dds import RANGE, clean_shared_memory
 
 # Ports of RTPS: 7400 + 250 domain + 10 + 2 participant (+ 1). Beyond domain 101 they meet Linux's ephemeral ports.
 LAST_FREE_DOMAIN = 101
 LAST_DOMAIN = 232
 _PARTICIPANTS = 4
 _SPREAD = 37  # runs that start at the same time look at different domains first
+
+_FAST_DDS = "rmw_fastrtps_cpp"
+
+
+def clear_hindrances(environment: MutableMapping[str, str]) -> None:
+    """Changes variables of a user's shell that keep the processes of a flight from each other, and says which.
+
+    :param environment: of this process, which has not imported rclpy yet.
+    """
+    for name, wrong, value in (
+        ("RMW_IMPLEMENTATION", environment.get("RMW_IMPLEMENTATION", _FAST_DDS) != _FAST_DDS, _FAST_DDS),
+        ("ROS_DISCOVERY_SERVER", "ROS_DISCOVERY_SERVER" in environment, ""),
+        (RANGE, environment.get(RANGE) == "OFF", "LOCALHOST"),
+    ):
+        if wrong:
+            instead = f"{value} is taken" if value else "none is asked"
+            said = f"{name}={environment.pop(name)} does not count in a flight on this machine alone: {instead}"
+            print(f"dtsa: {said}", file=sys.stderr, flush=True)
+            environment |= {name: value} if value else {}
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 This module owns the order in which a flight ends; each step is elsewhere, and has a limit of its own:
 
-1. **Why.** The run is over (all have arrived, or its limits), or :class:`.ending.EarlyEnd` is true: a signal, or no
+1. **Why.** The run is over (all have arrived, or its limits), or a `StopToken` is true: a signal, or no
    more wall time. Or an error: a node has died, the recorder cannot write. Ctrl-C reaches this process alone
    (`children.Children.start`), and sets a flag (`dtsa_agent/stop.py`): the slot that goes on is carried out whole.
 2. **The channel** leaves its loop and publishes the END message, by which agents end by themselves.
@@ -21,6 +21,7 @@ ends this process after its patience, with the place of each thread.
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ from dtsa_agent.ros.common.process.node_process import init_ros
 from dtsa_agent.ros.common.process.priority import give_way_by, take_place, take_priority
 from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_agent.ros.common.workarounds.kept_nodes import keep_node
+from dtsa_agent.stop import StopToken
 from dtsa_bench.runs.config import LOCKSTEP, RunConfig
 from dtsa_bench.runs.options import new_directory
 from dtsa_bench.simulation.simulate import may_share
@@ -55,10 +57,9 @@ from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.observer import ChannelObserver
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .agent_parameters import CHANNEL_NICE, clock_parameters
+from .agents import CHANNEL_NICE, agent_processes
 from .children import Children
 from .domain import ros_domain
-from .ending import EarlyEnd, wall_limit_s
 from .options import FlightOptions
 from .progress import FlightProgress, ProgressLine
 from .recorded_channel import BAG, RecordedFlight
@@ -100,17 +101,6 @@ class Flight:
     scenario: Scenario
     positions: NDArray[np.float64]  # (T, 3, N) m, frame map, at the start of each slot
     bag: Path
-
-
-def split(agents: int, processes: int) -> list[list[int]]:
-    """Ids of the agents of each process, as evenly as possible.
-
-    :param processes: number of processes.
-    """
-    return [
-        list(range(agents * index // processes + 1, agents * (index + 1) // processes + 1))
-        for index in range(processes)
-    ]
 
 
 def check_options(run: RunConfig, options: FlightOptions) -> None:
@@ -226,8 +216,9 @@ def _fly(
             supervisor = RealtimeSupervisor(children, channel, measurement, progress.say, options.respawn, late)
             supervisor.follow_parameters(node)
         channel.observe(supervisor, shown, *observers)
-        limit_s = wall_limit_s(options.wall_timeout_s, flight.run_config.limits.timeout_s)
-        ended = EarlyEnd(stop, limit_s, lambda: measurement.wall_time_s)
+        limit_s = options.wall_limit_s(flight.run_config.limits.timeout_s)
+        late_text = f"the flight took longer than {limit_s:g} s by the clock on the wall (--wall-timeout-s)"
+        ended = StopToken(stop, lambda: late_text if measurement.wall_time_s > limit_s else "")
         try:
             _run(channel, ended, shown, options.priority)
         except DtsaError as error:
@@ -252,7 +243,7 @@ def _fly(
             keep_node(node)  # who was killed may have left locks behind
 
 
-def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: FlightProgress, priority: int) -> None:
+def _run(channel: LockstepChannel | RealtimeChannel, ended: StopToken, shown: FlightProgress, priority: int) -> None:
     """The flight itself; the channel is closed afterwards."""
     # Before its agents, and both before all else if that is allowed.
     first = isinstance(channel, RealtimeChannel) and not take_place(priority and priority + 1, CHANNEL_NICE, False)
@@ -270,7 +261,7 @@ def _run(channel: LockstepChannel | RealtimeChannel, ended: EarlyEnd, shown: Fli
                 give_way_by(0)
 
 
-def _cut_short(channel: Any, ended: EarlyEnd, failure: DtsaError | None) -> dict[str, str]:
+def _cut_short(channel: Any, ended: StopToken, failure: DtsaError | None) -> dict[str, str]:
     """Why a flight ended before its time, as the summary has it; empty if it did not, or the user ended it."""
     reason = str(failure or "") or ended.reason or getattr(channel, "fell_behind", "")
     return {"cut_short": reason} if reason else {}
@@ -283,40 +274,24 @@ def _start_agents(
 
     :raises KeyboardInterrupt: on a signal; not while a process is being started, so that none is forgotten.
     """
-    swarm = run.swarm
     parameters = directory / "parameters.yaml"
-    values = {**to_parameters(swarm.to_dict(), SwarmConfig), "mode": run.mode}
+    values = {**to_parameters(run.swarm.to_dict(), SwarmConfig), "mode": run.mode}
     content = {"/**": {"ros__parameters": values}}
     parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     common = ["--ros-args", "--params-file", str(parameters), "--disable-external-lib-logs", "--disable-rosout-logs"]
     late: list[LateStart] = []
-    if options.processes is None:
-        for agent in range(1, swarm.agents + 1):
-            if stop:
-                raise KeyboardInterrupt
-            place = ["-r", f"__ns:={names.agent_namespace(agent)}", *_clock_arguments(run, [agent], options.priority)]
-            start = partial(children.start, f"cf{agent}", [agent], "dtsa_agent.ros.agent_node", [*common, *place])
-            if agent in options.late:
-                late.append(LateStart(options.late[agent], agent, start))
-            else:
-                start()
-        return late
-    shared = str(run.mode == LOCKSTEP and may_share(run)).lower()
-    for number, ids in enumerate(split(swarm.agents, options.processes), 1):
+    for process in agent_processes(run, options.processes, options.priority):
         if stop:
             raise KeyboardInterrupt
-        own = ["-r", f"__node:=swarm_host_{number}", "-p", f"ids:={ids}", "-p", f"shared_table:={shared}"]
-        name = f"swarm_host_{number} with {named(ids)}"
-        children.start(
-            name, ids, "dtsa_agent.ros.swarm_host", [*common, *own, *_clock_arguments(run, ids, options.priority)]
-        )
+        own, name, module = dict(process.parameters), f"cf{process.ids[0]}", "dtsa_agent.ros.agent_node"
+        if process.executable == "swarm_host":
+            name, module = f"{process.node} with {named(process.ids)}", "dtsa_agent.ros.swarm_host"
+            own["shared_table"] = run.mode == LOCKSTEP and may_share(run)
+        words = [*common, "-r", f"__ns:={process.namespace}", "-r", f"__node:={process.node}"]
+        words += [word for key, value in own.items() for word in ("-p", f"{key}:={json.dumps(value)}")]
+        start = partial(children.start, name, process.ids, module, words)
+        if options.processes is None and process.ids[0] in options.late:
+            late.append(LateStart(options.late[process.ids[0]], process.ids[0], start))
+        else:
+            start()
     return late
-
-
-def _clock_arguments(run: RunConfig, ids: list[int], priority: int) -> list[str]:
-    values = clock_parameters(run, ids, priority)
-    return [word for name, value in values.items() for word in ("-p", f"{name}:={_plain(value)}")]
-
-
-def _plain(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)

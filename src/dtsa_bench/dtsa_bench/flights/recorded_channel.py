@@ -37,7 +37,6 @@ from .clock_statistics import ClockStatistics
 from .live_topics import LiveTopics
 from .machine import DeliveryStatistics, channel_summary, warning
 from .measurement import FlightMeasurement
-from .memory import keep_heap_small
 from .recorder import FlightRecorder
 
 BAG = "bag"  # the bag's directory within a flight's directory
@@ -65,7 +64,6 @@ class RecordedFlight:
         end_s: float = 4.0,
         space: str = names.SWARM,
     ) -> None:
-        keep_heap_small()
         identity = Run.draw(run.swarm.auth_session)
         agreed = agreed_settings(run.swarm, run.mode)
         if run.swarm.auth:  # the bag says in which session its frames are authentic

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import signal
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,9 @@ pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.ros.common.process.loop import Stop
-from dtsa_bench.flights.domain import ros_domain
+from dtsa_agent.ros.common.workarounds.dds import RANGE
+from dtsa_bench.flights.children import Children
+from dtsa_bench.flights.domain import clear_hindrances, ros_domain
 from dtsa_bench.flights.flight import fly as fly_here
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.runs.config import RunConfig, RunLimits
@@ -168,7 +168,7 @@ def test_the_channel_changes_in_flight_and_the_bag_still_verifies(tmp_path: Path
         (["--axis-x-m", "64"], "extent_m: got 65.534; allowed: 66.1 m or more: starts and goals are up to 64.0"),
         (["--slot-ms", "-5"], "slot_ms: got -5.0; allowed: 0.3 to 1000 ms"),
         (["--loss", "1.2"], "loss: got 1.2; allowed: a number from 0 to 1"),
-        (["--processes", "13"], "processes: got '13'; allowed: per-agent, or a whole number, 1 to 12"),
+        (["--processes", "13"], "processes: got '13'; allowed: per-agent, or 1 to 12"),
         (["--domain", "233"], "domain: got '233'; allowed: a whole number, 0 to 232"),
         (["--mode", "turbo"], "mode: got 'turbo'; allowed: lockstep, realtime"),
         (["--estimator", "oracle"], "estimator: got 'oracle'; allowed: hold, linear or intent"),
@@ -207,25 +207,6 @@ def test_a_directory_or_a_domain_in_use_is_one_line_and_exit_code_2(
     assert not (tmp_path / "out").exists()
 
 
-def test_large_blocks_of_a_recorder_stay_out_of_its_heap() -> None:
-    program = """
-import ctypes
-from dtsa_bench.flights.memory import keep_heap_small
-libc = ctypes.CDLL(None)
-class Blocks(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_size_t) for name in "arena free small mapped bytes a b c d e".split()]
-libc.mallinfo2.restype = Blocks
-def taken():
-    before = libc.mallinfo2().mapped
-    kept = [bytearray(1 << 17) for _ in range(64)]
-    return libc.mallinfo2().mapped - before
-bytearray(1 << 20)  # freed at once: from now on glibc puts such blocks into the heap
-print(taken(), keep_heap_small(), taken() > 0)
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["0", "True", "True"]
-
-
 def test_after_a_signal_no_process_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_LOG_DIR", "")  # put back afterwards
     swarm, stop = SwarmConfig(agents=4), Stop()
@@ -234,3 +215,25 @@ def test_after_a_signal_no_process_is_started(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(KeyboardInterrupt):
         fly_here(run, tmp_path / "out", stop=stop)
     assert list((tmp_path / "out" / "log").iterdir()) == []
+
+
+def test_variables_of_a_shell_that_would_keep_processes_apart_do_not_count(capsys: pytest.CaptureFixture[str]) -> None:
+    shell = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "ROS_DISCOVERY_SERVER": "a:1", RANGE: "OFF", "HOME": "/"}
+    clear_hindrances(shell)
+    assert shell == {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", RANGE: "LOCALHOST", "HOME": "/"}
+    said = capsys.readouterr().err.splitlines()
+    assert [line.split("=")[0] for line in said] == [
+        "dtsa: RMW_IMPLEMENTATION",
+        "dtsa: ROS_DISCOVERY_SERVER",
+        f"dtsa: {RANGE}",
+    ]
+    clear_hindrances(shell)
+    assert not capsys.readouterr().err
+
+
+def test_modules_in_the_current_folder_are_not_those_of_agents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "numpy.py").write_text("raise RuntimeError('not NumPy')")
+    monkeypatch.chdir(tmp_path)
+    children = Children(tmp_path, {})
+    children.start("one", [1], "dtsa_channel_sim.model.channel", ["word"])
+    assert children.all[0].process.wait(60) == 0, children.all[0].log.read_text()

@@ -21,8 +21,9 @@ from process_helpers import addresses, may_be_real_time, real_time, segments_of
 from waiting import wait_for
 
 from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import describe
-from dtsa_bench.flights.ending import EarlyEnd, wall_limit_s
+from dtsa_bench.flights.options import FlightOptions
 from dtsa_bench.recordings.verify import verify_bag
 from dtsa_channel_sim.ros.pace import Pace
 
@@ -195,16 +196,16 @@ def test_delays_in_constant_memory_are_right_to_five_percent() -> None:
 
 
 def test_an_end_has_one_reason() -> None:
-    assert wall_limit_s(None, 60.0) == 600.0
-    assert wall_limit_s(None, 1.0) == 120.0
-    assert wall_limit_s(7.0, 60.0) == 7.0
-    stop: list[int] = []
-    assert not EarlyEnd(stop, 1.0, lambda: 0.5)
-    ended = EarlyEnd(stop, 1.0, lambda: 1.5)
+    assert FlightOptions().wall_limit_s(60.0) == 600.0
+    assert FlightOptions().wall_limit_s(1.0) == 120.0
+    assert FlightOptions(wall_timeout_s=7.0).wall_limit_s(60.0) == 7.0
+    stop = Stop()
+    assert not StopToken(stop, lambda: "")
+    ended = StopToken(stop, lambda: "no more time")
     assert ended
-    assert "--wall-timeout-s" in ended.reason
-    stop.append(signal.SIGINT)
-    by_hand = EarlyEnd(stop, 1.0, lambda: 1.5)
+    assert ended.reason == "no more time"
+    stop.signal = signal.SIGINT
+    by_hand = StopToken(stop, lambda: "no more time")
     assert by_hand
     assert by_hand.reason == ""  # the user knows why
 
