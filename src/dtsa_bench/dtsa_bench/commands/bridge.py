@@ -101,8 +101,6 @@ def simulated(config: Path, stack: ExitStack) -> Path:
     """Start simulated Crazyflies in place of a file's real ones.
 
     :param config: the swarm's YAML.
-    :param stack: ends them.
-    :return: the YAML with their addresses.
     """
     import yaml
 

@@ -58,7 +58,6 @@ def build_parser(command: str | None, others: Sequence[str] = ()) -> tuple[OneLi
     """Parser of the whole command line; only the chosen command's module is imported.
 
     :param command: first word of the command line, None if there is none.
-    :param others: further commands, of which nothing is known but their names.
     :returns: the parser, and the chosen command's module or None.
     """
     parser = OneLineParser(prog=PROGRAM, description="Channel access in quadcopter swarms.")
@@ -87,7 +86,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     :param arguments: command line without the program's name; None: this process's.
-    :returns: exit code: 0 done, 1 the command failed, 2 wrong input, 130 interrupted.
     """
     try:
         try:
@@ -112,10 +110,7 @@ def _run(words: Sequence[str]) -> int:
 
 
 def report(error: Exception) -> int:
-    """Print an error that was raised on purpose, or by the system, as one line; pass on all others.
-
-    :returns: exit code.
-    """
+    """Print an error that was raised on purpose, or by the system, as one line; pass on all others."""
     if isinstance(error, ImportError):
         return say_missing(PROGRAM, error)
     if isinstance(error, OSError):

@@ -97,10 +97,7 @@ def _add_crazyflie_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Flies.
-
-    :returns: 0; 1 when the flight was cut short or its agents did not hear each other; 130 when interrupted.
-    """
+    """Flies; 1 when the flight was cut short or its agents did not hear each other, 130 when it was interrupted."""
     if args.backend == "cflib":
         return run_crazyflies(args)
     config = run_config(args)
@@ -196,10 +193,7 @@ def late_agents(text: str | None) -> dict[int, float]:
 
 
 def run_crazyflies(args: argparse.Namespace) -> int:
-    """A mission with Crazyflies.
-
-    :returns: 0; 1 when a vehicle cut the exchange short or the agents did not hear each other; 130 when interrupted.
-    """
+    """A mission; 1 when a vehicle cut the exchange short or agents did not hear each other, 130 when interrupted."""
     from dtsa_agent.core.errors import ConfigError
     from dtsa_agent.crazyflie.settings.config import load_swarm
 
@@ -238,7 +232,6 @@ def mission_problem(cut_short: str, not_landed: Sequence[str]) -> str:
     """What went wrong in a mission; empty: nothing.
 
     :param cut_short: why the exchange was; empty: it was not.
-    :param not_landed: names of those that may still fly.
     """
     if not (cut_short or not_landed):
         return ""

@@ -24,10 +24,7 @@ _HOW = {
 
 
 def explained(error: ImportError) -> str:
-    """What is missing and how to get it; empty if the error is not about a package that we use.
-
-    :param error: what an import raised.
-    """
+    """What is missing and how to get it; empty if the error is not about a package that we use."""
     name = (error.name or "").split(".")[0]
     how = _HOW.get(name)
     if name == "dtsa_msgs" and not _found("rclpy"):
@@ -45,9 +42,6 @@ def _found(name: str) -> bool:
 def say_missing(program: str, error: ImportError) -> int:
     """Prints one line about a missing package.
 
-    :param program: who needs it.
-    :param error: what an import raised.
-    :returns: exit code 2.
     :raises ImportError: the error itself, if it is about something else.
     """
     text = explained(error)

@@ -66,7 +66,6 @@ def run(args: argparse.Namespace) -> int:
 def _checked(picture: Path) -> Path:
     """A file that a picture can be written to.
 
-    :param picture: what was asked for.
     :raises ConfigError: if its name or its directory does not fit.
     """
     from dtsa_agent.core.errors import ConfigError

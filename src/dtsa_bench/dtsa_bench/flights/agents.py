@@ -47,7 +47,6 @@ def agent_processes(
 
     :param processes: how many, with as many agents each as can be; None: one an agent.
     :param priority: real-time priority of the agents; 0: none.
-    :param space: namespace of what the whole swarm shares.
     """
     agents = run.swarm.agents
     if processes is None:

@@ -44,7 +44,6 @@ class Child:
 class Children:
     """The processes that one supervisor started.
 
-    :param logs: directory for what they print.
     :param environment: their environment variables, on top of this process's.
     """
 
@@ -60,9 +59,6 @@ class Children:
         It becomes a process group of its own, so that Ctrl-C in the terminal reaches the supervisor alone, which then
         ends all in good order. It stays in the supervisor's session: Linux gives each session as much of the processor
         as any other one, and a session an agent would leave next to nothing for the channel.
-
-        :param name: what errors call it.
-        :param agents: ids of the agents in it.
         """
         log = self._logs / f"{name.replace(' ', '')}.log"
         with log.open("ab") as output:
@@ -77,11 +73,7 @@ class Children:
         self.all.append(Child(name, agents, process, log, module, arguments))
 
     def again(self, child: Child, more: Sequence[str] = ()) -> None:
-        """Starts a process that has ended another time; the new one takes its place.
-
-        :param child: the process.
-        :param more: arguments on top of those it had.
-        """
+        """Starts a process that has ended another time; the new one takes its place."""
         self.all.remove(child)
         self.start(child.name, child.agents, child.module, [*child.arguments, *more])
         self.all[-1].arguments = child.arguments
@@ -107,11 +99,7 @@ class Children:
         return any((child.process.returncode or 0) < 0 for child in self.all)
 
     def stop(self, hurry: bool = False) -> list[str]:
-        """Waits until all have ended, and helps those that do not.
-
-        :param hurry: somebody waits for the end of it all.
-        :returns: names of those that had to be helped.
-        """
+        """Waits until all have ended, and helps those that do not."""
         helped: dict[str, None] = {}
         leave_s, term_s = (_HURRY_S, _HURRY_S) if hurry else (_LEAVE_S, _TERM_S)
         for number, patience in ((None, leave_s), (signal.SIGTERM, term_s), (signal.SIGKILL, 10.0)):

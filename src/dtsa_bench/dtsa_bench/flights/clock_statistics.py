@@ -42,10 +42,7 @@ class _Sends:
 
 
 class ClockStatistics(ChannelObserver):
-    """Collects when slots start and frames leave, and sums it up.
-
-    :param agents: number of agents N.
-    """
+    """Collects when slots start and frames leave, and sums it up."""
 
     def __init__(self, agents: int) -> None:
         self._slot = np.full(_OPEN, -1, dtype=np.int64)  # each in row slot % _OPEN, -1: none yet
@@ -66,7 +63,6 @@ class ClockStatistics(ChannelObserver):
 
         :param slot: (m,) as its agents count, ascending.
         :param ids: (n,) ids of the agents.
-        :param offsets_ns: (m n) ns, of each agent's slot from the channel's; of its transmission, if it sends.
         :param lengths: (m n) bytes of each frame, 0: silent.
         """
         slots = np.asarray(slot, dtype=np.int64)

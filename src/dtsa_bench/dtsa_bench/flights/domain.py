@@ -24,10 +24,7 @@ _FAST_DDS = "rmw_fastrtps_cpp"
 
 
 def clear_hindrances(environment: MutableMapping[str, str]) -> None:
-    """Changes variables of a user's shell that keep the processes of a flight from each other, and says which.
-
-    :param environment: of this process, which has not imported rclpy yet.
-    """
+    """Changes variables of a user's shell that keep the processes of a flight from each other, and says which."""
     for name, wrong, value in (
         ("RMW_IMPLEMENTATION", environment.get("RMW_IMPLEMENTATION", _FAST_DDS) != _FAST_DDS, _FAST_DDS),
         ("ROS_DISCOVERY_SERVER", "ROS_DISCOVERY_SERVER" in environment, ""),
@@ -45,7 +42,6 @@ def ros_domain(wanted: int | None = None, *, shared: bool = False) -> Iterator[i
     """Takes a domain for as long as the context lasts, and removes what dead processes have left in shared memory.
 
     :param wanted: number of the domain, 0 to 232; None: any that is free.
-    :param shared: others may be on the wanted one already, such as motion capture; but no other run.
     :raises ConfigError: if the wanted one is in use.
     :raises DtsaError: if all are in use.
     """

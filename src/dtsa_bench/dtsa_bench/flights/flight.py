@@ -82,9 +82,7 @@ END_S = 1.0  # wall time in which the nodes are to hear of the end; those that h
 def run_environment(domain: int, logs: Path, shared_memory: bool = True) -> dict[str, str]:
     """Variables for the processes of a run; this process gets those that its own node needs.
 
-    :param domain: ROS domain, 0 to 232.
     :param logs: directory for ROS's logs.
-    :param shared_memory: whether this process and those that it starts use it: not in real time, nor if they are many.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -149,16 +147,9 @@ def fly(
 ) -> Flight:
     """Carries out one flight; when this returns or raises, no process of it is left and its bag is closed.
 
-    :param run: what is flown.
     :param out: directory for the bag and the results; empty, or not there yet.
-    :param options: how.
-    :param stop: a flag that ends the flight early.
-    :param label: what stands in front of the progress line.
-    :param started: is told the processes once they are started.
-    :param observers: are told what happens on the channel, after all others.
     :param progress: shows how it goes; None: a line on standard error.
     :param on_domain: called with the ROS domain and the variables of its processes before the flight begins.
-    :returns: its results, which are also in ``out``.
     :raises ConfigError: for options that are not usable; nothing has been started then.
     :raises DtsaError: when a node dies, hangs or sends garbage; the message names it.
     """

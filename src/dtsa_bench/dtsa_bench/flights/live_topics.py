@@ -21,8 +21,6 @@ class LiveTopics(ChannelObserver):
     """Publishes each slot's decisions and receptions, and pictures of the swarm, while somebody subscribes.
 
     :param node: the channel's node.
-    :param scenario: the scenario.
-    :param slot_ns: ns, length of a slot.
     :param run_id: the run's id.
     :param space: namespace of the swarm's topics.
     """

@@ -18,10 +18,7 @@ _ON_TIME = 0.95
 
 
 class DeliveryStatistics(ChannelObserver):
-    """How long after its arrival by the channel's time line each receiver took in a frame, as it says itself.
-
-    :param agents: number of agents N.
-    """
+    """How long after its arrival by the channel's time line each receiver took in a frame, as it says itself."""
 
     def __init__(self, agents: int) -> None:
         self._agents, self._delays = agents, Delays(agents)
@@ -46,10 +43,7 @@ class DeliveryStatistics(ChannelObserver):
 
 
 def channel_summary(channel: RealtimeChannel) -> dict[str, Any]:
-    """How the channel kept up.
-
-    :param channel: the channel of a flight that is over.
-    """
+    """How the channel kept up."""
     pace = channel.pace
     return {
         "late_frames": channel.late_frames,
@@ -63,10 +57,7 @@ def channel_summary(channel: RealtimeChannel) -> dict[str, Any]:
 
 
 def tight(channel: RealtimeChannel) -> str:
-    """What to say before slot 0 of a flight that the machine will hardly keep up with; empty if it should.
-
-    :param channel: the channel, after its rounds of messages before slot 0.
-    """
+    """What to say before slot 0 of a flight that the machine will hardly keep up with; empty if it should."""
     if not channel.tight:
         return ""
     return (
@@ -76,11 +67,7 @@ def tight(channel: RealtimeChannel) -> str:
 
 
 def warning(channel: RealtimeChannel, summary: dict[str, Any]) -> str | None:
-    """Why figures of a flight describe the machine rather than the protocol; None if they do not.
-
-    :param channel: the channel of a flight that is over.
-    :param summary: its results.
-    """
+    """Why figures of a flight describe the machine rather than the protocol; None if they do not."""
     frames = max(1, channel.pace.lag.count() + channel.late_frames)
     entries = max(1, summary["slots"]["total"] * channel.agents)
     lag, on_time = summary["channel_lag_p99_ms"], summary["sends_on_time_share"]

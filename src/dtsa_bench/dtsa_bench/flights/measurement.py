@@ -20,11 +20,7 @@ from .position_log import PositionLog
 
 
 class FlightMeasurement(ChannelObserver, Referee):
-    """Follows a flight with the metrics; as its referee, ends it when they say so.
-
-    :param run: the run.
-    :param scenario: its scenario.
-    """
+    """Follows a flight with the metrics; as its referee, ends it when they say so."""
 
     def __init__(self, run: RunConfig, scenario: Scenario) -> None:
         self.scenario = scenario

@@ -47,10 +47,7 @@ class FlightOptions(AnswerLimits):
     pictures: bool = setting(True, "draw trajectories.png")
 
     def wall_limit_s(self, timeout_s: float) -> float:
-        """How long a flight may take by the clock on the wall, s.
-
-        :param timeout_s: its limit in simulated time, s.
-        """
+        """How long a flight may take by the clock on the wall, s."""
         return max(120.0, 10.0 * timeout_s) if self.wall_timeout_s is None else self.wall_timeout_s
 
     def __post_init__(self) -> None:

@@ -13,10 +13,7 @@ _IN_MEMORY = 1 << 20  # bytes; what is longer goes to a temporary file
 
 
 class PositionLog:
-    """(3, N) m at each slot's start, one after the other.
-
-    :param agents: number of agents N.
-    """
+    """(3, N) m at each slot's start, one after the other."""
 
     def __init__(self, agents: int) -> None:
         self._agents = agents

@@ -18,7 +18,6 @@ _TERMINAL_S, _LOG_S = 0.2, 5.0
 class ProgressLine:
     """Rewrites one line on a terminal; elsewhere prints a line every few seconds.
 
-    :param label: what stands in front.
     :param stream: where to; default: standard error.
     """
 
@@ -58,26 +57,14 @@ class ProgressLine:
 
 
 def flight_text(slot: int, simulated_s: float, wall_s: float, closest_m: float, pair: tuple[int, int]) -> str:
-    """The line of a flight under way.
-
-    :param slot: number of the slot.
-    :param simulated_s: s since slot 0, simulated.
-    :param wall_s: s by the clock on the wall.
-    :param closest_m: m, smallest distance so far.
-    :param pair: ids of the two that came so close.
-    """
+    """The line of a flight under way."""
     factor = simulated_s / wall_s if wall_s > 0.0 else 0.0
     near = f"  closest cf{pair[0]} cf{pair[1]} {closest_m:.3f} m" if pair[0] else ""  # no slot is over, or one agent
     return f"slot {slot}  simulated {simulated_s:.2f} s  wall {wall_s:.1f} s  real-time factor {factor:.2f}{near}"
 
 
 class FlightProgress(ChannelObserver):
-    """Keeps the line up to date while a flight is under way.
-
-    :param line: the line.
-    :param measurement: the flight so far.
-    :param channel: the channel.
-    """
+    """Keeps the line up to date while a flight is under way."""
 
     def __init__(self, line: ProgressLine, measurement: FlightMeasurement, channel: RosChannel) -> None:
         self._line, self._measurement, self._channel = line, measurement, channel

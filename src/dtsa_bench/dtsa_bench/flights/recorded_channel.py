@@ -46,11 +46,7 @@ class RecordedFlight:
     """A channel, and those that observe it in a recorded flight.
 
     :param node: the ROS node; the channel's settings are its parameters.
-    :param run: the run.
     :param directory: the flight's directory; the bag becomes a directory in it.
-    :param startup_s: s of wall time that all agents have to answer for the first time.
-    :param answer_s: s of wall time that all agents have to answer any later slot, in lockstep.
-    :param end_s: s of wall time that the nodes have to hear of the end.
     :param space: namespace of the swarm's topics; those in the bag have the default one.
     """
 
@@ -113,12 +109,7 @@ class RecordedFlight:
         return result
 
     def write_results(self, pictures: bool = True, **more: Any) -> dict[str, Any]:
-        """Writes ``summary.json`` and ``trajectories.png``; the channel is closed.
-
-        :param pictures: whether the picture is drawn.
-        :param more: further results.
-        :returns: the summary.
-        """
+        """Writes ``summary.json`` and ``trajectories.png``; the channel is closed."""
         summary = {**self.summary(), **more}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         (self.directory / "summary.json").write_text(text, encoding="utf-8")

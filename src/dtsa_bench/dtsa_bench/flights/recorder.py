@@ -35,9 +35,6 @@ class FlightRecorder(ChannelObserver):
     that is cut short leaves half done does not get into its bag.
 
     :param directory: the bag's directory.
-    :param run: the run.
-    :param scenario: its scenario.
-    :param run_id: its id.
     """
 
     def __init__(self, directory: Path, run: RunConfig, scenario: Scenario, run_id: int) -> None:

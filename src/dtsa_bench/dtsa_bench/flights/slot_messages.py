@@ -39,8 +39,6 @@ def _decision(count: int) -> Message:
 class SlotMessages:
     """Packs what the agents of a swarm decided in a slot, who received what, and where everybody was.
 
-    :param scenario: the scenario.
-    :param slot_ns: ns, length of a slot.
     :param run_id: the run's id.
     """
 
@@ -55,11 +53,7 @@ class SlotMessages:
         return header_of(names.slot_time_ns(slot, self._slot_ns))
 
     def transmission(self, slot: int, answers: Answers) -> bytes:
-        """A dtsa_msgs/Transmission as CDR, of all agents that have reported for a slot in real time.
-
-        :param slot: the slot.
-        :param answers: what they reported, and their frames.
-        """
+        """A dtsa_msgs/Transmission as CDR, of all agents that have reported for a slot in real time."""
         here = np.flatnonzero(answers.answered)
         frames = [answers.frames.get(int(index) + 1, b"") for index in here]
         planes = {name: getattr(answers, name)[..., here] for name in ("track", "velocity", "command", "goal")}
@@ -81,11 +75,7 @@ class SlotMessages:
         return bytes(serialize_message(message))
 
     def decision(self, slot: int, answers: Answers) -> bytes:
-        """A dtsa_msgs/Decision as CDR.
-
-        :param slot: the slot.
-        :param answers: what the agents answered to it.
-        """
+        """A dtsa_msgs/Decision as CDR."""
         key = answers.reason.tobytes()
         known = self._reasons.get(key)
         if known is None:
@@ -108,7 +98,6 @@ class SlotMessages:
     def reception(self, slot: int, verdict: Verdict) -> bytes:
         """A dtsa_msgs/Reception as CDR.
 
-        :param slot: the slot.
         :param verdict: the channel's verdict on it.
         """
         nothing = (0,) * len(verdict.senders)
@@ -123,8 +112,6 @@ class SlotMessages:
     def markers(self, slot: int, answers: Answers, verdict: Verdict) -> bytes:
         """A visualization_msgs/MarkerArray as CDR: the swarm at the start of a slot.
 
-        :param slot: the slot.
-        :param answers: what the agents answered to it.
         :param verdict: the channel's verdict on it.
         """
         state = np.where(self._scenario.moving, WAITING, QUIET).astype(np.uint8)

@@ -24,10 +24,7 @@ from .measurement import FlightMeasurement
 
 
 class Supervisor(ChannelObserver):
-    """Ends the run when a process has ended: in lockstep a flight cannot go on without one of them.
-
-    :param children: the processes.
-    """
+    """Ends the run when a process has ended: in lockstep a flight cannot go on without one of them."""
 
     def __init__(self, children: Children) -> None:
         self._children = children
@@ -48,12 +45,7 @@ class LateStart:
 class RealtimeSupervisor(ChannelObserver):
     """In real time the others fly on when a process ends, and it may be started again.
 
-    :param children: the processes.
-    :param channel: the channel, which is told who is gone.
-    :param measurement: the flight so far, which is told who will come back.
-    :param say: prints a line that stays.
     :param respawn_s: s of wall time after which a process that died is started again; None: it is not.
-    :param late: agents that are started while the flight is under way.
     """
 
     def __init__(

@@ -26,10 +26,7 @@ _FEWEST = 5  # frames expected, of which a share says something
 
 
 def lasts_s(config: SwarmConfig) -> float:
-    """How long a check takes, s: until agents that begin cold have settled, and some rounds in which frames count.
-
-    :param config: the settings that all agents share.
-    """
+    """How long a check takes, s: until agents that begin cold have settled, and some rounds in which frames count."""
     begun = 3 * config.anchor_every * config.agents  # at the latest, where nothing is lost
     return max(_LEAST_S, (begun + _settled_after(config) + _ROUNDS * config.agents) * config.slot_s)
 
@@ -43,20 +40,13 @@ class HeldVehicle(SimulatedVehicle):
     """A vehicle that stays where it is, whatever its agent wants; it is never at its goal, so that all speak alike."""
 
     def sense(self, swarm: AbstractSwarm) -> None:
-        """An agent at its goal would rest, and speak seldom: it says that it is below it.
-
-        :param swarm: the agent.
-        """
+        """An agent at its goal would rest, and speak seldom: it says that it is below it."""
         away = swarm.goal[:, 0] - swarm.position[:, 0]
         if float(away @ away) <= swarm.config.r_min**2:
             swarm.position[2, 0] -= 2.0 * swarm.config.r_min
 
     def fly(self, swarm: AbstractSwarm, slot: int) -> None:
-        """Nothing.
-
-        :param swarm: the agent.
-        :param slot: the slot.
-        """
+        """Nothing."""
 
 
 @dataclass(slots=True)
@@ -72,20 +62,12 @@ class _Other:
     says: dict[int, int] = field(default_factory=dict)  # by id: how often it said to hear it, less how often not
 
     def hears(self, agent: int) -> bool | None:
-        """Whether it hears another one: what it said more often, for others may end their check before it.
-
-        :param agent: id.
-        """
+        """Whether it hears another one: what it said more often, for others may end their check before it."""
         return self.says[agent] > 0 if agent in self.says else None
 
 
 class Check:
-    """A watcher of an agent that only listens and speaks.
-
-    :param agent: its id.
-    :param config: the settings that all agents share.
-    :param port: what carries the frames.
-    """
+    """A watcher of an agent that only listens and speaks."""
 
     def __init__(self, agent: int, config: SwarmConfig, port: PortProperties) -> None:
         self._agent, self._config = agent, config
@@ -98,10 +80,7 @@ class Check:
         self._expects = False  # whether the policy says at all who is to send
 
     def slot(self, record: SlotRecord) -> None:
-        """A slot is over.
-
-        :param record: all of it.
-        """
+        """A slot is over."""
         if record.anew:  # another time: what was heard before counts its slots differently
             self._others.clear()
             self._slots = 0
@@ -138,9 +117,7 @@ class Check:
     def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
         """A datagram has not been taken in.
 
-        :param reason: why.
         :param data: its bytes.
-        :param arrival_ns: ns, own clock.
         """
         self._refused[reason] += 1
 
@@ -196,10 +173,7 @@ class Check:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The result for people.
-
-    :param result: of :meth:`Check.result`.
-    """
+    """The result for people."""
     head = ("", "frames", "heard", "in time", "delay ms", "largest", f"hears cf{result['id']}", "does not hear")
     rows = [head]
     for name, told in result["others"].items():

@@ -33,9 +33,7 @@ class AgentJob:
 def check(job: AgentJob, seconds: float) -> int:
     """Flies with the vehicle held, and prints who is heard, and by whom.
 
-    :param job: the agent; its bag is not made.
     :param seconds: how long; 0: as long as it takes.
-    :returns: exit code: 0 if all hear all in time.
     :raises ConfigError: for a port or an id that cannot be used.
     """
     from .check import Check, HeldVehicle, lasts_s, table
@@ -57,7 +55,6 @@ def check(job: AgentJob, seconds: float) -> int:
 def fly(job: AgentJob) -> int:
     """Flies until a signal comes, and prints what came of it.
 
-    :returns: exit code.
     :raises ConfigError: for a port, a directory or an id that cannot be used.
     :raises BagError: if the record is not whole.
     """

@@ -39,8 +39,6 @@ _MOST_REFUSED = 50  # recorded from one flush to the next
 class Sniffer:
     """One who listens.
 
-    :param config: the settings that all agents share.
-    :param port: what carries the frames.
     :param path: file for what was heard; None: it is only judged.
     :param say: is told a line when the port fails or is back; None: nobody is.
     :raises ConfigError: for a port that cannot be used, or without the key of sealed frames.
@@ -73,7 +71,6 @@ class Sniffer:
     def run(self, stop: Stop, seconds: float = 0.0) -> None:
         """Listens until a signal comes, or for a time.
 
-        :param stop: the signal flag.
         :param seconds: how long; 0: without end.
         """
         end = time.monotonic() + seconds

@@ -68,9 +68,6 @@ class OdometryPacker:
     The orientation is the identity, so that the axes of the child frame are those of the frame: the
     twist, which Odometry gives in the child frame (REP-103, REP-147), holds the velocity in the frame as
     it is. Covariances do not claim certainty: see dtsa_agent.ros.common.wire.covariances.
-
-    :param child_frames: child frame of each body.
-    :param frame: the frame that positions are given in.
     """
 
     def __init__(self, child_frames: Sequence[str], frame: str = "map") -> None:
@@ -87,7 +84,6 @@ class OdometryPacker:
     def pack(self, stamp_ns: int, position: NDArray[np.float64], velocity: NDArray[np.float64]) -> list[bytes]:
         """One message a body.
 
-        :param stamp_ns: ns, time of the states.
         :param position: m, (3, n), in the frame.
         :param velocity: m/s, (3, n), in the frame.
         """
@@ -106,9 +102,7 @@ class OdometryPacker:
 class MarkerPacker:
     """CDR of a `visualization_msgs/MarkerArray` of a swarm: sphere, name and target of each agent.
 
-    :param names: what is written above each agent.
     :param diameter: m, of the spheres.
-    :param frame: the frame that positions are given in.
     :param targets: whether each agent's target is drawn too, as a flat disc.
     :param ids: the agents' ids; None: 1, 2, ...
     """
@@ -154,7 +148,6 @@ class MarkerPacker:
     ) -> bytes:
         """The whole array as one message.
 
-        :param stamp_ns: ns, time of the states.
         :param position: m, (3, n), in the frame.
         :param state: (n,), QUIET (pale), WAITING, SENDING or COLLIDED.
         :param target: m, (3, n); needed if the targets are drawn.
@@ -174,10 +167,7 @@ class MarkerPacker:
 
     @classmethod
     def nothing(cls, frame: str = "map") -> bytes:
-        """A message that takes all markers away.
-
-        :param frame: the frame that positions are given in.
-        """
+        """A message that takes all markers away."""
         message = CdrBuilder()
         message.number("I", 1)
         cls._add(message, 0, 0, "", 1.0, frame, DELETE_ALL)

@@ -108,8 +108,6 @@ class _Walker:
 class Table:
     """Collects messages of one type and gives them back as columns.
 
-    :param store: knows the type.
-    :param kind: "package/msg/Type".
     :param fields: dotted names of the fields to keep; None: all.
     """
 

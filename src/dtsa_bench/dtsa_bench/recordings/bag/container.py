@@ -104,7 +104,6 @@ def records(buffer: bytes) -> Iterator[tuple[int, int, int]]:
 def messages(buffer: bytes, chunk: int = 0) -> Iterator[Entry]:
     """All whole messages in uncompressed records, as they were written.
 
-    :param buffer: the records.
     :param chunk: bytes, offset of their chunk in the file.
     """
     position, size = 0, len(buffer)

@@ -34,10 +34,6 @@ class BagDigest:
     ) -> None:
         """Take in one message.
 
-        :param topic: its name, encoded.
-        :param log_time_ns: ns, simulated time of reception.
-        :param publish_time_ns: ns, simulated time of transmission.
-        :param sequence: its number on the topic.
         :param data: its CDR bytes.
         :param run: whether it carries a run's id.
         """

@@ -10,11 +10,7 @@ class BagError(DtsaError):
 
 
 class UnusableBag(ConfigError):
-    """What was given as a bag is not one, or is damaged. The text says what is wrong and what would help.
-
-    :param path: what was given.
-    :param reason: what is wrong with it and what to do about it.
-    """
+    """What was given as a bag is not one, or is damaged. The text says what is wrong and what would help."""
 
     def __init__(self, path: object, reason: str) -> None:
         super().__init__("bag", str(path), "a recorded run (bag directory or .mcap file)")

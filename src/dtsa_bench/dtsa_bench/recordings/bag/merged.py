@@ -43,7 +43,6 @@ def _check(about: Any) -> None:
 def merged_from(bag: Bag) -> MergedFrom | None:
     """What a bag was merged from; None: it was recorded in flight.
 
-    :param bag: the bag.
     :raises UnusableBag: if what it says of that cannot be read.
     """
     if MERGED_FROM not in bag.custom_data:

@@ -43,11 +43,7 @@ def build(
 ) -> dict[str, Any]:
     """The whole map below the root key.
 
-    :param file_name: name of the .mcap file inside the bag directory.
-    :param topics: all topics of the bag.
     :param start_ns: log time of the first message, ns; 0 in an empty bag.
-    :param end_ns: log time of the last message, ns.
-    :param custom_data: text by name: configuration, seed, version.
     """
     count = sum(topic.count for topic in topics)
     starting_time = {"nanoseconds_since_epoch": start_ns}
@@ -130,11 +126,7 @@ def has_packed_messages(content: Mapping[str, Any]) -> bool:
 
 
 def write(directory: Path, content: Mapping[str, Any]) -> Path:
-    """Write `metadata.yaml` so that it is either whole or absent: temporary file, then rename.
-
-    :param directory: the bag directory.
-    :param content: what `build` gave.
-    """
+    """Write `metadata.yaml` so that it is either whole or absent: temporary file, then rename."""
     path = directory / FILE_NAME
     temporary = directory / f".{FILE_NAME}.part"
     with temporary.open("w", encoding="utf-8") as stream:

@@ -13,7 +13,6 @@ PACKED = "its file is compressed as a whole; `ros2 bag convert` makes a plain ba
 def bag_of(path: str | Path) -> Path:
     """The bag of what was given as a recorded run.
 
-    :param path: the directory of a run with the bag `bag` in it, a bag directory, or a .mcap file.
     :returns: the bag in a run's directory; anything else as it is.
     """
     given = Path(path)
@@ -24,7 +23,6 @@ def bag_of(path: str | Path) -> Path:
 def find_file(path: str | Path) -> Path:
     """The .mcap file of what was given as a recorded run.
 
-    :param path: see :func:`bag_of`.
     :raises UnusableBag: if there is none, or several.
     """
     path = bag_of(path)

@@ -16,12 +16,7 @@ Profile = dict[str, Any]
 
 
 def profile(reliability: str = "reliable", durability: str = "volatile", depth: int = 10) -> Profile:
-    """One QoS profile with all the fields that rosbag2 stores.
-
-    :param reliability: "reliable" or "best_effort".
-    :param durability: "volatile" or "transient_local".
-    :param depth: messages kept for late readers, 1 or more.
-    """
+    """One QoS profile with all the fields that rosbag2 stores."""
     return {
         "history": "keep_last",
         "depth": depth,

@@ -53,12 +53,7 @@ class Definition:
 
 
 def dependencies(text: str, package: str) -> list[str]:
-    """Message types that a definition names, in order of appearance, once each.
-
-    :param text: text of one `.msg` file.
-    :param package: package of that file, for types that are named without one.
-    :return: full names, "package/msg/Type".
-    """
+    """Message types that a definition names, in order of appearance, once each."""
     found: dict[str, None] = {}
     for line in text.splitlines():
         line = line.split("#", 1)[0]
@@ -74,7 +69,6 @@ def dependencies(text: str, package: str) -> list[str]:
 def concatenate(name: str, text_of: Callable[[str], str]) -> str:
     """Definition of a type with all that it needs, as rosbag2 stores it in a schema.
 
-    :param name: "package/msg/Type".
     :param text_of: gives the text of one `.msg` file by its type's full name.
     """
     root = text_of(name)
@@ -97,7 +91,6 @@ def concatenate(name: str, text_of: Callable[[str], str]) -> str:
 def installed(name: str) -> Definition:
     """Definition and RIHS01 hash of an installed message type.
 
-    :param name: "package/msg/Type".
     :raises BagError: if the package or its type description is not installed.
     """
     if importlib.util.find_spec("ament_index_python") is None and _BROUGHT.is_dir():
@@ -112,11 +105,7 @@ def installed(name: str) -> Definition:
 
 
 def brought(name: str, folder: Path) -> Definition:
-    """Definition and RIHS01 hash of a message type where there is no ROS.
-
-    :param name: "package/msg/Type".
-    :param folder: with the `.msg` files of dtsa_msgs.
-    """
+    """Definition and RIHS01 hash of a message type where there is no ROS."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     own = {f"dtsa_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.msg"))}

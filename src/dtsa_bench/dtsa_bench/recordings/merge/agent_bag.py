@@ -58,7 +58,6 @@ class NothingWritten(UnusableBag):
 def find(path: str | Path) -> Path:
     """The file of what was given as an agent's bag.
 
-    :param path: the file, or a directory with one in it.
     :raises UnusableBag: if there is none, or several.
     :raises NothingWritten: for a directory without one.
     """
@@ -78,7 +77,6 @@ def find(path: str | Path) -> Path:
 def read(path: str | Path) -> AgentBag:
     """The bag of an agent; of a file that was not finished, what is whole.
 
-    :param path: see :func:`find`.
     :raises UnusableBag: if it is no bag of an agent on a network.
     :raises NothingWritten: if its process ended before it wrote anything.
     """
@@ -115,7 +113,6 @@ def read(path: str | Path) -> AgentBag:
 def read_all(paths: Sequence[str | Path]) -> tuple[list[AgentBag], list[str]]:
     """The bags of a flight's agents, and, by path, the processes that wrote nothing.
 
-    :param paths: see :func:`find`.
     :raises UnusableBag: if one is no bag of an agent on a network, or the only one given is not written.
     """
     if len(paths) == 1:

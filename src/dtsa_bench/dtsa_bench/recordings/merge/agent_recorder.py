@@ -71,10 +71,7 @@ REFUSED_SCHEMA = described(
 
 
 def about_port(port: PortSettings) -> dict[str, str]:
-    """What a bag says of the port: its settings under its name, and what they come to.
-
-    :param port: its settings.
-    """
+    """What a bag says of the port: its settings under its name, and what they come to."""
     properties = dataclasses.asdict(port.properties)
     return {
         properties["name"]: json.dumps(port.to_dict(), sort_keys=True),
@@ -85,10 +82,6 @@ def about_port(port: PortSettings) -> dict[str, str]:
 class AgentRecorder(JsonBag):
     """The bag of one agent, written while it flies: a watcher of the agent.
 
-    :param path: the file; must not exist.
-    :param own: the agent.
-    :param config: the settings that all agents share.
-    :param port: what carries the frames.
     :param goals_told: the agent is told goals in flight, beside those of the scenario: none is known to be its last.
     :raises BagError: if the file cannot be made.
     """
@@ -108,10 +101,7 @@ class AgentRecorder(JsonBag):
         self.summary: dict[str, Any] = {}  # of the agent; known at the end
 
     def slot(self, record: SlotRecord) -> None:
-        """A slot of the agent is over.
-
-        :param record: all of it.
-        """
+        """A slot of the agent is over."""
         self._slots.append(record)  # several at a time: each then takes half as long
         if len(self._slots) >= _AT_A_TIME:
             self._write_slots()
@@ -136,9 +126,7 @@ class AgentRecorder(JsonBag):
     def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
         """A datagram has not been taken in.
 
-        :param reason: why.
         :param data: its bytes.
-        :param arrival_ns: ns, own clock.
         """
         self._refused += 1
         if self._refused > _MOST_REFUSED:
@@ -167,8 +155,6 @@ def recorded(out: str, agent: AirAgent, port: PortSettings) -> Iterator[AgentRec
     It is an entry point, so that the agent's node finds it (``dtsa.recorders``).
 
     :param out: the directory; it is empty or does not exist yet.
-    :param agent: before its flight.
-    :param port: the settings of what carries its frames.
     :raises ConfigError: for a directory that cannot be used.
     :raises BagError: if the bag cannot be made.
     """

@@ -20,11 +20,7 @@ AnyBag = TypeVar("AnyBag", bound="JsonBag")
 
 
 def described(title: str, **fields: tuple[str, str]) -> dict[str, Any]:
-    """The JSON schema of a message.
-
-    :param title: its name.
-    :param fields: type and meaning of each field.
-    """
+    """The JSON schema of a message."""
     properties = {name: {"type": kind, "description": text} for name, (kind, text) in fields.items()}
     return {"title": title, "type": "object", "properties": properties}
 
@@ -34,10 +30,6 @@ class JsonBag:
 
     When it cannot be written any more it keeps still, and ``failure`` says why: a full disk does not end a flight.
 
-    :param path: the file; must not exist.
-    :param topics: topics and the schemas of their messages.
-    :param name: of a metadata record at the beginning,
-    :param about: and what it holds.
     :raises BagError: if the file cannot be made.
     """
 
@@ -61,12 +53,7 @@ class JsonBag:
         self.failure = ""
 
     def write(self, topic: str, time_ns: int, values: Mapping[str, Any]) -> None:
-        """Records a message.
-
-        :param topic: one of those announced.
-        :param time_ns: ns, when.
-        :param values: the message.
-        """
+        """Records a message."""
         self._counts[topic] += 1
         data = _encode(values).encode()
         at = max(0, time_ns)
@@ -81,11 +68,7 @@ class JsonBag:
         return True
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Records what is known at the end.
-
-        :param name: of the metadata record.
-        :param values: what it holds.
-        """
+        """Records what is known at the end."""
         self._try(self._mcap.add_metadata, name, dict(values))
 
     def _try(self, act: Callable[..., object], *arguments: Any) -> None:

@@ -13,19 +13,12 @@ from dtsa_agent.core import AbstractSwarm, SwarmConfig
 
 
 def all_known_after(config: SwarmConfig) -> int:
-    """Slots after which each agent that is there can be known to all that hear it: (M + 2) N.
-
-    :param config: the settings that all agents share.
-    """
+    """Slots after which each agent that is there can be known to all that hear it: (M + 2) N."""
     return (config.anchor_every + 2) * config.agents
 
 
 class KnownPairs:
-    """Pairs of two agents that are there: which of them knew each other, and the oldest frame heard.
-
-    :param config: the settings that all agents share.
-    :param observers: ids, in the order of the rows of the tables.
-    """
+    """Pairs of two agents that are there: which of them knew each other, and the oldest frame heard."""
 
     def __init__(self, config: SwarmConfig, observers: Sequence[int]) -> None:
         self._slot_ms, self._fresh = config.slot_ms, all_known_after(config)
@@ -36,29 +29,17 @@ class KnownPairs:
         self._oldest: tuple[int, int] | None = None
 
     def hear(self, observer: int, record: SlotRecord) -> None:
-        """Takes in what an agent heard in a slot.
-
-        :param observer: its id.
-        :param record: of the slot.
-        """
+        """Takes in what an agent heard in a slot."""
         for one in (*record.before, *record.heard):
             pair = observer, one.sender
             self._heard[pair] = max(one.slot, self._heard.get(pair, one.slot))
 
     def begin(self, slot: int) -> None:
-        """Results count from a slot on; who was never heard is as old as they are.
-
-        :param slot: the first one.
-        """
+        """Results count from a slot on; who was never heard is as old as they are."""
         self._first = slot
 
     def follow(self, slot: int, here: Sequence[int], tables: AbstractSwarm) -> None:
-        """Takes in the end of a slot.
-
-        :param slot: its number.
-        :param here: ids of the agents that are there.
-        :param tables: what they know, a row an observer.
-        """
+        """Takes in the end of a slot."""
         for observer in here:
             sent = tables.sent_slot[self._row[observer]].tolist()
             for other in here:

@@ -33,8 +33,6 @@ class Sent(NamedTuple):
 class Merge:
     """Bags of one flight on one time line.
 
-    :param bags: one a process, in any order; an agent that came back has several.
-    :param nothing_written: directories and files of processes that ended before they wrote anything.
     :raises ConfigError: for bags of different swarms, two of one agent at one time, or none with a slot in it.
     """
 
@@ -52,7 +50,6 @@ class Merge:
         """Judges the flight; once.
 
         :param air_ns: ns that a frame is on the air, to tell which overlapped there; 0: only turns are compared.
-        :returns: the results, plain values.
         """
         lives, line, common_slot = self.lives, self.line, self.turns.common_slot
         replays = {life: Replay(bag) for life, bag in lives.items()}
@@ -90,10 +87,7 @@ class Merge:
 
 
 def verified(summary: Mapping[str, Any]) -> bool:
-    """Whether nothing in a merged flight contradicts the protocol or another bag.
-
-    :param summary: of :meth:`Merge.judge`.
-    """
+    """Whether nothing in a merged flight contradicts the protocol or another bag."""
     again = summary["decisions_again"]
     # Of frames that nobody else heard nothing is known if their sender's bag was not finished.
     parts = summary["broken_off"] or summary["missing"] or summary["nothing_written"]
@@ -103,10 +97,7 @@ def verified(summary: Mapping[str, Any]) -> bool:
 
 
 def clocks_apart(groups: Sequence[Sequence[str]]) -> str:
-    """Says that clocks of groups cannot be compared; empty where there are none.
-
-    :param groups: the names in each, `not_determined` of :meth:`Merge.judge`.
-    """
+    """Says that clocks of groups cannot be compared; empty where there are none."""
     if not groups:
         return ""
     named_groups = " | ".join(", ".join(group) for group in groups)
@@ -145,10 +136,7 @@ def _apart(lives: Mapping[Life, AgentBag], line: TimeLine) -> list[list[str]]:
 
 
 def sent_of(lives: Mapping[Life, AgentBag]) -> dict[tuple[int, int], Sent]:
-    """All frames that were sent, by slot and sender.
-
-    :param lives: the bags.
-    """
+    """All frames that were sent, by slot and sender."""
     return {
         (record.slot, life[0]): Sent(life, record)
         for life, bag in lives.items()
@@ -158,21 +146,13 @@ def sent_of(lives: Mapping[Life, AgentBag]) -> dict[tuple[int, int], Sent]:
 
 
 def senders_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent]) -> Counter[int]:
-    """How many are known to have sent, by slot: by their own bags, or, where these are missing, by those of others.
-
-    :param lives: the bags.
-    :param sent: all frames of their bags.
-    """
+    """How many are known to have sent, by slot: by their own bags, or, where these are missing, by those of others."""
     heard = {(h.slot, h.sender) for bag in lives.values() for r in bag.slots for h in (*r.before, *r.heard)}
     return Counter(slot for slot, _ in heard | sent.keys())
 
 
 def again(lives: Mapping[Life, AgentBag], replays: Mapping[Life, Replay]) -> dict[str, Any]:
-    """What came of making all decisions again.
-
-    :param lives: the bags.
-    :param replays: of each of them, flown.
-    """
+    """What came of making all decisions again."""
     return {
         "equal": sum(replay.equal for replay in replays.values()),
         "of": sum(len(bag.slots) for bag in lives.values()),
@@ -181,12 +161,7 @@ def again(lives: Mapping[Life, AgentBag], replays: Mapping[Life, Replay]) -> dic
 
 
 def strange_of(lives: Mapping[Life, AgentBag], sent: Mapping[tuple[int, int], Sent], complete: bool) -> int:
-    """How many frames were heard that their sender's bag does not have, or has otherwise.
-
-    :param lives: the bags.
-    :param sent: all frames of their bags.
-    :param complete: whether each process of the agents that have bags has one here.
-    """
+    """How many frames were heard that their sender's bag does not have, or has otherwise."""
     return _crossings(lives, sent, complete)[0]
 
 
@@ -214,8 +189,6 @@ def judged(
 ) -> dict[str, Any]:
     """What the protocol says of the frames that were sent, or heard, from when on all counted alike.
 
-    :param lives: the bags.
-    :param sent: all frames of their bags.
     :param common_slot: from which all counted alike; None: never.
     """
     config = next(iter(lives.values())).swarm

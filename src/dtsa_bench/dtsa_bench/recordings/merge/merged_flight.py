@@ -42,10 +42,7 @@ class Moment:
 
 
 def run_of(config: SwarmConfig) -> RunConfig:
-    """A merged flight's configuration, as of any other one; its channel stands for a network of which nothing is known.
-
-    :param config: the settings that all agents share.
-    """
+    """A merged flight's configuration; its channel stands for a network of which nothing is known."""
     limits = RunLimits(timeout_s=_FOREVER_S, stop_on_crash=False)
     return RunConfig(config, ChannelConfig(**from_swarm(config)), limits, REALTIME)
 
@@ -58,9 +55,6 @@ def fly(
 ) -> Generator[Moment, None, dict[str, Any] | None]:
     """Replays all agents slot by slot; gives the slots from the common one on.
 
-    :param lives: the bags.
-    :param replays: of each of them.
-    :param senders: how many have sent, by slot.
     :param common_slot: from which all counted alike; None: never.
     :returns: the results of the flight from when all can have become known, (M + 2) N slots after that,
         and from when nobody is new any more (until then they hover), until the first of them ends in order; None:
@@ -112,10 +106,7 @@ def fly(
 
 
 class Flown:
-    """The slots of a flight, and its results afterwards.
-
-    :param flight: see :func:`fly`.
-    """
+    """The slots of a flight, and its results afterwards."""
 
     def __init__(self, flight: Generator[Moment, None, dict[str, Any] | None]) -> None:
         self._flight = flight
@@ -126,10 +117,7 @@ class Flown:
 
 
 def ended(flight: Generator[Moment, None, dict[str, Any] | None]) -> dict[str, Any] | None:
-    """The results of a flight, flown to its end.
-
-    :param flight: see :func:`fly`.
-    """
+    """The results of a flight, flown to its end."""
     flown = Flown(flight)
     for _ in flown:
         pass
@@ -159,10 +147,7 @@ def _new(replay: Replay) -> bool:
 
 
 def _follow(metrics: FlightMetrics, records: Records, slot: int, track: Any) -> list[int]:
-    """Where all were during a slot, as their records of the next one say; who has fallen out is lost.
-
-    :returns: ids of those that are here.
-    """
+    """Where all were during a slot, as their records of the next one say; who has fallen out is lost."""
     here = []
     for agent, slots in records.items():
         following = slots.get(slot + 1)

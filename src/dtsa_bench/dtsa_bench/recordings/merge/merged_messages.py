@@ -60,7 +60,6 @@ class Out(NamedTuple):
 class MergedMessages:
     """Packs a merged flight.
 
-    :param run: the flight.
     :param config: as recorded; None: as it is recorded now.
     :raises BagError: if most slots are missing.
     """

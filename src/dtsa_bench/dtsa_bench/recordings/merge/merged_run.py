@@ -88,8 +88,6 @@ class MergedRun:
 def lay(merge: Merge, summary: Mapping[str, Any]) -> MergedRun:
     """A merged flight with the times of its bag.
 
-    :param merge: the bags on one time line.
-    :param summary: what came of judging them.
     :raises ConfigError: if there is no slot that all counted alike.
     """
     first = merge.turns.common_slot
@@ -186,9 +184,6 @@ def _process(life: Life, bag: AgentBag) -> dict[str, Any]:
 def read(found: MergedFrom, config: SwarmConfig, path: Path) -> MergedRun:
     """A merged flight from the messages of its bag.
 
-    :param found: what the bag holds.
-    :param config: the settings that all agents share.
-    :param path: the bag.
     :raises UnusableBag: if its messages do not fit together.
     """
     try:

@@ -21,7 +21,6 @@ from .merged_run import MergedRun
 def check_free(directory: Path) -> None:
     """Whether a flight can be written there.
 
-    :param directory: where to.
     :raises ConfigError: if something is there already.
     """
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
@@ -32,9 +31,6 @@ def write(directory: Path, run: MergedRun, summary: Mapping[str, Any]) -> Path:
     """Writes `bag` and `summary.json`, as flights leave them.
 
     :param directory: where to; must not exist, or be empty.
-    :param run: the flight.
-    :param summary: what came of merging it.
-    :returns: the bag.
     :raises ConfigError: if something is there already.
     :raises BagError: if it cannot be written.
     """

@@ -17,10 +17,7 @@ _KEPT = ("sent_position", "sent_velocity", "sent_intent", "sent_slot", "last_tur
 
 
 class Replay:
-    """One agent that is where it said it was, and hears what it said it heard.
-
-    :param bag: its bag.
-    """
+    """One agent that is where it said it was, and hears what it said it heard."""
 
     def __init__(self, bag: AgentBag) -> None:
         # Tags are left out: whether they are right was for the agent to judge, and the key is not in the bag.
@@ -36,10 +33,7 @@ class Replay:
         self.differences: list[dict[str, Any]] = []
 
     def fly(self, record: SlotRecord) -> None:
-        """One slot.
-
-        :param record: what the agent said about it; slots come in ascending order.
-        """
+        """One slot."""
         swarm, slot = self.swarm, record.slot
         if record.anew:
             self._group.restart(0, slot)
@@ -58,11 +52,7 @@ class Replay:
         self._group.on_slot_end()
 
     def lay(self, tables: Any, row: int) -> None:
-        """Copies what the agent knows into a row of tables.
-
-        :param tables: a swarm of observers.
-        :param row: the row.
-        """
+        """Copies what the agent knows into a row of tables."""
         for name in _KEPT:
             getattr(tables, name)[row] = getattr(self.swarm, name)[0]
 

@@ -45,10 +45,7 @@ class Clock:
     drift: float
 
     def common_ns(self, local_ns: int) -> int:
-        """The common time at which it shows a time, ns.
-
-        :param local_ns: what it shows, ns.
-        """
+        """The common time at which it shows a time, ns."""
         since = local_ns - self.coarse_ns
         return since - round(self.offset_ns + self.drift * since)
 
@@ -86,19 +83,12 @@ class TimeLine:
 
 
 def named(life: Life) -> str:
-    """How an agent's process is called.
-
-    :param life: the process.
-    """
+    """How an agent's process is called."""
     return f"cf{life[0]}" + (f" ({life[1] + 1})" if life[1] else "")
 
 
 def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
-    """The time line of the largest group of processes whose frames go both ways, directly or by way of others.
-
-    :param crossings: frames heard.
-    :param flight_ns: ns, how long a frame is under way, about.
-    """
+    """The time line of the largest group of processes whose frames go both ways, directly or by way of others."""
     groups = both_ways(crossings)
     rows = _used(crossings, set(groups[0])) if groups else []
     coarse = _coarse(rows, flight_ns)
@@ -130,11 +120,7 @@ def fit(crossings: Sequence[Crossing], flight_ns: int) -> TimeLine:
 
 
 def both_ways(crossings: Sequence[Crossing]) -> list[tuple[Life, ...]]:
-    """Groups of processes between any two of which frames go both ways, directly or by way of others.
-
-    :param crossings: frames heard.
-    :returns: the largest group first; of equal ones that of the lowest id. Each process is in one of them.
-    """
+    """Groups of processes between any two of which frames go both ways, directly or by way of others."""
     pairs = {(c.sender, c.receiver) for c in crossings}
     lives = sorted({life for pair in pairs for life in pair})
     column = {life: k for k, life in enumerate(lives)}

@@ -17,8 +17,6 @@ class Judge:
 
     What was given away before it began it cannot know: unless it begins with slot 0, it only listens for as long as
     leases reach.
-
-    :param config: the settings that all agents share.
     """
 
     def __init__(self, config: SwarmConfig) -> None:
@@ -42,11 +40,7 @@ class Judge:
     ) -> None:
         """A slot in which frames were sent.
 
-        :param slot: its number; slots come in ascending order.
         :param frames: the frames as they were on the air, by the sender's id.
-        :param unsent: frames, without tags, that were too late to be sent; turns given away in them are given away.
-        :param unrecorded: agents whose frame was too late to be sent and is not known. Such an agent keeps to what it
-            gave away, and may relay it: until those turns are over, slots that seem wrong are counted, not judged.
         """
         if self._from is None:
             self._from = slot + self._window if slot else 0

@@ -20,8 +20,6 @@ OPEN = 255
 class Ledger:
     """Who gave which turn to whom, and whether all kept to it.
 
-    :param agents: number of agents N.
-    :param anchor_every: M: every M-th turn of an owner is an anchor.
     :param main_every: K M; 0: M.
     """
 
@@ -45,11 +43,7 @@ class Ledger:
         self._rules = Memory(Rules(agents=self.agents, slot_s=1.0, anchor_every=self.anchor_every, main_every=main))
 
     def slot(self, slot: int, frames: dict[int, bytes]) -> None:
-        """Takes in one slot.
-
-        :param slot: its number; slots come in order.
-        :param frames: the frames of all senders, by id.
-        """
+        """Takes in one slot."""
         given, handed = self.issued.pop(slot, []), self.handed.pop(slot, {})
         owner = slot % self.agents + 1
         is_open = any(lessee == OPEN for _, lessee in given)
@@ -97,12 +91,7 @@ class Ledger:
             self.broken.append(f"slot {slot}: owner {owner} sends in a turn that it gave to {sorted(last)}")
 
     def read(self, slot: int, sender: int, data: bytes) -> None:
-        """Takes note of what a frame gives away, whether or not it got on the air.
-
-        :param slot: number of the slot in which it was made.
-        :param sender: id.
-        :param data: the frame.
-        """
+        """Takes note of what a frame gives away, whether or not it got on the air."""
         try:
             frame = decode_extended(data)
         except RemoteProtocolError as error:
@@ -145,20 +134,12 @@ class Ledger:
 
 
 def last_lessee(handed: dict[int, tuple[int, int]], lessee: int) -> int:
-    """Whose turn it is after it has been handed on, each agent once.
-
-    :param handed: by the id of each: to which id it handed the turn on, and in which slot.
-    :param lessee: id of the agent whose it was at first.
-    """
+    """Whose turn it is after it has been handed on, each agent once."""
     return lessees(handed, lessee)[-1]
 
 
 def lessees(handed: dict[int, tuple[int, int]], first: int) -> list[int]:
-    """Whose a turn was, one after the other.
-
-    :param handed: by the id of each: to which id it handed the turn on, and in which slot.
-    :param first: id of the agent whose it was at first.
-    """
+    """Whose a turn was, one after the other."""
     chain = [first]
     while chain[-1] in handed and len(chain) <= len(handed):
         chain.append(handed[chain[-1]][0])

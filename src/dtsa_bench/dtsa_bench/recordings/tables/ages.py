@@ -48,18 +48,12 @@ def _usable(run: RecordedRun) -> _Usable:
 
 
 def why_without_ages(run: RecordedRun) -> str:
-    """Why a bag does not hold enough to know what the agents knew; empty: it does.
-
-    :param run: the recorded run.
-    """
+    """Why a bag does not hold enough to know what the agents knew; empty: it does."""
     return _usable(run).why_not
 
 
 def follow_run(run: RecordedRun) -> Followed:
-    """What the agents knew of each other, and the results, by the one definition of `FlightMetrics`.
-
-    :param run: the recorded run.
-    """
+    """What the agents knew of each other, and the results, by the one definition of `FlightMetrics`."""
     usable = _usable(run)
     if usable.config is None or usable.scenario is None:
         return Followed(usable.scenario, None, {}, [usable.why_not])
@@ -77,10 +71,7 @@ def follow_run(run: RecordedRun) -> Followed:
 
 
 def observed(run: RecordedRun) -> Iterator[Observed]:
-    """What each observer knew, slot by slot; nothing where the bag does not hold enough.
-
-    :param run: the recorded run.
-    """
+    """What each observer knew, slot by slot; nothing where the bag does not hold enough."""
     usable = _usable(run)
     if usable.config is None or usable.scenario is None:
         return
@@ -116,10 +107,6 @@ def _steps(
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
     """Feed the recorded frames to the tables, and the metrics with what they then know.
 
-    :param run: a run whose slots are complete from 0 on and that has odometry of all agents.
-    :param tables: tables only; their estimates are those for the end of the slot.
-    :param metrics: updated slot by slot, if there are any.
-    :param hearing: so is this.
     :returns: each slot, and where the agents truly were at its end, (3, N) m, frame map.
     """
     count = len(run.slots)

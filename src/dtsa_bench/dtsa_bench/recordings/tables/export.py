@@ -45,12 +45,8 @@ def export(
 ) -> list[Exported]:
     """Write the tables of a bag and a description of their columns.
 
-    :param path: run directory, bag directory or .mcap file.
     :param directory: where they go; must not exist, or be empty.
-    :param kind: "parquet" or "csv".
     :param tables: names from `COLUMNS`; None: all.
-    :param progress: called with the name of each table before it is written.
-    :param note: called with each reason why something is left out of the tables.
     :raises ConfigError: for unusable settings and bags.
     :raises BagError: if the files cannot be written.
     """
@@ -90,11 +86,7 @@ def export(
 
 
 def arrow_table(run: RecordedRun, name: str) -> pa.Table:
-    """One table of a run in memory.
-
-    :param run: the run.
-    :param name: from `COLUMNS`.
-    """
+    """One table of a run in memory."""
     return pa.concat_tables([pa.table(batch) for batch in _TABLES[name](run)])
 
 
@@ -244,11 +236,7 @@ def _states(run: RecordedRun) -> Iterator[dict[str, Any]]:
 
 
 def ages_table(run: RecordedRun, followed: Followed) -> dict[str, Any]:
-    """Columns of the table `ages`; no rows where the bag does not hold enough.
-
-    :param run: the run.
-    :param followed: what came of following it.
-    """
+    """Columns of the table `ages`; no rows where the bag does not hold enough."""
     ages = followed.ages
     slot = np.zeros(0, np.int64) if ages is None else np.repeat(ages.slot, run.agents)
     none = np.zeros(0)

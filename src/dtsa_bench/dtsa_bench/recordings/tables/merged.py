@@ -25,12 +25,7 @@ def _merged(run: RecordedRun, config: RunConfig) -> MergedRun:
 
 
 def follow_merged(run: RecordedRun, config: RunConfig, scenario: Scenario) -> Followed:
-    """A merged flight, by making all decisions again: its ages are those of `merge`.
-
-    :param run: the recorded run.
-    :param config: its configuration.
-    :param scenario: its scenario.
-    """
+    """A merged flight, by making all decisions again: its ages are those of `merge`."""
     flight = _merged(run, config)
     shape = len(run.slots), run.agents
     ages = Ages(run.slots, np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.int64),
@@ -61,11 +56,7 @@ def _seen(moment: Moment) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray
 
 
 def observed_merged(run: RecordedRun, config: RunConfig) -> Iterator[Observed]:
-    """What each observer of a merged flight knew, slot by slot; only those of which there is a record.
-
-    :param run: the recorded run.
-    :param config: its configuration.
-    """
+    """What each observer of a merged flight knew, slot by slot; only those of which there is a record."""
     flight = _merged(run, config)
     assert run.told is not None
     for moment in flight.fly():
@@ -82,11 +73,7 @@ def observed_merged(run: RecordedRun, config: RunConfig) -> Iterator[Observed]:
 
 
 def merged_notes(about: Mapping[str, Any], results: NDArray[np.int64]) -> list[str]:
-    """What to know of a merged flight.
-
-    :param about: what it was merged from.
-    :param results: slots that its results take.
-    """
+    """What to know of a merged flight."""
     residual = about["residual_us"]
     notes = [
         f"Merged from {len(about['processes'])} agents' bags. Slot 0 is slot {about['common_slot']} of the agents, the "

@@ -23,9 +23,6 @@ from .result import Difference, Mismatch, Result
 def verify_bag(path: str | Path, progress: Callable[[int], None] | None = None) -> Result:
     """Checks a recorded run.
 
-    :param path: a bag directory, the directory of a run with one in it, or a .mcap file.
-    :param progress: is called with the slot now and then.
-    :returns: what was checked, and the first difference if there is one.
     :raises UnusableBag: if it cannot be read as a bag of this project at all.
     """
     begin = time.perf_counter()

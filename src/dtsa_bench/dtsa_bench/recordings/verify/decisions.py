@@ -25,11 +25,7 @@ class _Heard(NamedTuple):
 
 
 class Decisions:
-    """All agents of a run, who fly where they reported to be, and hear what they reported to have taken in.
-
-    :param run: the run.
-    :param frames: all its frames.
-    """
+    """All agents of a run, who fly where they reported to be, and hear what they reported to have taken in."""
 
     def __init__(self, run: RunConfig, frames: SentFrames) -> None:
         self._frames, self._config, self._agents = frames, run.swarm, run.swarm.agents
@@ -39,10 +35,7 @@ class Decisions:
         self._heard: dict[int, list[_Heard]] = {}
 
     def report(self, said: Any) -> None:
-        """Takes in one report.
-
-        :param said: a dtsa_msgs/Report.
-        """
+        """Takes in one report."""
         count, index = len(said.agent), np.asarray(said.agent, dtype=np.intp) - 1
         slots = said.slot.tolist()
         for row, slot in enumerate(slots):
@@ -63,8 +56,6 @@ class Decisions:
     def check(self, slots: int) -> int:
         """Makes all decisions again.
 
-        :param slots: number of slots.
-        :returns: how many are equal.
         :raises Mismatch: at the first that is not.
         """
         swarm = self._group.swarm

@@ -51,12 +51,7 @@ def short(value: Any) -> str:
 
 
 def differing(bag: Bag, recorded: Message, expected: bytes, slot: int) -> Difference:
-    """The first difference between a recorded message and the expected bytes.
-
-    :param recorded: the message.
-    :param expected: what it should be, as CDR.
-    :param slot: the slot that is being checked.
-    """
+    """The first difference between a recorded message and the expected bytes."""
     kind = recorded.topic.rsplit("/", 1)[-1]
     agent = int(recorded.topic.split("/")[1][2:]) if kind == "odom" else None
     right = bag.decode(recorded._replace(data=expected))

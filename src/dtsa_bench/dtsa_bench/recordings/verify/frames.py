@@ -80,11 +80,7 @@ class SentFrames:
         self.overlapping = 0  # pairs of frames
 
     def send(self, slot: int, sender: int, start_ns: int, data: bytes) -> None:
-        """A frame goes out.
-
-        :param slot: as its sender counts.
-        :param start_ns: ns from the start of slot 0 by the channel's clock.
-        """
+        """A frame goes out."""
         airtime = self.config.airtime
         on_air = OnAir.of(airtime, sender, start_ns, len(data))
         sent = Sent(slot, on_air, data, start_ns, on_air.end_ns + airtime.from_radio_ns(len(data)))
@@ -105,11 +101,7 @@ class SentFrames:
             sent.arrival_ns = verdict.arrival_ns
 
     def get(self, slot: int, sender: int) -> Sent | None:
-        """A frame; None if it has not gone out.
-
-        :param slot: number of the slot.
-        :param sender: its id.
-        """
+        """A frame; None if it has not gone out."""
         return self._sent.get((slot, sender))
 
     def all(self) -> list[Sent]:
@@ -132,7 +124,6 @@ class SentFrames:
     def deliver(self, slot: int, sender: int, data: bytes, received: Mask) -> Sent:
         """A frame reaches some.
 
-        :param slot: number of the slot.
         :raises Mismatch: nobody has sent it, it has been delivered already, or to its own sender.
         """
         sent = self._sent.get((slot, sender))
@@ -152,9 +143,6 @@ class SentFrames:
     def judged(self, slot: int, sender: int, received: Mask, lost: int, collided: int) -> None:
         """The channel's verdict on a sender's next frame.
 
-        :param slot: number of the slot.
-        :param lost: number of receivers that lost it.
-        :param collided: number of receivers at which it collided.
         :raises Mismatch: there is no such frame.
         """
         waiting = self._unjudged.get(sender)
@@ -166,8 +154,6 @@ class SentFrames:
     def check_overlaps(self, late: int = 0) -> dict[str, int]:
         """Whether deliveries and verdicts agree, and nobody has heard two frames at one time, or while it sent.
 
-        :param late: number of frames that the channel dropped; they were not on the air.
-        :returns: how often what was found right.
         :raises Mismatch: at the first frame for which that is not so.
         """
         by_start = sorted(self._sent.values(), key=lambda sent: sent.on_air.start_ns)
@@ -212,9 +198,6 @@ class SentFrames:
         """Makes all verdicts again from the frames, their times and the channel's seed; after :meth:`check_overlaps`.
 
         :param changes: first slot and values of each change of the channel's settings.
-        :param late: frames that the channel dropped. If the recording does not show just as many, it is not known
-            which frames were on the air: those that met another one are left out.
-        :returns: how many are equal.
         :raises Mismatch: at the first that is not.
         """
         channel = Channel(self.config)

@@ -14,11 +14,7 @@ from .result import Difference, Mismatch
 
 
 class Intake:
-    """Checks the reports of a run against the channel's deliveries.
-
-    :param frames: all frames of the run, with who received them.
-    :param slots: frames of this slot and later ones are not in the bag.
-    """
+    """Checks the reports of a run against the channel's deliveries."""
 
     def __init__(self, frames: SentFrames, slots: int) -> None:
         self._frames, self._slots = frames, slots
@@ -30,7 +26,6 @@ class Intake:
     def report(self, said: Any) -> None:
         """One report.
 
-        :param said: a dtsa_msgs/Report.
         :raises Mismatch: an agent took in what was not delivered to it, or before it was, or twice.
         """
         count = len(said.agent)
@@ -63,10 +58,7 @@ class Intake:
         self.checked += len(receivers)
 
     def hearing(self, slots: int) -> Hearing:
-        """Whether the agents have heard each other.
-
-        :param slots: number of slots of the run.
-        """
+        """Whether the agents have heard each other."""
         found = Hearing(self._frames.config.agents)
         found.slots, found.sent = slots, len(self._frames.all())
         found.delivered, found.taken_in = self._frames.delivered, self.checked

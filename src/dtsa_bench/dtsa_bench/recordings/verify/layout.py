@@ -79,10 +79,7 @@ class _Walk:
 class Layout:
     """Several messages of one type with all their arrays and strings of the same lengths, filled together.
 
-    :param store: rosbags' typestore.
-    :param kind: "package/msg/Type".
     :param example: a message of that shape; its bytes are the template.
-    :param rows: how many messages.
     """
 
     def __init__(self, store: Any, kind: str, example: Any, rows: int = 1) -> None:
@@ -101,11 +98,7 @@ class Layout:
         }
 
     def fill(self, path: str, value: Any) -> None:
-        """Writes a number or an array of numbers into the messages.
-
-        :param path: dotted name of the field.
-        :param value: its value or values, the same for all messages, or with one row a message.
-        """
+        """Writes a number or an array of numbers into the messages."""
         self._numbers[path][...] = value
 
     def data(self) -> list[bytes]:
@@ -115,12 +108,7 @@ class Layout:
 
 
 def equal_but_padding(recorded: bytes, expected: bytes, mask: NDArray[np.uint8]) -> bool:
-    """Whether two messages differ at most in unused bytes.
-
-    :param recorded: the message found.
-    :param expected: what it should be.
-    :param mask: 0xFF where a byte is used, 0 where it is padding.
-    """
+    """Whether two messages differ at most in unused bytes."""
     if len(recorded) != len(expected) or len(expected) != mask.size:
         return False
     different = np.frombuffer(recorded, dtype=np.uint8) ^ np.frombuffer(expected, dtype=np.uint8)

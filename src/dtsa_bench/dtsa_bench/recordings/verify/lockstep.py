@@ -25,12 +25,7 @@ _NOT_COMPARED = ("wall_time_s", "realtime_factor", "unusable_messages", "not_tak
 
 
 class LockstepCheck:
-    """One pass over a lockstep bag.
-
-    :param bag: the bag.
-    :param result: where checks are noted.
-    :param progress: is called with the slot now and then.
-    """
+    """One pass over a lockstep bag."""
 
     def __init__(self, bag: Bag, result: Result, progress: Callable[[int], None] | None = None) -> None:
         self.bag, self.result, self._progress = bag, result, progress

@@ -23,8 +23,6 @@ class MergedCheck:
     Reports and frames on the air say what each agent did and heard. All else in the bag must follow from them, byte by
     byte, and so must each decision, which the core makes again.
 
-    :param bag: the bag.
-    :param result: where checks are noted.
     :raises UnusableBag: if a part of the bag is lost, or its reports do not fit together.
     """
 

@@ -30,8 +30,6 @@ def odometry_fault(
     :param times_ns: (R,) ns, when each row holds, ascending.
     :param found: (R, 3) m, frame map, the recorded positions.
     :param carried: (R,) rows of slots whose report came too late.
-    :param reports: one or more, by ascending slot.
-    :param slot_ns: length of a slot, ns.
     :returns: index of the row, distance from where it should be and the largest allowed one, m; None: all fit.
     """
     at = names.TIME_ZERO_NS + np.array([slot for slot, _, _ in reports]) * slot_ns

@@ -21,11 +21,7 @@ _SLOT_MASK = 0xFFFFFFFF  # slots have 32 bits in frames
 
 
 class OwnStates:
-    """Compares frames with the states that their senders reported.
-
-    :param config: the settings that all agents share.
-    :param result: where checks are noted; that tags cannot be checked, where there is no key.
-    """
+    """Compares frames with the states that their senders reported."""
 
     def __init__(self, config: SwarmConfig, result: Result) -> None:
         self._config, self._result = config, result
@@ -44,9 +40,6 @@ class OwnStates:
     def check(self, slot: int, agent: int, data: bytes, *state: NDArray[np.float64]) -> None:
         """One frame: it decodes, names its sender and slot, and says where its sender really was.
 
-        :param slot: the slot.
-        :param agent: id of the sender.
-        :param data: the frame, as it was on the air.
         :param state: (3,) each, frame map: position, m, velocity and commanded velocity, m/s, at the slot's start.
         :raises Mismatch: if it does not.
         """

@@ -44,11 +44,7 @@ def stamp_ns(stamp: Any) -> int:
 
 
 class RealtimeCheck:
-    """One pass over the bag of a run in real time.
-
-    :param bag: the bag; its configuration has ``mode`` beside the sections of a run.
-    :param result: where checks are noted, and what cannot be checked and why.
-    """
+    """One pass over the bag of a run in real time."""
 
     def __init__(self, bag: Bag, result: Result) -> None:
         self.bag, self.result = bag, result

@@ -42,10 +42,7 @@ class Expected(NamedTuple):
 
 
 def first_agent(data: bytes) -> int:
-    """Id of the first agent of a Transmission message, 0 if it has none.
-
-    :param data: the message as CDR: representation 4, header 16, run 4, slot 4, number of agents 4, ids 2 each.
-    """
+    """Id of the first agent of a Transmission message, 0 if it has none."""
     at = RUN_BYTES.stop + 4
     if len(data) < at + 6 or _IDS.unpack_from(data, at)[0] == 0:
         return 0
@@ -57,9 +54,6 @@ class Rebuild:
 
     Every agent keeps a table of its own, fed only by what the channel let it hear.
 
-    :param run: the run, as recorded.
-    :param typestore: message types of the bag, from rosbags.
-    :param groups: ids of the agents of each process, as answered to slot 0.
     :param run_id: the run's id.
     """
 

@@ -106,7 +106,6 @@ class Result:
     def take_judgement(self, judge: Judge) -> None:
         """Notes whether the frames kept to the policy's rules.
 
-        :param judge: it has read the frames of all slots.
         :raises Mismatch: at the first rules that were broken.
         """
         if not judge.knows_rules:

@@ -13,11 +13,7 @@ from .result import Difference, Mismatch, Result
 
 
 class Streams:
-    """Queues of messages by topic, filled from the bag as far as needed.
-
-    :param bag: the bag.
-    :param wanted: says whether messages of a topic are kept; the others are counted only.
-    """
+    """Queues of messages by topic, filled from the bag as far as needed."""
 
     def __init__(self, bag: Bag, wanted: Callable[[str], bool]) -> None:
         self._messages = bag.messages()
@@ -58,20 +54,14 @@ class Streams:
         return queue.popleft()
 
     def at_hand(self, topic: str, until_ns: int) -> list[Message]:
-        """Messages of a topic that have been read already, up to a time.
-
-        :param until_ns: ns, log time, up to and with this.
-        """
+        """Messages of a topic that have been read already, up to a time."""
         queue, found = self._queues.get(topic, deque()), []
         while queue and queue[0].log_time_ns <= until_ns:
             found.append(queue.popleft())
         return found
 
     def first(self, topic: str, time_ns: int) -> list[Message]:
-        """All messages of a topic at one time, left in their queue.
-
-        :param time_ns: ns, log time.
-        """
+        """All messages of a topic at one time, left in their queue."""
         while not self._ended and self._pull():
             queue = self._queues.get(topic)
             if queue and queue[-1].log_time_ns > time_ns:
