@@ -33,11 +33,10 @@ from dtsa_channel_sim.ros.channel_node import follow_parameters, watch
 from dtsa_channel_sim.ros.lockstep import LockstepChannel
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .clock_statistics import ClockStatistics
-from .live_topics import LiveTopics
-from .machine import DeliveryStatistics, channel_summary, warning
 from .measurement import FlightMeasurement
 from .recorder import FlightRecorder
+from .slot_messages import LiveTopics
+from .statistics import ClockStatistics, DeliveryStatistics, channel_summary, warning
 
 BAG = "bag"  # the bag's directory within a flight's directory
 

@@ -19,8 +19,8 @@ from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
 from .children import Child, Children, NodeError, describe_end
-from .machine import tight
 from .measurement import FlightMeasurement
+from .statistics import tight
 
 
 class Supervisor(ChannelObserver):

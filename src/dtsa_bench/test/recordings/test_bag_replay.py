@@ -317,17 +317,17 @@ def test_recorded_qos_becomes_that_of_the_publisher() -> None:
     pytest.importorskip("rclpy", reason="rclpy is not installed")
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-    from dtsa_bench.recordings.bag import qos
+    from dtsa_bench.recordings.bag.metadata import PROFILES
 
-    latched = ros_profile([qos.NAMED["latched"]])
+    latched = ros_profile([PROFILES["latched"]])
     assert (latched.reliability, latched.durability) == (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
     assert latched.depth == 1
-    sensor = ros_profile([qos.NAMED["sensor_data"]])
+    sensor = ros_profile([PROFILES["sensor_data"]])
     assert (sensor.reliability, sensor.depth) == (ReliabilityPolicy.BEST_EFFORT, 5)
-    mixed = ros_profile([qos.NAMED["reliable"], qos.NAMED["best_effort"]])
+    mixed = ros_profile([PROFILES["reliable"], PROFILES["best_effort"]])
     assert mixed.reliability == ReliabilityPolicy.BEST_EFFORT
     depths = [
-        ros_profile([qos.NAMED["reliable"] | {"depth": depth} for depth in pair]).depth for pair in ((3, 7), (7, 3))
+        ros_profile([PROFILES["reliable"] | {"depth": depth} for depth in pair]).depth for pair in ((3, 7), (7, 3))
     ]
     assert depths == [7, 7]
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.reference.alignment import ClockAligner
-from dtsa_bench.flights.clock_statistics import ClockStatistics
+from dtsa_bench.flights.statistics import ClockStatistics
 from dtsa_bench.recordings.verify.frames import SentFrames
 from dtsa_bench.recordings.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig

@@ -1,7 +1,7 @@
 """Bags: runs recorded to MCAP the way rosbag2 does it.
 
 `writer` records, `reader` reads back (without ROS), `recover` mends what a killed writer left, `replay`
-publishes it again, `export` turns it into tables. `schema`, `qos` and `metadata` hold what rosbag2 wants
+publishes it again. `schema` and `metadata` hold what rosbag2 wants
 to find in a bag, `cdr` serialises the two messages that a recorder writes often without going through
 ROS.
 """

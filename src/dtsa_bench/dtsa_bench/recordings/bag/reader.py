@@ -24,7 +24,7 @@ from rosbags.typesys.store import Typestore
 
 from dtsa_bench.runs.program import program
 
-from . import columns, container, metadata, qos
+from . import columns, container, metadata
 from .errors import BagError, UnusableBag
 from .place import find_file
 
@@ -51,7 +51,7 @@ class Topic:
     name: str
     type: str  # "package/msg/Type"
     count: int  # messages
-    profiles: tuple[qos.Profile, ...]  # offered QoS
+    profiles: tuple[metadata.Profile, ...]  # offered QoS
     type_hash: str  # "RIHS01_...", or empty
     definition: str  # message definition with all that it needs
 
@@ -128,7 +128,7 @@ class Bag:
                 channel.topic,
                 schema.name,
                 counts.get(identifier, 0) + (before.count if before else 0),
-                tuple(qos.load(channel.metadata.get("offered_qos_profiles", ""))),
+                tuple(metadata.load_profiles(channel.metadata.get("offered_qos_profiles", ""))),
                 channel.metadata.get("topic_type_hash", ""),
                 schema.data.decode("utf-8", "replace"),
             )

@@ -20,13 +20,12 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 
-from . import container, metadata, qos
-from .digest import KEY
+from . import container, metadata
 from .errors import UnusableBag
 from .place import bag_of, find_file
 from .reader import PACKED_MESSAGES
 from .schema import Definition
-from .writer import BROKEN_OFF, BagWriter
+from .writer import BROKEN_OFF, KEY, BagWriter
 
 _KINDS: dict[int, Any] = {
     container.SCHEMA: Schema, container.CHANNEL: Channel, container.CHUNK: Chunk, container.METADATA: Metadata,
@@ -182,7 +181,7 @@ def _copy(records: _WholeRecords, about: dict[str, Any], result: Recovery) -> bo
                 if record.topic not in topics:
                     schema = schemas[record.schema_id]
                     text, type_hash = schema.data.decode("utf-8", "replace"), record.metadata.get("topic_type_hash", "")
-                    profiles = qos.load(record.metadata.get("offered_qos_profiles", ""))
+                    profiles = metadata.load_profiles(record.metadata.get("offered_qos_profiles", ""))
                     definition = Definition(schema.name, text, type_hash)
                     topics[record.topic] = writer.add_topic(record.topic, schema.name, profiles, definition)
                 targets[record.id] = topics[record.topic]

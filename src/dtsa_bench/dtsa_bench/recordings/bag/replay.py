@@ -13,8 +13,9 @@ from typing import Any, Protocol
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.ros.common.wire.cdr import SECOND
 
-from . import qos, schema
+from . import schema
 from .errors import BagError
+from .metadata import PROFILES, Profile
 from .reader import Bag, Message, Topic
 
 SPIN_NS = 150_000  # ns, the last part of each wait is waited out awake: sleeping is not exact enough
@@ -139,7 +140,7 @@ class RosOutput:
             kind = getattr(import_module(f"{package}.msg"), name)
             self._publishers[topic.name] = node.create_publisher(kind, topic.name, ros_profile(topic.profiles))
         self._clock, self._time = (
-            node.create_publisher(Clock, "/clock", ros_profile([qos.NAMED["best_effort"]])),
+            node.create_publisher(Clock, "/clock", ros_profile([PROFILES["best_effort"]])),
             Clock(),
         )
 
@@ -157,7 +158,7 @@ class RosOutput:
         self._clock.publish(self._time)
 
 
-def ros_profile(profiles: Collection[qos.Profile]) -> Any:
+def ros_profile(profiles: Collection[Profile]) -> Any:
     """rclpy's QoSProfile for recorded profiles: what every one of them offers; none: the default profile."""
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 

@@ -10,8 +10,10 @@ nowhere else: whatever byte such a file is cut at, its whole chunks are a run up
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from hashlib import blake2b
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
@@ -20,14 +22,13 @@ from typing import Any, NoReturn
 from mcap.writer import CompressionType, Writer
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES
+from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES, without_run
 from dtsa_bench import __version__
 from dtsa_bench.runs.program import program
 
 from . import metadata, schema
-from .digest import KEY, BagDigest
 from .errors import BagError
-from .qos import Profile, dump, resolve
+from .metadata import Profile
 
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 MIN_TIME_NS = 1_000_000_000  # a player's /clock starts at the first message, and a ROS clock must not stand at 0
@@ -138,7 +139,7 @@ class BagWriter:
 
         :param topic: full name, with its leading slash.
         :param type_name: "package/msg/Type".
-        :param qos: name from `qos.NAMED`, or the profile or profiles that its publishers offer.
+        :param qos: name from `metadata.PROFILES`, or the profile or profiles that its publishers offer.
         :param definition: message definition and type hash; None: those of the installed type.
         :return: the channel for `write`.
         :raises ConfigError: if the topic is there already or the QoS name is unknown.
@@ -147,7 +148,7 @@ class BagWriter:
         self._check_open()
         if topic in self._topics:
             raise ConfigError("topic", topic, "a name that is not in the bag yet")
-        profiles = resolve(qos)
+        profiles = metadata.resolve_profiles(qos)
         definition = definition or schema.installed(type_name)
         if type_name not in self._schemas:
             self._schemas[type_name] = self._mcap.register_schema(type_name, "ros2msg", definition.text.encode())
@@ -155,7 +156,7 @@ class BagWriter:
             topic,
             "cdr",
             self._schemas[type_name],
-            {"offered_qos_profiles": dump(profiles), "topic_type_hash": definition.type_hash},
+            {"offered_qos_profiles": metadata.dump_profiles(profiles), "topic_type_hash": definition.type_hash},
         )
         self._topics[topic] = (channel, definition, profiles)
         self._counts.append(0)
@@ -279,3 +280,41 @@ class BagWriter:
         with suppress(OSError):
             self._stream.close()
         raise BagError(self._failure) from error
+
+
+KEY = "digest"  # name of the digest in a bag's custom data
+
+_TIMES = struct.Struct("<QQQ")
+_MASK = (1 << 128) - 1
+
+
+class BagDigest:
+    """Running digest of a bag: a dropped, swapped or altered message shows even where nothing else does.
+
+    It is the sum, modulo 2^128, of one BLAKE2b hash a message over topic, times, number on the topic and bytes; so it
+    does not depend on the order of reading. It guards against mishaps and careless edits, not against somebody who
+    writes a new digest as well. A run's random id is left out. Fast CDR leaves the bytes between aligned fields as they
+    happen to be: two recordings of one flight may differ in their digests although no field does.
+    """
+
+    __slots__ = ("_sum",)
+
+    def __init__(self) -> None:
+        self._sum = 0
+
+    def add(
+        self, topic: bytes, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes, run: bool = False
+    ) -> None:
+        """Take in one message.
+
+        :param data: its CDR bytes.
+        :param run: whether it carries a run's id.
+        """
+        state = blake2b(topic, digest_size=16)
+        state.update(_TIMES.pack(log_time_ns, publish_time_ns, sequence))
+        state.update(without_run(data) if run else data)
+        self._sum = (self._sum + int.from_bytes(state.digest(), "little")) & _MASK
+
+    def hexdigest(self) -> str:
+        """The digest so far, 32 hexadecimal digits."""
+        return f"{self._sum:032x}"

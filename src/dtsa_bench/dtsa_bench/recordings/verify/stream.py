@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Callable
 
 from dtsa_agent.ros.common.wire.packing import RUN_MESSAGES
-from dtsa_bench.recordings.bag.digest import KEY, BagDigest
 from dtsa_bench.recordings.bag.reader import Bag, Message
+from dtsa_bench.recordings.bag.writer import KEY, BagDigest
 
 from .result import Difference, Mismatch, Result
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dtsa_bench.flights import position_log
-from dtsa_bench.flights.position_log import PositionLog
+from dtsa_bench.flights import measurement
+from dtsa_bench.flights.measurement import PositionLog
 
 
 @pytest.mark.parametrize("in_memory", [1 << 20, 0, 1000])
 def test_what_was_put_in_comes_out(in_memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(position_log, "_IN_MEMORY", in_memory)
+    monkeypatch.setattr(measurement, "_IN_MEMORY", in_memory)
     random = np.random.default_rng(1)
     positions = random.normal(size=(50, 3, 7))
     log = PositionLog(7)
@@ -27,7 +27,7 @@ def test_an_empty_one_is_empty() -> None:
 
 
 def test_a_full_disk_keeps_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(position_log, "_IN_MEMORY", 1000)
+    monkeypatch.setattr(measurement, "_IN_MEMORY", 1000)
     log, random = PositionLog(4), np.random.default_rng(2)
     positions = random.normal(size=(60, 3, 4))
     for position in positions[:30]:
