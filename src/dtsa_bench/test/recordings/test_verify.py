@@ -311,22 +311,13 @@ def test_a_recovered_bag_verifies_up_to_where_it_was_cut(flight: Path, tmp_path:
     assert 0.5 * whole.slots < result.slots < whole.slots
 
 
-def with_a_hole(flight: Path, folder: Path) -> Path:
-    """A copy of a flight's file whose middle is lost, saved again."""
-    copy = rewrite(flight, folder / "copy.mcap", lambda messages: messages)
-    with copy.open("rb") as stream:
-        chunks = make_reader(stream).get_summary().chunk_indexes
-    data = bytearray(copy.read_bytes())
-    data[chunks[len(chunks) // 2].chunk_start_offset + 200] ^= 1
-    copy.write_bytes(data)
-    recover(copy, folder / "saved")
-    return folder / "saved"
-
-
-def test_of_a_recovered_bag_with_a_hole_it_is_said_what_is_missing(
+def test_of_a_bag_with_a_hole_it_is_said_what_is_missing(
     holed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    saved = with_a_hole(holed, tmp_path)
+    begin, end = 1_505_000_000, 1_595_000_000  # ns, where slots have 10 ms from 1 s on
+    saved = rewrite(
+        holed, tmp_path / "saved.mcap", lambda messages: [m for m in messages if not begin < m.log_time_ns < end]
+    )
     with Bag(saved) as bag:
         run = load_run(bag)
     (before,) = np.flatnonzero(np.diff(run.slots) > 1)
@@ -335,9 +326,6 @@ def test_of_a_recovered_bag_with_a_hole_it_is_said_what_is_missing(
     assert run.missing == missing
     result = verify_bag(saved)
     assert result.difference is not None
-    assert result.difference.recorded == f"{missing} are missing"
-    assert "recovered" in result.difference.reason
-    assert first <= result.slots <= len(run.slots)  # that many are equal, and none that is missing counts
     assert main(["export", str(saved), "--to", "csv", "--out", str(tmp_path / "tables")]) == 0
     why = f"Ages, estimates and results are left out: {missing} are missing in the bag."
     assert capsys.readouterr().err == f"dtsa: {why}\n"
