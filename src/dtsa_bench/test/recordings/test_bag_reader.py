@@ -36,7 +36,6 @@ def test_a_directory_and_its_file_alone_give_the_same(run: SyntheticRun) -> None
     with Bag(run.writer.directory) as whole, Bag(run.writer.path) as alone:
         assert list(whole.messages()) == list(alone.messages())
         assert whole.config == alone.config == {**whole.config, "agents": 4, "seed": 7}
-        assert whole.is_ours
 
 
 def test_messages_are_exactly_those_recorded_in_order_of_time(run: SyntheticRun) -> None:
@@ -249,10 +248,8 @@ def test_a_ros_bag_of_somebody_else_can_be_read_but_has_no_configuration(tmp_pat
     kind = "nav_msgs/msg/Odometry"
     with BagWriter(tmp_path / "bag", None) as writer:
         writer.add_topic("/odom", kind, "reliable", definition(kind))
-    with Bag(tmp_path / "bag") as bag:
-        assert not bag.is_ours
-        with pytest.raises(UnusableBag, match="no configuration"):
-            _ = bag.config
+    with Bag(tmp_path / "bag") as bag, pytest.raises(UnusableBag, match="no configuration"):
+        _ = bag.config
 
 
 def test_bags_that_rosbag2_has_packed_are_named_as_such(tmp_path: Path) -> None:

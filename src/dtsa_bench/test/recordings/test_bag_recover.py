@@ -142,7 +142,6 @@ def test_the_new_bag_knows_the_run_and_where_it_comes_from(run: SyntheticRun, tm
     assert not result.closed
     with Bag(result.directory) as bag, Bag(run.writer.directory) as original:
         assert bag.config == original.config
-        assert bag.is_ours
         assert bag.custom_data["recovered_from"] == "flight_0.mcap"
         for name, topic in bag.topics.items():
             before = original.topics[name]

@@ -143,11 +143,6 @@ class Bag:
                     found = metadata.load(record.metadata.get(metadata.RECORD_KEY, ""))
         return found
 
-    @property
-    def is_ours(self) -> bool:
-        """Whether this project recorded the bag."""
-        return self.custom_data.get("project") == "dtsa"
-
     @cached_property
     def config(self) -> dict[str, Any]:
         """Configuration of the run, as given to the recorder.
