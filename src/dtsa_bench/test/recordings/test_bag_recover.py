@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 from bag_helpers import SyntheticRun, synthetic_bag
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_bench.recordings.bag import container
 from dtsa_bench.recordings.bag.errors import UnusableBag
-from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.bag.reader import MAGIC, PREFIX, Bag
 from dtsa_bench.recordings.bag.recover import recover
 
 Row = tuple[str, int, int, int, bytes]
@@ -95,7 +95,7 @@ def check_flipped(run: SyntheticRun, directory: Path, flips: list[tuple[int, int
         path.write_bytes(data)
         found, said = recovered(path, directory / "new")
         assert found == rows[: len(found)], (place, bit)
-        if place >= len(container.MAGIC):  # else it is taken for something else
+        if place >= len(MAGIC):  # else it is taken for something else
             assert len(found) >= sum(count for _, end, count in chunks if end <= place), (place, bit)
         assert len(found) == len(rows) or said, (place, bit)
 
@@ -109,11 +109,11 @@ def test_a_flipped_bit_in_what_a_record_is_brings_nothing_wrong(
     run: SyntheticRun, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     whole = run.writer.path.read_bytes()
-    places, position = [], len(container.MAGIC)
-    while position < len(whole) - len(container.MAGIC):
+    places, position = [], len(MAGIC)
+    while position < len(whole) - len(MAGIC):
         places.append(position)
-        position += container.PREFIX.size + container.PREFIX.unpack_from(whole, position)[1]
-    last = max(place for place in places if whole[place] == container.CHUNK)
+        position += PREFIX.size + PREFIX.unpack_from(whole, position)[1]
+    last = max(place for place in places if whole[place] == Opcode.CHUNK)
     # One compression for each bit: what tells of a record is not compressed.
     first = COMPRESSIONS.index(request.node.callspec.params["run"])
     chosen = enumerate([*places[:16], last, *places[-12:]])

@@ -8,14 +8,18 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import ChunkIndex
+from mcap.records import Chunk, ChunkIndex
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -24,13 +28,29 @@ from rosbags.typesys.store import Typestore
 
 from dtsa_bench.runs.program import program
 
-from . import columns, container, metadata
+from . import columns, metadata
 from .errors import BagError, UnusableBag
 from .place import find_file
 
 PACKED_MESSAGES = "its messages are compressed one by one; `ros2 bag convert` makes a plain bag of it"
 MERGED = "one agent's, recorded on a network: `{} merge` with --out makes one bag of those of all agents"
 _ON_A_NETWORK = "dtsa."  # names of schemas of such bags begin with it
+MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file, and the last
+PREFIX = struct.Struct("<BQ")  # opcode and length of every record
+_MESSAGE = struct.Struct("<BQHIQQ")  # a message record up to its data
+
+
+class _Entry(NamedTuple):
+    """One message inside a chunk."""
+
+    log_time_ns: int
+    chunk: int  # offset of the chunk in the file: with `start`, the order in which messages were written
+    start: int  # offset of the data in the uncompressed chunk
+    end: int
+    channel: int
+    sequence: int
+    publish_time_ns: int
+    buffer: bytes  # the uncompressed chunk
 
 
 class Message(NamedTuple):
@@ -77,14 +97,14 @@ class Bag:
             raise
 
     def _open(self) -> None:
-        if self._stream.read(len(container.MAGIC)) != container.MAGIC:
+        if self._stream.read(len(MAGIC)) != MAGIC:
             raise UnusableBag(self.given, f"{self.path.name} is not an MCAP file")
         self._stream.seek(0)
         try:
             self._reader = SeekingReader(self._stream)
             self.header = self._reader.get_header()
-            self._stream.seek(-len(container.MAGIC), 2)
-            if self._stream.read() != container.MAGIC:
+            self._stream.seek(-len(MAGIC), 2)
+            if self._stream.read() != MAGIC:
                 raise McapError("no end mark")
             summary = self._reader.get_summary()
         except Exception as error:  # the library meets damaged files with many kinds of errors
@@ -174,15 +194,13 @@ class Bag:
         wanted = {
             identifier: names for identifier, names in self._channels.items() if topics is None or names[0] in topics
         }
-        waiting: list[container.Entry] = []
+        waiting: list[_Entry] = []
         for entry in self._entries(wanted, start_ns, end_ns, waiting):
             topic, kind = wanted[entry.channel]
             data = entry.buffer[entry.start : entry.end]
             yield Message(topic, kind, entry.log_time_ns, entry.publish_time_ns, entry.sequence, data)
 
-    def _entries(
-        self, wanted: Collection[int], start_ns: int, end_ns: int, waiting: list[container.Entry]
-    ) -> Iterator[container.Entry]:
+    def _entries(self, wanted: Collection[int], start_ns: int, end_ns: int, waiting: list[_Entry]) -> Iterator[_Entry]:
         chunks = [
             index
             for index in self._chunks
@@ -199,22 +217,24 @@ class Bag:
             del waiting[:ready]
             waiting += [
                 entry
-                for entry in container.messages(self._chunk(index), index.chunk_start_offset)
+                for entry in _messages(self._chunk(index), index.chunk_start_offset)
                 if entry.channel in wanted and start_ns <= entry.log_time_ns <= end_ns
             ]
             waiting.sort(key=lambda entry: entry[:3])
         yield from waiting
 
     def _chunk(self, index: ChunkIndex) -> bytes:
-        self._stream.seek(index.chunk_start_offset)
+        """The uncompressed records of a chunk."""
         try:
-            record = memoryview(self._stream.read(min(index.chunk_length, 2 * container.MAX_CHUNK)))
-            if len(record) != index.chunk_length or record[0] != container.CHUNK:
-                raise ValueError("a chunk is not where the index says")
-            head = container.chunk_head(record)
-            return container.decompress(head, record[head.offset : head.offset + head.length])
-        except (ValueError, IndexError, OSError) as error:
-            raise self._damaged(f"{error} (at byte {index.chunk_start_offset})") from None
+            self._stream.seek(index.chunk_start_offset)
+            record = self._stream.read(index.chunk_length)
+            if len(record) != index.chunk_length or record[0] != Opcode.CHUNK:
+                raise ValueError("it is not where the index says")
+            chunk = Chunk.read(ReadDataStream(BytesIO(record[PREFIX.size :])))
+            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+            return stream.read(length)
+        except Exception as error:  # the library meets damage with many kinds of errors
+            raise self._damaged(f"damaged chunk at byte {index.chunk_start_offset}: {error}") from None
 
     def topic(self, name: str) -> Topic:
         """One topic by name.
@@ -298,3 +318,26 @@ class Bag:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _messages(buffer: bytes, chunk: int = 0) -> Iterator[_Entry]:
+    """All whole messages in uncompressed records, as they were written.
+
+    :param chunk: bytes, offset of their chunk in the file.
+    """
+    position, size = 0, len(buffer)
+    unpack, head, kind = _MESSAGE.unpack_from, _MESSAGE.size, int(Opcode.MESSAGE)
+    least = head - PREFIX.size
+    while position + PREFIX.size <= size:
+        if buffer[position] == kind and position + head <= size:
+            _, length, channel, sequence, log_ns, publish_ns = unpack(buffer, position)
+            end = position + PREFIX.size + length
+            if length < least or end > size:
+                return
+            yield _Entry(log_ns, chunk, position + head, end, channel, sequence, publish_ns, buffer)
+        else:
+            opcode, length = PREFIX.unpack_from(buffer, position)
+            end = position + PREFIX.size + length
+            if opcode in (0, kind) or end > size:
+                return
+        position = end

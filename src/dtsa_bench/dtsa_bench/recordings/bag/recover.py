@@ -16,19 +16,20 @@ from pathlib import Path
 from typing import IO, Any
 
 from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 
-from . import container, metadata
+from . import metadata
 from .errors import UnusableBag
 from .place import bag_of, find_file
-from .reader import PACKED_MESSAGES
+from .reader import MAGIC, PACKED_MESSAGES, PREFIX
 from .schema import Definition
 from .writer import BROKEN_OFF, KEY, BagWriter
 
 _KINDS: dict[int, Any] = {
-    container.SCHEMA: Schema, container.CHANNEL: Channel, container.CHUNK: Chunk, container.METADATA: Metadata,
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK: Chunk, Opcode.METADATA: Metadata,
 }  # fmt: skip
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of the entries that follow
 
@@ -60,18 +61,18 @@ class _WholeRecords:
         self.fault = ""  # where and why the file cannot be read any further; empty: it was read to the end of its data
 
     def __iter__(self) -> Iterator[Any]:
-        position, chunked = len(container.MAGIC), False
+        position, chunked = len(MAGIC), False
         while True:
             self._stream.seek(position)
             try:
-                prefix = self._stream.read(container.PREFIX.size)
-                opcode, length = container.PREFIX.unpack(prefix)
-                begin = position + container.PREFIX.size
+                prefix = self._stream.read(PREFIX.size)
+                opcode, length = PREFIX.unpack(prefix)
+                begin = position + PREFIX.size
                 if length > self._size - begin:
                     raise ValueError("it is cut off")
-                if opcode == container.DATA_END and length == 4:
+                if opcode == Opcode.DATA_END and length == 4:
                     return
-                if opcode == container.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
+                if opcode == Opcode.MESSAGE and chunked:  # it has no checksum: as likely a damaged index
                     raise ValueError("a message outside of chunks")
                 records = _parsed(opcode, self._stream.read(length))
             except Exception as error:  # the library meets damage with many kinds of errors
@@ -79,17 +80,17 @@ class _WholeRecords:
                 self.fault = f"what stands at byte {position} cannot be read ({error}): {lost} bytes are left out"
                 return
             yield from records
-            position, chunked = begin + length, chunked or opcode == container.CHUNK
+            position, chunked = begin + length, chunked or opcode == Opcode.CHUNK
 
 
 def _parsed(opcode: int, content: bytes) -> list[Any]:
     """One record as the library's objects, a chunk as those in it; raises errors of any kind for a damaged one."""
-    if opcode in (container.HEADER, container.ATTACHMENT):
+    if opcode in (Opcode.HEADER, Opcode.ATTACHMENT):
         return []
-    if opcode == container.MESSAGE_INDEX and _INDEX.unpack_from(content)[1] == len(content) - _INDEX.size:
+    if opcode == Opcode.MESSAGE_INDEX and _INDEX.unpack_from(content)[1] == len(content) - _INDEX.size:
         return []
     stream = ReadDataStream(BytesIO(content))
-    if opcode == container.MESSAGE:
+    if opcode == Opcode.MESSAGE:
         return [Message.read(stream, len(content))]
     if opcode not in _KINDS:
         raise ValueError(f"opcode {opcode} is out of place")
@@ -114,7 +115,7 @@ def recover(path: str | Path, directory: str | Path | None = None) -> Recovery:
     except OSError as error:
         raise UnusableBag(path, f"cannot be read: {error.strerror or error}") from None
     with stream:
-        if stream.read(len(container.MAGIC)) != container.MAGIC:
+        if stream.read(len(MAGIC)) != MAGIC:
             raise UnusableBag(path, f"{source.name} is not an MCAP file, or its beginning is lost")
         result.expected = _indexed_counts(stream)
         records = _WholeRecords(stream, source.stat().st_size)
