@@ -105,9 +105,6 @@ def run(args: argparse.Namespace) -> int:
 
     if args.config is not None:
         raise ConfigError("config", args.config, "a swarm.yaml together with --backend cflib")
-    if args.attach:
-        raise ConfigError("attach", True, "a mission, --backend cflib")
-
     domain = None if args.domain is None else whole_number(args.domain, "domain", 0, 232)
     directory = Path(args.out)
 
@@ -159,21 +156,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def page_options(args: argparse.Namespace) -> PageOptions | None:
-    """The page that is wanted; None: none is.
+    """The page that is wanted; None: none is."""
+    if not (args.view or args.view_port or args.control):
+        return None
+    from dtsa_bench.pages.view.process import PageOptions
 
-    :raises ConfigError: for options of a page that is not wanted.
-    """
-    from dtsa_agent.core.errors import ConfigError
-
-    if args.view:
-        from dtsa_bench.pages.view.process import PageOptions
-
-        port = 0 if args.view_port is None else whole_number(args.view_port, "view_port", 0, 65535)
-        return PageOptions(port, args.control)
-    for name in ("view_port", "control"):
-        if getattr(args, name):
-            raise ConfigError(name, getattr(args, name), "only with --view")
-    return None
+    return PageOptions(whole_number(args.view_port or "0", "view_port", 0, 65535), args.control)
 
 
 def late_agents(text: str | None) -> dict[int, float]:
@@ -182,7 +170,7 @@ def late_agents(text: str | None) -> dict[int, float]:
     :raises ConfigError: if the text is none of that kind.
     """
     late = {}
-    for part in (text or "").split(",") if text is not None else ():
+    for part in () if text is None else text.split(","):
         found = re.fullmatch(r"\s*cf(\d{1,4})=(\d+\.?\d*)\s*", part)
         if not found:
             from dtsa_agent.core.errors import ConfigError
@@ -197,9 +185,6 @@ def run_crazyflies(args: argparse.Namespace) -> int:
     from dtsa_agent.core.errors import ConfigError
     from dtsa_agent.crazyflie.settings.config import load_swarm
 
-    for name, value in {"late": args.late, **given(args, FlightOptions, "flight")}.items():
-        if value is not None and name != "answer_s":
-            raise ConfigError(name, value, "only with --backend sim")
     if args.config is None:
         raise ConfigError("config", None, "--config FILE, the swarm.yaml of the Crazyflies")
     use_simulated_radio(args)

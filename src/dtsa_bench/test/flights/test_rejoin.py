@@ -321,10 +321,6 @@ def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) 
             ["--late", "cf2=1", "--mode", "realtime", "--policy", "lease", "--processes", "2"],
             "late: got {2: 1.0}; allowed: only with --processes per-agent",
         ),
-        (
-            ["--respawn", "1", "--backend", "cflib", "--config", "x"],
-            "respawn: got 1.0; allowed: only with --backend sim",
-        ),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

@@ -245,7 +245,6 @@ def test_usable_orders_are_read() -> None:
         (["view", "runs/a"], "a recorded run is shown by `tools/dtsa report runs/a`"),
         (["view", "--port", "99999"], "port: got"),
         (["view", "--listen", "0.0.0.0"], "listen: got"),
-        (["fly", "--out", "x", "--control"], "control: got True; allowed: only with --view"),
     ],
 )
 def test_unusable_settings_are_one_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
