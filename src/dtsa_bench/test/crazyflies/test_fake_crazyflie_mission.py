@@ -34,8 +34,8 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.crazyflie.links.link import require_cflib
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
+from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import mission_problem
-from dtsa_bench.crazyflies.missions.ground_station import Ended
 from dtsa_bench.crazyflies.missions.mission_flight import MissionWatch
 from dtsa_bench.crazyflies.missions.places import MissionError, assign_places, check_crossings, check_standing
 from dtsa_bench.crazyflies.simulated.truth import read_truth
@@ -106,7 +106,7 @@ def test_two_as_near_as_in_a_crash_cut_the_exchange_short() -> None:
     """A run that ended by itself was taken for complete, and nobody came to rest before they landed."""
     swarm = SwarmConfig(agents=3)
     run = RunConfig(swarm, ChannelConfig(**from_swarm(swarm)), RunLimits(stop_on_crash=False))
-    metrics, ended = FlightMetrics(run, make_scenario(swarm)), Ended(MagicMock())
+    metrics, ended = FlightMetrics(run, make_scenario(swarm)), StopToken(Stop())
     mission: Any = SimpleNamespace(ended=ended, bridge_alive=lambda: None)
     watch, status = MissionWatch(mission, MagicMock(), metrics), ChannelStatus(0, {}, [])
     watch.idle(status)

@@ -6,7 +6,6 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,8 @@ from dtsa_agent.crazyflie.motion.limits import shortest_s
 from dtsa_agent.crazyflie.node.agents_node import STOP_HERE
 from dtsa_agent.crazyflie.node.outputs import EVENTS, EVENTS_QOS
 from dtsa_agent.crazyflie.settings.config import SwarmSettings
-from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.serving import Serving
+from dtsa_agent.stop import StopToken
 
 from .mission_record import MissionLog
 from .places import MissionError, assign_places, check_crossings, check_standing
@@ -41,22 +40,11 @@ IN_AIR = (Status.STATE_FLYING, Status.STATE_LANDING, Status.STATE_LOST)
 BRIDGE_S = 60.0  # s, for the connections
 
 
-@dataclass(slots=True)
-class Ended:
-    """True once the flight has to end: a signal, or a vehicle in trouble."""
-
-    stop: Stop
-    reason: str = ""
-
-    def __bool__(self) -> bool:
-        return bool(self.stop) or bool(self.reason)
-
-
 class Mission:
     """The ground station's part: it calls the bridge's services, watches the vehicles, and sends its heartbeat."""
 
     def __init__(
-        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: Ended, say: Callable[[str], None]
+        self, node: Node, settings: SwarmSettings, scenario: Scenario, ended: StopToken, say: Callable[[str], None]
     ) -> None:
         self.node, self.settings, self.scenario, self.ended, self.say = node, settings, scenario, ended, say
         self.status: dict[str, Status] = {}

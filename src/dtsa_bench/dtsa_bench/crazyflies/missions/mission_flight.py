@@ -26,6 +26,7 @@ from dtsa_agent.ros.common.graph.parameters import to_parameters
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.node_process import init_ros
 from dtsa_agent.ros.common.process.priority import give_way, take_priority
+from dtsa_agent.stop import StopToken
 from dtsa_bench.flights.children import Children, NodeError, describe_end
 from dtsa_bench.flights.domain import LAST_DOMAIN, ros_domain
 from dtsa_bench.flights.flight import END_S, QUIET, Flight, run_environment
@@ -43,7 +44,7 @@ from dtsa_channel_sim.ros.channel_node import declare_channel
 from dtsa_channel_sim.ros.observer import ChannelObserver, ChannelStatus
 from dtsa_channel_sim.ros.realtime_channel import RealtimeChannel
 
-from .ground_station import Ended, Mission
+from .ground_station import Mission
 from .mission_record import MISSION_BAG
 from .places import APART_M, MissionError, check_places
 
@@ -109,7 +110,7 @@ class _Station:
             self.bridge.start("bridge", [], "dtsa_agent.crazyflie.node.bridge_node",
                               ["--ros-args", "-p", f"config:={swarm_yaml.resolve()}"])  # fmt: skip
 
-    def take_off(self, run: RunConfig, scenario: Scenario, domain: int, ended: Ended) -> tuple[RunConfig, Mission]:
+    def take_off(self, run: RunConfig, scenario: Scenario, domain: int, ended: StopToken) -> tuple[RunConfig, Mission]:
         """Connect all vehicles and bring them into the air, at their places; the run with these places, the mission."""
         init_ros(QUIET, self.context, domain)
         node = Node("mission", context=self.context, enable_rosout=False, start_parameter_services=False)
@@ -125,7 +126,7 @@ class _Station:
         mission.take_off()
         return run, mission
 
-    def end(self, ended: Ended) -> None:
+    def end(self, ended: StopToken) -> None:
         """All land, agents before; then the bridge ends, then the recorder closes its bag."""
         mission = self._mission
         with _second_interrupt() as urgent:
@@ -187,7 +188,7 @@ def fly_crazyflies(
         environment = run_environment(domain, directory / "log", shared_memory=False)
         if page is not None:
             shown.enter_context(view_process(domain, environment, page))
-        station, ended = _Station(settings, directory, environment, attach), Ended(stop)
+        station, ended = _Station(settings, directory, environment, attach), StopToken(stop)
         station.start(swarm_yaml)
         try:
             run, mission = station.take_off(run, scenario, domain, ended)
@@ -228,7 +229,7 @@ def _start_agents(agents: Children, run: RunConfig, settings: SwarmSettings, dir
 
 
 def _exchange(
-    station: _Station, run: RunConfig, directory: Path, options: FlightOptions, ended: Ended, mission: Mission
+    station: _Station, run: RunConfig, directory: Path, options: FlightOptions, ended: StopToken, mission: Mission
 ) -> Flight:
     agents, progress = station.agents, station.progress
     node = Node("channel", namespace=names.SWARM, context=station.context)
