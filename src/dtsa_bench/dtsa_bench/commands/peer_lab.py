@@ -31,19 +31,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     from dtsa_agent.core.settings.declaration import settings_of
     from dtsa_bench.crazyflies.peer_lab.app import LabSettings
+    from dtsa_bench.runs.options import add_options
 
     parser.add_argument("app", metavar="APP", help="directory of the app, or the name of one that comes with it")
     for name in _OF_PROTOCOL:
         text = "frames are sealed, the key is in DTSA_AUTH_KEY" if name == "auth_session" else "as for `dtsa simulate`"
         parser.add_argument(f"--{name.replace('_', '-')}", metavar="X", help=f"with {PROTOCOL}: {text}")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="virtual time [60]")
-    specs = {spec.name: spec for spec in settings_of(LabSettings)}
-    for name in _SETTINGS:
-        spec = specs[name]
-        parser.add_argument(
-            f"--{name.replace('_', '-')}", type={"int": int, "float": float}.get(spec.kind, str), metavar="X",
-            help=f"{spec.help} [{spec.default}]".replace("%", "%%"),
-        )  # fmt: skip
+    add_options(parser, LabSettings, "lab", skip={spec.name for spec in settings_of(LabSettings)} - set(_SETTINGS))
     parser.add_argument("--source", action="append", default=[], metavar="FILE", help="a further C file of the app")
     parser.add_argument("--include", action="append", default=[], metavar="DIR", help="a further directory of headers")
     parser.add_argument("--flag", action="append", default=[], metavar="F", help="a flag for the compiler: --flag=-O0")
@@ -57,12 +52,11 @@ def run(args: argparse.Namespace) -> int:
     from dtsa_agent.core.errors import ConfigError
     from dtsa_bench.crazyflies.peer_lab.app import LabSettings
     from dtsa_bench.crazyflies.peer_lab.process import fly
-    from dtsa_bench.runs.options import new_directory
+    from dtsa_bench.runs.options import given, new_directory
 
     if not 0.0 < args.seconds <= 1e6:
         raise ConfigError("seconds", args.seconds, "more than 0, up to 1000000")
-    given = {name: getattr(args, name) for name in _SETTINGS if getattr(args, name) is not None}
-    settings = LabSettings(**given)
+    settings = LabSettings(**given(args, LabSettings, "lab"))
     parameters = dict(map(_parameter, args.set))
     out = None if args.out is None else new_directory(args.out)
     swarm, place = None, args.app
