@@ -1,6 +1,7 @@
 """Build of dtsa_agent: Python packages, the compiled kernel of the protocol core, executables, plugins."""
 
 from glob import glob
+from xml.etree import ElementTree
 
 from setuptools import Extension, find_packages, setup
 
@@ -33,7 +34,7 @@ def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR, BINDING))
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(exclude=["test", "test.*"]),
     ext_modules=[
         Extension(

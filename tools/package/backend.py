@@ -1,72 +1,62 @@
-"""Builds the distribution `dtsa` from a checkout: `pip install .`, `pip wheel .`, `tools/dtsa release`.
+"""Builds the distribution `dtsa` for `pip install .`: setuptools, with what the workspace's packages declare.
 
-The workspace's root cannot be a Python package itself: `colcon build` would take it for one and look no further. So the
-sources are put into a folder of their own with the files beside this one on top, and setuptools builds there.
+A setup.py at the top of the checkout would do the same, but colcon would take the checkout for one package.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from distutils.core import run_setup
 from pathlib import Path
-from typing import Any
 
-from setuptools import build_meta
+from setuptools import setup
+from setuptools.build_meta import _BuildMetaBackend
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[1]
-_TOP = ("README.md", "LICENSE", "NOTICE", "CHANGELOG.md", "CITATION.cff")
-_PACKAGES = ("dtsa_agent", "dtsa_channel_sim", "dtsa_bench")
-_MESSAGES = "dtsa_bench/dtsa_bench/recordings/bag/messages"  # bags are written without ROS, too
-_LEFT_OUT = shutil.ignore_patterns("__pycache__", "*.so", "*.egg-info", "build", "test", "urdf", "rviz", "launch")
+PACKAGES = ("dtsa_agent", "dtsa_channel_sim", "dtsa_bench")
 
 
-def lay_out(folder: Path) -> None:
-    """Puts all that belongs into the distribution into a folder.
-
-    :param folder: an empty one.
-    """
-    for name in _TOP:
-        shutil.copy2(ROOT / name, folder)
-    for name in ("pyproject.toml", "setup.py", "MANIFEST.in"):
-        shutil.copy2(HERE / name, folder)
-    for name in _PACKAGES:
-        shutil.copytree(ROOT / "src" / name, folder / "src" / name, ignore=_LEFT_OUT)
-    shutil.copytree(ROOT / "src" / "dtsa_msgs" / "msg", folder / "src" / _MESSAGES)
-
-
-@contextmanager
-def _laid_out() -> Iterator[None]:
-    with tempfile.TemporaryDirectory(prefix="dtsa-") as name:
-        lay_out(Path(name))
-        before = Path.cwd()
-        os.chdir(name)
-        try:
-            yield
-        finally:
-            os.chdir(before)
-
-
-def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
-    """Nothing but what pyproject.toml names."""
-    return []
-
-
-get_requires_for_build_sdist = get_requires_for_build_wheel
-
-
-def build_wheel(wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None) -> str:
-    """The wheel; PEP 517."""
-    out = os.path.abspath(wheel_directory)
-    with _laid_out():
-        return build_meta.build_wheel(out, config_settings)
+class _Backend(_BuildMetaBackend):  # type: ignore[misc, unused-ignore]
+    def run_setup(self, setup_script: str = "setup.py") -> None:
+        """Call `setup()` with the packages, compiled modules and entry points of all three set-up scripts."""
+        packages, folders, data, extensions, points = [], {}, {}, [], {}
+        for name in PACKAGES:
+            folder, top = Path("src", name), Path.cwd()
+            os.chdir(folder)
+            try:
+                part = run_setup("setup.py", stop_after="config")
+            finally:
+                os.chdir(top)
+            packages += part.packages
+            folders |= {package: str(folder / package) for package in part.packages if "." not in package}
+            data |= part.package_data
+            for extension in part.ext_modules or ():
+                for field in ("sources", "depends", "include_dirs"):
+                    setattr(extension, field, [str(folder / path) for path in getattr(extension, field)])
+                extensions.append(extension)
+            points |= {group: entries for group, entries in part.entry_points.items() if group != "console_scripts"}
+            nodes = [f"{name}.{entry}" for entry in part.entry_points["console_scripts"]]
+            points["dtsa.nodes"] = [*points.get("dtsa.nodes", ()), *nodes]  # for `ros2 run`, not for the PATH
+        build = tempfile.mkdtemp(prefix="dtsa-build-")
+        atexit.register(shutil.rmtree, build, ignore_errors=True)
+        setup(
+            version=part.metadata.version,
+            packages=packages,
+            package_dir=folders,
+            package_data=data,
+            ext_modules=extensions,
+            entry_points={**points, "console_scripts": ["dtsa = dtsa_bench.entry:dtsa"]},
+            options={"build": {"build_base": build}, "bdist_wheel": {"py_limited_api": "cp310"}},
+            zip_safe=False,
+        )
 
 
-def build_sdist(sdist_directory: str, config_settings: Any = None) -> str:
-    """The source distribution; PEP 517."""
-    out = os.path.abspath(sdist_directory)
-    with _laid_out():
-        return build_meta.build_sdist(out, config_settings)
+_backend = _Backend()
+build_wheel, build_sdist, build_editable = _backend.build_wheel, _backend.build_sdist, _backend.build_editable
+get_requires_for_build_wheel = _backend.get_requires_for_build_wheel
+get_requires_for_build_sdist = _backend.get_requires_for_build_sdist
+get_requires_for_build_editable = _backend.get_requires_for_build_editable
+prepare_metadata_for_build_wheel = _backend.prepare_metadata_for_build_wheel
+prepare_metadata_for_build_editable = _backend.prepare_metadata_for_build_editable

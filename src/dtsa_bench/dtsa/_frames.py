@@ -34,7 +34,6 @@ def _pandas() -> Any:
     try:
         import pandas
     except ImportError:
-        raise ConfigError(
-            "pandas", None, "an installed pandas: tables are its data frames (pip install 'dtsa[tables]', or pandas)"
-        ) from None
+        allowed = "an installed pandas: tables are its data frames (pip install pandas)"
+        raise ConfigError("pandas", None, allowed) from None
     return pandas

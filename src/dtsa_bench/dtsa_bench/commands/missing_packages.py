@@ -9,15 +9,12 @@ _WORKSPACE = "build the workspace and source it: colcon build && . install/setup
 _ROS = "source an installation of ROS 2 Jazzy, or use tools/dtsa of a checkout on x86_64"
 _HOW = {
     **dict.fromkeys(("dtsa_msgs", "dtsa_agent", "dtsa_channel_sim"), _WORKSPACE),
-    **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard", "shtab"), "pip install {}"),
-    **dict.fromkeys(("pyarrow", "pandas"), "pip install 'dtsa[tables]', or {}"),
-    "distributed": "pip install 'dtsa[cluster]', or {}",
-    "aiohttp": "pip install 'dtsa[view]', or {}",
-    "cflib": "pip install 'dtsa[crazyflie]', or {}",
+    **dict.fromkeys(("mcap", "rosbags", "lz4", "zstandard", "pyarrow", "pandas", "aiohttp", "shtab"), "pip install {}"),
+    **dict.fromkeys(("cflib", "distributed"), "pip install {}"),
     **dict.fromkeys(
         ("rclpy", "ament_index_python", "builtin_interfaces", "geometry_msgs", "nav_msgs", "std_msgs"), _ROS
     ),
-    **dict.fromkeys(("serial", "cobs"), "pip install 'dtsa[serial]', or pip install pyserial cobs"),
+    **dict.fromkeys(("serial", "cobs"), "pip install pyserial cobs"),
     "yaml": "apt install python3-yaml, or pip install pyyaml",
     **dict.fromkeys(("numpy", "scipy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
 }

@@ -42,14 +42,14 @@ sys.exit({function}({arguments}))
             "dtsa_bench.commands.cli",
             "main",
             "['export', 'x']",
-            "pyarrow is missing: pip install 'dtsa[tables]'",
+            "pyarrow is missing: pip install pyarrow",
         ),
         (
             "aiohttp",
             "dtsa_bench.commands.cli",
             "main",
             "['view', 'x']",
-            "aiohttp is missing: pip install 'dtsa[view]'",
+            "aiohttp is missing: pip install aiohttp",
         ),
         *(
             (
@@ -57,7 +57,7 @@ sys.exit({function}({arguments}))
                 "dtsa_bench.commands.cli",
                 "main",
                 "['sniff', '--air', 'serial', '--device', 'x', '--no-seal']",
-                f"{package} is missing: pip install 'dtsa[serial]'",
+                f"{package} is missing: pip install pyserial cobs",
             )
             for package in ("serial", "cobs")
         ),

@@ -51,8 +51,7 @@ def require_cflib() -> None:
         raise ConfigError(
             "cflib",
             "not installed",
-            "an installed cflib: tools/dtsa setup --extra cflib, "
-            "pip install 'dtsa[crazyflie]', or pip install cflib==0.1.34",
+            "an installed cflib: tools/dtsa setup --extra cflib, or pip install cflib==0.1.34",
         )
     with warnings.catch_warnings():  # cflib shows all DeprecationWarnings, those of other packages too
         import cflib.crtp

@@ -31,7 +31,7 @@ def run_on_cluster(
     try:
         from distributed import Client, as_completed
     except ImportError as error:
-        needed = "only with the package distributed: pip install 'dtsa[cluster]', or requirements/cluster.txt"
+        needed = "only with the package distributed: pip install distributed"
         raise ConfigError("cluster", address, needed) from error
     try:
         client = Client(address, timeout=PATIENCE_S, set_as_default=False)

@@ -55,9 +55,10 @@ def _check_free(name: str, module: str) -> None:
     """
     if module in sys.stdlib_module_names:
         raise ConfigError("NAME", name, f"another name: {module} is a module of Python's own")
-    spec = find_spec(module)
-    if spec is not None and spec.origin is not None:  # a mere directory of that name has no origin
-        raise ConfigError("NAME", name, f"another name: a module {module} is installed ({spec.origin})")
+    for taken in (module, f"dtsa_{module}"):
+        spec = find_spec(taken)
+        if spec is not None and spec.origin is not None:  # a mere directory of that name has no origin
+            raise ConfigError("NAME", name, f"another name: a module {taken} is installed ({spec.origin})")
     try:
         distribution(f"dtsa-{name}")
     except PackageNotFoundError:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from .errors import BagError
 
-_BROUGHT = Path(__file__).resolve().parent / "messages"  # made by tools/package/backend.py; a checkout has none
+_BROUGHT = Path(__file__).resolve().parent / "messages"  # those of dtsa_msgs, where there is no ROS
 SEPARATOR = "=" * 80
 PRIMITIVES = frozenset(
     [
