@@ -14,7 +14,6 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.ros.common.process.node_process import SUPERVISOR
 from dtsa_bench.runs.processes import end_process
 
 FIRST = 19850  # where cflib's scan looks, too
@@ -71,7 +70,7 @@ def running_fleet(words: Sequence[str]) -> Iterator[str]:
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        env=os.environ | {SUPERVISOR: str(os.getpid())},
+        env=os.environ | {"DTSA_SUPERVISOR": str(os.getpid())},  # of the nodes, whose module needs rclpy
     )
     assert process.stdout is not None
     patience = threading.Timer(_START_S, process.kill)
