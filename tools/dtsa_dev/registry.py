@@ -13,8 +13,6 @@ COMMANDS = {
     "benchmark": "how fast the protocol, the nodes and the simulator are on this machine",
     "release": "the distribution: source and wheels, installed and tried in fresh environments; nothing is uploaded",
 }
-#: Sets of requirements that a command needs beyond those of every machine.
-NEEDS = {"docs": ("docs",), "release": ("release",)}
 
 
 def add_commands() -> None:
@@ -22,6 +20,7 @@ def add_commands() -> None:
     from dtsa_bench.commands import registry
 
     registry.add("dtsa_dev.commands", COMMANDS)
+    registry.add("dtsa_dev", {"release": COMMANDS["release"]})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
