@@ -1,4 +1,4 @@
-"""A scripted policy in the environment for learning: each agent sends in its own turn. It needs `dtsa[learning]`."""
+"""A scripted policy in the environment for learning: each agent sends in its own turn. It needs PettingZoo."""
 
 import dtsa
 from dtsa.env import fields, parallel_env

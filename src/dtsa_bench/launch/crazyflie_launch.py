@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 
-from ament_index_python.packages import get_package_prefix
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction, Shutdown
 from launch.events import matches_action
@@ -27,10 +27,7 @@ from dtsa_agent.crazyflie.settings.config import load_swarm
 
 CRAZYSWARM2 = "crazyswarm2"
 LAND_S = "60.0"  # from Ctrl-C until SIGTERM: all land first
-
-
-def _bench(executable: str) -> str:
-    return os.path.join(get_package_prefix("dtsa_bench"), "lib", "dtsa_bench", executable)
+DTSA = [sys.executable, "-m", "dtsa_bench"]
 
 
 def _processes(context: LaunchContext) -> list:
@@ -41,7 +38,7 @@ def _processes(context: LaunchContext) -> list:
     actions = []
     over = [Shutdown(reason="the Crazyflies have landed")]
     if LaunchConfiguration("simulated").perform(context) == "true":
-        words = [_bench("fake_crazyflie"), "--config", config, "--quiet", "--ignore-interrupt"]
+        words = [*DTSA, "fake-crazyflie", "--config", config, "--quiet", "--ignore-interrupt"]
         fleet = ExecuteProcess(cmd=words, output="screen", name="fake_crazyflie", sigterm_timeout=LAND_S)
         actions.append(fleet)
         end = SignalProcess(signal_number=signal.SIGTERM, process_matcher=matches_action(fleet))
@@ -50,7 +47,7 @@ def _processes(context: LaunchContext) -> list:
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         out = LaunchConfiguration("out").perform(context)
         more = LaunchConfiguration("options").perform(context).split()
-        fly = [_bench("dtsa"), "fly", "--backend", "cflib", "--config", config, "--domain", domain, "--out", out, *more]
+        fly = [*DTSA, "fly", "--backend", "cflib", "--config", config, "--domain", domain, "--out", out, *more]
         actions.append(ExecuteProcess(cmd=fly, output="screen", name="mission", sigterm_timeout=LAND_S, on_exit=over))
         return actions
     interfaces = LaunchConfiguration("interfaces").perform(context)

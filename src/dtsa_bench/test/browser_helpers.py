@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _NAMES = ("chromium", "chromium-browser", "google-chrome") if find_spec("playwright") else ()
 #: Path of the browser; None: `MISSING`.
 CHROMIUM = next((path for name in _NAMES if (path := shutil.which(name))), None)
-MISSING = "no Chromium on this machine, or no Playwright (`tools/dtsa setup --extra test`)"
+MISSING = "no Chromium on this machine, or no Playwright (`tools/dtsa setup --extra dev`)"
 PATIENCE_S = 90.0
 _OPTIONS = ("--enable-unsafe-swiftshader", "--disable-gpu", "--disable-dev-shm-usage")
 

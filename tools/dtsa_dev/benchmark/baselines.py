@@ -21,4 +21,4 @@ def baseline(name: str) -> ModuleType:
     try:
         return import_module(f"dtsa_dev.benchmark.{name}")
     except ImportError as error:
-        raise NotHere(f"{error} (requirements/benchmark.txt)") from error
+        raise NotHere(f"{error} (tools/dtsa setup --extra dev)") from error

@@ -218,22 +218,6 @@ def mutants(record: Row) -> str:
     )
 
 
-def setup(record: Row) -> str:
-    """How many interrupted set-ups ended well.
-
-    :param record: of `dtsa soak setup`.
-    """
-    figures = record["figures"]
-    signals, both = figures["by signal"], figures["with another set-up at the same time"]
-    how = f"{signals['SIGINT']} by Ctrl-C, {signals['SIGKILL']} by SIGKILL"
-    said = (
-        f"After {figures['interruptions that ended well']} interruptions at random moments ({how}) the same command",
-        f"ended well, {both} times with another set-up in the same moment; {len(record['failures'])} chains of",
-        "interruptions failed ([its record](../evidence/setup.json)).",
-    )
-    return "\n".join(said) + "\n"
-
-
 def flown_again(record: Row) -> str:
     """How many flights of entries were flown a second time.
 
@@ -456,7 +440,7 @@ def twelve(record: Row) -> str:
 QUOTED: dict[str, Callable[[Row], str]] = {
     "board": board, "board-cost": board_cost,
     "speed": speed, "environments": environments, "fuzz": fuzz, "league": flown_again,
-    "mutants": mutants, "setup": setup, "serial": serial, "twelve": twelve, "ns3": ns3,
+    "mutants": mutants, "serial": serial, "twelve": twelve, "ns3": ns3,
 }  # fmt: skip
 
 

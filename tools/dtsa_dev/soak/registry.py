@@ -21,7 +21,6 @@ SOAKS = {
     "league": "every entry of league-1 flown again, whole; entries with one number changed are found",
     "ns3": "the simulated channel beside ns-3's, the same loads (needs a Python with ns-3's wheel)",
     "mutants": "small random changes of the source, each of which the tests should find",
-    "setup": "set-ups ended by Ctrl-C and SIGKILL at random moments: the plain command again ends well",
     "load": "12 and 18 agents at 10 ms beside six busy loops: flights end by themselves and by Ctrl-C",
 }
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from dtsa_dev.registry import add_commands
 
+import checkout
 from dtsa_bench.commands import cli, registry
 from dtsa_bench.commands.cli import OneLineParser, build_parser
 from dtsa_bench.commands.completion import OF_THE_TOOL
 from dtsa_bench.flights.progress import flight_text
-from machine.main import OWN_COMMANDS
 
 add_commands()
 COMMANDS = list(registry.COMMANDS)
@@ -90,9 +90,7 @@ def test_the_options_of_fly_are_in_groups() -> None:
 
 
 def test_the_tool_names_the_nearest_command(capsys: pytest.CaptureFixture[str]) -> None:
-    from machine.main import main
-
-    assert main(["flyy"]) == 2
+    assert checkout.main(["flyy"]) == 2
     assert "did you mean fly?" in capsys.readouterr().err
 
 
@@ -131,7 +129,7 @@ def test_completion_knows_every_command_and_option(capsys: pytest.CaptureFixture
     assert cli.main(["completion", "zsh"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("#compdef dtsa")
-    assert set(OF_THE_TOOL) == set(OWN_COMMANDS)
+    assert set(OF_THE_TOOL) == set(checkout.COMMANDS)
     assert all(f"    {command}:'" in text for command in (*COMMANDS, *OF_THE_TOOL))
     for command in COMMANDS:
         options = {o for action in parser_of(command)._actions for o in action.option_strings if o.startswith("--")}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import runpy
 import signal
@@ -25,7 +24,6 @@ pytest.importorskip("cflib")
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from ament_index_python.packages import get_package_prefix
 from bridge_helpers import fake_fleet
 from bridge_helpers import settings as fleet_settings
 from builtin_interfaces.msg import Duration
@@ -162,9 +160,8 @@ def launched(monkeypatch: pytest.MonkeyPatch, **arguments: str) -> list[SimpleNa
         return SimpleNamespace(**values)
 
     def node(package: str, executable: str, **values: Any) -> SimpleNamespace:
-        program = os.path.join(get_package_prefix(package), "lib", package, executable)
         words = [word for name, value in values["parameters"][0].items() for word in ("-p", f"{name}:={value}")]
-        return action(cmd=[program, "--ros-args", *words], **values)
+        return action(cmd=["ros2", "run", package, executable, "--ros-args", *words], **values)
 
     actions = MagicMock(ExecuteProcess=action, EmitEvent=action, Shutdown=action, Node=node)
     events = MagicMock(matches_action=lambda found: found, SignalProcess=action)

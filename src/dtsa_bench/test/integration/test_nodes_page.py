@@ -16,18 +16,10 @@ from dtsa_agent.ros.common.graph import names
 from dtsa_bench.flights.domain import ros_domain
 
 SHARE = Path(__file__).resolve().parents[2]
-packages = pytest.importorskip("ament_index_python.packages")
 pytest.importorskip("dtsa_msgs.msg")
 
 PAGE = (Path(__file__).resolve().parents[4] / "docs/how-to/nodes.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
-
-
-def command(line: str) -> list[str]:
-    """What `ros2 run` starts."""
-    tool, verb, package, node, *rest = shlex.split(line)
-    assert (tool, verb) == ("ros2", "run")
-    return [str(Path(packages.get_package_prefix(package), "lib", package, node)), *rest]
 
 
 @pytest.mark.ros
@@ -36,7 +28,7 @@ def test_the_lines_of_the_page_fly(block: str, tmp_path: Path) -> None:
     with ros_domain() as domain:
         environment = ros_environment() | {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(tmp_path / "log")}
         processes = [
-            subprocess.Popen(command(line), cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+            subprocess.Popen(shlex.split(line), cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
             for line in block.splitlines()
         ]
         try:

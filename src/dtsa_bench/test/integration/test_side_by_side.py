@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from machine.main import SIDE_BY_SIDE
+from checkout import SIDE_BY_SIDE
 
 ROOT = Path(__file__).resolve().parents[4]
 
