@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from dtsa_dev.network.hosts import CABLE, Host, hosts, inside, why_not
-from dtsa_dev.network.trial import Trial, under_way
+from trials import Trial, under_way
 
 from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings
 from dtsa_agent.core import SwarmConfig
@@ -93,15 +93,14 @@ def test_agents_fly_on_when_their_interfaces_change(tmp_path: Path) -> None:
     """cf2 gets another address, cf3 has no interface for a while, that of cf4 is off for a while."""
     with under_way(Trial(SWARM, seconds=4.0, spread_s=0.2), tmp_path) as flight:
         flight.carry(1.0)
-        joined = flight.joined
+        joined = flight.hosts
         change_address(joined[2])
         joined[3].unplug()
         joined[4].switch(up=False)
         flight.carry(2.0)
         joined[3].plug(joined[3].address)
         joined[4].switch(up=True)
-        for agent in (2, 3, 4):
-            flight.carry_until_heard(agent)
+        flight.wait_for_frames((2, 3, 4))
         flight.carry(1.0)
         flight.end()
         found = Merge(flight.bags()).judge()

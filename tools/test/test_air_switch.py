@@ -17,9 +17,8 @@ from typing import Any
 
 import pytest
 from dtsa_dev.network.hosts import Host, hosts, why_not
-from dtsa_dev.network.intruder import Intruder
-from dtsa_dev.network.switch import Links, Switch
-from dtsa_dev.network.trial import NotFlown, Trial, flight_time, under_way
+from dtsa_dev.network.switch import Intruder, Links, Switch
+from trials import Trial, TrialError, flight_time, under_way
 
 import dtsa
 from dtsa_agent.air.datagram import Wrapping
@@ -53,9 +52,8 @@ class Cables:
 
     def __init__(self, links: Links | None = None, **channel: Any) -> None:
         self.pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(3)]
-        for pair in self.pairs:
-            for end in pair:
-                end.setblocking(False)
+        for end in (end for pair in self.pairs for end in pair):
+            end.setblocking(False)
         joined = [Host(k + 1, "", pair[0].fileno(), -1) for k, pair in enumerate(self.pairs)]
         self.switch = Switch(joined, GROUP, ChannelConfig(agents=3, link_delay_ns=0, **channel), links)
 
@@ -63,14 +61,10 @@ class Cables:
         """A host sends."""
         self.pairs[host - 1][1].send(data)
 
-    def carry_on(self, frames: int) -> None:
-        """Carries until so many frames have left the air."""
+    def carry(self, frames: int, longer_s: float = 0.02) -> None:
+        """Carry until so many frames have left the air, and a little longer."""
         assert self.switch.run(lambda: len(self.switch.log) >= frames, 30.0)
-
-    def carry(self, frames: int) -> None:
-        """Carries until so many frames have left the air, and a little longer."""
-        self.carry_on(frames)
-        self.switch.run(lambda: False, 0.02)
+        self.switch.run(lambda: False, longer_s)
 
     def heard(self, host: int) -> list[bytes]:
         """What has arrived at a host."""
@@ -80,18 +74,13 @@ class Cables:
                 found.append(self.pairs[host - 1][1].recv(4096))
         return found
 
-    def close(self) -> None:
-        """All cables are pulled."""
-        for pair in self.pairs:
-            for end in pair:
-                end.close()
-
 
 @pytest.fixture
-def cables() -> Iterator[Cables]:
-    joined = Cables()
+def cables(request: pytest.FixtureRequest) -> Iterator[Cables]:
+    joined = Cables(**getattr(request, "param", {}))
     yield joined
-    joined.close()
+    for end in (end for pair in joined.pairs for end in pair):
+        end.close()
 
 
 def test_a_frame_reaches_all_others_as_it_was_sent(cables: Cables) -> None:
@@ -104,16 +93,13 @@ def test_a_frame_reaches_all_others_as_it_was_sent(cables: Cables) -> None:
     assert seen.end_ns - seen.start_ns == 130_000 + (73 + 8 * 47) * 500
 
 
-def test_frames_that_overlap_destroy_each_other() -> None:
-    cables = Cables(bitrate=2000)  # 0.2 s on the air: a busy machine reads both cables within it
-    try:
-        cables.send(1, frame(1, 3))
-        cables.send(2, frame(2, 3))
-        cables.carry(2)
-        assert [cables.heard(host) for host in (1, 2, 3)] == [[], [], []]
-        assert [seen.collided > 0 for seen in cables.switch.log] == [True, True]
-    finally:
-        cables.close()
+@pytest.mark.parametrize("cables", [{"bitrate": 2000}], indirect=True)  # 0.2 s on the air
+def test_frames_that_overlap_destroy_each_other(cables: Cables) -> None:
+    cables.send(1, frame(1, 3))
+    cables.send(2, frame(2, 3))
+    cables.carry(2)
+    assert [cables.heard(host) for host in (1, 2, 3)] == [[], [], []]
+    assert [seen.collided > 0 for seen in cables.switch.log] == [True, True]
 
 
 def test_a_cut_medium_carries_to_one_side(cables: Cables) -> None:
@@ -137,16 +123,13 @@ def test_what_is_no_frame_is_not_on_the_air(cables: Cables) -> None:
     assert cables.switch.left_out >= len(strange) + 2
 
 
-def test_links_delay_and_double() -> None:
-    cables = Cables(Links(delay_ns=50_000_000, double=1.0))
-    try:
-        cables.send(1, frame(1, 1))
-        assert cables.switch.run(lambda: len(cables.switch.log) == 1, 30.0)
-        assert cables.heard(2) == []
-        cables.switch.run(lambda: False, 0.1)
-        assert cables.heard(2) == [frame(1, 1)] * 2
-    finally:
-        cables.close()
+@pytest.mark.parametrize("cables", [{"links": Links(delay_ns=50_000_000, double=1.0)}], indirect=True)
+def test_links_delay_and_double(cables: Cables) -> None:
+    cables.send(1, frame(1, 1))
+    cables.carry(1, 0.0)
+    assert cables.heard(2) == []
+    cables.switch.run(lambda: False, 0.1)
+    assert cables.heard(2) == [frame(1, 1)] * 2
 
 
 def test_a_stranger_brings_all_what_was_never_on_the_air(cables: Cables) -> None:
@@ -155,7 +138,7 @@ def test_a_stranger_brings_all_what_was_never_on_the_air(cables: Cables) -> None
     found: list[bytes] = []
     for number, data in enumerate(good, 1):
         cables.send(1, data)
-        cables.carry_on(number)
+        cables.carry(number, 0.0)
         found += cables.heard(2)
     said = len(found) - len(good)
     assert said == intruder.said >= len(good)
@@ -247,5 +230,5 @@ def test_agents_say_in_flight_that_slots_are_too_short_for_a_network(tmp_path: P
 @pytest.mark.skipif(bool(why_not()), reason=why_not() or "hosts can be made")
 def test_an_agent_that_does_not_begin_says_why(tmp_path: Path) -> None:
     wrong = dataclasses.replace(SWARM, agents=1, policy="dtsa", moving=None)
-    with pytest.raises(NotFlown, match="policy: got 'dtsa'"), under_way(Trial(wrong, spread_s=0.0), tmp_path):
+    with pytest.raises(TrialError, match="policy: got 'dtsa'"), under_way(Trial(wrong, spread_s=0.0), tmp_path):
         pass

@@ -14,7 +14,7 @@ from dtsa_agent.core.reference.lease import issue, listen
 from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
 from dtsa_channel_sim import ChannelConfig
 
-SAMPLE = 10  # settings; `dtsa soak reference` has 200
+SAMPLE = 10  # settings; `dtsa soak statements` has 200
 
 
 @pytest.mark.parametrize("seed", range(1, SAMPLE + 1))

@@ -41,12 +41,9 @@ class _Agent:
         self.swarm.active[:] = 0
         self.swarm.goal[0, 0] = FAR
         self.base = TimeBase(
-            agents=config.agents,
-            anchor_every=config.anchor_every,
-            slot_ns=config.slot_ns,
-            agent=agent,
+            agents=config.agents, anchor_every=config.anchor_every, slot_ns=config.slot_ns, agent=agent,
             seed=config.seed,
-        )
+        )  # fmt: skip
         self.align = align
         self.open: int | None = None
         self.on = False
@@ -68,21 +65,14 @@ class _Agent:
 class OwnClocks:
     """The swarm, its clocks and its channel.
 
-    :param config: the swarm, policy ``lease``.
-    :param channel: the channel.
-    :param clocks: one clock an agent.
     :param start_ns: ns of the channel's time: when each agent is switched on.
     :param align: whether agents go on listening for the time once they have one; without it their slots drift apart.
     """
 
     def __init__(
-        self,
-        config: SwarmConfig,
-        channel: ChannelConfig,
-        clocks: Sequence[AgentClock],
-        start_ns: Sequence[int],
+        self, config: SwarmConfig, channel: ChannelConfig, clocks: Sequence[AgentClock], start_ns: Sequence[int],
         align: bool = True,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.config, self.seen = config, Seen()
         self._air: Air[tuple[int, int]] = Air(Channel(channel))
         self._delay_ns = 2 * channel.link_delay_ns
@@ -94,11 +84,7 @@ class OwnClocks:
             heapq.heappush(self._events, (when, k, True))
 
     def run(self, until_ns: int, probe_ns: int = 1_000_000_000) -> Seen:
-        """Runs on.
-
-        :param until_ns: ns of the channel's time.
-        :param probe_ns: how often the agents' slot starts are compared.
-        """
+        """Run until a moment of the channel's time; slot starts are compared at each probe."""
         probe = (self._events[0][0] // probe_ns + 1) * probe_ns
         while self._events[0][0] < until_ns:
             now, k, on = heapq.heappop(self._events)

@@ -6,12 +6,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from dtsa_dev.proofs.board_cost import STACK_BYTES, fly_app_on_cortex
-from dtsa_dev.proofs.embedded import FUSING, fly_here, fly_on_cortex, fused
+from dtsa_dev.embedded import FUSING, STACK_BYTES, fly_app_on_cortex, fly_here, fly_on_cortex, fused
 from dtsa_dev.proofs.fuzz import Found, build, fuzz
 from dtsa_dev.proofs.library import LIBRARY, NotHere
-from dtsa_dev.proofs.prove import MUTANTS, World, explore
-from dtsa_dev.proofs.prove import build as build_prover
+from dtsa_dev.prove import MUTANTS, World, explore
+from dtsa_dev.prove import build as build_prover
 
 
 @pytest.mark.parametrize(("target", "inputs"), [("frames", 200_000), ("agents", 10_000), ("hearing", 20_000)])

@@ -1,4 +1,4 @@
-"""No pattern of loss, death, restart, partition or jam makes two agents send in one slot."""
+"""Integration: no pattern of loss, death, restart, partition or jam makes two agents send in one slot."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.protocol.experiment import Event, Experiment
-from dtsa_dev.protocol.faults import random_schedule
+from dtsa_dev.protocol.experiment import Event, Experiment, random_schedule
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
 from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
@@ -37,12 +36,7 @@ class Misfortune:
     def experiment(self) -> Experiment:
         """The run to make with it; ages are not measured."""
         return Experiment(
-            self.config,
-            self.channel,
-            movers=self.movers,
-            events=self.events,
-            final=self.final,
-            warmup=NEVER,
+            self.config, self.channel, movers=self.movers, events=self.events, final=self.final, warmup=NEVER
         )
 
 
@@ -57,13 +51,7 @@ def _events(random: np.random.Generator, agents: int, slots: int) -> list[Event]
 
 
 def random_misfortune(seed: int, slots: int, most_agents: int = 16, **settings: Any) -> Misfortune:
-    """Everything that can go wrong, at random.
-
-    :param seed: seed of all of it.
-    :param slots: slots that the run lasts for which it is meant.
-    :param most_agents: upper bound of the swarm's size.
-    :param settings: of the swarm, on top of the random ones.
-    """
+    """Everything that can go wrong, at random, in a run that lasts so many slots; settings: of the swarm."""
     random = np.random.default_rng(seed)
     agents = int(random.integers(2, most_agents + 1))
     config = SwarmConfig(
@@ -149,9 +137,6 @@ def test_a_run_is_repeatable() -> None:
 
 def test_the_ledger_sees_broken_rules() -> None:
     """The referee itself: each rule broken once."""
-    from dtsa_agent.core.frame import Frame
-    from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
-
     zero = (0.0, 0.0, 0.0)
 
     def frame(sender: int, slot: int, leases: bytes = b"") -> bytes:

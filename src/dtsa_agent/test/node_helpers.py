@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dtsa_dev.soak.nodes import node_command, node_environment
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -24,6 +24,21 @@ from dtsa_agent.ros.common.workarounds.dds import limit_to_machine
 from dtsa_bench.flights.domain import ros_domain
 
 PATIENCE_S = 120.0
+
+
+def node_command(module: str, *arguments: str, logs: bool = False) -> list[str]:
+    """``python -m module --ros-args arguments``, in this environment.
+
+    :param logs: whether the node's log goes to standard error, beside its own last line.
+    """
+    quiet = [] if logs else ["--disable-stdout-logs"]
+    return [sys.executable, "-m", module, "--ros-args", *quiet, *arguments]
+
+
+def node_environment(domain: int, logs: Path) -> dict[str, str]:
+    """Environment of nodes that discover none beyond this machine."""
+    here = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return {**here, **os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs)}
 
 
 class Graph:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dtsa_dev.soak.flights import end_all, process_with
 from waiting import wait_for
 
 from dtsa_agent.ros.common.wire.packing import split_frames
 from dtsa_bench.recordings.bag.reader import Bag
+from dtsa_bench.recordings.bag.recover import recover
 from dtsa_bench.recordings.verify import verify_bag
 
-PATIENCE_S = 120.0
+PATIENCE_S = 180.0
+ENDLESS = ("--tail-s", "3600", "--no-picture")  # of simulated time, long enough to be disturbed
+_BEGUN_BYTES = 6_000  # of a bag: some slots have been recorded
+_GROWTH_BYTES = 2_000
 
 
 def command(*words: str) -> list[str]:
@@ -68,3 +75,159 @@ def readable(out: Path) -> int:
     result = verify_bag(out / "bag")
     assert result.ok, result.difference
     return result.slots
+
+
+def run_dtsa(*words: str) -> subprocess.CompletedProcess[str]:
+    """A command of `dtsa`, run to its end; whatever ends this, none of its processes is left."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dtsa_bench", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        output, errors = process.communicate(timeout=PATIENCE_S)
+    finally:
+        end_all(process)
+    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
+
+
+def children(supervisor: int) -> list[int]:
+    """Processes that a flight has started and that still run, whoever their parent is by now."""
+    mark = f"DTSA_SUPERVISOR={supervisor}".encode()
+    pids = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                marked = mark in (entry / "environ").read_bytes().split(b"\0")
+                if marked and b") Z " not in (entry / "stat").read_bytes():
+                    pids.append(int(entry.name))
+    return sorted(pids)
+
+
+def process_with(supervisor: int, argument: str) -> int:
+    """The process of a flight that was started with an argument, the whole word."""
+    for pid in children(supervisor):
+        with contextlib.suppress(OSError):
+            if argument.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                return pid
+    raise AssertionError(f"no process of the flight was started with {argument}")
+
+
+def end_all(process: subprocess.Popen[Any]) -> None:
+    """Kill a flight and all that it has started."""
+    left = children(process.pid)
+    if process.poll() is None:
+        process.kill()
+    process.wait()
+    for pid in {*left, *children(process.pid)}:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    if not all(pipe is None or pipe.closed for pipe in (process.stdout, process.stderr)):
+        process.communicate()  # the pipes end with the last of them
+
+
+@dataclass(slots=True)
+class FlightProcess:
+    """A flight under way, to be killed, stopped or disturbed, and what is asserted of it."""
+
+    out: Path
+    process: subprocess.Popen[bytes]
+    nodes: list[int] = field(default_factory=list)  # its node processes when it had begun
+
+    def bag_bytes(self) -> int:
+        """Size of the file that is being recorded; 0: not there yet."""
+        with contextlib.suppress(OSError):
+            return (self.out / "bag" / "bag_0.mcap").stat().st_size
+        return 0
+
+    def stderr(self) -> str:
+        """Everything on standard error until now."""
+        return (self.out.parent / "stderr.txt").read_text(errors="replace")
+
+    def pid_of(self, agent: int) -> int:
+        """Process of one agent, in flights with a process each."""
+        return process_with(self.process.pid, f"__ns:=/cf{agent}")
+
+    def environment(self, pid: int) -> dict[str, str]:
+        """Environment variables of a process of the flight."""
+        words = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
+        return dict(word.split("=", 1) for word in words if "=" in word)
+
+    def end(self) -> int:
+        """Wait for the flight to end by itself; its exit code."""
+        code = self.process.wait(PATIENCE_S)
+        assert "Timeout (" not in self.stderr(), f"the flight stood still after a signal: {self.stderr()[-1500:]}"
+        return code
+
+    def assert_no_process_left(self) -> None:
+        """Wait until no process of the flight is left."""
+        wait_for(lambda: not children(self.process.pid), 20.0, "a process of the flight stays")
+
+    def assert_ends(self, code: int, *messages: str) -> None:
+        """The flight ends by itself with a code and messages, without a traceback, and no process stays."""
+        found = self.end()
+        text = self.stderr()
+        assert found == code, text[-300:]
+        assert "Traceback" not in text, text[-300:]
+        for message in messages:
+            assert message in text, text[-300:]
+        self.assert_no_process_left()
+
+    def assert_flies_on(self) -> None:
+        """The flight goes on: its bag grows."""
+        size = self.bag_bytes()
+        wait_for(
+            lambda: self.process.poll() is not None or self.bag_bytes() > size + _GROWTH_BYTES, PATIENCE_S, "no growth"
+        )
+        assert self.process.poll() is None, f"the flight has ended: {self.stderr()[-300:]}"
+
+    def interrupt(self, number: int = signal.SIGINT) -> dict[str, Any]:
+        """A signal ends the flight in good order, and its bag verifies; its summary."""
+        self.process.send_signal(number)
+        self.assert_ends(130, "interrupted")
+        self.assert_verifies()
+        summary: dict[str, Any] = json.loads((self.out / "summary.json").read_text())
+        return summary
+
+    def assert_verifies(self) -> None:
+        """The bag is closed, has slots, and is what the protocol gives."""
+        result = verify_bag(self.out / "bag")
+        assert result.ok, result.difference
+        assert result.slots
+
+    def assert_recovered_verifies(self) -> None:
+        """The bag was not closed; what `recover` makes of it verifies up to where it breaks off."""
+        result = verify_bag(recover(self.out / "bag").directory)
+        assert result.ok, result.difference
+        assert result.broken_off
+        assert result.slots
+
+
+@contextmanager
+def start_flight(directory: Path, *words: str, begun: bool = True, files_bytes: int = 0) -> Iterator[FlightProcess]:
+    """A flight in a directory; whatever happens to it, no process of it is left afterwards.
+
+    :param begun: wait until some slots are in its bag.
+    :param files_bytes: largest size of a file that it can write; 0: any.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+
+    def limit() -> None:
+        import resource
+
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (files_bytes, files_bytes))
+
+    out = directory / "out"
+    with (directory / "stderr.txt").open("wb") as errors:
+        process = subprocess.Popen(
+            command("--out", str(out), *words),
+            stdout=subprocess.DEVNULL, stderr=errors, preexec_fn=limit if files_bytes else None,
+        )  # fmt: skip
+    flight = FlightProcess(out, process)
+    try:
+        if begun:
+            wait_for(lambda: process.poll() is not None or flight.bag_bytes() > _BEGUN_BYTES, PATIENCE_S)
+            assert process.poll() is None, f"the flight ended before it had begun: {flight.stderr()[-300:]}"
+            flight.nodes = children(process.pid)
+        yield flight
+    finally:
+        end_all(process)

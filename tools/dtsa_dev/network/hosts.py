@@ -23,7 +23,6 @@ from dtsa_agent.core.errors import DtsaError
 CABLE = "air0"  # the interface of each host
 _NET = "10.68"
 _CLONE_NEWNET, _CLONE_NEWTIME = 0x40000000, 0x80
-_CLONE_NEWNS, _MS_REC, _MS_PRIVATE = 0x00020000, 0x4000, 0x40000
 _TUNSETIFF, _IFF_TAP, _IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
 _SIOCSIFADDR, _SIOCSIFNETMASK, _SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8916, 0x891C, 0x8913, 0x8914
 _IFF_UP = 1
@@ -45,27 +44,16 @@ class Host:
     cable: int  # file descriptor of the switch's end
     namespace: int  # file descriptor
 
-    def start(
-        self, command: Sequence[str], clock_ahead_s: int = 0, own_memory: bool = False, **more: Any
-    ) -> subprocess.Popen[str]:
-        """Starts a process on it.
+    def start(self, command: Sequence[str], clock_ahead_s: int = 0, **more: Any) -> subprocess.Popen[str]:
+        """Start a process on the host.
 
-        :param command: its command line.
-        :param clock_ahead_s: s, by how much its CLOCK_MONOTONIC is ahead of everybody else's, where Linux has time
+        :param clock_ahead_s: s, by how much its CLOCK_MONOTONIC is ahead of all others, where Linux has time
             namespaces; CLOCK_REALTIME is one for all.
-        :param own_memory: whether it shares no memory (``/dev/shm``) with any other process.
-        :param more: as for ``subprocess.Popen``.
         """
         libc, namespace = _libc(), self.namespace
 
         def enter() -> None:
             if libc.setns(namespace, _CLONE_NEWNET):
-                os._exit(126)
-            if own_memory and (
-                libc.unshare(_CLONE_NEWNS)
-                or libc.mount(b"none", b"/", None, _MS_REC | _MS_PRIVATE, None)
-                or libc.mount(b"none", b"/dev/shm", b"tmpfs", 0, None)
-            ):
                 os._exit(126)
             if clock_ahead_s and not libc.unshare(_CLONE_NEWTIME):
                 with suppress(OSError), open("/proc/self/timens_offsets", "w") as offsets:
@@ -80,39 +68,26 @@ class Host:
             os.dup2(loose.fileno(), self.cable, inheritable=False)
 
     def plug(self, address: str) -> None:
-        """An interface of the same name is made anew.
-
-        :param address: its address.
-        """
+        """An interface of the same name is made anew."""
         with inside(self):
             made = _new_cable(address)
             os.dup2(made, self.cable, inheritable=False)
             os.close(made)
 
     def readdress(self, address: str) -> None:
-        """Its interface gets another address in place of the one that it has.
-
-        :param address: the new one.
-        """
+        """Its interface gets another address in place of the one that it has."""
         with inside(self):
             _set_address(address)
 
     def switch(self, up: bool) -> None:
-        """Its interface is switched on or off; it keeps its address.
-
-        :param up: on.
-        """
+        """Its interface is switched on or off; it keeps its address."""
         with inside(self):
             _set_up(CABLE, up)
 
 
 @contextmanager
 def hosts(count: int) -> Iterator[list[Host]]:
-    """Some hosts, until the end of the context; processes on them have ended by then.
-
-    :param count: how many, up to 254.
-    :raises Unavailable: if this machine does not let us.
-    """
+    """Some hosts, until the end of the context; processes on them have ended by then."""
     with ExitStack() as stack:
         home = _opened(stack, _OWN, os.O_RDONLY)
         try:
@@ -125,10 +100,7 @@ def hosts(count: int) -> Iterator[list[Host]]:
 
 @contextmanager
 def inside(host: Host) -> Iterator[None]:
-    """Until the end of the context this thread is on a host: sockets that it makes stay there.
-
-    :param host: the host.
-    """
+    """Until the end of the context this thread is on a host: sockets that it makes stay there."""
     home = os.open(_OWN, os.O_RDONLY | os.O_CLOEXEC)
     try:
         if _libc().setns(host.namespace, _CLONE_NEWNET):
@@ -143,10 +115,7 @@ def inside(host: Host) -> Iterator[None]:
 
 
 def arrived(cable: int) -> Iterator[bytes]:
-    """Ethernet frames that wait on a host's cable, one after the other; not more than others can wait for.
-
-    :param cable: its descriptor, which does not block.
-    """
+    """Ethernet frames that wait on a host's cable, one after the other; not more than others can wait for."""
     for _ in range(_BURST):
         try:
             frame = os.read(cable, LONGEST)

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import heapq
 import os
+import random
 import select
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,10 +25,14 @@ from dtsa_agent.air.precision import wake_precisely
 from dtsa_agent.core.frame import named_in
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
-from .hosts import LONGEST, Host, arrived
+from .hosts import Host, arrived
 
 _ETHERNET, _IPV4, _UDP = 14, 0x0800, 17
 _SECOND = 1_000_000_000
+_PAYLOAD = 14 + 20 + 8  # bytes of Ethernet, IP and UDP headers before a datagram
+_CHECKSUM = slice(_PAYLOAD - 2, _PAYLOAD)  # of UDP; 0: none
+_KEPT = 500  # frames that an intruder remembers
+_FLOOD = 20  # frames at a time, now and then
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +56,10 @@ class Links:
     delay_ns: int = 0
     jitter_ns: int = 0  # more, evenly distributed
     double: float = 0.0  # share of frames that arrive twice
-    later_to: Mapping[int, int] = field(default_factory=dict)  # ns more on the way to a host, by its number
 
 
 class Switch:
-    """Joins hosts.
-
-    :param joined: the hosts; a host's number is the id of its agent.
-    :param group: address and port of the swarm's group.
-    :param config: the medium.
-    :param links: what links do beside it.
-    """
+    """Joins hosts."""
 
     def __init__(
         self, joined: Sequence[Host], group: tuple[str, int], config: ChannelConfig, links: Links | None = None
@@ -81,7 +80,6 @@ class Switch:
         #: Is told each Ethernet frame that has left the air.
         self.listener: Callable[[bytes], None] | None = None
         self.left_out = 0  # Ethernet frames that were nothing for the air
-        self.undelivered = 0  # frames that a host did not take
         wake_precisely()
 
     @property
@@ -90,19 +88,11 @@ class Switch:
         return time.monotonic_ns() - self._zero
 
     def set(self, **values: object) -> None:
-        """Changes the medium from the next slot on.
-
-        :param values: settings of the channel.
-        """
+        """Changes the medium from the next slot on."""
         self.channel.set(**values)
 
     def run(self, until: Callable[[], bool], seconds: float) -> bool:
-        """Carries frames.
-
-        :param until: asked about a hundred times a second: whether to stop.
-        :param seconds: s after which it stops, whatever happens.
-        :returns: whether it was asked to stop.
-        """
+        """Carries frames."""
         end, ask = self.now_ns + round(seconds * _SECOND), 0
         while True:
             now = self.now_ns
@@ -151,7 +141,6 @@ class Switch:
                 times = 1 + bool(self._links.double and self._random.random() < self._links.double)
                 for _ in range(times):
                     delay = self._links.delay_ns + round(self._links.jitter_ns * self._random.random())
-                    delay += self._links.later_to.get(number, 0)
                     self._count += 1
                     entry = (verdict.arrival_ns + delay, self._count, self._cables[number], frame)
                     heapq.heappush(self._due, entry)
@@ -170,23 +159,46 @@ class Switch:
         now = self.now_ns
         while self._due and self._due[0][0] <= now:
             *_, cable, frame = heapq.heappop(self._due)
-            try:
+            with suppress(OSError):
                 os.write(cable, frame)
-            except OSError:
-                self.undelivered += 1
 
     def tell_all(self, frame: bytes) -> None:
-        """Brings all hosts a frame that was never on the air.
-
-        :param frame: an Ethernet frame.
-        """
+        """Brings all hosts a frame that was never on the air."""
         for cable in self._hosts:
             with suppress(OSError):
                 os.write(cable, frame)
 
-    def drain(self) -> None:
-        """Throws away what the hosts have sent and nobody has read."""
-        for cable in self._hosts:
-            with suppress(OSError):
-                while os.read(cable, LONGEST):
-                    pass
+
+class Intruder:
+    """A stranger without a key: plays frames again, at once and later, changes them, makes some up.
+
+    Each frame is answered; no transmission of the intruder disturbs another one.
+    """
+
+    def __init__(self, switch: Switch, seed: int) -> None:
+        self._switch, self._random = switch, random.Random(seed)
+        self._heard: deque[bytes] = deque(maxlen=_KEPT)
+        self.said = 0
+        switch.listener = self.hear
+
+    def hear(self, frame: bytes) -> None:
+        """Answer an Ethernet frame that has left the air."""
+        self._heard.append(frame)
+        for _ in range(_FLOOD if self._random.random() < 0.01 else 1):
+            self._switch.tell_all(self._forged(frame))
+            self.said += 1
+
+    def _forged(self, frame: bytes) -> bytes:
+        """A frame again; one of long ago; or one with a byte, all of the swarm's frame, or everything changed."""
+        draw = self._random
+        kind = draw.randrange(5)
+        if kind < 2:
+            return frame if kind else self._heard[0]
+        data = bytearray(frame)
+        data[_CHECKSUM] = b"\0\0"
+        if kind == 2:
+            data[draw.randrange(_PAYLOAD, len(data))] ^= 1 << draw.randrange(8)
+        else:
+            begin = _PAYLOAD + (HEADER if kind == 3 else 0)
+            data[begin:] = draw.randbytes(len(data) - begin)
+        return bytes(data)

@@ -12,7 +12,7 @@ from dtsa_agent.core import REASONS, AbstractSwarm, Swarm, SwarmConfig, make_sce
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
 from dtsa_channel_sim import Channel, ChannelConfig
-from dtsa_dev.protocol.faults import random_schedule
+from dtsa_dev.protocol.experiment import random_schedule
 
 POLICIES = ("tdma", "dtsa", "age", "aloha", "lease", "lease")
 ESTIMATORS = ("hold", "linear", "intent", "oracle")
@@ -67,8 +67,7 @@ class Setting:
 def random_setting(seed: int, policy: str | None = None, *, lasts: bool | None = None) -> Setting:
     """A flight with a random policy, estimator, avoider, scenario, channel and random misfortune.
 
-    :param seed: of all of it.
-    :param policy: a policy instead of a random one.
+    :param policy: instead of a random one.
     :param lasts: with policy ``lease``: so long, with so few agents, that the dead are adopted and some come back;
         default: now and then.
     """
@@ -145,11 +144,7 @@ def _deaths_and_returns(random: np.random.Generator, swarm: SwarmConfig) -> Iter
 
 
 def happen(fault: Fault, swarm: AbstractSwarm) -> None:
-    """Lets a fault happen to a swarm all of whose agents are here, before a slot begins.
-
-    :param fault: the fault.
-    :param swarm: the swarm.
-    """
+    """Lets a fault happen to a swarm all of whose agents are here, before a slot begins."""
     k = fault.agent - 1
     if fault.kind == "die":
         swarm.present[k] = 0
@@ -166,12 +161,7 @@ def happen(fault: Fault, swarm: AbstractSwarm) -> None:
 
 
 def fly_both(setting: Setting) -> Mapping[str, Any]:
-    """Flies a setting on the compiled core and on the specification, side by side.
-
-    :param setting: the flight.
-    :returns: figures: slots, frames, frames heard, collisions, decisions by reason.
-    :raises Differs: at the first difference.
-    """
+    """Flies a setting on the compiled core and on the specification, side by side."""
     scenario = make_scenario(setting.swarm)
     pair: tuple[AbstractSwarm, AbstractSwarm] = (
         Swarm(setting.swarm, scenario, shared_table=setting.shared),

@@ -31,13 +31,7 @@ class Fuzzed:
 
 
 def build(target: str, directory: Path, library: Path = LIBRARY) -> Path:
-    """The fuzzer of a target.
-
-    :param target: a key of TARGETS.
-    :param directory: for the program.
-    :param library: folder of libdtsa.
-    :raises NotHere: without clang or its runtime.
-    """
+    """Compile the fuzzer of a target of :data:`TARGETS`."""
     clang = tool("clang", "clang")
     parts = sources(library)
     if target == "frames":
@@ -55,14 +49,10 @@ def build(target: str, directory: Path, library: Path = LIBRARY) -> Path:
 
 
 def fuzz(program: Path, seconds: float, corpus: Path, seed: int = 0, most: int = -1) -> Fuzzed:
-    """Fuzzes for a while.
+    """Fuzz for a while, or until so many inputs (-1: any number).
 
-    :param program: from :func:`build`.
-    :param seconds: how long, s.
-    :param corpus: folder of inputs that reach something new; read, and added to.
-    :param seed: of the fuzzer; 0: another each time.
-    :param most: inputs after which it ends before its time is over; -1: any number.
-    :raises Found: with the fuzzer's words; the input is in the corpus' parent.
+    The corpus is a folder of inputs that reach something new: read, and added to. An input on which libdtsa does what
+    it must not is kept in its parent.
     """
     target = program.name.removeprefix("fuzz_")
     corpus.mkdir(parents=True, exist_ok=True)

@@ -21,12 +21,7 @@ class NotHere(DtsaError):
 
 
 def tool(name: str, package: str) -> str:
-    """The path of a program.
-
-    :param name: its name.
-    :param package: the Debian package that has it.
-    :raises NotHere: if it is not on this machine.
-    """
+    """The path of a program; ``package`` is the Debian package that has it."""
     found = shutil.which(name)
     if found is None:
         raise NotHere(f"missing: {name}; on Debian and Ubuntu: sudo apt install {package}")
@@ -34,11 +29,7 @@ def tool(name: str, package: str) -> str:
 
 
 def sources(library: Path = LIBRARY, without: Sequence[str] = ()) -> list[Path]:
-    """The C files of libdtsa.
-
-    :param library: its folder.
-    :param without: names of files to leave out.
-    """
+    """The C files of libdtsa."""
     found = [path for path in sorted(library.rglob("*.c")) if path.name not in without]
     if not found:
         raise ConfigError("libdtsa", str(library), "a folder with its sources")
@@ -53,15 +44,10 @@ def compile_program(
     library: Path = LIBRARY,
     links: Sequence[str] = ("-lm",),
 ) -> Path:
-    """Compiles and links files with libdtsa's headers in reach; returns the program.
+    """Compile and link files, those of libdtsa among them, with its headers in reach; the program.
 
-    :param compiler: path of the compiler.
-    :param out: the program.
-    :param files: C files, those of libdtsa among them.
     :param flags: besides those that keep the bits the same.
-    :param library: folder of libdtsa.
     :param links: options of the linker, at the end.
-    :raises DtsaError: with what the compiler said.
     """
     include = [f"-I{library / 'include'}", f"-I{library}"]
     command = [compiler, *SAME_BITS, *flags, *include, *map(str, files), "-o", str(out), *links]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,27 +79,20 @@ class Outcome:
 
 
 def still_scenario(agents: int, seed: int, spread: float = 6.0) -> Scenario:
-    """Agents at random places, with nowhere to go.
-
-    :param agents: number of agents.
-    :param seed: seed of the places.
-    :param spread: m, half width of the cube they are in.
-    """
+    """Agents at random places in a cube (half its width: ``spread``, m), with nowhere to go."""
     places = np.round(np.random.default_rng(seed).uniform(-spread, spread, (3, agents)), 3)
     return Scenario(places, places.copy(), np.zeros(agents, dtype=np.bool_), goals_known=False)
 
 
 class Experiment:
-    """One swarm, all agents with a table of their own, and its channel.
+    """One swarm, all agents with a table of their own, and its channel; the scenario in its settings is not used.
 
-    :param config: the swarm; the scenario in it is not used.
-    :param channel: the channel; default: loss-free.
     :param movers: ids that have something to say from the start.
     :param absent: ids that are not there at the start.
     :param events: what happens; any order.
     :param final: whether an agent that rests knows that no further goal will come.
     :param warmup: slots before ages count.
-    :param shared: one table serves all agents: right only where nothing is lost and nobody comes or goes.
+    :param shared: one table serves all agents: right only where nothing is lost and no agent comes or goes.
     """
 
     def __init__(
@@ -174,11 +168,7 @@ class Experiment:
         self.outcome.waits.append(wait)
 
     def run(self, slots: int, each: Callable[[Experiment, tuple[int, ...]], None] | None = None) -> Outcome:
-        """Runs on.
-
-        :param slots: how many slots.
-        :param each: called after every slot with the ids that sent in it.
-        """
+        """Run on; ``each`` is called after every slot with the ids that sent in it."""
         for _ in range(slots):
             senders = self.step()
             if each is not None:
@@ -248,3 +238,21 @@ class Experiment:
                 if (tables[:, wait.agent - 1] >= wait.since).all():
                     wait.all = self.slot
         self._waiting = [wait for wait in self._waiting if wait.all < 0]
+
+
+def random_schedule(random: np.random.Generator, agents: int, slots: int) -> list[dict[str, Any]]:
+    """Jams and partitions, one after the other."""
+    entries: list[dict[str, Any]] = []
+    slot = 0
+    while slot < slots:
+        slot += int(random.integers(50, 800))
+        length = int(random.integers(5, 600))
+        kind = random.integers(0, 3)
+        if kind == 0:
+            entries.append({"slot": slot, "until": slot + length, "jam": True})
+        elif kind == 1 and agents > 3:
+            ids = [int(k) + 1 for k in random.permutation(agents)]
+            cut = int(random.integers(1, agents))
+            entries.append({"slot": slot, "until": slot + length, "partition": [ids[:cut], ids[cut:]]})
+        slot += length
+    return entries

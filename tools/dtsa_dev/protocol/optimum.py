@@ -35,12 +35,7 @@ class Optimum:
 
 
 def optimum(loss: float, cap: int = 9, tolerance: float = 1e-6) -> Optimum:
-    """Solves the problem for three agents.
-
-    :param loss: probability p that a receiver loses a frame.
-    :param cap: slots; ages do not grow beyond it. Large enough if the result no longer changes with it.
-    :param tolerance: of the mean cost, slots.
-    """
+    """Solve the problem for three agents, each of which loses a frame with a probability."""
     ages = np.indices((cap + 1,) * len(PAIRS), dtype=np.int8)
     cost = np.asarray(ages.sum(axis=0) / len(PAIRS), dtype=np.float64)
     greedy = _largest_sum(list(ages))
@@ -51,10 +46,7 @@ def optimum(loss: float, cap: int = 9, tolerance: float = 1e-6) -> Optimum:
 
 
 def _largest_sum(weights: Sequence[NDArray[Any]]) -> NDArray[np.intp]:
-    """The sender with the largest sum over its receivers, for each state.
-
-    :param weights: by pair, of each state.
-    """
+    """The sender with the largest sum over its receivers, for each state."""
     sums = [sum(weights[i] for i, (_, k) in enumerate(PAIRS) if k == sender) for sender in range(3)]
     return np.asarray(np.stack(sums).argmax(axis=0))
 
@@ -68,13 +60,7 @@ def _round_robin(loss: float) -> float:
 
 
 def _mean_cost(cost: NDArray[np.float64], loss: float, tolerance: float, choice: NDArray[np.intp] | None) -> float:
-    """Cost of a slot in the long run, by relative value iteration.
-
-    :param cost: of each state.
-    :param loss: probability of a loss.
-    :param tolerance: of the result.
-    :param choice: who sends in each state; None: whoever is best.
-    """
+    """Cost of a slot in the long run, by relative value iteration."""
     value = np.zeros_like(cost)
     for _ in range(100_000):
         expected = [_after(value, sender, loss) for sender in range(3)]

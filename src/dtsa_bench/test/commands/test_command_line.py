@@ -172,7 +172,7 @@ def test_every_parser_is_of_the_kind_that_is_checked_here() -> None:
 
 
 def test_what_prints_results_prints_them_as_json() -> None:
-    for command in ("demo", "fly", "simulate", "sweep", "soak", "benchmark", "verify", "recover", "export"):
+    for command in ("demo", "fly", "simulate", "sweep", "verify", "recover", "export"):
         parser = parser_of(command)
         assert any("--json" in action.option_strings for action in parser._actions), command
 

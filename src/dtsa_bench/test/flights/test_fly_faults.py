@@ -1,4 +1,4 @@
-"""Integration: nodes that send garbage: they are named, and everything ends. What else may fail is in test_soak.py."""
+"""Integration: nodes that send garbage are named, and everything ends. What else may fail: tools/test/faults."""
 
 from __future__ import annotations
 

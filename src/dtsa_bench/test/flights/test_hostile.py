@@ -16,14 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import PATIENCE_S, command, fly, frames
+from fly_helpers import PATIENCE_S, children, command, end_all, fly, frames
 from node_helpers import Graph, end_of, graph_in, ros_graph
 from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
 import dtsa_msgs.msg
-from dtsa_dev.soak.flights import children, end_all
 from dtsa_msgs.msg import Frame, Process, Report, Slot, Transmission
 from rclpy.serialization import serialize_message
 

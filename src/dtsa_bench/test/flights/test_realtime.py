@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fly_helpers import PATIENCE_S, fly, flying, pid_of, readable
+from fly_helpers import PATIENCE_S, children, fly, flying, pid_of, process_with, readable
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_dev.soak.flights import children, process_with
 
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.verify import verify_bag

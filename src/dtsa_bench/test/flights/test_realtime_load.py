@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.soak.flights import children, end_all
-from fly_helpers import command
+from fly_helpers import children, command, end_all
 from node_helpers import ros_graph
 from process_helpers import addresses, may_be_real_time, real_time, segments_of
 from waiting import wait_for

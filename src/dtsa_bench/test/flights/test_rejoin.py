@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dtsa_dev.soak.flights import children, end_all, process_with
+from fly_helpers import children, end_all, process_with
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame_extended import decode_extended

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.soak.flights import children
+from fly_helpers import children
 from PIL import Image
 
 from dtsa_agent.core import make_scenario

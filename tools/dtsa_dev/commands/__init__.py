@@ -1,1 +1,0 @@
-"""Commands of a checkout beside those of `dtsa_bench.commands`."""
