@@ -1,17 +1,19 @@
-"""A round of messages without any protocol: what the middleware alone costs a slot.
+"""Real nodes in lockstep, recorded, beside rounds of messages without any protocol.
 
-One process publishes a number, every other process answers it, and the round is over when all answers are there: what a
-flight in lockstep does in every slot, with the same loop, quality of service and number of processes. As a module, this
-is the process that answers.
+In a bare round one process publishes a number, every other process answers it, and the round is over when all answers
+are there: what a flight in lockstep does in every slot, with the same loop, quality of service and number of processes.
+As a module, this is the process that answers.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from rclpy.context import Context
@@ -22,22 +24,46 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Loop, Stop
 from dtsa_agent.ros.common.process.node_process import init_ros, node_options, run_node
+from dtsa_bench.experiments.sweep.spec import run_config
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.domain import ros_domain
-from dtsa_bench.flights.flight import run_environment
+from dtsa_bench.flights.flight import fly, run_environment
+from dtsa_bench.flights.options import FlightOptions
 
+from . import Row
+
+TARGETS = ((4, 4, None), (12, 12, 200.0), (18, 1, 500.0), (70, 2, 200.0))  # agents, processes, slots/s
+SLOTS, REPEATS = 1000, 3
+RATIO = 2.5  # bare rounds over slots at most
 _ASK, _ANSWER, _OVER = "/bare_round/ask", "/bare_round/answer", 2**32 - 1
 _START_S = 60.0
 
 
-def rounds_per_s(processes: int, rounds: int, repeats: int) -> list[float]:
-    """Rounds per second, one value a repetition.
+def nodes() -> Iterator[Row]:
+    """Slots a second; where each agent has a process, bare rounds in turn: the machine changes within minutes."""
+    for agents, processes, limit in TARGETS:
+        run = run_config({"agents": agents, "timeout_s": SLOTS / 100, "stop_on_crash": False})
+        rates, bare = [], []
+        for _ in range(REPEATS):
+            with tempfile.TemporaryDirectory() as place:
+                options = FlightOptions(processes=processes, pictures=False)
+                summary = fly(run, Path(place) / "flight", options, label="benchmark").summary
+            rates.append(summary["slots"]["total"] / summary["wall_time_s"])
+            if processes == agents:
+                bare.append(rounds_per_s(processes, SLOTS, 2)[-1])  # the first ones are slower
+        row = Row(f"nodes in lockstep, agents {agents}, processes {processes}", f"{max(rates):.0f} slots/s")
+        if bare:
+            ratio = statistics.median(rounds / slots for rounds, slots in zip(bare, rates, strict=True))
+            row = row._replace(other=f"bare rounds {statistics.median(bare):.0f}/s", ratio=ratio)
+        if limit:
+            slow = row.ratio is not None and row.ratio > RATIO
+            target = f"{f'<= {RATIO:g}, ' * bool(bare)}>= {limit:g} slots/s"
+            row = row._replace(target=target, met=max(rates) >= limit and not slow)
+        yield row
 
-    :param processes: number of processes that answer.
-    :param rounds: rounds in one repetition.
-    :param repeats: number of repetitions.
-    :raises DtsaError: if a process ends, or they do not find each other.
-    """
+
+def rounds_per_s(processes: int, rounds: int, repeats: int) -> list[float]:
+    """Bare rounds a second with so many processes that answer, one value a repetition."""
     with ros_domain() as domain, tempfile.TemporaryDirectory() as place:
         context = Context()
         children = Children(Path(place), run_environment(domain, Path(place)))
