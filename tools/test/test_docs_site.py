@@ -17,12 +17,10 @@ pytest.importorskip("mkdocs")
 
 from dtsa_dev.registry import main
 
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.settings.declaration import settings_of
+
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [
-    *sorted((ROOT / "docs").rglob("*.md")),
-    *(ROOT / f"{name}.md" for name in ("REPRODUCTION", "CONTRIBUTING", "CHANGELOG")),
-]
-_ITEM = re.compile(r"(?P<indent> *)(?:[-*]|\d+\.) \S.*")
 _LINK = re.compile(r'<a [^>]*?href="([^"#]*)')
 _LOADED = re.compile(r'<(?:script|img|iframe)[^>]*? src="([^"]+)"|<link [^>]*?href="([^"]+)"')
 
@@ -62,26 +60,16 @@ def test_the_site_needs_no_network(site: Path) -> None:
         assert 'class="mermaid"' not in text, path.relative_to(site)
 
 
-def test_pages_made_from_the_code_are_in_the_search(site: Path) -> None:
+def test_pages_and_tables_are_made_from_the_code(site: Path) -> None:
     rows = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))["docs"]
     found = {row["location"]: row["text"] for row in rows}
     assert "flies every combination" in found["reference/commands.html#sweep"].lower()
     assert "reference/messages.html#report" in found
     assert any(place.startswith("reference/library.html#") and place.endswith(".Table") for place in found)
-
-
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_lists_are_lists_on_the_site_as_in_the_repository(path: Path) -> None:
-    """MkDocs' Markdown wants an empty line before a list or a table, and four spaces before a list in a list."""
-    text = re.sub(r"^```.*?^```$", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    for paragraph in re.split(r"\n\s*\n|^#.*$|^<!--.*-->$", text, flags=re.MULTILINE):
-        lines = paragraph.strip("\n").splitlines()
-        found = [_ITEM.match(line) for line in lines]
-        late = [line for line, item in zip(lines, found, strict=True) if item and not found[0] and lines[0][0] != " "]
-        assert not late, f"in a paragraph: {late[0]}"
-        near = [item[0] for item in found if item and len(item["indent"]) in (1, 2, 3)]
-        assert not near, f"too near to the margin: {near[0]}"
-        assert len({line.startswith("|") for line in lines}) <= 1, f"in a table's paragraph: {lines}"
+    settings = (site / "reference" / "settings.html").read_text(encoding="utf-8")
+    assert all(f"<code>{spec.name}</code>" in settings for spec in settings_of(SwarmConfig))
+    assert "<code>/swarm/slot</code>" in (site / "reference" / "nodes.html").read_text(encoding="utf-8")
+    assert not [path.name for path in pages(site) if "<!-- table:" in path.read_text(encoding="utf-8")]
 
 
 def test_dead_links_and_pages_that_nobody_finds_end_the_build(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from dtsa_dev.documents.pictures import PICTURES, slots
+from dtsa_dev.documents.pictures import PICTURES, play
 
 from dtsa_agent.core import SwarmConfig
 
@@ -19,9 +19,9 @@ def test_a_picture_is_what_its_code_draws(name: str) -> None:
 
 def test_a_frame_that_one_agent_misses_makes_choices_differ() -> None:
     config = SwarmConfig(agents=8, moving=8, policy="dtsa", scenario="waypoints", stops=4, seed=2)
-    whole, _ = slots(config, 199)
-    cut, moving = slots(config, 199, (183, 8))
+    whole, _ = play(config, 199)
+    cut, moving = play(config, 199, (183, 8))
     assert all(moving)
-    assert all(len(set(slot.taken)) == 1 and len(slot.senders) == 1 for slot in whole)
+    assert all(len(set(slot.chosen)) == 1 and len(slot.senders) == 1 for slot in whole)
     assert [slot.senders for slot in cut[:184]] == [slot.senders for slot in whole[:184]]
-    assert any(len(set(slot.taken)) > 1 for slot in cut[184:])
+    assert any(len(set(slot.chosen)) > 1 for slot in cut[184:])

@@ -147,11 +147,3 @@ def test_flight_models_take_the_kernels_parameters() -> None:
         model = flight_model(name)
         assert model.kind == NAMES["avoiders"].index(model.avoider_kind)
         assert set(model.avoider.to_dict()) == {spec.name for spec in settings_of(AvoiderParams)}
-
-
-def test_the_page_of_policies_lists_the_rows() -> None:
-    page = (CORE.parents[3] / "docs" / "reference" / "policies.md").read_text()
-    for row in POLICIES.rows.values():
-        assert f"| `{row.name}` | {row.decides} | {row.under_loss} |" in page
-    listed = page[page.index("Estimators: ") : page.index("The channel: ")]
-    assert all(f"`{name}`" in listed for name in (*ESTIMATORS.names, *AVOIDERS.names))

@@ -10,9 +10,9 @@ from pathlib import Path
 import dtsa
 from dtsa_agent.core.plugins import kinds
 from dtsa_bench.commands import cli, registry
+from dtsa_dev import registry as developers
 
-from .. import registry as developers
-from .markdown import table
+from . import table
 
 _TYPES = Path(__file__).resolve().parents[3] / "src" / "dtsa_msgs"
 _SETTINGS = ("RunConfig", "SwarmConfig", "ChannelConfig", "ClockConfig", "RunLimits")
@@ -78,10 +78,7 @@ def messages() -> str:
 
 
 def library() -> str:
-    """The page of the public names of `dtsa`, from their docstrings.
-
-    :raises ValueError: if a public name stands nowhere on the page.
-    """
+    """The page of the public names of `dtsa`, from their docstrings."""
     grouped = {name for names in _GROUPS.values() for name in names}
     if missing := set(dtsa.__all__) - grouped - {"REASONS", "__version__", "env"}:
         raise ValueError(f"public names of dtsa that no group of the page has: {', '.join(sorted(missing))}")

@@ -10,9 +10,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
-from dataclasses import dataclass, field
-from functools import cache
+from contextlib import redirect_stderr
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -34,10 +32,11 @@ from dtsa_bench.runs.config import RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 from dtsa_channel_sim.ros import channel_node
 
-from .markdown import table
+from . import table
 
 _EVERY_NODE = re.compile(r"/tf|/rosout|/parameter_events|.*/(\w*parameters?(_\w+)?|get_type_description)$")
 _ELSEWHERE = (SwarmConfig, ChannelConfig, RunLimits, ClockConfig)  # settings that have tables of their own
+_OF_ROS = ("use_sim_time", "start_type", "qos_overrides")
 _AGENT = re.compile(r"/cf\d+/")
 NODES: dict[str, tuple[Callable[[Sequence[str]], int], tuple[str, ...]]] = {
     "agent": (agent_node.main, ("id:=1", "agents:=2")),
@@ -49,92 +48,62 @@ NODES: dict[str, tuple[Callable[[Sequence[str]], int], tuple[str, ...]]] = {
 }
 
 
-@dataclass
-class Interface:
-    """What a node shows to others."""
-
-    topics: set[tuple[str, str, str, str]] = field(default_factory=set)  # topic, type, way, quality of service
-    services: set[tuple[str, str]] = field(default_factory=set)
-    parameters: dict[str, tuple[Any, Any]] = field(default_factory=dict)  # name: value, descriptor
-
-
 def node_tables(name: str) -> str:
-    """Topics, services and parameters of a node, as Markdown.
-
-    :param name: one of :data:`NODES`.
-    """
-    found = _interface(name)
-    parts = [table(("topic", "type", "", "quality of service"), sorted(found.topics))]
-    if found.services:
-        parts.append(table(("service", "type"), sorted(found.services)))
-    known = {spec.name for cls in _ELSEWHERE for spec in settings_of(cls)}
-    rows = [
-        (f"`{key}`", _shown(value), _allowed(info), info.description)
-        for key, (value, info) in sorted(found.parameters.items())
-        if key.rpartition(".")[2] not in known and not key.startswith(("use_sim_time", "start_type", "qos_overrides"))
-    ]
-    if rows:
-        parts.append(table(("parameter", "default", "allowed", "meaning"), rows))
-    return "\n".join(parts)
-
-
-@cache
-def _interface(name: str) -> Interface:
+    """Topics, services and parameters of a node, as Markdown."""
     main, values = NODES[name]
-    found = Interface()
-    keep = Node.destroy_node
+    parts: list[str] = []
+    destroy = Node.destroy_node
 
-    def look(node: Node) -> None:
-        _read(node, found)
-        keep(node)
+    def describe_and_destroy(node: Node) -> None:
+        parts[:] = _tables(node)
+        destroy(node)
 
-    arguments = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
-    for value in values:
-        arguments += ["-p", value]
-    with (
-        _quiet_place() as domain,
-        patch.object(Stop, "__bool__", lambda stop: True),
-        patch.object(Node, "destroy_node", look),
-        patch.dict(os.environ, {"ROS_DOMAIN_ID": str(domain)}),
-    ):
-        main(arguments)
-    return found
-
-
-@contextmanager
-def _quiet_place() -> Iterator[int]:
-    """A domain and a directory of its own, and nothing on the terminal; gives the domain."""
+    words = ["--ros-args", "--disable-stdout-logs", "--disable-external-lib-logs"]
+    words += [word for value in values for word in ("-p", value)]
     before = Path.cwd()
     with (
         tempfile.TemporaryDirectory() as directory,
         ros_domain() as domain,
         redirect_stderr(StringIO()),
         patch.dict(os.environ),
+        patch.object(Stop, "__bool__", lambda stop: True),
+        patch.object(Node, "destroy_node", describe_and_destroy),
     ):
         run_environment(domain, Path(directory))
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
         os.chdir(directory)
         try:
-            yield domain
+            main(words)
         finally:
             os.chdir(before)
+    return "\n".join(parts)
 
 
-def _read(node: Node, found: Interface) -> None:
-    ends = [(entry, "publishes") for entry in node.publishers]
-    ends += [(entry, "subscribes") for entry in node.subscriptions]
-    found.topics = {
-        (f"`{_AGENT.sub('/cfN/', entry.topic_name)}`", _type(entry.msg_type), way, _quality(entry.qos_profile))
-        for entry, way in ends
-        if not _EVERY_NODE.fullmatch(entry.topic_name)
+def _tables(node: Node) -> Iterator[str]:
+    def shown(name: str) -> str:
+        return f"`{_AGENT.sub('/cfN/', name)}`"
+
+    ends = [(end, end.topic_name, "publishes") for end in node.publishers]
+    ends += [(end, end.topic_name, "subscribes") for end in node.subscriptions]
+    topics = {
+        (shown(name), _type(end.msg_type), way, _quality(end.qos_profile))
+        for end, name, way in ends
+        if not _EVERY_NODE.fullmatch(name)
     }
-    found.services = {
-        (f"`{_AGENT.sub('/cfN/', entry.srv_name)}`", _type(entry.srv_type))
-        for entry in node.services
-        if not _EVERY_NODE.fullmatch(entry.srv_name)
-    }
-    found.parameters = {
-        name: (parameter.value, node.describe_parameter(name)) for name, parameter in node._parameters.items()
-    }
+    yield table(("topic", "type", "", "quality of service"), sorted(topics))
+    names = [(end.srv_name, _type(end.srv_type)) for end in node.services if not _EVERY_NODE.fullmatch(end.srv_name)]
+    if names:
+        yield table(("service", "type"), sorted({(shown(name), kind) for name, kind in names}))
+    known = {spec.name for cls in _ELSEWHERE for spec in settings_of(cls)}
+    rows = []
+    for name, parameter in sorted(node._parameters.items()):
+        if name.rpartition(".")[2] not in known and not name.startswith(
+            ("use_sim_time", "start_type", "qos_overrides")
+        ):
+            info = node.describe_parameter(name)
+            rows.append((f"`{name}`", _value(parameter.value), _allowed(info), info.description))
+    if rows:
+        yield table(("parameter", "default", "allowed", "meaning"), rows)
 
 
 def _type(kind: Any) -> str:
@@ -147,7 +116,7 @@ def _quality(profile: QoSProfile) -> str:
     return f"{reliable}{kept}, last {profile.depth}"
 
 
-def _shown(value: Any) -> str:
+def _value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return "" if value is None or value == "" else f"`{Parameter('x', value=value).value}`"

@@ -14,7 +14,7 @@ from dtsa_agent.air.serial.settings import SerialSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_channel_sim.model.airtime import RADIOS
 
-from .markdown import table
+from . import table
 
 _AGENTS, _MOVING, _SEEDS = 12, 4, 20
 _GUARD_NS = 70_000  # docs/evidence/league.md, "Which slot length can this hardware do?"

@@ -1,4 +1,4 @@
-"""What the site needs beyond pages in `docs` (hooks of MkDocs): pages made from the code, and files of the repository.
+"""What the site needs beyond pages in `docs` (hooks of MkDocs): pages and tables made from the code, other files.
 
 A page may link to any file of the repository, as it does when it is read there. On the site README's neighbours are
 pages, other files are copied to `files/`, and a directory's name is no link.
@@ -18,7 +18,8 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[3]
 if str(ROOT / "tools") not in sys.path:
     sys.path.insert(0, str(ROOT / "tools"))
-from dtsa_dev.documents import code_pages  # noqa: E402
+from dtsa_bench.recordings.tables.columns import describe  # noqa: E402
+from dtsa_dev.documents import pages, tables  # noqa: E402
 
 #: Pages that stand at the top of the repository, and where they are on the site.
 TOP = {
@@ -27,9 +28,10 @@ TOP = {
     "CHANGELOG.md": "project/changelog.md",
 }
 MADE = {
-    "reference/commands.md": code_pages.commands,
-    "reference/messages.md": code_pages.messages,
-    "reference/library.md": code_pages.library,
+    "reference/columns.md": describe,
+    "reference/commands.md": pages.commands,
+    "reference/messages.md": pages.messages,
+    "reference/library.md": pages.library,
 }
 #: How much more, or less, a page of a part counts in a search; `search: {boost: N}` at a page's head overrides it.
 BOOST = {"tutorials": 1.5, "how-to": 2.0, "evidence": 0.7, "project": 0.2, "reference/library.md": 0.5}
@@ -52,7 +54,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: Any, files: Files) -> str:
-    """Makes links to the repository's files links to what the site has of them, and says what counts in a search."""
+    """Fill in tables, link to what the site has of the repository's files, and set what counts in a search."""
     place = page.file.src_uri
     boost = BOOST.get(place, BOOST.get(place.partition("/")[0], 1.0))
     page.meta.setdefault("search", {}).setdefault("boost", boost)
@@ -67,7 +69,7 @@ def on_page_markdown(markdown: str, page: Page, config: Any, files: Files) -> st
         anchor = url.partition("#")[1] + url.partition("#")[2]
         return f"[{found['label']}]({os.path.relpath(_on_site(path), Path(place).parent)}{anchor})"
 
-    return _LINK.sub(link, markdown)
+    return _LINK.sub(link, tables.filled(markdown))
 
 
 def on_page_content(html: str, page: Page, config: Any, files: Files) -> str:
