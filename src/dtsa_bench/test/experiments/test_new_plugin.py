@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import os
-import runpy
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-import dtsa
 from dtsa_agent.core import ConfigError
-from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.experiments.plugin_template import write_package
 from dtsa_bench.experiments.sweep import spec
 
@@ -71,24 +67,6 @@ raise SystemExit(main(["simulate", "--agents", "4", "--policy", "myrule", "--opt
 """
     ended = subprocess.run([sys.executable, "-c", text], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert ended.returncode == 0, ended.stderr
-
-
-def test_ages_in_the_tutorial_are_those_of_the_simulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_package("my-policy", tmp_path / "package")
-    monkeypatch.setattr(POLICIES, "_plug_ins", {})
-    monkeypatch.setattr(POLICIES, "registered", set())
-    POLICIES.register("my-policy", runpy.run_path(str(tmp_path / "package/src/my_policy/__init__.py"))["MyPolicy"])
-
-    def age(policy: str, **settings: Any) -> float:
-        found = dtsa.simulate(agents=12, moving=2, policy=policy, **settings).summary["age_mean_slots"]
-        assert isinstance(found, float)
-        return found
-
-    page = (Path(__file__).resolve().parents[4] / "docs/tutorials/own-scheme.md").read_text(encoding="utf-8")
-    assert f"`age mean slots {age('my-policy'):.3f}`" in page
-    assert f"TDMA has {age('tdma'):.1f} here, `lease` {age('lease'):.1f}." in page
-    assert "my-policy.tdma_every=5\n" in page
-    assert f"falls to `{age('my-policy', options={'my-policy.tdma_every': 5}):.3f}`" in page
 
 
 def test_what_is_there_stays(tmp_path: Path) -> None:

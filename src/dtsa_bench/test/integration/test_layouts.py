@@ -13,9 +13,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 from bag_helpers import typestore
 from rosbags.interfaces import Nodetype
 
+from dtsa_agent.ros.common.graph import names
+
+SHARE = Path(__file__).resolve().parents[2]
 LAYOUTS = Path(__file__).resolve().parents[4] / "layouts"
 TYPES = {
     "/swarm/slot": "dtsa_msgs/msg/Slot",
@@ -193,9 +197,9 @@ def test_other_numbers_of_agents(make: ModuleType) -> None:
     assert "/cf70/odom" in make.foxglove(70)
     assert "/cf3/odom" not in make.foxglove(2)
     for agents, pairs in ((1, 1), (3, 2), (70, 5)):  # with one agent a pair stays, from which others are made again
-        names = [curve.get("name", "") for curve in ElementTree.fromstring(make.plotjuggler(agents)).iter("curve")]
-        assert sum(name.startswith("age of") for name in names) == agents
-        assert sum(name.startswith("distance") for name in names) == pairs
+        curves = [curve.get("name", "") for curve in ElementTree.fromstring(make.plotjuggler(agents)).iter("curve")]
+        assert sum(name.startswith("age of") for name in curves) == agents
+        assert sum(name.startswith("distance") for name in curves) == pairs
 
 
 def test_nonsense_is_refused() -> None:
@@ -203,3 +207,21 @@ def test_nonsense_is_refused() -> None:
         result = subprocess.run([sys.executable, str(LAYOUTS / "make.py"), *words], capture_output=True, text=True)
         assert result.returncode == 2
         assert "allowed: one number" in result.stderr
+
+
+def test_the_model_of_a_quadcopter_hangs_on_the_frame_that_transforms_name() -> None:
+    body = names.body_frame(names.agent_namespace(3, "/north"))
+    text = (SHARE / "urdf/quadcopter.urdf").read_text(encoding="utf-8").replace("${PREFIX}", "north/cf3/")
+    robot = ElementTree.fromstring(text)
+    links = {link.attrib["name"] for link in robot.iter("link")}
+    children = {child.attrib["link"] for child in robot.iter("child")}
+    parents = {parent.attrib["link"] for parent in robot.iter("parent")}
+    assert links - children == parents == {body}
+    assert len(links) == 5
+
+
+def test_the_picture_of_the_swarm_shows_its_markers() -> None:
+    content = yaml.safe_load((SHARE / "rviz/swarm.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
+    topics = [display["Topic"]["Value"] for display in content["Displays"] if "Topic" in display]
+    assert topics == [f"{names.SWARM}/{names.MARKERS}"]
+    assert content["Global Options"]["Fixed Frame"] == names.FRAME

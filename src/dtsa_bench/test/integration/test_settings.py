@@ -1,16 +1,14 @@
-"""Every settings object survives a round trip; the tables of the documentation are those of the code."""
+"""Integration: every settings object survives a round trip through plain values, JSON, YAML and ROS parameters."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from dtsa_dev.documents.settings_tables import TABLES, rewritten
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
@@ -24,9 +22,8 @@ from dtsa_bench.crazyflies.simulated import FleetConfig
 from dtsa_bench.experiments.sweep import aggregate, spec
 from dtsa_bench.experiments.sweep.columns import RESERVED
 from dtsa_bench.runs.config import LOCKSTEP, MODES, RunConfig, RunLimits
-from dtsa_channel_sim import CHANGEABLE, ChannelConfig, ClockConfig
+from dtsa_channel_sim import ChannelConfig, ClockConfig
 
-DOCS = Path(__file__).resolve().parents[4] / "docs"
 MANY = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
 
 
@@ -277,21 +274,6 @@ def test_all_columns_of_the_results_are_reserved() -> None:
     assert RESERVED & settings_names == {"seed"}
 
 
-# -- documentation ---------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("path", sorted(DOCS.rglob("*.md")), ids=lambda path: str(path.relative_to(DOCS)))
-def test_tables_of_settings_are_those_of_the_code(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert rewritten(text) == text, "run: python -m dtsa_dev.documents.settings_tables docs/*/*.md"
-
-
-def test_every_setting_is_in_the_documentation() -> None:
-    text = "".join(path.read_text(encoding="utf-8") for path in DOCS.rglob("*.md"))
-    missing = {name for name in TABLES if f"<!-- settings: {name} -->" not in text}
-    assert missing <= {"flight models, none"}
-    assert all(f"| `{name}` * |" in text for name in CHANGEABLE)
-
-
-def test_a_table_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ConfigError, match="SwarmConfig"):
-        rewritten("<!-- settings: SwarmSettings -->\n<!-- end -->\n")
-    assert "| `agents` | 12 |" in rewritten("<!-- settings: SwarmConfig -->\nold\n<!-- end -->\n")
+def test_every_setting_has_a_help_text() -> None:
+    for cls in (SwarmConfig, ChannelConfig, ClockConfig, RunLimits, RunConfig, SafetySettings, FleetConfig):
+        assert all(spec.help for spec in settings_of(cls)), cls.__name__

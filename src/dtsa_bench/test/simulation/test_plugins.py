@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -367,14 +366,6 @@ def test_an_option_that_no_plug_in_has_is_refused_with_the_nearest(
 def test_options_of_plug_ins_that_do_not_fly_are_allowed() -> None:
     for _ in range(2):
         SwarmConfig(policy="tdma", options={"event-tdma.error_m": 0.1, "damped.rest_s": 2.0})
-
-
-def test_the_page_lists_the_fields_of_the_table() -> None:
-    page = (EXAMPLE.parents[1] / "docs" / "reference" / "plug-ins.md").read_text(encoding="utf-8")
-    rows = page.partition("| field | what it is |\n|---|---|\n")[2].partition("\n\n")[0].splitlines()
-    assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row.split("|")[1])) == sorted(
-        plugins.Table.__slots__
-    )
 
 
 def test_random_numbers_of_plug_ins_follow_from_seed_agent_and_name() -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dtsa_dev.documents.slot_lengths import rewritten, ring
 from dtsa_dev.protocol.experiment import Experiment
 from dtsa_dev.protocol.optimum import optimum
 
@@ -21,7 +20,6 @@ from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings.config import StationSettings, SwarmSettings
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
-from dtsa_bench.experiments.sweep import spec
 from dtsa_bench.experiments.sweep.spec import run_config
 from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
@@ -33,8 +31,6 @@ from dtsa_bench.simulation.unslotted import UnslottedTraffic
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.airtime import Airtime
 from dtsa_channel_sim.model.verdict import COLLISION
-
-LEAGUE = Path(__file__).resolve().parents[4] / "docs" / "evidence" / "league.md"
 
 
 def steady(
@@ -323,12 +319,6 @@ def test_beacons_behind_lines_wait_for_receptions_and_are_heard_all_the_same() -
     assert 0 < heard_behind < heard
 
 
-def test_the_table_of_token_rings_is_what_the_flights_give() -> None:
-    """Its first row."""
-    (row,) = (line for line in ring([(4, 0.0)]).splitlines() if line.startswith("| 4, none"))
-    assert row in LEAGUE.read_text(encoding="utf-8").splitlines()
-
-
 def test_the_token_ring_survives_losses_and_is_for_twenty() -> None:
     config = SwarmConfig(agents=4, policy="dtr", seed=5, slot_ms=2)
     air = UnslottedTraffic(make_swarm(config), Channel(ChannelConfig(agents=4, slot_ns=2_000_000, seed=5, loss=0.3)))
@@ -452,34 +442,3 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
         simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="wrong-genie")))
     with pytest.raises(PluginError, match="policy stuck, wake: gave 0 ns"):
         simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="stuck")))
-
-
-def test_the_table_of_slot_lengths_is_what_the_model_says() -> None:
-    text = LEAGUE.read_text(encoding="utf-8")
-    assert rewritten(text, ["lengths"]) == text, "run: python -m dtsa_dev.documents.slot_lengths FILE"
-    rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| nRF51")]
-    assert len(rows) >= 10
-    for _, policy, *parts, shortest, constant in (map(str.strip, row) for row in rows):
-        turn, frame, guard, from_radio, decide, to_radio = (
-            float(part.split("x ")[-1].split()[0]) if part else 0.0 for part in parts
-        )
-        length = int(policy.rsplit(", ", 1)[1])
-        assert from_radio == pytest.approx((8 + length) / 100)
-        assert to_radio == pytest.approx((7 + length) / 100 if policy.startswith("dtsa") else 0.0)
-        on_air = turn + frame + 2 * guard
-        slot_ms, constant_ms = (float(text.strip("* ms")) for text in (shortest, constant))
-        assert slot_ms == pytest.approx(on_air + from_radio + decide + to_radio, abs=6e-3)
-        assert constant_ms == pytest.approx(on_air + (0.6 + decide if decide else 0.0), abs=6e-3)
-
-
-def test_the_table_of_ages_at_these_slots_is_what_the_flights_give() -> None:
-    """Its first column of `lease`."""
-    text = LEAGUE.read_text(encoding="utf-8").split("<!-- slots: ages -->")[1]
-    (row,) = (line for line in text.splitlines() if line.startswith("| lease |"))
-    sweep = spec.load_preset("crazyflie-radio")
-    labels = {"swarm": "12, 2 moving", "frames lost": "none", "scheme and radio": "lease"}
-    (cell,) = (cell for cell in sweep.cells if cell.labels == labels)
-    flown = [simulate(cell.run(seed)).summary() for seed in sweep.seeds]
-    assert not any(summary["collided"] for summary in flown)
-    age_ms = sum(summary["age_mean_ms"] for summary in flown) / len(flown)
-    assert [part.strip() for part in row.split("|")[2:4]] == [f"{cell.run(1001).swarm.slot_ms:g} ms", f"{age_ms:.1f}"]
