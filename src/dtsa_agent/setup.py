@@ -1,8 +1,11 @@
 """Build of dtsa_agent: Python packages, the compiled kernel of the protocol core, executables, plugins."""
 
+import re
 from glob import glob
+from pathlib import Path
 from xml.etree import ElementTree
 
+from cffi import FFI, recompiler
 from setuptools import Extension, find_packages, setup
 
 NAME = "dtsa_agent"
@@ -21,15 +24,33 @@ COMPILE_FLAGS = [
     "-Wno-psabi",  # vectors are passed between inlined functions only
 ]
 
-LIBRARY, SIMULATOR, BINDING = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim", "dtsa_agent/core/_kernel"
+LIBRARY, SIMULATOR = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim"
+# What Python sees of both: all that these headers declare, in the order in which they include each other.
+HEADERS = [f"{LIBRARY}/{name}.h" for name in ("include/dtsa", "frame", "core", "avoider/avoider")]
+HEADERS += [f"{SIMULATOR}/{name}.h" for name in ("vehicle", "swarm", "metrics")]
 HEARING, SOCKET = "dtsa_agent/air/_hearing", "dtsa_agent/air/udp/_socket"
 QUEUE = "dtsa_agent/air/_queue"
 OF_THE_LIBRARY = ("draw", "frame", "tag", "timebase")  # what an agent on a network uses without Python between
 
 
-def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR, BINDING)) -> list[str]:
-    """Sources of the compiled core with a suffix: one agent, many agents, the binding to Python."""
+def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR)) -> list[str]:
+    """Sources of the compiled core with a suffix: one agent, many agents."""
     return [path for folder in folders for path in sorted(glob(f"{folder}/**/*{suffix}", recursive=True))]
+
+
+def binding() -> str:
+    """Write the C code by which Python calls what HEADERS declare (cffi, limited API); return its path."""
+    text = "\n".join(Path(header).read_text(encoding="utf-8") for header in HEADERS)
+    text = re.sub(r"/\*.*?\*/|#ifdef __cplusplus.*?#endif", "", text, flags=re.DOTALL)
+    text = re.sub(r"^#define (DTSA_VERSION) (\d+)$", r"enum { \1 = \2 };", text, flags=re.MULTILINE)
+    text = re.sub(r"^#.*$|\bDTSA_API\b", "", text, flags=re.MULTILINE)
+    ffi = FFI()
+    ffi.cdef(text, override=True)  # one function may stand in two headers
+    path = Path("build/binding/_kernel.c")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    includes = "".join(f'#include "{Path(header).name}"\n' for header in HEADERS)
+    recompiler.make_c_source(ffi, "dtsa_agent.core._kernel", includes, str(path))  # a file that is right stays
+    return str(path)
 
 
 setup(
@@ -39,11 +60,11 @@ setup(
     ext_modules=[
         Extension(
             "dtsa_agent.core._kernel",
-            sources=files(".c"),
+            sources=[binding(), *files(".c")],
             depends=[*files(".h"), "setup.py"],
-            include_dirs=[f"{LIBRARY}/include", LIBRARY, SIMULATOR, BINDING],
+            include_dirs=[f"{LIBRARY}/include", f"{LIBRARY}/avoider", LIBRARY, SIMULATOR],
             extra_compile_args=COMPILE_FLAGS,
-            py_limited_api=True,  # module.c says so, too: one compiled file for Python 3.10 and later
+            py_limited_api=True,  # cffi's code says so, too: one compiled file for Python 3.10 and later
             libraries=["m"],
         ),
         Extension(

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-
 import pytest
 from dtsa_dev.proofs.both_statements import Differs, Setting, fly_both, random_setting
 
-from dtsa_agent.core import AbstractSwarm, ConfigError, Swarm, SwarmConfig
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.reference.lease import issue, listen
-from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
 from dtsa_channel_sim import ChannelConfig
 
 SAMPLE = 10  # settings; `dtsa soak statements` has 200
@@ -52,48 +47,3 @@ def test_a_rule_that_differs_is_found(monkeypatch: pytest.MonkeyPatch, module: o
     monkeypatch.setattr(module, name, value)
     with pytest.raises(Differs, match="slot"):
         fly_both(random_setting(36, "lease", lasts=True))
-
-
-FLIGHT = (
-    "--policy", "lease", "--agents", "4", "--moving", "2", "--loss", "0.1", "--avoider", "none", "--jitter-m", "0.05",
-    "--axis-y-m", "3", "--timeout-s", "3", "--json", "--no-stop-on-crash",
-)  # fmt: skip
-WITHOUT_KERNEL = """
-import sys
-sys.modules["dtsa_agent.core._kernel"] = None
-from dtsa_bench.commands.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-def simulated(*words: str, kernel: bool) -> subprocess.CompletedProcess[str]:
-    command = ["-m", "dtsa_bench"] if kernel else ["-c", WITHOUT_KERNEL]
-    return subprocess.run(
-        [sys.executable, *command, "simulate", *words], capture_output=True, text=True, timeout=120, check=False
-    )
-
-
-def test_simulate_flies_on_the_specification_where_no_compiler_is() -> None:
-    """And with the same results to the digit, but for the time it takes."""
-    results = []
-    for kernel, words in ((True, ()), (True, ("--core", "reference")), (False, ("--core", "reference"))):
-        done = simulated(*FLIGHT, *words, kernel=kernel)
-        assert done.returncode == 0, done.stderr
-        results.append(
-            {k: v for k, v in json.loads(done.stdout).items() if k not in ("wall_time_s", "realtime_factor")}
-        )
-    assert results[0] == results[1] == results[2]
-    assert results[0]["age_mean_slots"] > 0
-    refused = simulated(*FLIGHT, kernel=False)
-    assert refused.returncode == 2
-    assert "core: got 'compiled'; allowed: reference" in refused.stderr
-    assert "Traceback" not in refused.stderr
-
-
-def test_a_swarm_says_what_moves_it() -> None:
-    config = SwarmConfig(agents=3)
-    swarm: AbstractSwarm = Swarm(config, core="reference", shared_table=True)
-    assert isinstance(swarm, ReferenceSwarm)
-    assert type(Swarm(config)) is Swarm
-    with pytest.raises(ConfigError, match="compiled, reference"):
-        Swarm(config, core="other")

@@ -12,7 +12,7 @@ import pytest
 from dtsa_dev.protocol.experiment import Event, Experiment, random_schedule
 
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
-from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
+from dtsa_agent.core.frame import ExtendedFrame, encode_extended
 from dtsa_bench.recordings.rules.judge import Judge
 from dtsa_bench.recordings.rules.ledger import Ledger
 from dtsa_bench.recordings.verify.result import Mismatch, Result

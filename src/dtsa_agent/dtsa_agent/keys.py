@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import os
 
-from dtsa_agent.core.agents.authentication import AuthenticatedSwarm, Authenticator
+from dtsa_agent.core.authentication import Authenticator
 
-from .core import AbstractSwarm, ConfigError, SwarmConfig
+from .core import ConfigError, Swarm, SwarmConfig
 
 VARIABLE = "DTSA_AUTH_KEY"
 
 
-def with_key(swarm: AbstractSwarm) -> AbstractSwarm:
+def with_key(swarm: Swarm) -> Swarm:
     """The swarm, with its frames authenticated if its settings say so (``auth``).
 
-    :param swarm: as it was made.
     :raises ConfigError: if there is no key, or none that is usable.
     """
-    found = authenticator(swarm.config)
-    return AuthenticatedSwarm(swarm, found) if found else swarm
+    swarm.authenticator = authenticator(swarm.config)
+    return swarm
 
 
 def check_key(config: SwarmConfig) -> None:
     """Looks whether there is a usable key where the settings ask for one, before anything is started or written.
 
-    :param config: the swarm's settings.
     :raises ConfigError: if there is none.
     """
     authenticator(config)
@@ -33,7 +31,6 @@ def check_key(config: SwarmConfig) -> None:
 def check_session(config: SwarmConfig) -> None:
     """Whether sealed frames say which flight they are of, where no channel's node draws that.
 
-    :param config: the swarm's settings.
     :raises ConfigError: if they do not: frames of earlier flights, played again, would count as genuine.
     """
     if config.auth and not config.auth_session:
@@ -44,7 +41,6 @@ def check_session(config: SwarmConfig) -> None:
 def authenticator(config: SwarmConfig) -> Authenticator | None:
     """What seals and opens the frames of a swarm; None if its settings do not ask for that.
 
-    :param config: the swarm's settings.
     :raises ConfigError: if there is no key, or none that is usable.
     """
     if not config.auth:

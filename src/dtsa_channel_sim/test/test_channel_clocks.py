@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.reference.alignment import ClockAligner
+from dtsa_agent.core.reference.timebase import ClockAligner
 from dtsa_channel_sim import Air, Channel, ChannelConfig, ClockConfig, make_clocks
 
 MS = 1_000_000

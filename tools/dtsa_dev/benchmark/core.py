@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.frame import Frame, decode_frame, encode_frame
+from dtsa_agent.core.kernel import lib, memory
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS
-from dtsa_agent.core.swarms.priority import priority
 from dtsa_bench.experiments.sweep.spec import run_config
 from dtsa_bench.simulation.simulate import simulate
 
@@ -69,8 +69,10 @@ def kernels() -> Iterator[Row]:
     """The priorities g of all agents beside vectorised NumPy, the frame's codec, and avoidance beside pyrvo's."""
     for agents in SIZES:
         p, v = np.random.default_rng(1).normal(size=(2, agents, 3)) * np.array([[[5.0]], [[1.0]]])
-        assert np.allclose(priority(p, v, STEP_S), _numpy_priority(p, v, STEP_S), rtol=1e-9)
-        ours, plain = (1e6 * seconds(partial(f, p, v, STEP_S)) for f in (priority, _numpy_priority))
+        g, call = _priorities(p, v)
+        call()
+        assert np.allclose(g, _numpy_priority(p, v, STEP_S), rtol=1e-9)
+        ours, plain = (1e6 * seconds(f) for f in (call, partial(_numpy_priority, p, v, STEP_S)))
         yield Row(f"priorities of all, N = {agents}", f"{ours:.3g} us", f"NumPy {plain:.3g} us", ours / plain)
     frame = Frame(7, 1234, 1, (1.0, -2.0, 0.5), (0.3, 0.2, -0.1))
     data = encode_frame(frame)
@@ -80,6 +82,15 @@ def kernels() -> Iterator[Row]:
         ours, pyrvo = _avoidance_us(agents)
         other = {"other": f"pyrvo {pyrvo:.3g} us", "ratio": ours / pyrvo} if pyrvo else {"other": "pyrvo is missing"}
         yield Row(f"avoidance of all, N = {agents}", f"{ours:.3g} us", **other)
+
+
+def _priorities(position: Array, velocity: Array) -> tuple[Array, Callable[[], object]]:
+    """The array of the values g of all agents, and the call that fills it."""
+    agents = len(position)
+    p, v = np.ascontiguousarray(position.T), np.ascontiguousarray(velocity.T)
+    g, scratch = np.zeros(agents), np.zeros(lib.priority_scratch_doubles(agents))
+    arrays = [memory(array) for array in (p, v, g, scratch)]
+    return g, lambda: lib.priority_values(agents, STEP_S, *arrays)
 
 
 def _numpy_priority(position: Array, velocity: Array, slot_s: float) -> Array:

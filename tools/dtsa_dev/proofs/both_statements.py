@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.core import REASONS, AbstractSwarm, Swarm, SwarmConfig, make_scenario
+from dtsa_agent.core import REASONS, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
+from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_dev.protocol.experiment import random_schedule
 
@@ -22,12 +22,16 @@ GOALS, FAR = ("go", "go", "stop", "rest"), 30.0  # m
 SHORT, LONG = 300, 1700  # slots
 FAULTS = ("die", "join", "join", "restart", "leave")
 
-# What a swarm is compared by after every slot, besides senders and frames.
-_COMPARED = (
+# What a swarm is compared by after every slot, besides senders and frames: of agents, of tables, and estimates, which
+# a shared table has of all.
+_OF_AGENTS = (
     "chosen", "reason", "score", "digest", "sends", "present", "position", "velocity", "command", "track",
-    "sent_position", "sent_velocity", "sent_intent", "sent_slot", "last_turn", "in_ap", "entry_hash", "table_hash",
-    "estimate_position", "estimate_velocity", "priority", "counter",
 )  # fmt: skip
+_OF_TABLES = (
+    "sent_position", "sent_velocity", "sent_intent", "sent_slot", "last_turn", "in_ap", "entry_hash", "table_hash",
+    "priority", "counter",
+)  # fmt: skip
+_ESTIMATES = ("estimate_position", "estimate_velocity")
 
 
 class Differs(DtsaError):
@@ -143,7 +147,7 @@ def _deaths_and_returns(random: np.random.Generator, swarm: SwarmConfig) -> Iter
             yield Fault(slot, GOALS[random.integers(len(GOALS))], agent)
 
 
-def happen(fault: Fault, swarm: AbstractSwarm) -> None:
+def happen(fault: Fault, swarm: Swarm) -> None:
     """Lets a fault happen to a swarm all of whose agents are here, before a slot begins."""
     k = fault.agent - 1
     if fault.kind == "die":
@@ -156,17 +160,15 @@ def happen(fault: Fault, swarm: AbstractSwarm) -> None:
         swarm.goal[:, k] = swarm.position[:, k]
         swarm.goal[0, k] += FAR if fault.kind == "go" else 0.0
         swarm.final[k] = fault.kind == "rest"
-    elif fault.kind == "restart" and swarm.present[k] and not swarm.shared:
+    elif fault.kind == "restart" and swarm.present[k]:
         swarm.restart(k)
 
 
 def fly_both(setting: Setting) -> Mapping[str, Any]:
     """Flies a setting on the compiled core and on the specification, side by side."""
     scenario = make_scenario(setting.swarm)
-    pair: tuple[AbstractSwarm, AbstractSwarm] = (
-        Swarm(setting.swarm, scenario, shared_table=setting.shared),
-        ReferenceSwarm(setting.swarm, scenario, shared_table=setting.shared),
-    )
+    pair = Swarm(setting.swarm, scenario, shared_table=setting.shared), ReferenceSwarm(setting.swarm, scenario)
+    pair[1].shares = setting.shared
     channel = Channel(setting.channel)
     faults: dict[int, list[Fault]] = {}
     for fault in setting.faults:
@@ -175,17 +177,17 @@ def fly_both(setting: Setting) -> Mapping[str, Any]:
     reasons = np.zeros(len(REASONS), dtype=np.int64)
     for slot in range(setting.slots):
         for fault in faults.get(slot, ()):
-            for swarm in pair:
+            for swarm in () if fault.kind == "restart" and pair[0].shared else pair:
                 happen(fault, swarm)
         pair = _fly_slot(pair, channel, slot, figures)
-        _compare(pair, slot)
+        _compare(pair, slot, estimates=not setting.shared)
         reasons += np.bincount(pair[0].reason, minlength=len(REASONS))
     return {**figures, "reasons": {name: int(n) for name, n in zip(REASONS, reasons, strict=True) if n}}
 
 
 def _fly_slot(
-    pair: tuple[AbstractSwarm, AbstractSwarm], channel: Channel, slot: int, figures: dict[str, int]
-) -> tuple[AbstractSwarm, AbstractSwarm]:
+    pair: tuple[Swarm, ReferenceSwarm], channel: Channel, slot: int, figures: dict[str, int]
+) -> tuple[Swarm, ReferenceSwarm]:
     compiled, plain = pair
     for swarm in pair:
         scenario = swarm.scenario
@@ -204,7 +206,8 @@ def _fly_slot(
         swarm.fly(slot)
     lost = verdict.received is not None and not verdict.received.all()
     if compiled.shared and (lost or len(senders) > 1):
-        pair = compiled, plain = compiled.with_own_tables(slot), plain.with_own_tables(slot)
+        pair = compiled, plain = compiled.with_own_tables(slot), plain
+        plain.shares = False
     if verdict.received is not None or len(senders) == 1:
         for row, data in enumerate(frames):
             mask = None if verdict.received is None or compiled.shared else verdict.received[row]
@@ -218,10 +221,12 @@ def _fly_slot(
     return pair
 
 
-def _compare(pair: tuple[AbstractSwarm, AbstractSwarm], slot: int) -> None:
+def _compare(pair: tuple[Swarm, ReferenceSwarm], slot: int, estimates: bool) -> None:
     compiled, plain = pair
-    for name in _COMPARED:
+    for name in (*_OF_AGENTS, *_OF_TABLES, *(_ESTIMATES if estimates else ())):
         ours, theirs = getattr(compiled, name), getattr(plain, name)
+        if compiled.shared and name in _OF_TABLES:
+            theirs = theirs[:1]
         if name == "priority":  # of those on whom the choice depended
             theirs = np.where(np.isnan(ours), ours, theirs)
         if ours.tobytes() != theirs.tobytes():

@@ -17,11 +17,10 @@ from dtsa_agent.core.agents.agent import AgentGroup
 from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.agents.pacing import BETWEEN, LEAD, MOST_EARLY, latest_send_ns, too_long_ns
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
-from dtsa_agent.core.frame import condition_in
-from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.frame import condition_in, decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
+from dtsa_agent.core.swarm import PRESENT_LEAVING, Swarm
 from dtsa_agent.keys import authenticator, check_session
 from dtsa_agent.stop import Stop
 
@@ -81,7 +80,7 @@ class AirAgent:
         self.own, self.config, self._port = own, config, port
         check_fits(config, port.properties)
         wrapping = Wrapping(config, authenticator(config), port=port.properties)
-        self.swarm: AbstractSwarm = make_swarm(config, local=[own.id])
+        self.swarm: Swarm = make_swarm(config, local=[own.id])
         self._group = AgentGroup(self.swarm)
         self._present, self._chosen = self.swarm.present.data, self.swarm.chosen.data
         self._active = self.swarm.active.data

@@ -24,13 +24,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from dtsa_agent.core.agents.authentication import Authenticator
 from dtsa_agent.core.agents.pacing import BETWEEN
+from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import named_in
 from dtsa_agent.core.registry import POLICIES
-from dtsa_agent.core.settings.agreement import agreed_settings, settings_hash
-from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
 
 from .delay import Peer
 from .port import Header, PortProperties

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 from dtsa_agent.core.frame import position_step
-from dtsa_agent.core.reference.timebase import ALONE, JOINED, LISTENING
 from dtsa_agent.core.settings.config import SwarmConfig
 
 from ._hearing import Hearing
@@ -34,7 +33,7 @@ REASONS = (
     "", NOT_OURS, LENGTH, OTHER_SETTINGS, NO_FRAME, UNKNOWN, REJECTED, REPEATED, OTHER_TIME, OWN_ID,
 )  # fmt: skip
 OF_OWN_NAME = REASONS.index(OWN_ID)
-STATES = (LISTENING, ALONE, JOINED)
+STATES = ("listening", "alone", "joined")  # of a time base, in the order of libdtsa's numbers
 
 
 def make_hearing(config: SwarmConfig, own: AgentSettings, wrapping: Wrapping, port: DatagramPort) -> Hearing:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from dtsa_agent.core.swarms.abstract_swarm import Floats
+from dtsa_agent.core.swarm import Floats
 
 
 @dataclass(frozen=True, slots=True)

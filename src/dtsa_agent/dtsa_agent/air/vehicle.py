@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarm import Swarm
 
 
 class Vehicle(Protocol):
@@ -13,13 +13,13 @@ class Vehicle(Protocol):
     def ready(self) -> bool:
         """Whether it is known where the vehicle is: the agent listens and speaks only from then on."""
 
-    def sense(self, swarm: AbstractSwarm) -> None:
+    def sense(self, swarm: Swarm) -> None:
         """Writes where the vehicle is, and how it moves, into its agent.
 
         :param swarm: the agent, between two slots.
         """
 
-    def fly(self, swarm: AbstractSwarm, slot: int) -> None:
+    def fly(self, swarm: Swarm, slot: int) -> None:
         """Flies through a slot.
 
         :param swarm: the agent, after it has decided.
@@ -34,13 +34,13 @@ class SimulatedVehicle:
         """Always."""
         return True
 
-    def sense(self, swarm: AbstractSwarm) -> None:
+    def sense(self, swarm: Swarm) -> None:
         """The agent's arrays are the vehicle.
 
         :param swarm: the agent.
         """
 
-    def fly(self, swarm: AbstractSwarm, slot: int) -> None:
+    def fly(self, swarm: Swarm, slot: int) -> None:
         """See :class:`Vehicle`.
 
         :param swarm: the agent.

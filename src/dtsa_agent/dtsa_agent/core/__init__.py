@@ -3,17 +3,14 @@
 from dtsa_agent.core.agents.agent import Agent, AgentGroup, Decision
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import Scenario, make_scenario, plug_in_random
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
-from dtsa_agent.core.swarms.outcome import SlotOutcome
-from dtsa_agent.core.swarms.priority import priority, select
-from dtsa_agent.core.swarms.swarm import Swarm
 
 from .errors import ConfigError, DtsaError, LocalProtocolError, PluginError, RemoteProtocolError
 from .frame import Frame, decode_frame, encode_frame
 from .registry import REASONS
+from .swarm import SlotOutcome, Swarm
 
 __all__ = [
-    "REASONS", "AbstractSwarm", "Agent", "AgentGroup", "ConfigError", "Decision", "DtsaError", "Frame",
-    "LocalProtocolError", "PluginError", "RemoteProtocolError", "Scenario", "SlotOutcome", "Swarm", "SwarmConfig",
-    "decode_frame", "encode_frame", "make_scenario", "plug_in_random", "priority", "select",
+    "REASONS", "Agent", "AgentGroup", "ConfigError", "Decision", "DtsaError", "Frame", "LocalProtocolError",
+    "PluginError", "RemoteProtocolError", "Scenario", "SlotOutcome", "Swarm", "SwarmConfig", "decode_frame",
+    "encode_frame", "make_scenario", "plug_in_random",
 ]  # fmt: skip

@@ -10,10 +10,7 @@ class DtsaError(Exception):
 
 
 def shown(value: object) -> str:
-    """A value as errors repeat it: not too long, whatever its own ``__repr__`` does.
-
-    :param value: the value.
-    """
+    """A value as errors repeat it: not too long, whatever its own ``__repr__`` does."""
     try:
         given = repr(value)
     except Exception:
@@ -22,30 +19,18 @@ def shown(value: object) -> str:
 
 
 class ConfigError(DtsaError, ValueError):
-    """A setting is not usable: the user's to mend.
-
-    :param field: name of the setting, as the user wrote it.
-    :param value: the value that was given.
-    :param allowed: what would have been allowed, in words.
-    """
+    """A setting, as the user wrote it, is not usable; ``allowed`` says in words what would have been."""
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
         super().__init__(f"{field}: got {shown(value)}; allowed: {allowed}")
-        self.field = field
-        self.value = value
-        self.allowed = allowed
+        self.field, self.value, self.allowed = field, value, allowed
 
     def __reduce__(self) -> tuple[type[ConfigError], tuple[str, object, str]]:
         return (ConfigError, (self.field, self.value, self.allowed))
 
 
 def range_text(low: float | None, high: float | None, unit: str = "") -> str:
-    """A range in words, as ``allowed`` of an error says it.
-
-    :param low: smallest allowed number, or None.
-    :param high: largest allowed number, or None; at least one of the two is given.
-    :param unit: unit of both; empty or "1": none.
-    """
+    """A range in words, as ``allowed`` of an error says it; one of the bounds may be None."""
     first, last = (f"{bound:g}" if isinstance(bound, float) else str(bound) for bound in (low, high))
     tail = f" {unit}" if unit not in ("", "1") else ""
     if high is None:
@@ -60,22 +45,14 @@ class LocalProtocolError(DtsaError):
 
 
 class PluginError(DtsaError):
-    """A part from another package raised an error, or gave what it may not give.
-
-    :param part: what it is: kind, name and method.
-    :param fault: what is wrong with it.
-    """
+    """A part from another package (kind, name and method) raised an error, or gave what it may not give."""
 
     def __init__(self, part: str, fault: str) -> None:
         super().__init__(f"{part}: {fault}")
 
     @classmethod
     def raised(cls, part: str, error: BaseException) -> PluginError:
-        """An error that the part raised, with the place in it.
-
-        :param part: what it is: kind, name and method.
-        :param error: what it raised.
-        """
+        """An error that the part raised, with the place in it."""
         trace = error.__traceback__
         while trace is not None and trace.tb_next is not None:
             trace = trace.tb_next

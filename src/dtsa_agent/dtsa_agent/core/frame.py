@@ -1,138 +1,203 @@
-"""The radio frame: fields and bytes. The codec is ``libdtsa/frame.c``, specified in ``reference/frame.py``."""
+"""The radio frame: its fields, and its bytes by the codec in C. Layout: docs/reference/protocol.md."""
 
 from __future__ import annotations
 
-import dataclasses
-import struct
+from dataclasses import dataclass
+from typing import Any
 
-from dtsa_agent.core.reference.arithmetic import Vector
-from dtsa_agent.core.reference.frame import Frame
-
-from .compiled import MISSING
-from .compiled import kernel as _kernel
 from .errors import LocalProtocolError, RemoteProtocolError
-from .reference import frame as plain
-from .reference import tag
-from .reference.frame_extended import LEAVING
-from .registry import PROFILES
+from .kernel import ffi, lib
 
-PROFILE_PAPER = PROFILES.index("paper")  # id, c_r, slot, position, velocity: 19 bytes
-PROFILE_PAPER_INTENT = PROFILES.index("paper-intent")  # the same and the commanded velocity: 23 bytes
-PROFILE_EXTENDED = PROFILES.index("extended")  # 56 bytes
+Vector = tuple[float, float, float]
 
-_VERSION = 1
+PROFILE_PAPER: int = lib.DTSA_PROFILE_PAPER  # id, c_r, slot, position, velocity
+PROFILE_PAPER_INTENT: int = lib.DTSA_PROFILE_PAPER_INTENT  # the same and the commanded velocity
+PROFILE_EXTENDED: int = lib.DTSA_PROFILE_EXTENDED
+_PROFILES = (PROFILE_PAPER, PROFILE_PAPER_INTENT, PROFILE_EXTENDED)
+LENGTHS: dict[int, int] = {profile: lib.frame_length(profile) for profile in _PROFILES}  # bytes
+EXTENDED_LENGTH = LENGTHS[PROFILE_EXTENDED]
+FRAME_MAX: int = lib.DTSA_FRAME_MAX  # bytes
+TAG_LENGTH: int = lib.DTSA_TAG_BYTES  # bytes of authentication after a frame, and after what plug-ins append to it
+MAX_EXTENDED_AGENTS: int = lib.DTSA_EXTENDED_AGENTS_MAX  # ids have 8 bits in extended frames
+OPEN: int = lib.LEASE_OPEN  # lessee of a turn that is open to all who wake
 _HEADER_LENGTH = 8  # bytes up to the end of the slot
-TAG_LENGTH = tag.LENGTH  # bytes of authentication after a frame, and after what plug-ins append to it
+_LEAVING = 255
 
 POSITION_STEP = 0.002  # m, one step of a coordinate at the default extent
 EXTENT_M = 65.534  # m, default extent: 32767 steps, the largest coordinate that a frame can say
 
-__all__ = [
-    "EXTENT_M", "POSITION_STEP", "PROFILE_EXTENDED", "PROFILE_PAPER", "PROFILE_PAPER_INTENT", "TAG_LENGTH", "Frame",
-    "Vector", "condition_in", "decode_frame", "encode_frame", "named_in", "position_step",
-]  # fmt: skip
+_ZERO: Vector = (0.0, 0.0, 0.0)
+_NEAR = range(1, lib.RELAY_REACH + 1)  # slots ahead that a relay speaks of
+_FAR = range(lib.RELAY_REACH + 1, lib.FAR_REACH + 1)  # ... and that are handed on to one agent
+_FAULTS = {
+    lib.FRAME_BAD_LENGTH: "wrong length",
+    lib.FRAME_BAD_HEADER: "unknown version or profile",
+    lib.FRAME_BAD_FIELD: "field out of range",
+}
 
-# The structure of libdtsa/frame.h: profile, sender, slot, c_r; position, velocity, intent.
-RECORD = struct.Struct("=iiIi9d")
-if not MISSING and RECORD.size != _kernel.FRAME_RECORD:
-    raise ImportError("the compiled kernel is of another version; build dtsa_agent again")
 
-_FAULTS = {-1: "wrong length", -2: "unknown version or profile", -3: "field out of range"}
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What one agent says in one slot (profile ``paper``).
+
+    Values are those of the air after :func:`decode_frame`: quantised (2 mm, 1 cm/s) and saturated, never wrapped.
+    """
+
+    sender: int  # id, 1 .. 65535
+    slot: int  # slot in which the state was sampled
+    c_r: int  # transmission parameter (eq:remaining_t_slots), 0: arrived
+    position: Vector  # m, frame map
+    velocity: Vector  # m/s, frame map
+    intent: Vector | None = None  # m/s, commanded velocity; None: not carried
+
+
+@dataclass(frozen=True, slots=True)
+class Gossip:
+    """What the sender of a frame last heard of another agent."""
+
+    agent: int  # id, 1 .. 254
+    age: int  # slots since the state was sampled, 1 .. 127
+    moving: bool  # its c_r was not 0
+    position: Vector  # m, frame map; 4 mm on the air at the default extent
+    velocity: Vector  # m/s, frame map; 2 cm/s on the air
+
+
+@dataclass(frozen=True, slots=True)
+class ExtendedFrame:
+    """What one agent says in one slot (profile ``extended``).
+
+    ``own.c_r`` is 0 or 1 on the air. Gossip, a section of 11 leases, the relay and what is handed on far ahead take one
+    of three places each.
+    """
+
+    own: Frame
+    c_s: int = 0  # consecutive ids before the sender that it thinks dead, 0 .. 253
+    leaving: bool = False  # the sender leaves with this frame; c_s does not count
+    probation: bool = False  # the sender uses its anchors only
+    gossip: tuple[Gossip, ...] = ()
+    leases: bytes = b""  # a byte a turn: 0 none, id of the lessee, OPEN
+    relay: tuple[tuple[int, int], ...] = ()  # (slots ahead, 1 .. 24, ascending; lessee), at most 8
+    far: tuple[int, ...] = ()  # slots ahead, 25 .. 104, ascending, of turns that are handed on to `far_lessee`
+    far_lessee: int = 0  # id, 1 .. 254; 0: nothing is handed on far ahead
 
 
 def position_step(extent_m: float) -> float:
-    """One step of a coordinate in frames, m; gossip has twice that.
-
-    :param extent_m: the swarm's setting ``extent_m``, m.
-    """
+    """One step of a coordinate in frames, m, by the swarm's setting ``extent_m``; gossip has twice that."""
     return POSITION_STEP * (extent_m / EXTENT_M)
 
 
 def encode_frame(frame: Frame, extent_m: float = EXTENT_M) -> bytes:
-    """The bytes of a frame.
+    """The 19 bytes of a frame, 23 with intent; positions beyond the extent and velocities beyond +-20.4 m/s saturate.
 
-    :param frame: its fields; positions beyond the extent and velocities beyond +-20.4 m/s saturate.
-    :param extent_m: largest coordinate that fits, m, as the swarm has agreed.
-    :returns: 19 bytes, 23 with intent.
     :raises LocalProtocolError: if a field is not a number or an id is out of range.
     """
-    if MISSING:
-        return plain.encode(frame, position_step(extent_m))
     profile = PROFILE_PAPER if frame.intent is None else PROFILE_PAPER_INTENT
-    data = encode_record(record_of(frame, profile), extent_m)
-    if not data:
-        raise LocalProtocolError(f"not encodable: {frame}")
-    return data
+    return _encode(frame, lambda: ffi.new("dtsa_frame *", _own(frame, profile)), lib.frame_encode, extent_m)
 
 
-def record_of(frame: Frame, profile: int) -> bytes:
-    """A frame's own fields as the kernel's structure.
+def encode_extended(frame: ExtendedFrame, extent_m: float = EXTENT_M) -> bytes:
+    """The 56 bytes of an extended frame; gossip saturates beyond half the extent and +-10.2 m/s.
 
-    :param frame: its fields.
-    :param profile: number of the profile.
-    :raises LocalProtocolError: if a field does not fit.
+    :raises LocalProtocolError: if a field is out of range, or the sections do not fit.
     """
-    slot, intent = frame.slot & 0xFFFFFFFF, frame.intent or (0.0, 0.0, 0.0)
+    return _encode(frame, lambda: _record(frame), lib.extended_encode, extent_m)
+
+
+def _encode(frame: object, make: Any, encode: Any, extent_m: float) -> bytes:
+    out = ffi.new("uint8_t[]", FRAME_MAX)
     try:
-        return RECORD.pack(profile, frame.sender, slot, frame.c_r, *frame.position, *frame.velocity, *intent)
-    except struct.error as error:
+        length = encode(make(), position_step(extent_m), out)
+    except (OverflowError, IndexError, TypeError, ValueError) as error:
         raise LocalProtocolError(f"not encodable: {frame} ({error})") from error
+    if not length:
+        raise LocalProtocolError(f"not encodable: {frame}")
+    return bytes(ffi.buffer(out, length))
 
 
-def encode_record(record: bytes, extent_m: float) -> bytes:
-    """The bytes of a frame from the kernel's structure; none if it is not encodable.
+def _own(frame: Frame, profile: int) -> dict[str, Any]:
+    return {
+        "profile": profile, "sender": frame.sender, "slot": frame.slot & 0xFFFFFFFF, "c_r": frame.c_r,
+        "p": frame.position, "v": frame.velocity, "c": frame.intent or _ZERO,
+    }  # fmt: skip
 
-    :param record: the structure.
-    :param extent_m: largest coordinate that fits, m.
+
+def _record(frame: ExtendedFrame) -> Any:
+    far = _mask_of(frame.far, _FAR)
+    return ffi.new("extended_frame *", {
+        "own": _own(frame.own, PROFILE_EXTENDED), "c_s": frame.c_s, "leaving": frame.leaving,
+        "probation": frame.probation, "gossip_count": len(frame.gossip), "lease_count": len(frame.leases),
+        "gossip": [
+            {"id": g.agent, "age": g.age, "c_r": g.moving, "p": g.position, "v": g.velocity} for g in frame.gossip
+        ],
+        "leases": frame.leases, "relay_mask": _mask_of(tuple(ahead for ahead, _ in frame.relay), _NEAR),
+        "relay_ids": bytes(lessee for _, lessee in frame.relay),
+        "far_id": frame.far_lessee, "far_mask": far.to_bytes(lib.FAR_BYTES, "little"),
+    })  # fmt: skip
+
+
+def _mask_of(ahead: tuple[int, ...], reach: range) -> int:
+    """Return a mask with a bit for each of the slots ahead; ValueError: they do not ascend, or are out of reach."""
+    if any(slots not in reach for slots in ahead) or list(ahead) != sorted(set(ahead)):
+        raise ValueError(f"slots ahead {ahead}")
+    return sum(1 << (slots - reach.start) for slots in ahead)
+
+
+def _slots_of(mask: int, reach: range) -> tuple[int, ...]:
+    return tuple(slots for slots in reach if mask >> (slots - reach.start) & 1)
+
+
+def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
+    """The fields of a frame that all profiles have.
+
+    :raises RemoteProtocolError: if the bytes are no frame: sealed ones are opened first.
     """
-    return _kernel.encode(record, position_step(extent_m))
+    return _frame_of(_decode("dtsa_frame *", lib.frame_decode, data, extent_m), PROFILE_PAPER_INTENT)
 
 
-def decode_record(data: bytes, extent_m: float, extended: bool = False) -> bytes:
-    """The kernel's structure from the bytes of a frame.
+def decode_extended(data: bytes, extent_m: float = EXTENT_M) -> ExtendedFrame:
+    """The fields of an extended frame.
 
-    :param data: the bytes heard.
-    :param extent_m: largest coordinate that fits, m.
-    :param extended: the structure of extended frames, not that of all profiles.
-    :raises RemoteProtocolError: if they are no frame.
+    :raises RemoteProtocolError: if the bytes are no frame of profile ``extended``.
     """
-    record = _kernel.decode(bytes(data), position_step(extent_m), extended)
-    if isinstance(record, int):
-        raise RemoteProtocolError(f"{_FAULTS[record]} ({len(data)} bytes)")
+    record = _decode("extended_frame *", lib.extended_decode, data, extent_m)
+    entries = (record.gossip[k] for k in range(record.gossip_count))
+    gossip = tuple(Gossip(g.id, g.age, bool(g.c_r), _vector(g.p), _vector(g.v)) for g in entries)
+    far = int.from_bytes(bytes(record.far_mask), "little")
+    return ExtendedFrame(
+        _frame_of(record.own, PROFILE_EXTENDED), record.c_s, bool(record.leaving), bool(record.probation), gossip,
+        bytes(record.leases)[: record.lease_count],
+        tuple(zip(_slots_of(record.relay_mask, _NEAR), record.relay_ids, strict=False)),
+        _slots_of(far, _FAR), record.far_id,
+    )  # fmt: skip
+
+
+def _decode(record_type: str, decode: Any, data: bytes, extent_m: float) -> Any:
+    record = ffi.new(record_type)
+    fault = decode(bytes(data), len(data), position_step(extent_m), record)
+    if fault:
+        raise RemoteProtocolError(f"{_FAULTS[fault]} ({len(data)} bytes)")
     return record
 
 
-def named_in(data: bytes) -> tuple[int, int] | None:
-    """The id of the sender and the slot (32 bits) that a frame of any profile names; None: it is none.
+def _frame_of(record: Any, with_intent: int) -> Frame:
+    intent = _vector(record.c) if record.profile == with_intent else None
+    return Frame(record.sender, record.slot, record.c_r, _vector(record.p), _vector(record.v), intent)
 
-    :param data: the bytes, whatever follows a frame in them: bytes of plug-ins, a tag.
-    """
-    if len(data) < _HEADER_LENGTH or data[0] >> 4 != _VERSION or data[0] & 15 >= len(PROFILES):
+
+def _vector(numbers: Any) -> Vector:
+    return numbers[0], numbers[1], numbers[2]
+
+
+def named_in(data: bytes) -> tuple[int, int] | None:
+    """The sender's id and the slot (32 bits) that a frame names, whatever follows it in the bytes; None: it is none."""
+    if len(data) < _HEADER_LENGTH or data[0] >> 4 != lib.FRAME_VERSION or data[0] & 15 not in LENGTHS:
         return None
     sender = data[1] if data[0] & 15 == PROFILE_EXTENDED else int.from_bytes(data[1:3], "little")
     return sender, int.from_bytes(data[4:8], "little")
 
 
 def condition_in(data: bytes) -> tuple[bool, bool, bool]:
-    """Whether the sender of a frame leaves, rests, is on probation; extended frames alone say the first and the last.
-
-    :param data: the bytes of a frame, at least those that :func:`named_in` reads.
-    """
+    """Whether a frame's sender leaves, rests, is on probation; extended frames alone say the first and the last."""
     if data[0] & 15 != PROFILE_EXTENDED:
         return False, not data[3], False
-    return data[2] == LEAVING, not data[3] & 1, bool(data[3] & 2)
-
-
-def decode_frame(data: bytes, extent_m: float = EXTENT_M) -> Frame:
-    """The fields of a frame that all profiles have.
-
-    :param data: the bytes heard.
-    :param extent_m: largest coordinate that fits, m, as the swarm has agreed.
-    :raises RemoteProtocolError: if they are no frame: sealed ones are opened first.
-    """
-    if MISSING:
-        heard = plain.decode(data, position_step(extent_m))
-        return dataclasses.replace(heard, intent=None) if data[0] & 15 == PROFILE_EXTENDED else heard
-    profile, sender, slot, c_r, *v = RECORD.unpack(decode_record(data, extent_m))
-    intent = (v[6], v[7], v[8]) if profile == PROFILE_PAPER_INTENT else None
-    return Frame(sender, slot, c_r, (v[0], v[1], v[2]), (v[3], v[4], v[5]), intent)
+    return data[2] == _LEAVING, not data[3] & 1, bool(data[3] & 2)

@@ -1,9 +1,8 @@
 """Policies and estimators: one row each. Whatever depends on the nature of one asks its row.
 
-Avoiders and their vehicles are rows as well: :data:`.settings.flight_models.AVOIDERS`. Rows are in the order of
-the kernel's numbers, which is checked when this module is imported. Plug-ins get their rows from what they declare.
-
-A built-in policy is a row here, a file in ``libdtsa/policy``, and its number and name in ``libdtsa``.
+Avoiders and their vehicles are rows as well: :data:`.settings.flight_models.AVOIDERS`. Built-in rows are in the order
+of libdtsa's numbers; plug-ins get their rows from what they declare. A built-in policy is a row here, a file in
+``libdtsa/policy``, and its number and name in ``libdtsa``.
 """
 
 from __future__ import annotations
@@ -13,13 +12,38 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-from .compiled import MISSING, NAMES
 from .errors import ConfigError
+from .kernel import NAMES
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 PORT = ("send", "sent", "received", "busy")  # what an air offers; see docs/reference/protocol.md
+MAX_OWN_BYTES = 16  # of one plug-in
+SELECTIONS, PROFILES, REASONS = NAMES["selections"], NAMES["profiles"], NAMES["reasons"]
+
+# Why an agent takes whom it takes for the sender of a slot, and what that means.
+REASON_TEXTS: Mapping[str, str] = MappingProxyType(
+    {
+        "nobody": "nobody moves any more, so nobody has a claim to the slot",
+        "tdma": "the slot's number says whose turn it is: slot modulo N",
+        "boot": "first round: every agent sends once, in the order of ids, so that all know all",
+        "age-cap": "was silent for longer than the age cap allows, whatever its priority",
+        "priority": "has the largest priority g, and no other comes within epsilon of it",
+        "tie": "several priorities are within epsilon of the largest: of these, the longest silent",
+        "oldest": "the longest silent of those that move, because priorities say nothing here or are not used",
+        "return": "slot kept for agents that have arrived, so that they can say that they move again",
+        "random": "a draw decides whether the agent sends",
+        "plugin": "a policy from another package decided",
+        "own": "the owner uses its own turn",
+        "anchor": "the owner's turn that nobody else gives away, so that all hear of it now and then",
+        "leased": "the owner gave this turn to an agent that has more to say",
+        "adopted": "the owner is thought dead; the next one alive gave its turn away",
+        "open": "turn for whoever has just woken or joined; nobody in particular is expected",
+        "absent": "the owner is thought dead, and nobody was given its turn",
+        "probation": "the owner is new or was away, and may send at its anchors only",
+    }
+)
 
 
 class _Named(Protocol):
@@ -32,44 +56,22 @@ Row = TypeVar("Row", bound=_Named)
 
 @dataclass(frozen=True, slots=True)
 class PolicyRow:
-    """Who sends next: what the rest of the software has to know about a policy.
+    """Who sends next: what the rest of the software has to know about a policy."""
 
-    :param name: what the setting ``policy`` calls it.
-    :param label: what figures call it.
-    :param decides: who sends in a slot, in a few words.
-    :param under_loss: what becomes of it on a channel that loses frames.
-    :param may_share: agents that have heard the same decide the same: one table may serve all of them.
-    :param may_join: agents may come late or come back, because nobody needs a table that all have equal.
-    :param says_leaving: an agent that leaves says so in a last frame.
-    :param probation: an agent that is new or stood still for long may not use all of its turns yet.
-    :param extended: its frames are extended ones.
-    :param agent_state: it keeps state of its own for each agent (``lease_state`` of a swarm).
-    :param weighs_all: it computes the priorities of all agents in every slot.
-    :param most_agents: largest number of agents; None: as many as a swarm may have.
-    :param port: what it uses of the air, of :data:`PORT`.
-    :param own_bytes: bytes of its own that a plug-in appends to frames.
-    :param needs_everybody: it looks into all agents: they must be in one process. For comparison only.
-    :param unslotted: it sends at any instant; slots only say how often vehicles are steered and ages are counted.
-    :param reacts: unslotted, and it acts on each packet as it arrives. For comparison only.
-    """
-
-    name: str
-    label: str
-    decides: str
-    under_loss: str
-    may_share: bool = False
-    may_join: bool = False
-    says_leaving: bool = False
-    probation: bool = False
-    extended: bool = False
-    agent_state: bool = False
-    weighs_all: bool = False
-    most_agents: int | None = None
-    port: tuple[str, ...] = ("send", "received")
-    own_bytes: int = 0
-    needs_everybody: bool = False
-    unslotted: bool = False
-    reacts: bool = False
+    name: str  # what the setting ``policy`` calls it
+    label: str  # what figures call it
+    may_share: bool = False  # agents that have heard the same decide the same: one table may serve all of them
+    may_join: bool = False  # agents may come late or come back: nobody needs a table that all have equal
+    says_leaving: bool = False  # an agent that leaves says so in a last frame
+    probation: bool = False  # an agent that is new or stood still for long may not use all of its turns yet
+    extended: bool = False  # its frames are extended ones
+    agent_state: bool = False  # it keeps state of its own for each agent (``lease_state`` of a swarm)
+    weighs_all: bool = False  # it computes the priorities of all agents in every slot
+    port: tuple[str, ...] = ("send", "received")  # what it uses of the air, of :data:`PORT`
+    own_bytes: int = 0  # bytes of its own that a plug-in appends to frames
+    needs_everybody: bool = False  # it looks into all agents: they must be in one process; for comparison only
+    unslotted: bool = False  # it sends at any instant; slots only say how often vehicles are steered and ages counted
+    reacts: bool = False  # unslotted, and it acts on each packet as it arrives; for comparison only
 
     @property
     def listens(self) -> bool:
@@ -84,29 +86,19 @@ class PolicyRow:
 
 @dataclass(frozen=True, slots=True)
 class EstimatorRow:
-    """Where the others are by now.
+    """Where the others are by now."""
 
-    :param name: what the setting ``estimator`` calls it.
-    :param text: what it supposes, in a few words.
-    :param needs_intent: frames carry the commanded velocity.
-    :param needs_everybody: it knows the truth: all agents must be in one process.
-    :param own_bytes: bytes of its own that a plug-in appends to frames.
-    """
-
-    name: str
-    text: str
-    needs_intent: bool = False
-    needs_everybody: bool = False
-    own_bytes: int = 0
+    name: str  # what the setting ``estimator`` calls it
+    needs_intent: bool = False  # frames carry the commanded velocity
+    needs_everybody: bool = False  # it knows the truth: all agents must be in one process
+    own_bytes: int = 0  # bytes of its own that a plug-in appends to frames
 
 
 class Registry(Generic[Row]):
-    """Rows by name: the built-in ones, in the order of the kernel's numbers, and those of plug-ins.
+    """Rows by name: the built-in ones, in the order of libdtsa's numbers, and those of plug-ins.
 
-    :param kind: the setting that names a row.
-    :param group: the group of entry points in which packages announce plug-ins.
-    :param rows: the built-in rows.
-    :param plug_in_row: makes the row of a plug-in from its name and its factory.
+    ``kind`` is the setting that names a row, ``group`` that of the entry points in which packages announce plug-ins.
+    ``row`` and ``factory`` raise a ConfigError if there is none of a name, or it cannot be used.
     """
 
     def __init__(self, kind: str, group: str, rows: Iterable[Row], plug_in_row: Callable[[str, Any], Row]) -> None:
@@ -122,35 +114,19 @@ class Registry(Generic[Row]):
         return tuple(self.rows)
 
     def number(self, name: str) -> int:
-        """The kernel's number of a row; plug-ins have the one after the last.
-
-        :param name: the name.
-        """
+        """The number of a row in libdtsa; plug-ins have the one after the last."""
         return self.names.index(name) if name in self.rows else len(self.rows)
 
     def row(self, name: str) -> Row:
-        """The row of a name.
-
-        :param name: the name.
-        :raises ConfigError: if there is none, or it is a plug-in that cannot be used.
-        """
+        """The row of a name."""
         return self.rows[name] if name in self.rows else self._plug_in(name)[1]
 
     def factory(self, name: str) -> Any:
-        """The factory of a plug-in.
-
-        :param name: the name it was announced by.
-        :raises ConfigError: if there is none, or it cannot be used.
-        """
+        """The factory of a plug-in."""
         return self._plug_in(name)[0]
 
     def register(self, name: str, factory: Any) -> None:
-        """Makes a plug-in known to this process, under a name that no built-in row has; an older one is replaced.
-
-        :param name: what the setting calls it.
-        :param factory: called as ``factory(config, agent)`` for every observer.
-        :raises ConfigError: for a name or a factory that cannot be used.
-        """
+        """Makes a plug-in known to this process, under a name that no built-in row has; an older one is replaced."""
         if not isinstance(name, str) or not name or name in self.rows:
             raise ConfigError(self.kind, name, f"another name: {', '.join(self.rows)} are built in")
         if not callable(factory):
@@ -159,10 +135,7 @@ class Registry(Generic[Row]):
         self.registered.add(name)
 
     def plug_ins(self) -> dict[str, EntryPoint]:
-        """The plug-ins installed on this machine, by name.
-
-        :raises ConfigError: if one has the name of a built-in row.
-        """
+        """The plug-ins installed on this machine, by name; ConfigError: one has the name of a built-in row."""
         from importlib.metadata import entry_points  # a tenth of a node's start, which mostly needs no plug-in
 
         points = {point.name: point for point in entry_points(group=self.group)}
@@ -188,9 +161,6 @@ class Registry(Generic[Row]):
                 raise ConfigError(self.kind, name, f"a plug-in that can be imported, unlike {source}") from error
             self._plug_ins[name] = factory, self._plug_in_row(name, factory)
         return self._plug_ins[name]
-
-
-MAX_OWN_BYTES = 16  # of one plug-in
 
 
 def _own_bytes(name: str, factory: Any) -> int:
@@ -221,110 +191,31 @@ def _policy_plug_in(name: str, factory: Any) -> PolicyRow:
     if reacts and "busy" in port:
         raise ConfigError(f"{name}.port", port, "no 'busy' where a method received answers packets")
     return PolicyRow(
-        name,
-        name,
-        "plug-in",
-        "as it was written",
-        may_join=_flag(name, factory, "may_join"),
-        port=tuple(port),
-        own_bytes=_own_bytes(name, factory),
-        needs_everybody=needs_everybody,
-        unslotted=unslotted,
-        reacts=reacts,
-    )
+        name, name, may_join=_flag(name, factory, "may_join"), port=tuple(port), own_bytes=_own_bytes(name, factory),
+        needs_everybody=needs_everybody, unslotted=unslotted, reacts=reacts,
+    )  # fmt: skip
 
 
 def _estimator_plug_in(name: str, factory: Any) -> EstimatorRow:
-    needs_intent = _flag(name, factory, "needs_intent")
-    return EstimatorRow(name, "plug-in", needs_intent, own_bytes=_own_bytes(name, factory))
+    return EstimatorRow(name, _flag(name, factory, "needs_intent"), own_bytes=_own_bytes(name, factory))
 
 
-POLICIES = Registry(
-    "policy",
-    "dtsa.policies",
-    (
-        PolicyRow("tdma", "TDMA", "slot modulo N", "works", may_share=True, may_join=True, port=("send",)),
-        PolicyRow(
-            "dtsa",
-            "DTSA",
-            "the agent whose state is most urgent, as in the paper",
-            "tables diverge, slots collide, for good",
-            may_share=True,
-            weighs_all=True,
-        ),
-        PolicyRow("age", "age", "the longest silent of those that have not arrived", "the same", may_share=True),
-        PolicyRow("aloha", "aloha", "everybody with probability 1/N_p", "collides by design", may_join=True),
-        PolicyRow(
-            "lease",
-            "lease",
-            "the owner; an owner with nothing to say leases its slot, in its own frame, to an agent that has",
-            "works; no two senders by construction",
-            may_join=True,
-            says_leaving=True,
-            probation=True,
-            extended=True,
-            agent_state=True,
-        ),
-    ),
-    _policy_plug_in,
+_POLICIES = (
+    PolicyRow("tdma", "TDMA", may_share=True, may_join=True, port=("send",)),
+    PolicyRow("dtsa", "DTSA", may_share=True, weighs_all=True),
+    PolicyRow("age", "age", may_share=True),
+    PolicyRow("aloha", "aloha", may_join=True),
+    PolicyRow("lease", "lease", may_join=True, says_leaving=True, probation=True, extended=True, agent_state=True),
 )
-
-ESTIMATORS = Registry(
-    "estimator",
-    "dtsa.estimators",
-    (
-        EstimatorRow("hold", "where last heard"),
-        EstimatorRow("linear", "on with the velocity last heard (eq:estimate)"),
-        EstimatorRow("intent", "towards the commanded velocity, which the frame carries", needs_intent=True),
-        EstimatorRow("oracle", "the truth, for comparison", needs_everybody=True),
-    ),
-    _estimator_plug_in,
+_ESTIMATORS = (
+    EstimatorRow("hold"),
+    EstimatorRow("linear"),
+    EstimatorRow("intent", needs_intent=True),
+    EstimatorRow("oracle", needs_everybody=True),
 )
+POLICIES = Registry("policy", "dtsa.policies", _POLICIES, _policy_plug_in)
+ESTIMATORS = Registry("estimator", "dtsa.estimators", _ESTIMATORS, _estimator_plug_in)
 
-SELECTIONS = ("candidates", "pairwise")  # readings of the selection function
-PROFILES = ("paper", "paper-intent", "extended")  # of frames
-# Why an agent takes whom it takes for the sender of a slot, and what that means.
-REASON_TEXTS: Mapping[str, str] = MappingProxyType(
-    {
-        "nobody": "nobody moves any more, so nobody has a claim to the slot",
-        "tdma": "the slot's number says whose turn it is: slot modulo N",
-        "boot": "first round: every agent sends once, in the order of ids, so that all know all",
-        "age-cap": "was silent for longer than the age cap allows, whatever its priority",
-        "priority": "has the largest priority g, and no other comes within epsilon of it",
-        "tie": "several priorities are within epsilon of the largest: of these, the longest silent",
-        "oldest": "the longest silent of those that move, because priorities say nothing here or are not used",
-        "return": "slot kept for agents that have arrived, so that they can say that they move again",
-        "random": "a draw decides whether the agent sends",
-        "plugin": "a policy from another package decided",
-        "own": "the owner uses its own turn",
-        "anchor": "the owner's turn that nobody else gives away, so that all hear of it now and then",
-        "leased": "the owner gave this turn to an agent that has more to say",
-        "adopted": "the owner is thought dead; the next one alive gave its turn away",
-        "open": "turn for whoever has just woken or joined; nobody in particular is expected",
-        "absent": "the owner is thought dead, and nobody was given its turn",
-        "probation": "the owner is new or was away, and may send at its anchors only",
-    }
-)
-REASONS: tuple[str, ...] = tuple(REASON_TEXTS)
-
-
-def check_kernel(kind: str, names: tuple[str, ...]) -> None:
-    """Compares a list of names with the compiled kernel's, whose numbers are places in it.
-
-    :param kind: the list's name in the kernel.
-    :param names: the list as Python has it.
-    :raises ImportError: if they differ: kernel and Python are not of the same version.
-    """
-    compiled = names if MISSING else NAMES.get(kind)
-    if compiled != names:
-        raise ImportError(f"{kind}: Python has {names}, the compiled kernel has {compiled}; build dtsa_agent again")
-
-
-for _kind, _names in (
-    ("policies", POLICIES.names),
-    ("estimators", ESTIMATORS.names),
-    ("selections", SELECTIONS),
-    ("profiles", PROFILES),
-    ("reasons", REASONS),
-):
-    check_kernel(_kind, _names)
+for _kind, _names in (("policies", POLICIES.names), ("estimators", ESTIMATORS.names), ("reasons", tuple(REASON_TEXTS))):
+    if _names != NAMES[_kind]:
+        raise ImportError(f"{_kind}: Python has {_names}, libdtsa has {NAMES[_kind]}; build dtsa_agent again")

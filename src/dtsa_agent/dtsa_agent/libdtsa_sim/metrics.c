@@ -41,13 +41,13 @@ static int nearest_index(int from, int n, const double *x, const double *y, cons
 }
 
 /* Paths flown and the smallest distance; -> whether two agents are closer than `collision_m`. */
-static int distances(metrics *m, int steps, int64_t slot, const double *track)
+static int distances(metrics *m, int64_t slot)
 {
     const int n = m->n;
     metrics_sums *sum = m->sums;
     int crashed = 0;
-    for (int step = 0; step < steps; step++) {
-        const double *x = track + (long)step * 3 * n, *y = x + n, *z = y + n;
+    for (int step = 0; step < m->steps; step++) {
+        const double *x = m->track + (long)step * 3 * n, *y = x + n, *z = y + n;
         for (int k = 0; k < n - 1; k++) {
             const double d2 =
                 nearest2(n - k - 1, x + k + 1, y + k + 1, z + k + 1, x[k], y[k], z[k]);
@@ -151,12 +151,12 @@ static void wakings(metrics *m, const swarm *s, int64_t last, const double *now)
     }
 }
 
-int metrics_update(metrics *m, int64_t slot, int steps, const double *track, swarm *tables)
+int metrics_update(metrics *m, int64_t slot)
 {
-    const double *now = track + (long)(steps - 1) * 3 * m->n;
-    int state = distances(m, steps, slot, track) ? METRICS_CRASHED : 0;
+    const double *now = m->track + (long)(m->steps - 1) * 3 * m->n;
+    int state = distances(m, slot) ? METRICS_CRASHED : 0;
     if (arrived(m, now)) state |= METRICS_ARRIVED;
-    if (tables && slot >= m->news_from) news(m, tables, slot, now);
-    if (tables) wakings(m, tables, slot - 1, now);
+    if (m->tables && slot >= m->news_from) news(m, m->tables, slot, now);
+    if (m->tables) wakings(m, m->tables, slot - 1, now);
     return state;
 }

@@ -6,7 +6,6 @@
 
 enum { METRICS_CRASHED = 1, METRICS_ARRIVED = 2, METRICS_DELAYS = 256 };
 
-/* Eight bytes each, in this order: dtsa_bench/runs/metrics.py reads them. */
 typedef struct metrics_sums {
     double min_distance2, error_sum, error_max;
     int64_t pair_1, pair_2, min_slot, age_count, age_sum, age_max;
@@ -28,11 +27,13 @@ typedef struct metrics {
     uint8_t *heard;        /* (n) somebody has heard it since */
     int64_t *delays; /* (METRICS_DELAYS) wakings by slots until the first frame was heard; the last:
                         or more */
-    metrics_sums *sums; /* so far */
+    metrics_sums *sums;  /* so far */
+    const double *track; /* (steps, 3, n) m, true positions in the slot that is over */
+    int steps;
+    swarm *tables; /* NULL: ages do not count */
 } metrics;
 
-/* A slot is over. track: (steps, 3, n) m; tables: NULL: ages do not count. -> METRICS_CRASHED,
- * METRICS_ARRIVED or both. */
-int metrics_update(metrics *m, int64_t slot, int steps, const double *track, swarm *tables);
+/* A slot is over. -> METRICS_CRASHED, METRICS_ARRIVED or both. */
+int metrics_update(metrics *m, int64_t slot);
 
 #endif

@@ -25,18 +25,18 @@ static void open_table(swarm *s, int table)
     s->tables[table] = (dtsa_table){
         .config = &s->config,
         .observer = s->observer[table],
-        .sent_p = s->sent_p + plane,
-        .sent_v = s->sent_v + plane,
-        .sent_c = s->sent_c + plane,
+        .sent_p = s->sent_position + plane,
+        .sent_v = s->sent_velocity + plane,
+        .sent_c = s->sent_intent + plane,
         .sent_slot = s->sent_slot + at,
-        .last = s->last + at,
+        .last = s->last_turn + at,
         .in_ap = s->in_ap + at,
         .entry_hash = s->entry_hash + at,
         .hash = s->table_hash + table,
-        .est_p = s->est_p + plane,
-        .est_v = s->est_v + plane,
-        .g = s->g + at,
-        .h = s->h + at,
+        .est_p = s->estimate_position + plane,
+        .est_v = s->estimate_velocity + plane,
+        .g = s->priority + at,
+        .h = s->counter + at,
         .scratch = s->scratch,
         .ages = s->ages,
     };
@@ -62,10 +62,9 @@ const char *swarm_open(swarm *s)
     if (fault) return fault;
     s->scratch = calloc((size_t)scratch_doubles(s->config.agents), sizeof(double));
     s->ages = calloc(n, sizeof(double));
-    s->senders = calloc(l + 1, sizeof *s->senders);
     s->tables = calloc((size_t)s->table_count + 1, sizeof *s->tables);
     s->agents = calloc(l + 1, sizeof *s->agents);
-    if (!s->scratch || !s->ages || !s->senders || !s->tables || !s->agents) return "memory";
+    if (!s->scratch || !s->ages || !s->tables || !s->agents) return "memory";
     for (int v = 0; v < s->table_count; v++) open_table(s, v);
     for (int i = 0; i < s->local_count; i++)
         s->agents[i] = (dtsa_agent){
@@ -82,7 +81,6 @@ void swarm_close(swarm *s)
 {
     free(s->scratch);
     free(s->ages);
-    free(s->senders);
     free(s->tables);
     free(s->agents);
 }
@@ -94,14 +92,14 @@ void swarm_reset(swarm *s)
     for (int l = 0; l < count; l++) {
         for (int i = 0; i < 3; i++) {
             const double p = s->config.start[i * n + s->local[l]];
-            s->pos[i * count + l] = p;
-            s->vel[i * count + l] = s->cmd[i * count + l] = 0.0;
+            s->position[i * count + l] = p;
+            s->velocity[i * count + l] = s->command[i * count + l] = 0.0;
             s->goal[i * count + l] = s->config.target[i * n + s->local[l]];
             for (int step = 0; step < s->config.steps; step++)
                 s->track[(step * 3 + i) * count + l] = p;
         }
         s->active[l] = s->present[l] = 1;
-        s->frame_len[l] = s->sends[l] = 0;
+        s->frame_length[l] = s->sends[l] = 0;
         if (s->agents[l].policy->begin) s->agents[l].policy->begin(&s->agents[l]);
     }
     s->sender_count = 0;
@@ -122,7 +120,7 @@ static dtsa_agent *agent_at(swarm *s, int l)
 {
     dtsa_agent *a = &s->agents[l];
     a->present = s->present[l];
-    take_vector(s, s->pos, l, a->position);
+    take_vector(s, s->position, l, a->position);
     take_vector(s, s->goal, l, a->goal);
     return a;
 }
@@ -146,19 +144,26 @@ void swarm_decide(swarm *s, int64_t slot)
     }
 }
 
-void swarm_emit(swarm *s, int64_t slot)
+int swarm_emit(swarm *s, int64_t slot)
 {
     s->sender_count = 0;
     for (int l = 0; l < s->local_count; l++) {
-        s->frame_len[l] = 0;
+        s->frame_length[l] = 0;
         if (!s->sends[l]) continue;
         dtsa_agent *a = agent_at(s, l);
         a->final = s->final[l];
-        take_vector(s, s->vel, l, a->velocity);
-        take_vector(s, s->cmd, l, a->command);
-        s->frame_len[l] = (uint8_t)agent_speak(a, slot, s->frames + (long)l * DTSA_FRAME_MAX);
-        if (s->frame_len[l]) s->senders[s->sender_count++] = l;
+        take_vector(s, s->velocity, l, a->velocity);
+        take_vector(s, s->command, l, a->command);
+        s->frame_length[l] = (uint8_t)agent_speak(a, slot, s->frames + (long)l * DTSA_FRAME_MAX);
+        if (s->frame_length[l]) s->senders[s->sender_count++] = l;
     }
+    return s->sender_count;
+}
+
+int swarm_begin(swarm *s, int64_t slot)
+{
+    swarm_decide(s, slot);
+    return swarm_emit(s, slot);
 }
 
 /* ---- what the air carried ---- */
@@ -190,7 +195,7 @@ void swarm_end(swarm *s, int64_t slot)
     for (int i = 0; i < s->sender_count; i++) {
         const int l = s->senders[i];
         s->agents[l].decision.reason = s->reason[l];
-        agent_said(&s->agents[l], slot, s->frames + (long)l * DTSA_FRAME_MAX, s->frame_len[l]);
+        agent_said(&s->agents[l], slot, s->frames + (long)l * DTSA_FRAME_MAX, s->frame_length[l]);
     }
     for (int l = 0; l < count; l++) {
         dtsa_agent *a = &s->agents[l];
@@ -215,9 +220,14 @@ void swarm_estimate(swarm *s, int table, int64_t slot, int step)
     }
     for (int l = 0; l < s->local_count; l++)
         for (int i = 0; i < 3; i++) {
-            t->est_p[i * n + s->local[l]] = s->pos[i * s->local_count + l];
-            t->est_v[i * n + s->local[l]] = s->vel[i * s->local_count + l];
+            t->est_p[i * n + s->local[l]] = s->position[i * s->local_count + l];
+            t->est_v[i * n + s->local[l]] = s->velocity[i * s->local_count + l];
         }
+}
+
+void swarm_estimate_all(swarm *s, int64_t slot, int step)
+{
+    for (int table = 0; table < s->table_count; table++) swarm_estimate(s, table, slot, step);
 }
 
 void swarm_steer(swarm *s, int64_t slot, int step, int estimate)
@@ -229,12 +239,12 @@ void swarm_steer(swarm *s, int64_t slot, int step, int estimate)
         if ((flies || (l == 0 && s->shared)) && estimate && (l == 0 || !s->shared))
             swarm_estimate(s, s->shared ? 0 : l, slot, step);
         if (flies) {
-            take_vector(s, s->pos, l, a->position);
-            take_vector(s, s->vel, l, a->velocity);
+            take_vector(s, s->position, l, a->position);
+            take_vector(s, s->velocity, l, a->velocity);
             take_vector(s, s->goal, l, a->goal);
             agent_steer(a, slot, step);
         }
-        for (int i = 0; i < 3; i++) s->cmd[i * count + l] = flies ? a->command[i] : 0.0;
+        for (int i = 0; i < 3; i++) s->command[i * count + l] = flies ? a->command[i] : 0.0;
     }
 }
 
@@ -243,10 +253,10 @@ void swarm_move(swarm *s, int step)
     const int count = s->local_count;
     const double dt = s->config.slot_s / s->config.steps;
     for (int l = 0; l < count; l++)
-        if (s->present[l] && (s->active[l] || s->vel[l] != 0.0 || s->vel[count + l] != 0.0 ||
-                              s->vel[2 * count + l] != 0.0))
-            vehicle_step(&s->vehicle, dt, s->pos + l, s->vel + l, s->cmd + l, count);
-    memcpy(s->track + (long)step * 3 * count, s->pos, sizeof(double) * 3 * (size_t)count);
+        if (s->present[l] && (s->active[l] || s->velocity[l] != 0.0 ||
+                              s->velocity[count + l] != 0.0 || s->velocity[2 * count + l] != 0.0))
+            vehicle_step(&s->vehicle, dt, s->position + l, s->velocity + l, s->command + l, count);
+    memcpy(s->track + (long)step * 3 * count, s->position, sizeof(double) * 3 * (size_t)count);
 }
 
 void swarm_fly(swarm *s, int64_t slot)
@@ -255,4 +265,15 @@ void swarm_fly(swarm *s, int64_t slot)
         swarm_steer(s, slot, step, 1);
         swarm_move(s, step);
     }
+}
+
+void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard)
+{
+    swarm_fly(s, slot);
+    for (int i = 0; i < s->sender_count && (all || heard); i++) {
+        const int l = s->senders[i];
+        swarm_hear(s, slot, s->frames + (long)l * DTSA_FRAME_MAX, s->frame_length[l],
+                   heard ? heard + (long)i * s->table_count : NULL);
+    }
+    swarm_end(s, slot);
 }

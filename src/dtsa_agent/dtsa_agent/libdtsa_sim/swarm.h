@@ -13,35 +13,35 @@ typedef struct swarm {
     int shared; /* one table serves every agent */
     vehicle_params vehicle;
 
-    /* Borrowed: v = table_count, l = local_count, n = agents. */
-    const int32_t *local;              /* (l) 0-based agent of each local slot */
-    const int32_t *observer;           /* (v) 0-based agent of each table, -1: serves all */
-    double *sent_p, *sent_v, *sent_c;  /* (v, 3, n) tables: see core.h */
-    int64_t *sent_slot, *last;         /* (v, n) */
-    uint8_t *in_ap;                    /* (v, n) */
-    uint32_t *entry_hash;              /* (v, n) */
-    uint32_t *table_hash;              /* (v) */
-    double *est_p, *est_v;             /* (v, 3, n) */
-    double *g;                         /* (v, n) */
-    int64_t *h;                        /* (v, n) */
-    double *pos, *vel, *cmd, *goal;    /* (3, l) */
-    double *track;                     /* (steps, 3, l) */
-    uint8_t *active, *final, *present; /* (l) see core.h */
-    uint16_t *chosen;                  /* (l) */
-    uint8_t *reason;                   /* (l) */
-    uint32_t *digest;                  /* (l) */
-    double *score;                     /* (l) */
-    uint8_t *sends;                    /* (l) */
-    uint8_t *frame_len;                /* (l) */
-    uint8_t *frames;                   /* (l, DTSA_FRAME_MAX) */
-    uint8_t *lease_state;              /* (l, bytes of the policy) */
-    uint64_t *rejects;                 /* (2) frames heard that were malformed, foreign */
+    /* Borrowed: v = table_count, l = local_count, n = agents; p = swarm_policy_bytes. */
+    int32_t *local;    /* (l) 0-based agent of each local slot */
+    int32_t *observer; /* (v) 0-based agent of each table, -1: serves all */
+    double *sent_position, *sent_velocity, *sent_intent; /* (v, 3, n) tables: see core.h */
+    int64_t *sent_slot, *last_turn;                      /* (v, n) */
+    uint8_t *in_ap;                                      /* (v, n) */
+    uint32_t *entry_hash;                                /* (v, n) */
+    uint32_t *table_hash;                                /* (v) */
+    double *estimate_position, *estimate_velocity;       /* (v, 3, n) */
+    double *priority;                                    /* (v, n) */
+    int64_t *counter;                                    /* (v, n) */
+    double *position, *velocity, *command, *goal;        /* (3, l) */
+    double *track;                                       /* (steps, 3, l) */
+    uint8_t *active, *final, *present;                   /* (l) see core.h */
+    uint16_t *chosen;                                    /* (l) */
+    uint8_t *reason;                                     /* (l) */
+    uint32_t *digest;                                    /* (l) */
+    double *score;                                       /* (l) */
+    uint8_t *sends;                                      /* (l) */
+    int32_t *senders;      /* (l) places of those that send in this slot */
+    uint8_t *frame_length; /* (l) */
+    uint8_t *frames;       /* (l, DTSA_FRAME_MAX) */
+    uint8_t *lease_state;  /* (l, p) */
+    uint64_t *rejects;     /* (2) frames heard that were malformed, foreign */
 
     /* Owned. */
     dtsa_table *tables; /* (v) */
     dtsa_agent *agents; /* (l) */
     double *scratch, *ages;
-    int32_t *senders; /* (l) */
     int sender_count;
 } swarm;
 
@@ -53,14 +53,19 @@ void swarm_close(swarm *s);
 void swarm_reset(swarm *s);
 void swarm_restart(swarm *s, int l); /* knows nothing but the settings */
 void swarm_decide(swarm *s, int64_t slot);
-/* Encodes the frames of all whose `sends` is set; lists them in senders. */
-void swarm_emit(swarm *s, int64_t slot);
+/* Encodes the frames of all whose `sends` is set; lists them in senders; -> their number. */
+int swarm_emit(swarm *s, int64_t slot);
+int swarm_begin(swarm *s, int64_t slot); /* decides and emits */
 /* mask (v): which tables hear it; NULL: all. -> whether it was a frame of this swarm and time. */
 int swarm_hear(swarm *s, int64_t slot, const uint8_t *data, long length, const uint8_t *mask);
 void swarm_end(swarm *s, int64_t slot);
 void swarm_estimate(swarm *s, int table, int64_t slot, int step);
+void swarm_estimate_all(swarm *s, int64_t slot, int step);
 void swarm_steer(swarm *s, int64_t slot, int step, int estimate);
 void swarm_move(swarm *s, int step);
 void swarm_fly(swarm *s, int64_t slot);
+/* The rest of a slot whose frames are the swarm's own: fly, hear, end. heard (senders, v): which
+ * tables hear each; NULL: `all` of them, or none. */
+void swarm_complete(swarm *s, int64_t slot, int all, const uint8_t *heard);
 
 #endif

@@ -10,12 +10,11 @@ from typing import Any
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
-from dtsa_agent.core import AbstractSwarm, SwarmConfig
+from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
 from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.keys import with_key
-from dtsa_agent.plugin_watch import watched
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings
 from dtsa_agent.ros.common.process.loop import Stop
@@ -88,19 +87,6 @@ def host_agents(
     """
     if shared and not shareable(config):
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
-    with watched(config):
-        _run_agents(node, ids, config, stop, space, shared, spaces)
-
-
-def _run_agents(
-    node: Node,
-    ids: Sequence[int],
-    config: SwarmConfig,
-    stop: Stop,
-    space: str,
-    shared: bool,
-    spaces: Sequence[str] | None,
-) -> None:
     host = HostSettings(**declare_settings(node, HostSettings))
     priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
     swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared and host.mode == "lockstep"))
@@ -123,7 +109,7 @@ def _run_agents(
         agents.loop.close()
 
 
-def _realtime(node: Node, swarm: AbstractSwarm, space: str, priority: int) -> SwarmNode:
+def _realtime(node: Node, swarm: Swarm, space: str, priority: int) -> SwarmNode:
     from .realtime import RealtimeNode
 
     count = len(swarm.ids)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.frame_extended import decode_extended
-from dtsa_agent.core.swarms.abstract_swarm import PRESENT_LEAVING, AbstractSwarm
+from dtsa_agent.core.frame import decode_extended
+from dtsa_agent.core.swarm import PRESENT_LEAVING, Swarm
 
 
 class Leaving:
@@ -15,7 +15,7 @@ class Leaving:
     :param swarm: the agents.
     """
 
-    def __init__(self, swarm: AbstractSwarm) -> None:
+    def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
         self._by: int | None = None  # slot: all have left then at the latest; None: nobody leaves
         self._signals = 0  # when it began

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from std_msgs.msg import Header
 
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
-from dtsa_agent.core.settings.agreement import settings_hash
+from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.runs import Call, run_text
 from dtsa_agent.ros.common.process.waiting import Patience

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from dtsa_agent.core.settings.declaration import Settings, setting
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Feed
 from dtsa_agent.ros.common.wire.checks import OTHER_SENDER, RANGE, OnePublisher, Unusable, check_odometry
@@ -146,7 +146,7 @@ class OdometryVehicle:
                     raise Unusable(RANGE, "odometry that has jumped")
             self._last, self._attitude = (now, position, velocity), attitude
 
-    def sense(self, swarm: AbstractSwarm) -> None:
+    def sense(self, swarm: Swarm) -> None:
         """See Vehicle.
 
         :param swarm: the agent.
@@ -162,7 +162,7 @@ class OdometryVehicle:
         swarm.position[:, 0] = position + velocity * min(time.monotonic() - since, _LONGEST_PREDICTION_S)
         swarm.track[:, :, 0] = swarm.position[:, 0]
 
-    def fly(self, swarm: AbstractSwarm, slot: int) -> None:
+    def fly(self, swarm: Swarm, slot: int) -> None:
         """See Vehicle.
 
         :param swarm: the agent.

@@ -13,7 +13,7 @@ How a flight in real time works, and where each part stands ("channel": `dtsa_ch
    frame that overlaps it can come any more, it is settled: who heard it, by reach, overlap and losses. A RUN message
    delivers it to all processes with the receivers' bits.
 4. **Heard.** :meth:`~RealtimeNode._take_frames` hands it to those agents whose bit is set, in the slot in which it was
-   sent. The lateness of its start moves their own slots (`core/reference/alignment.py`).
+   sent. The lateness of its start moves their own slots (`core/reference/timebase.py`).
 5. **Told.** Some ten times a second a process reports what its agents decided, took in and flew (`reporter`). The
    channel fills an account for each slot (`accounts`); it closes when all have reported or have been given up. The
    recorder, the metrics and the live view get closed accounts only: what agents had, not what they should have had.
@@ -353,12 +353,16 @@ class RealtimeNode(SwarmNode):
         self._reporter.add_slot(slot, offsets, self._lengths)
         if self._watched:
             self._publish_odometry(time_of(names.slot_time_ns(slot, self.slot_ns)))
-        swarm.fly(slot)
+        self._fly(slot)
         early, self._early = self._early, []
         for message in early:
             self._take(message)
         if self._reporter.due():
             self._reporter.publish(self.run_id)
+
+    def _fly(self, slot: int) -> None:
+        """Flies the vehicles through a slot."""
+        self.swarm.fly(slot)
 
     def _send(self, slot: int, senders: Sequence[int], starts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Hands the frames of a slot over to the channel, before anything else is done.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core import Swarm
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.report_fields import pack_report
 
@@ -25,7 +25,7 @@ class Reporter:
     :param swarm: the agents.
     """
 
-    def __init__(self, publisher: Any, swarm: AbstractSwarm) -> None:
+    def __init__(self, publisher: Any, swarm: Swarm) -> None:
         self._publisher, self._swarm = publisher, swarm
         self._slot_ns = swarm.config.slot_ns
         self._every = max(1, _PERIOD_NS // self._slot_ns)

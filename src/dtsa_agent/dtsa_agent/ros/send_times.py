@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from dtsa_agent.core.settings.scenario import STREAM_CLOCKS, generator
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarm import Swarm
 
 
 class SendTimes:
@@ -17,7 +17,7 @@ class SendTimes:
         frame, and for each of its bytes.
     """
 
-    def __init__(self, swarm: AbstractSwarm, jitter_ns: float, flight_time_ns: tuple[int, int]) -> None:
+    def __init__(self, swarm: Swarm, jitter_ns: float, flight_time_ns: tuple[int, int]) -> None:
         self._latest_ns = swarm.config.slot_ns // 2  # so much later the turn is as good as over
         self._jitter_ns = jitter_ns
         self._random = [generator(swarm.config.seed, STREAM_CLOCKS, agent) for agent in swarm.ids]

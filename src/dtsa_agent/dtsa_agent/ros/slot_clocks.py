@@ -10,9 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.reference.alignment import ClockAligner
+from dtsa_agent.core.kernel import ffi, lib
 
 _PPB = 1_000_000_000
+# Slots move by half the median of nine frames; what is off by more than 1 ms is not trusted (dtsa.h).
+_ALIGNER = {"receptions": 9, "share": 32768, "limit_ns": 1_000_000}
 
 
 def slot_starts(local_ns: int, offset_ns: NDArray[np.int64], drift_ppb: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -43,7 +45,7 @@ class SlotClocks:
         self._shift: NDArray[np.int64] = np.zeros(len(self._offset), dtype=np.int64)  # ns, learned
         self._starts: tuple[int | None, NDArray[np.int64]] = None, self._shift  # of the slot asked for last
         self._ideal = not (self._offset.any() or self._drift.any())  # all clocks show the channel's time
-        self._aligners = [ClockAligner() for _ in self._offset] if align else []
+        self._aligners = [ffi.new("dtsa_aligner *", _ALIGNER) for _ in self._offset] if align else []
 
     @property
     def align(self) -> bool:
@@ -76,7 +78,7 @@ class SlotClocks:
         """
         self._move(index, late_ns)
         if self._aligners:
-            self._aligners[index].reset()
+            lib.dtsa_align_reset(self._aligners[index])
 
     def hear(self, index: int | np.intp, late_ns: int) -> int:
         """An agent's slots move towards a frame that it heard.
@@ -86,15 +88,15 @@ class SlotClocks:
         :returns: how many frames in a row did not fit.
         """
         aligner = self._aligners[index]
-        moved = aligner.hear(late_ns)
+        moved = lib.dtsa_align(aligner, late_ns)
         if moved:
             self._move(index, moved)
-        return aligner.ignored_in_a_row
+        return int(aligner.ignored_in_a_row)
 
     def forget(self) -> None:
         """All begin to learn anew."""
         for aligner in self._aligners:
-            aligner.reset()
+            lib.dtsa_align_reset(aligner)
 
     def _move(self, index: int | np.intp, by_ns: int) -> None:
         self._shift[index] += by_ns

@@ -16,10 +16,10 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
-from dtsa_agent.core import AbstractSwarm, AgentGroup
+from dtsa_agent.core import AgentGroup, Swarm
 from dtsa_agent.core.agents.agent import REFUSED
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.core.settings.agreement import agreed_settings
+from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Loop, Stop
 from dtsa_agent.ros.common.process.waiting import Waiting
@@ -51,7 +51,7 @@ class SwarmNode:
 
     mode = "lockstep"
 
-    def __init__(self, node: Node, swarm: AbstractSwarm, swarm_namespace: str = names.SWARM, waiting: int = 1) -> None:
+    def __init__(self, node: Node, swarm: Swarm, swarm_namespace: str = names.SWARM, waiting: int = 1) -> None:
         self.node = node
         self.config = config = swarm.config
         self.agents = AgentGroup(swarm)
@@ -80,7 +80,7 @@ class SwarmNode:
         self._publisher = self.node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
 
     @property
-    def swarm(self) -> AbstractSwarm:
+    def swarm(self) -> Swarm:
         """The agents that live here."""
         return self.agents.swarm
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dtsa_agent.air.contacts import FOR_EVER, Contact, Contacts, Limits, limits_of, said_of
 from dtsa_agent.air.delay import Delay
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
-from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
+from dtsa_agent.core.frame import ExtendedFrame, encode_extended
 
 LIMITS = Limits(moving=100, resting=500, named=50)
 STATE = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))

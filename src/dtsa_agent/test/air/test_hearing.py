@@ -16,20 +16,20 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from plain_hearing import PlainHearing
 from waiting import wait_for
 
 import dtsa_agent
 from dtsa_agent.air.clock import OwnClock
 from dtsa_agent.air.datagram import HEADER, NOT_OURS, Wrapping, flight_ns, trust_ns
 from dtsa_agent.air.hearing import REASONS, STATES, Hearing, make_hearing
-from dtsa_agent.air.plain_hearing import PlainHearing
 from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings, _socket, sockets
 from dtsa_agent.air.udp.sockets import StampClock
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
-from dtsa_agent.core.agents.authentication import Authenticator
-from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
+from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core.frame import ExtendedFrame, encode_extended
 
 KEY = bytes.fromhex("8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4")
 OPEN = SwarmConfig(agents=5, policy="tdma", slot_ms=10.0)

@@ -14,6 +14,7 @@ import time
 from typing import Any
 
 import pytest
+from plain_hearing import SlotTime
 
 from dtsa_agent.air.agent import AirAgent
 from dtsa_agent.air.clock import OwnClock
@@ -22,13 +23,12 @@ from dtsa_agent.air.delay import Delay
 from dtsa_agent.air.precision import going_first
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.slots import SlotTime
 from dtsa_agent.air.tally import Tally
 from dtsa_agent.air.udp import MulticastSocket, UdpPort, UdpSettings
 from dtsa_agent.air.udp.sockets import Datagram, StampClock
 from dtsa_agent.core import ConfigError, Frame, SwarmConfig, encode_frame
-from dtsa_agent.core.agents.authentication import Authenticator
 from dtsa_agent.core.agents.pacing import latest_send_ns
+from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.reference.timebase import ALIGNED, FOREIGN, LISTENING, RESTARTED
 
 SLOT_NS = 10_000_000

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core import Agent, AgentGroup, ConfigError, SlotOutcome, Swarm, SwarmConfig, decode_frame
-from dtsa_agent.core.agents.authentication import Authenticator
+from dtsa_agent.core.authentication import Authenticator
 
 
 def test_agents_that_share_bytes_only_fly_like_the_swarm() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core import ConfigError, LocalProtocolError, Swarm, SwarmConfig
-from dtsa_agent.core.agents.authentication import TAG_LENGTH, Authenticator, is_pattern
+from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator, is_pattern
 
 KEY = bytes(range(32))
 RANDOM_KEY = "7c1f0a93e4d25b6880b13f96c2de470a"

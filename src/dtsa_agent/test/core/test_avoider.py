@@ -1,4 +1,4 @@
-"""The compiled avoiders against the specification, and what every avoider promises."""
+"""The compiled avoiders against the formulas, and what every avoider promises."""
 
 from __future__ import annotations
 
@@ -6,29 +6,19 @@ import dataclasses
 import math
 
 import numpy as np
+import plain_avoiders
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from kernel_parts import avoid
+from plain_avoiders import Case
 
-from dtsa_agent.core import Swarm, SwarmConfig, _kernel
-from dtsa_agent.core.binding import AVOID
+from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.reference import avoiders
-from dtsa_agent.core.reference.avoiders import Avoidance, Neighbour, Scene
+from dtsa_agent.core.kernel import lib
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, flight_model
 
 MODELS = tuple(FLIGHT_MODELS)
-
-
-@dataclasses.dataclass
-class Case:
-    """One question to an avoider."""
-
-    index: int
-    position: np.ndarray  # (3, N)
-    velocity: np.ndarray  # (3, N)
-    goal: np.ndarray  # (3,)
-    age: np.ndarray  # (N,)
 
 
 def make_case(seed: int, count: int, size: float, speed: float = 1.5) -> Case:
@@ -49,20 +39,7 @@ cases = st.builds(
 
 def command(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np.ndarray:
     i = case.index
-    return model.command(i, case.position[:, i], case.velocity[:, i], case.goal, case.position, case.velocity, age)
-
-
-def scene_of(case: Case, age: np.ndarray | None = None) -> Scene:
-    """The same question to the specification."""
-    ages = np.zeros(len(case.age)) if age is None else age
-    places, speeds = (list(map(tuple, array.T.tolist())) for array in (case.position, case.velocity))
-    others = [Neighbour(j + 1, places[j], speeds[j], float(ages[j])) for j in range(len(places)) if j != case.index]
-    return Scene(case.index + 1, places[case.index], speeds[case.index], tuple(case.goal.tolist()), others)
-
-
-def plain(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np.ndarray:
-    params = Avoidance(**model.avoider.to_dict())
-    return np.array(avoiders.command(model.avoider_kind, scene_of(case, age), params))
+    return avoid(model, i, case.position[:, i], case.velocity[:, i], case.goal, case.position, case.velocity, age)
 
 
 # --- the compiled kernel computes what the formulas say -------------------------------------------
@@ -77,46 +54,47 @@ orca_params = st.builds(
 )
 
 
+def off_the_edges(model: FlightModel, case: Case, age: np.ndarray | None) -> bool:
+    """Whether no neighbour's sphere just touches: a hair decides there, in both."""
+    ages = 0 * case.age if age is None else age
+    wider = np.minimum(model.avoider.margin_max, model.avoider.margin_rate * ages)
+    gaps = np.linalg.norm(case.position - case.position[:, [case.index]], axis=0) - model.avoider.radius - wider
+    return not (np.abs(np.delete(gaps, case.index)) < 1e-3).any()
+
+
 @settings(max_examples=150, deadline=None)
 @given(cases, orca_params, st.booleans())
 def test_orca_minimises_the_soft_problem(case: Case, params: AvoiderParams, aged: bool) -> None:
-    model = dataclasses.replace(FLIGHT_MODELS["orca"], avoider=params)
-    age = case.age if aged else None
-    for j in range(case.position.shape[1]):
-        # the cone is badly conditioned where the neighbour's sphere just touches
-        gap = np.linalg.norm(case.position[:, j] - case.position[:, case.index]) - params.radius
-        wider = 0.0 if age is None else min(params.margin_max, params.margin_rate * age[j])
-        assume(j == case.index or abs(gap - wider) > 1e-4)
-    assert command(model, case, age) == pytest.approx(plain(model, case, age), abs=1e-9)
+    model, age = dataclasses.replace(FLIGHT_MODELS["orca"], avoider=params), case.age if aged else None
+    assume(off_the_edges(model, case, age))
+    assert command(model, case, age) == pytest.approx(plain_avoiders.command(model, case, age), abs=1e-9)
 
 
 def test_orca_agrees_with_hildreth_sweeps() -> None:
     """Another way to the same minimum: coordinate ascent of the dual."""
     model = FLIGHT_MODELS["orca"]
-    rho, params = model.avoider.softness, Avoidance(**model.avoider.to_dict())
+    params, rho = model.avoider, model.avoider.softness
     for seed in range(20):
         case = make_case(seed, 12, 1.2)
-        scene = scene_of(case)
-        x, y, z = avoiders.preferred(scene, params)
-        v = np.array(avoiders.limited((x + params.bias * y, y - params.bias * x, z), params.v_max))
-        spaces = [avoiders.orca_half_space(scene, other, params) for other in scene.neighbours]
-        normals, dual = [np.array(space.normal) for space in spaces], np.zeros(len(spaces))
+        v = plain_avoiders.turned_wish(case, params)
+        normals, bounds = plain_avoiders.orca_half_spaces(case, params, np.zeros(12))
+        dual = np.zeros(len(bounds))
         for _ in range(3000):
-            for j, space in enumerate(spaces):
-                n = normals[j]
-                new = max(0.0, dual[j] + (space.bound - n @ v - dual[j] / rho) / (1 + 1 / rho))
+            for j, n in enumerate(normals):
+                new = max(0.0, dual[j] + (bounds[j] - n @ v - dual[j] / rho) / (1 + 1 / rho))
                 v = v + (new - dual[j]) * n
                 dual[j] = new
-        assert command(model, case) == pytest.approx(avoiders.limited(tuple(v), params.v_max), abs=1e-6)
+        assert command(model, case) == pytest.approx(plain_avoiders.limited(v, params.v_max), abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["potential", "jerky"])
+@pytest.mark.parametrize("name", MODELS)
 @settings(max_examples=100, deadline=None)
 @given(case=cases, aged=st.booleans(), rate=st.sampled_from([0.0, 0.1]))
-def test_potential_adds_the_forces(name: str, case: Case, aged: bool, rate: float) -> None:
-    model = flight_model(name, {"margin_rate": rate})
-    age = case.age if aged else None
-    assert command(model, case, age) == pytest.approx(plain(model, case, age), abs=1e-12)
+def test_avoiders_command_what_the_formulas_say(name: str, case: Case, aged: bool, rate: float) -> None:
+    model, age = flight_model(name, {"margin_rate": rate}), case.age if aged else None
+    assume(off_the_edges(model, case, age))
+    tolerance = 1e-9 if "bvc" in name else 1e-12  # its walls are stiff: 1e6 times what rounding does
+    assert command(model, case, age) == pytest.approx(plain_avoiders.command(model, case, age), abs=tolerance)
 
 
 @pytest.mark.parametrize("name", ["bvc", "bvc-firmware"])
@@ -125,9 +103,8 @@ def test_potential_adds_the_forces(name: str, case: Case, aged: bool, rate: floa
 def test_bvc_flies_to_the_nearest_point_of_its_cell(name: str, case: Case) -> None:
     params = dataclasses.replace(FLIGHT_MODELS[name].avoider, gain=0.05, sidestep=1e-6)
     model = dataclasses.replace(FLIGHT_MODELS[name], avoider=params)
-    same = Avoidance(**params.to_dict())
-    walls = [*avoiders.bvc_walls(scene_of(case), same), *avoiders.bvc_box(same)]
-    a, c = -np.array([wall.normal for wall in walls]), -np.array([wall.bound for wall in walls])
+    normals, bounds = plain_avoiders.bvc_walls(case, params, 0 * case.age)
+    a, c = -normals, -bounds
     goal = case.goal - case.position[:, case.index]
     target = command(model, case) / params.gain  # the gain is so small that no speed limit acts
     assume(np.all(c > 1e-3))  # in its own cell: the cell is not empty
@@ -157,12 +134,6 @@ def test_bvc_steps_to_its_right_in_front_of_a_wall() -> None:
     assert command(FLIGHT_MODELS["bvc"], far)[1] == pytest.approx(0.0, abs=1e-9)
 
 
-@given(case=cases)
-def test_none_flies_straight(case: Case) -> None:
-    model = FLIGHT_MODELS["none"]
-    assert command(model, case) == pytest.approx(plain(model, case), abs=1e-12)
-
-
 # --- what all avoiders promise --------------------------------------------------------------------
 
 
@@ -181,14 +152,14 @@ def test_commands_are_finite_and_within_v_max(name: str, case: Case, aged: bool)
 @given(case=cases, aged=st.booleans())
 def test_same_bits_with_and_without_avx2(name: str, case: Case, aged: bool) -> None:
     model = flight_model(name, {"margin_rate": 0.1})
-    best = _kernel.vector_level(-1)
+    best = lib.avoid_vector_level(-1)
     results = []
     try:
         for level in (0, best):
-            _kernel.vector_level(level)
+            lib.avoid_vector_level(level)
             results.append(command(model, case, case.age if aged else None).tobytes())
     finally:
-        _kernel.vector_level(best)
+        lib.avoid_vector_level(best)
     assert results[0] == results[1]
 
 
@@ -201,11 +172,11 @@ def test_own_entry_and_unknown_neighbours_are_ignored(name: str, case: Case) -> 
     changed = dataclasses.replace(case, position=case.position.copy(), velocity=case.velocity.copy())
     changed.position[:, case.index] = changed.velocity[:, case.index] = 77.0
     i = case.index
-    result = model.command(i, case.position[:, i], case.velocity[:, i], case.goal, changed.position, changed.velocity)
+    result = avoid(model, i, case.position[:, i], case.velocity[:, i], case.goal, changed.position, changed.velocity)
     assert result.tobytes() == expected.tobytes()
     nan = np.full((3, 1), np.nan)
     wider = [np.hstack((a, nan)) for a in (case.position, case.velocity)]
-    result = model.command(i, case.position[:, i], case.velocity[:, i], case.goal, *wider)
+    result = avoid(model, i, case.position[:, i], case.velocity[:, i], case.goal, *wider)
     assert result.tobytes() == expected.tobytes()
 
 
@@ -213,7 +184,7 @@ def test_own_entry_and_unknown_neighbours_are_ignored(name: str, case: Case) -> 
 def test_two_agents_at_one_point_part(name: str) -> None:
     model = FLIGHT_MODELS[name]
     both = np.zeros((3, 2))
-    commands = [model.command(i, both[:, i], both[:, i], np.zeros(3), both, both) for i in (0, 1)]
+    commands = [avoid(model, i, both[:, i], both[:, i], np.zeros(3), both, both) for i in (0, 1)]
     assert all(np.all(np.isfinite(c)) for c in commands)
     if name == "orca":
         assert commands[0][0] < -0.1
@@ -229,7 +200,7 @@ def test_all_agents_at_once_give_the_same_bits(name: str) -> None:
     swarm.position[:], swarm.velocity[:], swarm.goal[:] = case.position, case.velocity, goals
     swarm.steer(0, 0)
     for i in range(30):
-        one = model.command(i, case.position[:, i], case.velocity[:, i], goals[:, i], case.position, case.velocity)
+        one = avoid(model, i, case.position[:, i], case.velocity[:, i], goals[:, i], case.position, case.velocity)
         assert one.tobytes() == swarm.command[:, i].tobytes()
 
 
@@ -239,7 +210,7 @@ def test_margin_grows_with_age_up_to_its_limit() -> None:
     goal = np.array([5.0, 0.0, 0.0])
     model = flight_model("orca", {"margin_rate": 0.2, "margin_max": 0.3})
     fresh, old, older, oldest = (
-        model.command(0, position[:, 0], velocity[:, 0], goal, position, velocity, np.full(2, age))
+        avoid(model, 0, position[:, 0], velocity[:, 0], goal, position, velocity, np.full(2, age))
         for age in (0.0, 0.5, 1.5, 9.0)
     )
     assert fresh[1] > old[1] > older[1]  # evades more widely
@@ -305,26 +276,3 @@ def test_bad_settings_are_named(name: str, options: dict, field: str) -> None:
     with pytest.raises(ConfigError) as caught:
         flight_model(name, options)
     assert caught.value.field == field
-
-
-def test_wrong_arrays_are_refused() -> None:
-    model = FLIGHT_MODELS["orca"]
-    params, good, table = AVOID.image(model.avoider.to_dict()), bytes(3 * 8), bytes(3 * 4 * 8)
-    assert len(_kernel.avoid_command(0, params, 0, good, good, good, table, table, None)) == 3 * 8
-    for bad in (bytes(2 * 8), bytes(3 * 4), bytes(4 * 8)):
-        with pytest.raises(ValueError, match="argument 4"):
-            _kernel.avoid_command(0, params, 0, bad, good, good, table, table, None)
-    for bad in (np.zeros(3), None):
-        with pytest.raises(TypeError):
-            _kernel.avoid_command(0, params, 0, bad, good, good, table, table, None)
-    with pytest.raises(ValueError, match="argument 8"):
-        _kernel.avoid_command(0, params, 0, good, good, good, table, bytes(3 * 5 * 8), None)
-    with pytest.raises(ValueError, match="argument 9"):
-        _kernel.avoid_command(0, params, 0, good, good, good, table, table, bytes(3 * 8))
-    for kind in (4, -1):
-        with pytest.raises(ValueError, match="kind"):
-            _kernel.avoid_command(kind, params, 0, good, good, good, table, table, None)
-    with pytest.raises(ValueError, match="params"):
-        _kernel.avoid_command(0, params[8:], 0, good, good, good, table, table, None)
-    with pytest.raises(KeyError, match="softness"):
-        AVOID.image({"v_max": 1.0, "gain": 1.0, "radius": 1.0, "horizon": 1.0})

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from dataclasses import fields
 
 import pytest
 
 from dtsa_agent.core import ConfigError, SwarmConfig
+from dtsa_agent.core.settings.declaration import settings_of
 
 
 def test_defaults_are_those_of_the_paper_where_it_has_some() -> None:
@@ -62,8 +63,7 @@ def test_round_trip_through_plain_values() -> None:
 
 
 def test_every_setting_is_documented() -> None:
-    for spec in dataclasses.fields(SwarmConfig):
-        assert spec.metadata["help"], spec.name
+    assert {spec.name for spec in settings_of(SwarmConfig) if spec.help} == {f.name for f in fields(SwarmConfig)}
 
 
 def test_slots_are_cut_into_control_periods_of_ten_milliseconds_or_less() -> None:

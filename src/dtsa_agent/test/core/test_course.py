@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig, make_scenario
-from dtsa_agent.core.settings.course import Course, Plan
+from dtsa_agent.core.settings.scenario import Course, Plan
 
 KINDS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
 

@@ -9,24 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_agent.core import (
-    Frame,
-    LocalProtocolError,
-    RemoteProtocolError,
-    decode_frame,
-    encode_frame,
-)
-from dtsa_agent.core.frame import named_in
-from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
+from dtsa_agent.core import Frame, LocalProtocolError, RemoteProtocolError, decode_frame, encode_frame
+from dtsa_agent.core.frame import ExtendedFrame, encode_extended, named_in
 
 # Written down by hand from the layout in docs/reference/protocol.md: header 10 or 11, id, c_r, slot, position / 2 mm,
 # velocity / 1 cm/s in 12 bits each, low nibble first.
 GOLDEN = [
     (Frame(1, 0, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "10 0100 00 00000000 0000 0000 0000 000000 0000"),
-    (
-        Frame(18, 1000, 1, (1.0, -2.0, 0.5), (1.5, -0.01, 0.0)),
-        "10 1200 01 e8030000 f401 18fc fa00 96f0ff 0000",
-    ),
+    (Frame(18, 1000, 1, (1.0, -2.0, 0.5), (1.5, -0.01, 0.0)), "10 1200 01 e8030000 f401 18fc fa00 96f0ff 0000"),
     (
         Frame(300, 2**32 - 1, 255, (65.534, -65.536, 0.002), (20.47, -20.48, -0.02)),
         "10 2c01 ff ffffffff ff7f 0080 0100 ff0780 fe0f",
@@ -42,13 +32,7 @@ speed = st.floats(-20.4, 20.4)
 vectors = st.tuples(coordinate, coordinate, coordinate)
 speeds = st.tuples(speed, speed, speed)
 frames = st.builds(
-    Frame,
-    st.integers(1, 65535),
-    st.integers(0, 2**32 - 1),
-    st.integers(0, 255),
-    vectors,
-    speeds,
-    st.none() | speeds,
+    Frame, st.integers(1, 65535), st.integers(0, 2**32 - 1), st.integers(0, 255), vectors, speeds, st.none() | speeds
 )
 
 
@@ -99,13 +83,7 @@ def test_fields_saturate_and_never_wrap(huge: float) -> None:
 
 @pytest.mark.parametrize("change", [{"position": (math.nan, 0, 0)}, {"sender": 0}, {"sender": 70000}, {"c_r": 256}])
 def test_our_own_mistakes_are_refused(change: dict[str, object]) -> None:
-    fields: dict[str, object] = {
-        "sender": 1,
-        "slot": 0,
-        "c_r": 1,
-        "position": (0.0,) * 3,
-        "velocity": (0.0,) * 3,
-    }
+    fields: dict[str, object] = {"sender": 1, "slot": 0, "c_r": 1, "position": (0.0,) * 3, "velocity": (0.0,) * 3}
     with pytest.raises(LocalProtocolError):
         encode_frame(Frame(**(fields | change)))  # type: ignore[arg-type]
 

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.core.frame import Frame, encode_frame
-from dtsa_agent.core.frame_extended import (
+from dtsa_agent.core.frame import (
     EXTENDED_LENGTH,
     ExtendedFrame,
+    Frame,
     Gossip,
     decode_extended,
-    decode_head,
     encode_extended,
+    encode_frame,
 )
 from dtsa_agent.core.reference import frame_extended as plain
 
@@ -100,14 +100,6 @@ def test_round_trip(frame: ExtendedFrame) -> None:
     assert len(data) == EXTENDED_LENGTH
     assert close(decode_extended(data), frame)
     assert encode_extended(decode_extended(data)) == data
-
-
-@given(frames(), st.integers(23, 56))
-def test_the_first_bytes_hold_the_senders_state(frame: ExtendedFrame, heard: int) -> None:
-    data = encode_extended(frame)
-    assert decode_head(data[:heard]) == decode_extended(data).own
-    with pytest.raises(RemoteProtocolError):
-        decode_head(data[:22])
 
 
 def test_the_state_has_the_bytes_of_the_papers_frame() -> None:

@@ -10,19 +10,12 @@ import pytest
 from lease_helpers import FAR, is_anchor, still
 
 from dtsa_agent.core import ConfigError, Scenario, Swarm, SwarmConfig, make_scenario
-from dtsa_agent.core.frame import Frame
-from dtsa_agent.core.frame_extended import (
-    OPEN,
-    ExtendedFrame,
-    Gossip,
-    decode_extended,
-    encode_extended,
-)
+from dtsa_agent.core.frame import OPEN, ExtendedFrame, Frame, Gossip, decode_extended, encode_extended
 from dtsa_agent.core.reference.lease.decide import takes_open
 from dtsa_agent.core.reference.lease.issue import open_block
 from dtsa_agent.core.reference.lease.memory import HANDED, NEVER, Lease, Memory
 from dtsa_agent.core.reference.rules import Rules
-from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
+from dtsa_agent.core.reference.stepper import ReferenceSwarm
 
 STATEMENTS = pytest.mark.parametrize("statement", [Swarm, ReferenceSwarm], ids=["C", "Python"])
 OWN = {"position": (0.0, 0.0, 0.0), "velocity": (0.0, 0.0, 0.0), "intent": (0.0, 0.0, 0.0)}

@@ -10,8 +10,8 @@ import pytest
 from lease_helpers import FAR, is_anchor, still
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.frame_extended import ExtendedFrame, decode_extended, encode_extended
-from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
+from dtsa_agent.core.frame import ExtendedFrame, decode_extended, encode_extended
+from dtsa_agent.core.reference.stepper import ReferenceSwarm
 
 STATEMENTS = pytest.mark.parametrize("statement", [Swarm, ReferenceSwarm], ids=["C", "Python"])
 MAIN = 15  # K M of the default settings

@@ -8,16 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from dtsa_agent.core import (
-    AbstractSwarm,
-    Agent,
-    ConfigError,
-    PluginError,
-    SlotOutcome,
-    Swarm,
-    SwarmConfig,
-)
-from dtsa_agent.core.agents.authentication import AuthenticatedSwarm, Authenticator
+from dtsa_agent.core import Agent, ConfigError, PluginError, SlotOutcome, Swarm, SwarmConfig
+from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.plugins.table import Table
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES
@@ -92,11 +84,11 @@ def config(**settings: Any) -> SwarmConfig:
     return SwarmConfig(**{"agents": 3, "moving": 2, "policy": "counting", "estimator": "initials", **settings})
 
 
-def parts(swarm: AbstractSwarm, kind: str) -> list[Any]:
-    return [part.made for part in getattr(swarm, f"_{kind}")]
+def parts(swarm: Swarm, kind: str) -> list[Any]:
+    return [part.made for part in getattr(swarm, kind)]
 
 
-def fly(swarm: AbstractSwarm, slots: range, lost: tuple[int, int] | None = None) -> list[bytes]:
+def fly(swarm: Swarm, slots: range, lost: tuple[int, int] | None = None) -> list[bytes]:
     """Flies some slots; agent and slot of ``lost``: does not hear the frame of that slot."""
     frames = []
     for slot in slots:
@@ -158,7 +150,8 @@ def test_single_agents_hear_and_are_told_the_same() -> None:
 
 
 def test_bytes_of_plug_ins_are_authenticated_and_short_frames_are_none() -> None:
-    sealed = AuthenticatedSwarm(make_swarm(config()), Authenticator(KEY))
+    sealed = make_swarm(config())
+    sealed.authenticator = Authenticator(KEY)
     fly(sealed, range(3))
     (index,) = sealed.begin(3)
     data = sealed.frame(index)

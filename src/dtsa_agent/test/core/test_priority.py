@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernel_parts import priority, select
 
-from dtsa_agent.core import REASONS, ConfigError, priority, select
+from dtsa_agent.core import REASONS
 
 CASES = json.loads((Path(__file__).parents[1] / "golden" / "priority.json").read_text())["cases"]
 
@@ -86,10 +87,3 @@ def test_special_cases_of_the_selection() -> None:
     assert select([9, 8, 1], [0, 9, 9], everyone)[0::2] == (1, REASONS.index("tie"))
     assert select([9, 8, 1], [0, 9, 9], np.array([0, 0, 1]))[0] == 2
     assert select([9, 8, 1], [5, 5, 5], everyone)[0] == 0
-
-
-def test_bad_input_is_named() -> None:
-    with pytest.raises(ConfigError, match="position, velocity"):
-        priority([[0, 0]], [[0, 0]], 0.01)
-    with pytest.raises(ConfigError, match="selection"):
-        select([1], [1], [1], 0.5, "random")

@@ -1,8 +1,7 @@
-"""The compiled core computes what the specification says: bit for bit where agents must agree, to 1e-12 where not."""
+"""The compiled core computes what the specification says, bit for bit."""
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import math
 from collections.abc import Callable
@@ -10,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from kernel_parts import priority, select
 
 from dtsa_agent.core import (
     Frame,
@@ -21,18 +21,12 @@ from dtsa_agent.core import (
     SwarmConfig,
     decode_frame,
     encode_frame,
-    priority,
-    select,
 )
-from dtsa_agent.core.compiled import MISSING, kernel
-from dtsa_agent.core.frame import position_step
-from dtsa_agent.core.frame_extended import ExtendedFrame, Gossip, decode_extended, encode_extended
-from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.reference import arithmetic, frame, frame_extended, selection, tag, timebase
-from dtsa_agent.core.reference import priority as plain_priority
+from dtsa_agent.core.frame import ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
+from dtsa_agent.core.kernel import ffi, lib
+from dtsa_agent.core.reference import arithmetic, frame, frame_extended, policies, tag, timebase
+from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_agent.core.registry import REASONS
-from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, flight_model
-from dtsa_agent.core.swarms.reference_swarm import ReferenceSwarm
 
 EXTENTS = (65.534, 20.0, 1.0, 9999.0)
 
@@ -113,9 +107,7 @@ def test_priorities_have_the_same_bits(count: int, seed: int) -> None:
     velocity[random.random(count) < 0.2] = 0
     position[random.random(count) < 0.1] = 1.0
     compiled = priority(position, velocity, 0.01)
-    plain = plain_priority.priorities(
-        [tuple(p) for p in position.tolist()], [tuple(v) for v in velocity.tolist()], 0.01
-    )
+    plain = policies.priorities([tuple(p) for p in position.tolist()], [tuple(v) for v in velocity.tolist()], 0.01)
     assert compiled.tobytes() == np.array(plain).tobytes()
 
 
@@ -126,11 +118,11 @@ def test_the_same_is_selected_for_the_same_reason(count: int, seed: int, reading
     g = random.choice([0.0, 0.1, 0.3, 0.5, 1.0], count) * random.choice([0.0, 1.0, random.random()])
     h, in_ap, epsilon = random.integers(0, 5, count), random.random(count) < 0.7, float(random.choice([0, 0.5, 1]))
     index, close, reason = select(g, h, in_ap, epsilon, reading)
-    plain = selection.select(g.tolist(), h.tolist(), in_ap.tolist(), epsilon, reading)
+    plain = policies.select(g.tolist(), h.tolist(), in_ap.tolist(), epsilon, reading)
     assert (index, REASONS[reason]) == (plain.index, plain.reason)
     if reading == "candidates" and plain.reason in ("tie", "priority"):
         members = np.flatnonzero(in_ap).tolist()
-        assert np.flatnonzero(close).tolist() == selection.candidates(g.tolist(), members, epsilon)
+        assert np.flatnonzero(close).tolist() == policies.candidates(g.tolist(), members, epsilon)
 
 
 TABLES = ("tdma", "dtsa", "age", "aloha", "lease")
@@ -182,7 +174,7 @@ def test_who_is_most_urgent_is_found_without_all_priorities(count: int, seed: in
         velocity = -0.5 * position
     velocity[:, random.random(count) < random.choice([0, 0, 0.4])] = 0
     position[:, random.random(count) < random.choice([0, 0, 0.2])] = 1.0
-    g = plain_priority.priorities(
+    g = policies.priorities(
         [tuple(p) for p in position.T.tolist()], [tuple(v) for v in velocity.T.tolist()], 0.01
     )  # fmt: skip
     edge = 1 - random.choice(g) / max(g) if max(g) > 0 else 0.5
@@ -191,7 +183,7 @@ def test_who_is_most_urgent_is_found_without_all_priorities(count: int, seed: in
     in_ap, last = random.random(count) < 0.8, random.integers(0, 5, count)
     swarm.sent_position[:], swarm.sent_velocity[:], swarm.in_ap[:], swarm.last_turn[:] = position, velocity, in_ap, last
     swarm.decide(8)  # nobody was heard: states are as they are
-    plain = selection.select(g, (7 - last).tolist(), in_ap.tolist(), epsilon)
+    plain = policies.select(g, (7 - last).tolist(), in_ap.tolist(), epsilon)
     assert (int(swarm.chosen[0]) - 1, swarm.reason_name(0), swarm.score[0]) == (plain.index, plain.reason, plain.g)
     known = ~np.isnan(swarm.priority[0]) & in_ap.any()
     assert swarm.priority[0][known].tobytes() == np.array(g)[known].tobytes()
@@ -226,102 +218,54 @@ def random_frame(random: np.random.Generator, agents: int, slot: int, whole: boo
     return encode_extended(ExtendedFrame(own, c_s, bool(random.random() < 0.05), probation, others[:2], leases))
 
 
-@settings(max_examples=250)
-@given(
-    st.integers(0, 2**32 - 1),
-    st.sampled_from(sorted(FLIGHT_MODELS)),
-    st.sampled_from([0.0, 0.1]),
-    st.sampled_from([0.5, 1.5, 4.0]),
-)
-def test_avoiders_command_the_same_velocity(seed: int, name: str, rate: float, size: float) -> None:
-    """Random scenes, crowded and wide. Scenes on an edge are left out: a hair decides there, in both."""
-    random, model = np.random.default_rng(seed), flight_model(name, {"margin_rate": rate})
-    count = int(random.integers(1, 20))
-    position, velocity = random.uniform(-size, size, (3, count)), random.uniform(-1, 1, (3, count))
-    goal, ages = random.uniform(-5, 5, 3), random.uniform(0, 2, count)
-    own = int(random.integers(count))
-    away = np.sqrt(((position - position[:, [own]]) ** 2).sum(axis=0))
-    edge = model.avoider.radius + np.minimum(model.avoider.margin_max, rate * ages)
-    assume(not (np.abs(np.delete(away - edge, own)) < 1e-3).any())
-    scene = (own, position[:, own], velocity[:, own], goal, position, velocity, ages)
-    tolerance = 1e-12 if "bvc" not in name else 1e-9  # its walls are stiff: 1e6 times what rounding does
-    np.testing.assert_allclose(model.command(*scene, plain=True), model.command(*scene), rtol=0, atol=tolerance)
-
-
-def test_a_swarm_of_the_specification_is_reset_and_copied() -> None:
-    config = SwarmConfig(agents=4, policy="dtsa", seed=3)
-    swarm = ReferenceSwarm(config, shared_table=True)
-    digest = swarm.table_hash.copy()
-    for slot in range(12):
-        swarm.scenario.advance(slot, swarm)
-        for place in swarm.begin(slot):
-            swarm.fly(slot)
-            swarm.hear(slot, swarm.frame(place))
-        swarm.end(slot)
-    assert swarm.table_hash != digest
-    swarm.reset()
-    assert swarm.table_hash == digest
-    with pytest.raises(ValueError, match="share"):
-        swarm.restart(0)
-
-
 OUTCOMES = (timebase.ALIGNED, timebase.RESTARTED, timebase.FOREIGN)
-
-
-@pytest.fixture(scope="module")
-def library() -> ctypes.CDLL:
-    """The functions of libdtsa that the compiled kernel does not use itself."""
-    assert not MISSING
-    found = ctypes.CDLL(str(kernel.__file__))
-    for name in ("dtsa_timebase_start", "dtsa_timebase_slot", "dtsa_timebase_slot_start"):
-        getattr(found, name).restype = ctypes.c_int64
-    return found
+STATES = (timebase.LISTENING, timebase.ALONE, timebase.JOINED)
 
 
 @settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1))
-def test_the_same_is_heard_at_the_same_times_in_the_same_slots(library: ctypes.CDLL, seed: int) -> None:
+def test_the_same_is_heard_at_the_same_times_in_the_same_slots(seed: int) -> None:
     """Time base and alignment: random frames of one's own time and of others, on a clock that runs on."""
     random = np.random.default_rng(seed)
-    agents, every, slot_ns = (
-        int(random.integers(1, 255)),
-        int(random.integers(1, 16)),
-        int(random.choice([10**6, 10**7])),
-    )
-    agent, now, long = int(random.integers(1, agents + 1)), int(random.integers(0, 10**15)), ctypes.c_int64
+    agents, every = int(random.integers(1, 255)), int(random.integers(1, 16))
+    slot_ns = int(random.choice([10**6, 10**7]))
+    agent, now = int(random.integers(1, agents + 1)), int(random.integers(0, 10**15))
     plain = timebase.TimeBase(agents=agents, anchor_every=every, slot_ns=slot_ns, agent=agent, seed=seed)
-    compiled = ctypes.byref(ctypes.create_string_buffer(1024))
-    assert library.dtsa_timebase_init(compiled, agents, every, long(slot_ns), agent, ctypes.c_uint64(seed)) == 1
+    compiled = ffi.new("dtsa_timebase *")
+    assert lib.dtsa_timebase_init(compiled, agents, every, slot_ns, agent, seed) == 1
     deadline = plain.start(now)
-    assert library.dtsa_timebase_start(compiled, long(now)) == deadline
+    assert lib.dtsa_timebase_start(compiled, now) == deadline
     if random.random() < 0.4:
         now = deadline + int(random.integers(-1, 2))
-        assert library.dtsa_timebase_wake(compiled, long(now)) == plain.wake(now)
-    for _ in range(40):
+        assert lib.dtsa_timebase_wake(compiled, now) == plain.wake(now)
+    for _ in range(120):
         now += int(random.integers(0, 3 * slot_ns))
         expected = plain.slot(now)
         slot = int(random.integers(0, 10**6)) if expected is None or random.random() < 0.05 else expected
         late = int(random.choice([-(10**6) - 1, -400_000, 3, 250_001, 10**6, slot_ns // 2, 3 * slot_ns]))
         start = now if expected is None else plain.slot_start_ns(slot) + late + int(random.integers(-9, 10))
-        assert OUTCOMES[library.dtsa_timebase_hear(compiled, long(slot), long(start))] == plain.hear(slot, start)
-        assert library.dtsa_timebase_slot(compiled, long(now)) == plain.slot(now)
-        assert library.dtsa_timebase_slot_start(compiled, long(slot)) == plain.slot_start_ns(slot)
+        assert OUTCOMES[lib.dtsa_timebase_hear(compiled, slot, start)] == plain.hear(slot, start)
+        assert lib.dtsa_timebase_slot(compiled, now) == plain.slot(now)
+        assert lib.dtsa_timebase_slot_start(compiled, slot) == plain.slot_start_ns(slot)
+        assert (STATES[compiled.state], compiled.restarts) == (plain.state, plain.restarts)
+    ours, theirs = compiled.aligner, plain._aligner
+    assert (ours.corrections, ours.ignored) == (theirs.corrections, theirs.ignored)
 
 
 @given(st.binary(min_size=16, max_size=32), st.integers(0, 2**64 - 1), st.integers(0, 2**40), st.binary(max_size=300))
-def test_frames_get_the_same_tags(library: ctypes.CDLL, key: bytes, session: int, slot: int, data: bytes) -> None:
-    said = ctypes.create_string_buffer(tag.LENGTH)
-    session_c, slot_c, length = ctypes.c_uint64(session), ctypes.c_uint64(slot), ctypes.c_long(len(data))
-    library.dtsa_tag(key, len(key), session_c, slot_c, data, length, said)
-    assert said.raw == tag.tag(tag.keyed(key, session), slot, data)
+def test_frames_get_the_same_tags(key: bytes, session: int, slot: int, data: bytes) -> None:
+    said = ffi.new("uint8_t[]", tag.LENGTH)
+    lib.dtsa_tag(key, len(key), session, slot, data, len(data), said)
+    assert bytes(said) == tag.tag(tag.keyed(key, session), slot, data)
+    sealed = data + bytes(said)
+    assert lib.dtsa_open(key, len(key), session, slot, 0, sealed, len(sealed)) == len(data)
 
 
-@pytest.mark.skipif(bool(MISSING), reason="the core is not compiled")
 @pytest.mark.parametrize("estimator", ["hold", "linear", "intent"])
 def test_a_state_from_the_next_slot_is_estimated_within_its_memory(estimator: str) -> None:
     """A clock that is ahead: its frame is heard before the receiver's slot is over. Found by fuzzing."""
     config = SwarmConfig(agents=3, estimator=estimator, policy="tdma")
-    swarms = [make_swarm(config, core=core) for core in ("compiled", "reference")]
+    swarms = Swarm(config), ReferenceSwarm(config)
     for swarm in swarms:
         swarm.velocity[:] = 0.5
         swarm.begin(0)

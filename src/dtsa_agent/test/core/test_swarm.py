@@ -9,14 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_agent.core import (
-    REASONS,
-    ConfigError,
-    Swarm,
-    SwarmConfig,
-    encode_frame,
-    make_scenario,
-)
+from dtsa_agent.core import REASONS, ConfigError, Swarm, SwarmConfig, encode_frame, make_scenario
 from dtsa_agent.core.frame import Frame
 
 COLLISION_FREE = ("tdma", "dtsa", "age")

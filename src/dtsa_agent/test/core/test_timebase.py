@@ -7,8 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dtsa_agent.core import ConfigError
-from dtsa_agent.core.reference.alignment import ClockAligner
-from dtsa_agent.core.reference.timebase import ALIGNED, ALONE, FOREIGN, JOINED, LISTENING, RESTARTED, TimeBase
+from dtsa_agent.core.reference.timebase import (
+    ALIGNED,
+    ALONE,
+    FOREIGN,
+    JOINED,
+    LISTENING,
+    RESTARTED,
+    ClockAligner,
+    TimeBase,
+)
 
 SLOT = 10_000_000
 ROUND = 5 * 4 * SLOT

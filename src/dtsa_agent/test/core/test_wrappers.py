@@ -1,17 +1,16 @@
-"""Integration: swarms around swarms: what a wrapper does not change is as in the swarm inside, bit for bit."""
+"""Integration: swarms with keys, plug-ins and vehicles elsewhere: what these do not change is the same, bit for bit."""
 
 from __future__ import annotations
 
-import inspect
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from dtsa_agent.core import AbstractSwarm, Swarm, SwarmConfig
-from dtsa_agent.core.agents.authentication import AuthenticatedSwarm, Authenticator
+from dtsa_agent.core import Swarm, SwarmConfig
+from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.plugins.entry_points import PluginSwarm
 from dtsa_agent.core.settings.flight_models import VehicleParams
-from dtsa_agent.core.swarms.abstract_swarm import SwarmWrapper
 from dtsa_agent.crazyflie.node.external_vehicles import HOLD_GAIN, HOLD_MPS, ExternalVehicles
 
 KEY = bytes(range(16))
@@ -29,7 +28,7 @@ ARRAYS = (
 )
 
 
-def one_slot(swarm: AbstractSwarm, slot: int, random: np.random.Generator | None) -> tuple[int, ...]:
+def one_slot(swarm: Swarm, slot: int, random: np.random.Generator | None) -> tuple[int, ...]:
     swarm.scenario.advance(slot, swarm)
     senders = swarm.begin(slot)
     frames = [swarm.frame(index) for index in senders]
@@ -41,16 +40,16 @@ def one_slot(swarm: AbstractSwarm, slot: int, random: np.random.Generator | None
     return senders
 
 
+def sealed(swarm: Swarm) -> Swarm:
+    swarm.authenticator = Authenticator(KEY)
+    return swarm
+
+
 @pytest.mark.parametrize("policy", ["tdma", "dtsa", "lease"])
-@pytest.mark.parametrize("wrap", [
-    SwarmWrapper,
-    PluginSwarm,
-    lambda swarm: AuthenticatedSwarm(swarm, Authenticator(KEY)),
-    lambda swarm: AuthenticatedSwarm(PluginSwarm(swarm), Authenticator(KEY)),
-])  # fmt: skip
-def test_wrapped_swarms_fly_like_the_plain_one(policy: str, wrap: type[SwarmWrapper]) -> None:
+@pytest.mark.parametrize("make", [PluginSwarm, lambda c: sealed(Swarm(c)), lambda c: sealed(PluginSwarm(c))])
+def test_other_swarms_fly_like_the_plain_one(policy: str, make: Callable[[SwarmConfig], Swarm]) -> None:
     config = SwarmConfig(agents=6, moving=4, policy=policy, estimator="intent", scenario="stop-and-go", seed=3)
-    plain, wrapped = Swarm(config), wrap(Swarm(config))
+    plain, wrapped = Swarm(config), make(config)
     for _ in range(2):
         draws = np.random.default_rng(1), np.random.default_rng(1)
         for slot in range(250):
@@ -64,29 +63,28 @@ def test_wrapped_swarms_fly_like_the_plain_one(policy: str, wrap: type[SwarmWrap
 
 def test_an_authenticated_swarm_gives_its_shared_table_up_like_the_plain_one() -> None:
     config = SwarmConfig(agents=5, policy="dtsa", seed=3)
-    plain: AbstractSwarm = Swarm(config, shared_table=True)
-    sealed: AbstractSwarm = AuthenticatedSwarm(Swarm(config, shared_table=True), Authenticator(KEY))
+    plain, other = Swarm(config, shared_table=True), sealed(Swarm(config, shared_table=True))
     for slot in range(40):
-        for swarm in (plain, sealed):
+        for swarm in (plain, other):
             swarm.begin(slot)
             swarm.fly(slot)
         if slot == 20:
-            plain, sealed = plain.with_own_tables(slot), sealed.with_own_tables(slot)
+            plain, other = plain.with_own_tables(slot), other.with_own_tables(slot)
         for index in np.flatnonzero(plain.sends):
             mask = np.array([slot < 20 or k % 2 for k in range(len(plain.observer))], dtype=np.uint8)
-            assert sealed.hear(slot, sealed.frame(index), mask)
+            assert other.hear(slot, other.frame(index), mask)
             assert plain.hear(slot, plain.frame(index), mask)
-        for swarm in (plain, sealed):
+        for swarm in (plain, other):
             swarm.end(slot)
-        assert np.array_equal(plain.digest, sealed.digest)
-    assert len(set(sealed.digest.tolist())) > 1
+        assert np.array_equal(plain.digest, other.digest)
+    assert len(set(other.digest.tolist())) > 1
 
 
 def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothing_moves() -> None:
     config = SwarmConfig(agents=4, moving=2, policy="tdma", seed=2)
     sent: list[np.ndarray] = []
-    plain = Swarm(config)
-    outside = ExternalVehicles(Swarm(config), 2, lambda command: sent.append(command.copy()))
+    plain, outside = Swarm(config), Swarm(config)
+    vehicles = ExternalVehicles(outside, 2, lambda command: sent.append(command.copy()))
     for swarm in (plain, outside):
         swarm.scenario.advance(0, swarm)
     still = plain.active == 0
@@ -94,11 +92,11 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
         for swarm in (plain, outside):
             swarm.position[:, still] = plain.scenario.start[:, still] + 0.1
             swarm.begin(slot)
-        outside.place(plain.position)
+        vehicles.place(plain.position)
         outside.velocity[:] = plain.velocity
         before = outside.position.copy()
         plain.steer(slot, 0)
-        outside.fly(slot)
+        vehicles.fly(slot)
         assert np.array_equal(outside.position, before)
         assert np.array_equal(outside.track[-1], before)
         assert len(sent) == slot // 2 + 1
@@ -112,13 +110,6 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
         plain.move(0)
 
 
-def test_wrappers_hand_on_every_step_of_the_interface() -> None:
-    steps = AbstractSwarm.__abstractmethods__
-    assert steps <= {name for name, _ in inspect.getmembers(SwarmWrapper, inspect.isfunction)}
-    assert steps <= {name for name, _ in inspect.getmembers(Swarm, inspect.isfunction)}
-    assert not [name for name in steps if name in vars(Swarm(SwarmConfig(agents=2)))]  # methods, not attributes
-
-
 def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple[float, float, float]:
     """Twelve exchange places; smallest distance after a slot, m; 4 s later smallest horizontal distance, largest speed.
 
@@ -129,19 +120,20 @@ def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple
         shape="ellipse", axis_x_m=1.2, axis_y_m=2.0, permute=False,
     )  # fmt: skip
     commands = np.zeros((3, 12))
-    swarm = ExternalVehicles(Swarm(config), 1, lambda c: np.copyto(commands, c))
+    swarm = Swarm(config)
+    vehicles = ExternalVehicles(swarm, 1, lambda c: np.copyto(commands, c))
     swarm.scenario.advance(0, swarm)
     place, velocity, closest = swarm.scenario.start.copy(), np.zeros((3, 12)), np.inf
     for now in range(slot + 200):
-        swarm.place(place)
+        vehicles.place(place)
         swarm.velocity[:] = velocity
         if now == slot and stop_here:
-            swarm.stop_here()
+            vehicles.stop_here()
         swarm.begin(now)
         for index in np.flatnonzero(swarm.sends):
             swarm.hear(now, swarm.frame(index))
         if now < slot or stop_here:
-            swarm.fly(now)
+            vehicles.fly(now)
         elif now >= slot + 20:
             commands[:] = 0.0
         swarm.end(now)
@@ -167,7 +159,7 @@ def test_vehicles_that_are_told_to_stop_in_the_midst_of_an_exchange_come_to_rest
 def test_a_frame_is_authentic_in_its_slot_and_the_one_after(late: int, taken: bool) -> None:
     """Where agents have clocks of their own a receiver may be a slot ahead of the sender."""
     config = SwarmConfig(agents=3, policy="tdma")
-    sender, receiver = (AuthenticatedSwarm(Swarm(config, local=[agent]), Authenticator(KEY)) for agent in (1, 2))
+    sender, receiver = (sealed(Swarm(config, local=[agent])) for agent in (1, 2))
     (index,) = sender.begin(0)
     frame = sender.frame(index)
     for slot in range(late + 1):

@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 
 from dtsa_agent.core import REASONS, Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.settings.declaration import format_values, parse_values, settings_of
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.runs import Run

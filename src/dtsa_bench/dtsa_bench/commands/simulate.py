@@ -32,10 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print summary.json instead of lines")
     parser.add_argument("--picture", metavar="FILE.png", help="draw the paths from above")
-    parser.add_argument(
-        "--core", metavar="X", default="compiled",
-        help="compiled, or reference: the protocol's specification in plain Python, much slower [compiled]",
-    )  # fmt: skip
     add_run_options(parser)
 
 
@@ -52,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     make_scenario(config.swarm)
     picture = None if args.picture is None else _checked(Path(args.picture))
     directory = None if args.out is None else new_directory(args.out)
-    flight = simulate(config, core=args.core, trace=picture is not None)
+    flight = simulate(config, trace=picture is not None)
     summary = flight.summary()
     text = json.dumps(summary, indent=2) + "\n"
     if directory is not None:

@@ -10,7 +10,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm, Scenario
+from dtsa_agent.core import Scenario, Swarm
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.hearing import Hearing
 from dtsa_bench.runs.metrics import FlightMetrics, metrics_tables
@@ -36,7 +36,7 @@ class FlightMeasurement(ChannelObserver, Referee):
         self._compared = self._tables.digest, self._tables.chosen  # of the slot that is being flown
 
     @property
-    def tables(self) -> AbstractSwarm:
+    def tables(self) -> Swarm:
         """What each agent knows by what it has received: one table an agent."""
         return self._tables
 

@@ -13,7 +13,7 @@ from rclpy.node import Node
 
 from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.core.settings.agreement import agreed_settings
+from dtsa_agent.core.settings.config import agreed_settings
 from dtsa_agent.core.settings.declaration import Setting, settings_of
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names

@@ -15,7 +15,7 @@ from dtsa_agent.air.vehicle import SimulatedVehicle
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.agents.pacing import BETWEEN
 from dtsa_agent.core.frame import condition_in
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.keys import authenticator
 
 ENOUGH = 0.8  # of the frames that are expected of an agent have to be heard in time
@@ -39,13 +39,13 @@ def _settled_after(config: SwarmConfig) -> int:
 class HeldVehicle(SimulatedVehicle):
     """A vehicle that stays where it is, whatever its agent wants; it is never at its goal, so that all speak alike."""
 
-    def sense(self, swarm: AbstractSwarm) -> None:
+    def sense(self, swarm: Swarm) -> None:
         """An agent at its goal would rest, and speak seldom: it says that it is below it."""
         away = swarm.goal[:, 0] - swarm.position[:, 0]
         if float(away @ away) <= swarm.config.r_min**2:
             swarm.position[2, 0] -= 2.0 * swarm.config.r_min
 
-    def fly(self, swarm: AbstractSwarm, slot: int) -> None:
+    def fly(self, swarm: Swarm, slot: int) -> None:
         """Nothing."""
 
 

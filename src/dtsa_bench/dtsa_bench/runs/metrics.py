@@ -16,17 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm, Scenario
-from dtsa_agent.core.compiled import COMPILED
+from dtsa_agent.core import Scenario, Swarm
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_channel_sim.model.verdict import COLLISION, IDLE, SUCCESS
 
-from .compiled_sums import KernelSums
 from .config import RunConfig
-from .plain_sums import ARRIVED as _ARRIVED
-from .plain_sums import CRASHED as _CRASHED
-from .plain_sums import PlainSums
+from .sums import ARRIVED as _ARRIVED
+from .sums import CRASHED as _CRASHED
+from .sums import FlightSums
 from .wakings import Wakings
 
 Array = NDArray[np.float64]
@@ -35,7 +33,7 @@ Array = NDArray[np.float64]
 COMPLETED, CRASHED, TIMED_OUT, STOPPED = "completed", "crashed", "timed out", "stopped"
 
 
-def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> AbstractSwarm:
+def metrics_tables(run: RunConfig, scenario: Scenario, everyone: bool) -> Swarm:
     """Tables that follow a flight from what the air carried, for callers that do not host all agents.
 
     :param run: the run.
@@ -51,10 +49,9 @@ class FlightMetrics:
 
     :param run: the run.
     :param scenario: its scenario.
-    :param core: what moves the swarm whose tables :meth:`update` gets.
     """
 
-    def __init__(self, run: RunConfig, scenario: Scenario, core: str = COMPILED) -> None:
+    def __init__(self, run: RunConfig, scenario: Scenario) -> None:
         swarm, limits = run.swarm, run.limits
         self.run = run
         self.scenario = scenario
@@ -74,19 +71,15 @@ class FlightMetrics:
         start = np.ascontiguousarray(scenario.start, dtype=np.float64)
         target = np.ascontiguousarray(scenario.target, dtype=np.float64)
         moving = np.ascontiguousarray(scenario.moving, dtype=np.uint8)
-        self._plain = core != COMPILED
-        sums = PlainSums if self._plain else KernelSums
         self._wakings = Wakings(scenario)
-        self._kernel: Any = sums(start, target, moving, swarm.agents, limits.collision_m, swarm.r_min, self._wakings)
+        self._sums = FlightSums(start, target, moving, swarm.agents, limits.collision_m, swarm.r_min, self._wakings)
         self._last = start  # (3, N) m, positions at the end of the last slot
         self._frames: Counter[int] = Counter()  # frames on the air, by their lengths in bytes
         self._tail = math.ceil(limits.tail_s * 1e9 / swarm.slot_ns - 1e-6)
         # First number of slots at which the flight is over whatever happens.
         self._limit = max(1, math.ceil(limits.timeout_s * 1e9 / swarm.slot_ns - 1e-6))
 
-    def update(
-        self, slot: int, track: Array, tables: AbstractSwarm | None, outcome: int, lengths: Iterable[int] = ()
-    ) -> str:
+    def update(self, slot: int, track: Array, tables: Swarm | None, outcome: int, lengths: Iterable[int] = ()) -> str:
         """Takes in a slot that has just ended.
 
         :param slot: its number; slots come one after the other from 0.
@@ -107,7 +100,7 @@ class FlightMetrics:
             for agent in self.lost:  # its vehicle hovers where it was last known, or nobody knows
                 track[:, :, agent - 1] = self._last[:, agent - 1]
         self._last = track[-1].copy()
-        state = self._kernel.update(done, track, tables)
+        state = self._sums.update(done, track, tables)
         self._wakings.follow(done, self._last)
         final = self._wakings.final
         if final is not None and not all(final[k] for k in range(len(final)) if k + 1 not in self.lost):
@@ -117,7 +110,7 @@ class FlightMetrics:
         if state:
             if state & _CRASHED and self.crash_slot < 0:
                 self.crash_slot = done
-                self.collided_pair = self._kernel.result()["pair"]
+                self.collided_pair = self._sums.result()["pair"]
                 if self.run.limits.stop_on_crash:
                     self.end = CRASHED
                     return CRASHED
@@ -141,7 +134,7 @@ class FlightMetrics:
         self.lost.add(agent)
         self._wakings.gone[agent - 1], self._wakings.woken[agent - 1] = 1, -1
         self._torn_ways.add(agent)
-        self._kernel.drop(agent - 1)
+        self._sums.drop(agent - 1)
 
     def regain(self, agent: int) -> None:
         """An agent that fell out takes part again: it flies, and has to arrive.
@@ -200,7 +193,7 @@ class FlightMetrics:
 
     def closest(self) -> tuple[float, tuple[int, int]]:
         """Smallest distance so far, m, and the ids of the two agents."""
-        sums = self._kernel.result()
+        sums = self._sums.result()
         return math.sqrt(sums["min_distance2"]), sums["pair"]
 
     def efficiencies(self) -> dict[int, float]:
@@ -208,7 +201,7 @@ class FlightMetrics:
 
         With several goals it is the length of the straight lines from goal to goal, and known of complete flights only.
         """
-        path, plan = self._kernel.result()["path"], self.scenario.plan
+        path, plan = self._sums.result()["path"], self.scenario.plan
         if plan is not None and len(plan.goals) > 1:
             if self.completion_slot < 0:
                 return {}
@@ -227,7 +220,7 @@ class FlightMetrics:
 
         :param wall_time_s: wall-clock time that the flight took, s.
         """
-        swarm, sums = self.run.swarm, self._kernel.result()
+        swarm, sums = self.run.swarm, self._sums.result()
         flown = self.slots * swarm.slot_ns / 1e9
         pair = sums["pair"] if sums["pair"][0] else None
         news = sums["age_count"]

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import Scenario
+from dtsa_agent.core.kernel import lib
 
-DELAYS = 256  # METRICS_DELAYS of libdtsa_sim/metrics.h
+DELAYS = lib.METRICS_DELAYS
 
 
 class Wakings:

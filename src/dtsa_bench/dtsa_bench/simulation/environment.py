@@ -12,12 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig, make_scenario
+from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.plugins.entry_points import PluginSwarm
 from dtsa_agent.core.plugins.table import Table
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS
 from dtsa_agent.core.settings.flight_models import AVOIDERS
-from dtsa_agent.core.swarms.swarm import Swarm
 from dtsa_agent.keys import with_key
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
@@ -225,9 +224,8 @@ class SwarmEnv(ParallelEnv):  # type: ignore[misc]
         self._next_seed = seed + 1
         #: What no agent knows, to look at: the scenario, the swarm, the metrics of the flight under way.
         self.scenario = make_scenario(run.swarm)
-        swarm: AbstractSwarm = Swarm(run.swarm, self.scenario)
-        if run.swarm.estimator not in ESTIMATORS.rows or run.swarm.avoider not in AVOIDERS.rows:
-            swarm = PluginSwarm(swarm)
+        built_in = run.swarm.estimator in ESTIMATORS.rows and run.swarm.avoider in AVOIDERS.rows
+        swarm = (Swarm if built_in else PluginSwarm)(run.swarm, self.scenario)
         swarm.reason[:] = REASONS.index("plugin")
         self.swarm, self.metrics = with_key(swarm), FlightMetrics(run, self.scenario)
         self.slot = 0  # the one that begins

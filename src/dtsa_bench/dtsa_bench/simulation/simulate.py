@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm, Scenario, make_scenario
-from dtsa_agent.core.compiled import COMPILED
+from dtsa_agent.core import Scenario, Swarm, make_scenario
 from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
 from dtsa_agent.keys import with_key
-from dtsa_agent.plugin_watch import watched
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import FlightMetrics
 from dtsa_channel_sim import Channel
@@ -55,7 +53,7 @@ class Flight:
     run: RunConfig
     scenario: Scenario
     metrics: FlightMetrics
-    swarm: AbstractSwarm  # as it was at the end
+    swarm: Swarm  # as it was at the end
     trace: Trace | None
     wall_time_s: float
 
@@ -97,7 +95,6 @@ def simulate(
     shared_table: bool | None = None,
     trace: bool = False,
     observer: int = 1,
-    core: str = COMPILED,
 ) -> Flight:
     """Flies one run.
 
@@ -105,21 +102,19 @@ def simulate(
     :param shared_table: one table for all agents; None: where :func:`may_share` allows it.
     :param trace: keep what happened in every slot.
     :param observer: id whose table the trace follows.
-    :param core: ``compiled``, or ``reference``: the specification in plain Python, much slower.
     """
     begun = time.perf_counter()
     scenario = make_scenario(run.swarm)
     shared = may_share(run) if shared_table is None else shared_table
     kept = Trace() if trace else None
-    with watched(run.swarm):
-        swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared, core=core))
-        metrics = FlightMetrics(run, scenario, core)
-        fly = _fly_unslotted if run.swarm.policy_row.unslotted else _fly
-        fly(swarm, Channel(run.air), metrics, kept, observer)
+    swarm = with_key(make_swarm(run.swarm, scenario, shared_table=shared))
+    metrics = FlightMetrics(run, scenario)
+    fly = _fly_unslotted if run.swarm.policy_row.unslotted else _fly
+    fly(swarm, Channel(run.air), metrics, kept, observer)
     return Flight(run, scenario, metrics, swarm, kept, time.perf_counter() - begun)
 
 
-def _fly(swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int) -> None:
+def _fly(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int) -> None:
     """The slots of a flight until it is over. Everything in here runs once a slot: keep it bare."""
     advance, begin, update = swarm.scenario.advance, swarm.begin, metrics.update
     carry, track = SlottedTraffic(swarm, channel).slot, swarm.track
@@ -140,9 +135,7 @@ def _fly(swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: T
         slot += 1
 
 
-def _fly_unslotted(
-    swarm: AbstractSwarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int
-) -> None:
+def _fly_unslotted(swarm: Swarm, channel: Channel, metrics: FlightMetrics, kept: Trace | None, observer: int) -> None:
     """The same for agents that send at any instant: what arrives in a slot is heard in it."""
     traffic = UnslottedTraffic(swarm, channel)
     slot, over = 0, ""
@@ -162,7 +155,7 @@ def _fly_unslotted(
         slot += 1
 
 
-def _keep(kept: Trace, swarm: AbstractSwarm, slot: int, senders: tuple[int, ...], outcome: int, table: int) -> None:
+def _keep(kept: Trace, swarm: Swarm, slot: int, senders: tuple[int, ...], outcome: int, table: int) -> None:
     kept.senders.append(senders)
     kept.outcomes.append(outcome)
     kept.reasons.append(int(swarm.reason[table]))

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core import Swarm
 from dtsa_agent.core.errors import PluginError, shown
-from dtsa_agent.core.plugins.entry_points import plug_ins_of
+from dtsa_agent.core.plugins.entry_points import PluginSwarm
 from dtsa_agent.core.plugins.guard import Guarded
 from dtsa_channel_sim import Channel
 from dtsa_channel_sim.model.air import NEVER, Air
@@ -121,15 +121,14 @@ class UnslottedTraffic:
     :param channel: the medium.
     """
 
-    def __init__(self, swarm: AbstractSwarm, channel: Channel) -> None:
-        inside = plug_ins_of(swarm)
-        assert inside is not None
-        self._swarm, self._parts = swarm, inside
+    def __init__(self, swarm: Swarm, channel: Channel) -> None:
+        assert isinstance(swarm, PluginSwarm)
+        self._swarm = swarm
         self._slot_ns = swarm.config.slot_ns
         self._airtime = channel.config.airtime
         self._air: Air[int] = Air(channel)
         row = swarm.config.policy_row
-        self._radios = Radios(self._air, inside.policies) if row.listens else None
+        self._radios = Radios(self._air, swarm.policies) if row.listens else None
         self._reacts = row.reacts
         self._wakes = [(0, index) for index in range(len(swarm.ids))]
         heapify(self._wakes)
@@ -187,7 +186,7 @@ class UnslottedTraffic:
     def _wake(self, index: int, now_ns: int, end_ns: int) -> None:
         """Lets a policy act, unless its agent is switched off."""
         if self._swarm.present[index]:
-            policy, table = self._parts.policies[index], self._parts.tables[index]
+            policy, table = self._swarm.policies[index], self._swarm.tables[index]
             answer = policy.wake(table, now_ns, _Radio(self, index, now_ns))
             if self._radios is not None and self._radios.holds(self._swarm.ids[index]):
                 return
@@ -203,7 +202,7 @@ class UnslottedTraffic:
             self._call_at(index, end_ns)
         elif self._radios.listen(self._swarm.position) is not None:
             self._begin(_Packet(agent, self._frames[index]), now_ns, now_ns)
-            policy, table = self._parts.policies[index], self._parts.tables[index]
+            policy, table = self._swarm.policies[index], self._swarm.tables[index]
             answer = policy.sent(table, now_ns)
             self._call_at(index, _next_wake(policy, answer, now_ns, "sent"))
 
@@ -229,7 +228,7 @@ class UnslottedTraffic:
         :param now_ns: ns, now.
         """
         if not isinstance(packet.note, bytes) or packet.to not in range(len(self._frames) + 1):
-            policy, given = self._parts.policies[packet.sender - 1].name, (packet.note, packet.to)
+            policy, given = self._swarm.policies[packet.sender - 1].name, (packet.note, packet.to)
             raise PluginError(f"{policy}, wake", f"sent {given!r}; allowed: bytes, to 0 (all) to {len(self._frames)}")
         if now_ns < self._free_ns[packet.sender - 1]:
             return False
@@ -253,7 +252,7 @@ class UnslottedTraffic:
         :param slot: the slot at whose start its state was.
         """
         if not isinstance(frame, bytes) or not frame:
-            policy = self._parts.policies[index].name
+            policy = self._swarm.policies[index].name
             raise PluginError(f"{policy}, wake", f"took in {frame!r}; allowed: bytes of a frame")
         mask = np.zeros(len(self._frames), np.bool_)
         mask[index] = True
@@ -272,7 +271,7 @@ class UnslottedTraffic:
         """
         index, length = packet.sender - 1, len(packet.note) + len(packet.frame)
         if not 1 <= length <= self._airtime.longest:
-            policy = self._parts.policies[index].name
+            policy = self._swarm.policies[index].name
             raise PluginError(f"{policy}, wake", f"sent {length} bytes; allowed: 1 to {self._airtime.longest}")
         self._settle(now_ns)
         self._count += 1
@@ -306,7 +305,7 @@ class UnslottedTraffic:
             if not self._reacts:
                 continue
             for index in np.flatnonzero(received & (self._swarm.present > 0)).tolist():
-                policy, table = self._parts.policies[index], self._parts.tables[index]
+                policy, table = self._swarm.policies[index], self._swarm.tables[index]
                 answer = policy.received(table, now_ns, packet.sender, packet.note)
                 self._call_at(index, _next_wake(policy, answer, now_ns, "received"))
 

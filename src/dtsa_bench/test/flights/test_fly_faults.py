@@ -18,7 +18,7 @@ pytestmark = pytest.mark.ros
 NOISE = """
 import json, sys, rclpy
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.settings.agreement import agreed_settings, settings_hash
+from dtsa_agent.core.settings.config import agreed_settings, settings_hash
 from dtsa_msgs.msg import Process, Slot, Transmission
 from rclpy.serialization import serialize_message
 rclpy.init()

@@ -27,7 +27,7 @@ from fly_helpers import PATIENCE_S, command
 from node_helpers import end_of, ros_graph
 from waiting import wait_for
 
-from dtsa_agent.core.agents.authentication import TAG_LENGTH
+from dtsa_agent.core.authentication import TAG_LENGTH
 from dtsa_agent.core.reference.frame import LENGTHS
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.keys import VARIABLE

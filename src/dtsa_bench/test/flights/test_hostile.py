@@ -27,7 +27,7 @@ from dtsa_msgs.msg import Frame, Process, Report, Slot, Transmission
 from rclpy.serialization import serialize_message
 
 from dtsa_agent.core import Frame as OwnState
-from dtsa_agent.core.frame_extended import ExtendedFrame, encode_extended
+from dtsa_agent.core.frame import ExtendedFrame, encode_extended
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.stamps import header_of
 from dtsa_bench.recordings.bag.reader import Bag

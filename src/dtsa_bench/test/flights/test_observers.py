@@ -20,7 +20,7 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
-from dtsa_agent.core.settings.agreement import settings_hash
+from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.wire.stamps import header_of

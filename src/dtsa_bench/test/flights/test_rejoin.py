@@ -18,7 +18,7 @@ import pytest
 from fly_helpers import children, end_all, process_with
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
-from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.reference.lease.memory import Memory
 from dtsa_agent.core.reference.rules import Rules
 from dtsa_bench.recordings.bag.reader import Bag

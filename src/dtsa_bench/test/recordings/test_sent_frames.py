@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_agent.core.reference.alignment import ClockAligner
+from dtsa_agent.core.reference.timebase import ClockAligner
 from dtsa_bench.flights.statistics import ClockStatistics
 from dtsa_bench.recordings.verify.frames import SentFrames
 from dtsa_bench.recordings.verify.result import Mismatch

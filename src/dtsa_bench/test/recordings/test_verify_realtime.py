@@ -15,7 +15,7 @@ from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
 
-from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.frame import decode_extended
 from dtsa_bench.recordings.bag.reader import Bag, Message
 from dtsa_bench.recordings.bag.writer import BagWriter
 from dtsa_bench.recordings.verify import Result, verify_bag

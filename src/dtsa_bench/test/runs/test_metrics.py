@@ -6,8 +6,10 @@ import json
 
 import numpy as np
 import pytest
+from plain_sums import PlainSums
 
 from dtsa_agent.core import Scenario, Swarm, SwarmConfig, make_scenario
+from dtsa_bench.runs import metrics as metrics_module
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, TIMED_OUT, FlightMetrics, metrics_tables
 from dtsa_channel_sim import Channel, ChannelConfig
@@ -162,6 +164,12 @@ def test_ages_and_errors_are_those_of_numpy_and_of_a_listener(policy: str) -> No
     assert len(plain["age"]) > 1000
 
 
+def _plain_metrics(run: RunConfig, scenario: Scenario) -> FlightMetrics:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metrics_module, "FlightSums", PlainSums)
+        return FlightMetrics(run, scenario)
+
+
 @pytest.mark.parametrize(("policy", "task"), [("lease", "staggered"), ("tdma", "staggered"), ("tdma", "exchange")])
 def test_ages_from_waking_on_count_every_receiver_heard_or_not(policy: str, task: str) -> None:
     """Against plain NumPy, and against the sums in plain Python."""
@@ -169,7 +177,7 @@ def test_ages_from_waking_on_count_every_receiver_heard_or_not(policy: str, task
     air = ChannelConfig(agents=6, slot_ns=config.slot_ns, seed=3, loss=0.3)
     run, scenario = RunConfig(config, air, RunLimits(tail_s=100.0)), make_scenario(config)
     swarm, channel = Swarm(config, scenario), Channel(air)
-    compiled, plain = FlightMetrics(run, scenario), FlightMetrics(run, scenario, core="plain")
+    compiled, plain = FlightMetrics(run, scenario), _plain_metrics(run, scenario)
     begin = scenario.plan.begin if scenario.plan else np.zeros(6, dtype=np.int64)
     arrived, first, ages = np.zeros(6, dtype=bool), np.full(6, -1), []
     for slot in range(400):

@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -166,7 +165,6 @@ def _wrong(where: str, choose: str = "return 1", command: str = "(0.0, 0.0, 0.0)
     [
         ("policy", _wrong("factory"), r"policy wrong: KeyError: 'no such option' \(wrong.py:5\)"),
         ("policy", _wrong("", "raise RuntimeError('lost')"), r"policy wrong, choose: RuntimeError: lost \(wrong"),
-        ("policy", _wrong("", "while True: pass"), r"wrong, choose: TimeoutError: no answer within 0.2 s \(wrong.py:8"),
         ("policy", _wrong("", "return None"), r"chose agent None in slot 0; allowed: an integer, 0 \(nobody\) to 4"),
         ("policy", _wrong("", "return 3.0"), "wrong, choose: chose agent 3.0 in slot 0; allowed: an integer, 0"),
         ("policy", _wrong("", "return -1"), "policy wrong, choose: chose agent -1 in slot 0"),
@@ -176,10 +174,7 @@ def _wrong(where: str, choose: str = "return 1", command: str = "(0.0, 0.0, 0.0)
         ("avoider", _wrong("", command="'fast'"), "avoider wrong, command: gave 'fast'"),
     ],
 )  # fmt: skip
-def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(
-    monkeypatch: pytest.MonkeyPatch, kind: str, wrong: Any, said: str
-) -> None:
-    monkeypatch.setenv("DTSA_PLUGIN_LIMIT_S", "0.2")
+def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(kind: str, wrong: Any, said: str) -> None:
     dtsa.register(kind, "wrong", wrong)
     settings = {"policy": "tdma", "estimator": "linear", kind: "wrong"}
     run = spec.run_config({"agents": 4, "timeout_s": 0.2, **settings})
@@ -190,56 +185,26 @@ def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(
     assert row["reason"].startswith(f"PluginError: {kind} wrong")
 
 
-def test_a_plugin_that_catches_its_own_errors_or_waits_in_a_thread_is_ended_too(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("DTSA_PLUGIN_LIMIT_S", "0.2")
-    settings = {"agents": 4, "timeout_s": 0.2, "policy": "wrong"}
-    rows = []
-    for choose in (
-        "import time; time.sleep(60)",
-        "while True:\n            try: pass\n            except Exception: pass",
-    ):
-        dtsa.register("policy", "wrong", _wrong("", choose))
-        rows.append(work.fly_one(Task("key", 0, 1, settings, 1.0)))
-    other = threading.Thread(target=lambda: rows.append(work.fly_one(Task("key", 0, 1, settings, 1.0))))
-    other.start()  # as on a cluster
-    other.join(timeout=30)
-    assert len(rows) == 3
-    assert all("policy wrong, choose: TimeoutError: no answer within 0.2 s (wrong.py:" in r["reason"] for r in rows)
-    monkeypatch.setenv("DTSA_PLUGIN_LIMIT_S", "soon")
-    with pytest.raises(ConfigError, match=r"^DTSA_PLUGIN_LIMIT_S: got .soon.; allowed: 0\.05 to 86400 s"):
-        simulate(spec.run_config(settings))
-
-
 @pytest.mark.ros
-@pytest.mark.parametrize(
-    ("fault", "said"),
-    [
-        ("raise RuntimeError('lost')", "RuntimeError: lost ("),
-        ("while True: pass", "TimeoutError: no answer within 1 s ("),
-    ],
-)
-def test_a_plugin_that_raises_or_hangs_is_named_where_nodes_fly_it(
-    installed: Path, tmp_path: Path, fault: str, said: str
-) -> None:
+def test_a_plugin_that_raises_is_named_where_nodes_fly_it(installed: Path, tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     broken = tmp_path / "path"
     shutil.copytree(installed, broken)
     source = broken / "dtsa_plugins" / "__init__.py"
     source.write_text(
-        source.read_text().replace("        speed = np.sqrt(", f"        {fault}\n        speed = np.sqrt(")
+        source.read_text().replace(
+            "        speed = np.sqrt(", "        raise RuntimeError('lost')\n        speed = np.sqrt("
+        )
     )
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, [str(broken), os.environ.get("PYTHONPATH", "")])),
-        "DTSA_PLUGIN_LIMIT_S": "1",
     }
     for words in (["simulate"], ["fly", "--out", str(tmp_path / "flight"), "--no-picture", "--processes", "2"]):
         command = [sys.executable, "-m", "dtsa_bench", *words, "--agents", "4", "--policy", "least-known"]
         ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
         assert ended.returncode == 1, words
-        assert f"policy least-known, choose: {said}" in ended.stderr, words
+        assert "policy least-known, choose: RuntimeError: lost (" in ended.stderr, words
         assert "Traceback" not in ended.stderr, words
 
 

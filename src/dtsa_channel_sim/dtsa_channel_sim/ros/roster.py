@@ -10,7 +10,7 @@ from typing import Any
 from dtsa_msgs.msg import Process
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings.agreement import settings_hash
+from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.process.runs import run_text
 from dtsa_agent.ros.common.wire.checks import (

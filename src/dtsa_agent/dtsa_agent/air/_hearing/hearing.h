@@ -1,7 +1,7 @@
 /* What an agent with a clock of its own makes of datagrams: whose they are, what time they say it
  * is, how long they were under way. It knows no port and reads no clock.
  *
- * The same is said in plain Python by air/plain_hearing.py and what it is made of; tests compare
+ * The same is said in plain Python by test/plain_hearing.py and what it is made of; tests compare
  * the two. Times are ns. */
 #ifndef DTSA_HEARING_H
 #define DTSA_HEARING_H

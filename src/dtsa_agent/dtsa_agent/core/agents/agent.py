@@ -10,28 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.frame import Vector
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.scenario import Scenario
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm, Bytes
-from dtsa_agent.core.swarms.outcome import SlotOutcome
+from dtsa_agent.core.swarm import Bytes, SlotOutcome, Swarm
 
-from .authentication import AuthenticatedSwarm, Authenticator
 from .joining import Newcomers, check_slotted
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """What an agent decided for one slot, and why."""
-
-    slot: int
-    chosen: int  # id taken for the slot's sender, 0: nobody
-    reason: str  # one of REASONS
-    score: float  # priority value g of the chosen
-    digest: int  # of the agent's table: equal digests, equal tables
-
 
 REFUSED = "reception refused"  # a frame that reached an agent and was not taken in; what processes call it
 
@@ -43,7 +30,7 @@ class AgentGroup:
     :raises ConfigError: for a policy without slots.
     """
 
-    def __init__(self, swarm: AbstractSwarm) -> None:
+    def __init__(self, swarm: Swarm) -> None:
         check_slotted(swarm.config.policy)
         self.swarm = swarm
         self.newcomers = Newcomers(len(swarm.ids))
@@ -51,9 +38,8 @@ class AgentGroup:
         self.slot = -1  # the present slot, -1: none
 
     def on_slot(self, slot: int) -> tuple[int, ...]:
-        """Decides for a slot that begins now.
+        """Decides for a slot that begins now; the slot before is closed.
 
-        :param slot: its number; the slot before is closed.
         :returns: positions in ``swarm.ids`` of those that send; their frames are ``swarm.frame(position)``.
         """
         swarm = self.swarm
@@ -100,12 +86,19 @@ class AgentGroup:
         self.slot = -1
 
     def restart(self, local_index: int, slot: int) -> None:
-        """A local agent begins anew, knowing nothing; it hovers until the others know it.
-
-        :param local_index: position in ``swarm.ids``.
-        :param slot: its first slot.
-        """
+        """A local agent begins anew in a slot, knowing nothing; it hovers until the others know it."""
         self.newcomers.add(self.swarm, local_index, slot)
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What an agent decided for one slot, and why."""
+
+    slot: int
+    chosen: int  # id taken for the slot's sender, 0: nobody
+    reason: str  # one of REASONS
+    score: float  # priority value g of the chosen
+    digest: int  # of the agent's table: equal digests, equal tables
 
 
 class Agent:
@@ -122,22 +115,14 @@ class Agent:
     """
 
     def __init__(
-        self,
-        id: int,
-        config: SwarmConfig,
-        scenario: Scenario | None = None,
-        authenticator: Authenticator | None = None,
+        self, id: int, config: SwarmConfig, scenario: Scenario | None = None, authenticator: Authenticator | None = None
     ) -> None:
         if (authenticator is not None) != config.auth:
             raise ConfigError("authenticator", authenticator, "one if auth is on, else None")
-        swarm = make_swarm(config, scenario, local=[id])
         self.id = id
-        self.group = AgentGroup(AuthenticatedSwarm(swarm, authenticator) if authenticator else swarm)
-
-    @property
-    def swarm(self) -> AbstractSwarm:
-        """The agent's state and table, as arrays."""
-        return self.group.swarm
+        self.swarm = make_swarm(config, scenario, local=[id])  # the agent's state and table, as arrays
+        self.swarm.authenticator = authenticator
+        self.group = AgentGroup(self.swarm)
 
     def on_slot(self, slot: int) -> bytes | None:
         """Decides for a slot that begins now.
@@ -163,9 +148,8 @@ class Agent:
 
         :param outcome: what the receiver could tell; None: a frame if one was heard, else silence.
         """
-        self.group.on_slot_end(
-            None if outcome is None else np.array([outcome == SlotOutcome.COLLISION], dtype=np.uint8)
-        )
+        collided = None if outcome is None else np.array([outcome == SlotOutcome.COLLISION], dtype=np.uint8)
+        self.group.on_slot_end(collided)
 
     def decision(self) -> Decision:
         """The decision for the present slot."""
@@ -183,8 +167,7 @@ class Agent:
         :param step: control instant within the slot, 0 .. steps.
         :returns: commanded velocity, m/s, frame map.
         """
-        self.swarm.position[:, 0] = position
-        self.swarm.velocity[:, 0] = velocity
+        self.swarm.position[:, 0], self.swarm.velocity[:, 0] = position, velocity
         self.swarm.steer(slot, step)
-        x, y, z = self.swarm.command[:, 0]
-        return (float(x), float(y), float(z))
+        x, y, z = self.swarm.command[:, 0].tolist()
+        return (x, y, z)

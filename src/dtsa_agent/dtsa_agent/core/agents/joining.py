@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.reference.timebase import LISTENING, TimeBase
+from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarm import Swarm
 
 
 def check_slotted(policy: str) -> None:
@@ -46,30 +46,20 @@ class Listeners:
 
     def __init__(self, config: SwarmConfig, ids: Sequence[int], now_ns: Sequence[int]) -> None:
         check_joinable(config.policy)
-        self._bases = [
-            TimeBase(
-                agents=config.agents,
-                anchor_every=config.anchor_every,
-                slot_ns=config.slot_ns,
-                agent=agent,
-                seed=config.seed,
-            )
-            for agent in ids
-        ]
-        for base, now in zip(self._bases, now_ns, strict=True):
-            base.start(int(now))
+        self._bases = [ffi.new("dtsa_timebase *") for _ in ids]
+        for base, agent, now in zip(self._bases, ids, now_ns, strict=True):
+            lib.dtsa_timebase_init(base, config.agents, config.anchor_every, config.slot_ns, agent, config.seed)
+            lib.dtsa_timebase_start(base, int(now))
 
     def hear(self, index: Any, slot: int, start_ns: int) -> bool:
-        """An agent hears a frame; whether that is where it has its time from.
+        """An agent hears a frame of a slot; whether that is where it has its time from.
 
-        :param index: of the agent.
-        :param slot: slot that the frame was sent in.
         :param start_ns: ns, own clock, when its transmission started.
         """
         base = self._bases[index]
-        if base.state != LISTENING:
+        if base.state != lib.DTSA_LISTENING:
             return False
-        base.hear(slot, start_ns)
+        lib.dtsa_timebase_hear(base, slot, start_ns)
         return True
 
     def ready(self, now_ns: Sequence[int]) -> bool:
@@ -78,8 +68,8 @@ class Listeners:
         :param now_ns: (L,) what their clocks show.
         """
         for base, now in zip(self._bases, now_ns, strict=True):
-            base.wake(int(now))
-        return all(base.state != LISTENING for base in self._bases)
+            lib.dtsa_timebase_wake(base, int(now))
+        return all(base.state != lib.DTSA_LISTENING for base in self._bases)
 
 
 class Newcomers:
@@ -93,31 +83,17 @@ class Newcomers:
 
     def __init__(self, count: int) -> None:
         self._since: NDArray[np.int64] = np.full(count, -1, dtype=np.int64)  # first slot, -1: not new
-        self._some = False  # most processes never have any
+        self.some = False  # whether any is new; most processes never have any
 
-    @property
-    def some(self) -> bool:
-        """Whether any is new."""
-        return self._some
-
-    def add(self, swarm: AbstractSwarm, index: Any, slot: int) -> None:
-        """An agent begins anew, knowing nothing.
-
-        :param swarm: the agents, between two slots.
-        :param index: of the agent.
-        :param slot: its first slot.
-        """
+    def add(self, swarm: Swarm, index: Any, slot: int) -> None:
+        """An agent begins anew between two slots, knowing nothing; slot: its first one."""
         swarm.restart(index)
         self._since[index] = slot
-        self._some = True
+        self.some = True
 
-    def hold(self, swarm: AbstractSwarm, slot: int) -> None:
-        """Keeps those that are still new where they are.
-
-        :param swarm: the agents, after ``scenario.advance``.
-        :param slot: the slot that is about to begin.
-        """
-        if not self._some:
+    def hold(self, swarm: Swarm, slot: int) -> None:
+        """Keeps those that are still new where they are, after ``scenario.advance`` for the slot that begins."""
+        if not self.some:
             return
         for index in np.flatnonzero(self._since >= 0):
             swarm.active[index] = 0
@@ -126,9 +102,9 @@ class Newcomers:
                 course = swarm.course
                 flies = swarm.scenario.moving[swarm.local] if course is None else course.active
                 swarm.active[index] = flies[index]
-        self._some = bool((self._since >= 0).any())
+        self.some = bool((self._since >= 0).any())
 
-    def _known(self, swarm: AbstractSwarm, index: Any, slot: int) -> bool:
+    def _known(self, swarm: Swarm, index: Any, slot: int) -> bool:
         config = swarm.config
         since = self._since[index]
         if slot < since + config.agents or swarm.sent_slot[index, swarm.local[index]] < since:

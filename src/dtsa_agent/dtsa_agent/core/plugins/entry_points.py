@@ -17,15 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from dtsa_agent.core.compiled import COMPILED
 from dtsa_agent.core.frame import decode_frame
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, REASONS, Registry
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.flight_models import AVOIDERS
 from dtsa_agent.core.settings.scenario import Scenario
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm, Bytes, SwarmWrapper
-from dtsa_agent.core.swarms.outcome import SlotOutcome
-from dtsa_agent.core.swarms.swarm import Swarm
+from dtsa_agent.core.swarm import Bytes, SlotOutcome, Swarm
 
 from .guard import Guarded
 from .table import Table
@@ -48,10 +45,7 @@ def plug_ins_named(config: SwarmConfig) -> list[tuple[str, str]]:
 
 
 def shareable(config: SwarmConfig) -> bool:
-    """Whether agents of such a swarm may share one table for as long as all hear the same.
-
-    :param config: the swarm's settings.
-    """
+    """Whether agents of such a swarm may share one table for as long as all hear the same."""
     return config.policy_row.may_share and not uses_plugins(config)
 
 
@@ -61,29 +55,30 @@ def make_swarm(
     local: Sequence[int] | None = None,
     shared_table: bool = False,
     observers: Sequence[int] | None = None,
-    core: str = COMPILED,
-) -> AbstractSwarm:
-    """A :class:`Swarm`, in a :class:`PluginSwarm` if the configuration names plug-ins.
+) -> Swarm:
+    """A :class:`Swarm`, a :class:`PluginSwarm` if the configuration names plug-ins; parameters are those of ``Swarm``.
 
-    Parameters are those of ``Swarm``; with plug-ins every agent has a table of its own.
+    With plug-ins every agent has a table of its own.
 
     :raises ConfigError: for ids and plug-ins that do not exist.
     """
     if not uses_plugins(config):
-        return Swarm(config, scenario, local, shared_table, observers, core=core)
-    return PluginSwarm(Swarm(config, scenario, local, False, observers, core=core))
+        return Swarm(config, scenario, local, shared_table, observers)
+    return PluginSwarm(config, scenario, local, False, observers)
 
 
-class PluginSwarm(SwarmWrapper):
+class PluginSwarm(Swarm):
     """A swarm some of whose parts are Python objects from other packages. Every observer has its own instances.
 
-    :param inner: the swarm; its kernel leaves to this class what is not built in.
+    Its kernel leaves to this class what is not built in; parameters are those of :class:`Swarm`.
     """
 
-    def __init__(self, inner: AbstractSwarm) -> None:
-        super().__init__(inner)
+    _all_in_c = False
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
         self._ids = [int(index) + 1 for index in self.observer]
-        self._tables = [Table(self, row) for row in range(len(self._ids))]
+        self.tables = [Table(self, row) for row in range(len(self._ids))]  # what each observer knows
         self._outcome = np.zeros(len(self._ids), dtype=np.uint8)  # SlotOutcome of the present slot, collisions apart
         self._said: dict[int, bytes] = {}  # in this slot, by position in ids
         self._own_bytes = self.config.own_bytes
@@ -92,7 +87,8 @@ class PluginSwarm(SwarmWrapper):
     def _make_parts(self) -> None:
         everybody = self.config.policy_row.needs_everybody and bool(self.ids)
         self._genie = self._guarded(POLICIES, 0) if everybody else None
-        self._policies, self._estimators, self._avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
+        #: The parts of each observer; empty if they are built in, or one policy looks into all agents.
+        self.policies, self.estimators, self.avoiders = (self._instances(r, self._ids) for r in _REGISTRIES)
         self._list_speakers()
 
     def _instances(self, registry: Registry[Any], ids: list[int]) -> list[Guarded]:
@@ -108,46 +104,26 @@ class PluginSwarm(SwarmWrapper):
     def _list_speakers(self) -> None:
         """Notes the parts of each observer that may say something, with the size of it, in the frame's order."""
         policy, estimator = self.config.policy_row, self.config.estimator_row
-        parts = ((self._policies, policy.own_bytes), (self._estimators, estimator.own_bytes))
+        parts = ((self.policies, policy.own_bytes), (self.estimators, estimator.own_bytes))
         self._speakers = [[(made[row], size) for made, size in parts if made] for row in range(len(self._ids))]
         self._listen_to_outcome = any(hasattr(part, "slot_over") for row in self._speakers for part, _ in row)
 
-    @property
-    def policies(self) -> list[Guarded]:
-        """The policy of each observer; empty if it is built in, or one looks into all agents."""
-        return self._policies
-
-    @property
-    def tables(self) -> list[Table]:
-        """What each observer knows."""
-        return self._tables
-
     def decide(self, slot: int) -> None:
         if self._genie is not None:
-            self._ask_genie(self._genie, slot)
+            senders = self._genie.sending(self._genie.senders(self, slot), slot, self.config.agents)
+            self.chosen[:], self.sends[:] = senders[0] if senders else 0, 0
+            for agent in senders:
+                self.sends[agent - 1] = self.present[agent - 1] > 0
+        elif self.policies:
+            self.estimate(slot)  # the control instants and the metrics leave others, which depend on what flies it
+            for index, agent in enumerate(self.ids):
+                policy = self.policies[index]
+                chosen = policy.chosen(policy.choose(self.tables[index], slot), slot, self.config.agents)
+                self.chosen[index], self.sends[index] = chosen, chosen == agent and self.present[index]
+        else:
+            super().decide(slot)
             return
-        if not self._policies:
-            self.inner.decide(slot)
-            return
-        self.estimate(slot)  # the control instants and the metrics leave others, which depend on what flies it
-        for index, agent in enumerate(self.ids):
-            policy = self._policies[index]
-            chosen = policy.chosen(policy.choose(self._tables[index], slot), slot, self.config.agents)
-            self.chosen[index] = chosen
-            self.sends[index] = chosen == agent and self.present[index]
-        self._note_decision()
-
-    def _ask_genie(self, genie: Guarded, slot: int) -> None:
-        senders = genie.sending(genie.senders(self, slot), slot, self.config.agents)
-        self.chosen[:] = senders[0] if senders else 0
-        self.sends[:] = 0
-        for agent in senders:
-            self.sends[agent - 1] = self.present[agent - 1] > 0
-        self._note_decision()
-
-    def _note_decision(self) -> None:
-        self.reason[:] = _PLUGIN_REASON
-        self.score[:] = 0.0
+        self.reason[:], self.score[:] = _PLUGIN_REASON, 0.0
         self.digest[:] = self.table_hash[: len(self.ids)]
 
     def begin(self, slot: int) -> tuple[int, ...]:
@@ -155,7 +131,7 @@ class PluginSwarm(SwarmWrapper):
         return self.emit(slot)
 
     def emit(self, slot: int) -> tuple[int, ...]:
-        senders = self.inner.emit(slot)
+        senders = super().emit(slot)
         if self._own_bytes:
             self._said = {index: b"".join(self._say(index, slot)) for index in senders}
         return senders
@@ -163,19 +139,19 @@ class PluginSwarm(SwarmWrapper):
     def _say(self, index: int, slot: int) -> Iterator[bytes]:
         for part, size in self._speakers[index]:
             if size:
-                yield part.bytes_said(part.say(self._tables[index], slot), size)
+                yield part.bytes_said(part.say(self.tables[index], slot), size)
 
     def frame(self, local_index: int) -> bytes:
-        data = self.inner.frame(local_index)
-        return data + self._said[local_index] if data and self._own_bytes else data
+        data = self._encoded(local_index)
+        return self._sealed(data + self._said[local_index] if data and self._own_bytes else data)
 
-    def hear(self, slot: int, data: bytes, mask: Bytes | None = None) -> bool:
-        end = max(0, len(data) - self._own_bytes)
-        if not self.inner.hear(slot, data[:end], mask):
+    def _receive(self, slot: int, frame: bytes, mask: Bytes | None) -> bool:
+        end = max(0, len(frame) - self._own_bytes)
+        if not super()._receive(slot, frame[:end], mask):
             return False
         if not (self._own_bytes or self._listen_to_outcome):
             return True
-        sender = decode_frame(data[:end]).sender
+        sender = decode_frame(frame[:end]).sender
         for row, agent in enumerate(self._ids):
             if agent == sender or (mask is not None and not mask[row]):
                 continue
@@ -183,31 +159,30 @@ class PluginSwarm(SwarmWrapper):
             at = end
             for part, size in self._speakers[row]:
                 if size:
-                    part.heard(self._tables[row], slot, sender, data[at : at + size])
+                    part.heard(self.tables[row], slot, sender, frame[at : at + size])
                 at += size
         return True
 
     def estimate(self, slot: int, step: int = 0) -> None:
-        if not self._estimators:
-            self.inner.estimate(slot, step)
+        if not self.estimators:
+            super().estimate(slot, step)
             return
-        for index, table in enumerate(self._tables):
-            position, velocity = self.estimate_position[index], self.estimate_velocity[index]
-            self._estimators[index].estimate(table, slot, step, position, velocity)
-            self._estimators[index].estimated(position, velocity, slot=slot)
+        for estimator, table, position, velocity in zip(
+            self.estimators, self.tables, self.estimate_position, self.estimate_velocity, strict=True
+        ):
+            estimator.estimate(table, slot, step, position, velocity)
+            estimator.estimated(position, velocity, slot=slot)
 
     def end(self, slot: int, collided: Bytes | None = None) -> None:
-        self.inner.end(slot, collided)
+        super().end(slot, collided)
         if self._listen_to_outcome:
             self._tell_outcome(slot, collided)
-        if self._estimators:
+        if self.estimators:
             self.estimate(slot + 1)  # what the metrics compare with the truth
 
     def _tell_outcome(self, slot: int, collided: Bytes | None) -> None:
-        for index in np.flatnonzero(self.sends):
-            if self.inner.frame(int(index)):
-                self._outcome[index] = SlotOutcome.FRAME
-        for row, table in enumerate(self._tables):
+        self._outcome[np.flatnonzero(self.sends & (self.frame_length > 0))] = SlotOutcome.FRAME
+        for row, table in enumerate(self.tables):
             outcome = SlotOutcome(int(self._outcome[row]))
             if collided is not None and collided[row] and outcome == SlotOutcome.SILENCE:
                 outcome = SlotOutcome.COLLISION
@@ -217,38 +192,35 @@ class PluginSwarm(SwarmWrapper):
         self._outcome[:] = SlotOutcome.SILENCE
 
     def reset(self) -> None:
-        self.inner.reset()
+        super().reset()
         self._outcome[:] = SlotOutcome.SILENCE
         self._make_parts()
 
     def restart(self, local_index: int) -> None:
-        self.inner.restart(local_index)
-        for registry, parts in zip(_REGISTRIES, (self._policies, self._estimators, self._avoiders), strict=True):
+        super().restart(local_index)
+        for registry, parts in zip(_REGISTRIES, (self.policies, self.estimators, self.avoiders), strict=True):
             parts[local_index : local_index + 1] = self._instances(registry, [self.ids[local_index]])
         self._list_speakers()
 
     def steer(self, slot: int, step: int, estimate: bool = True) -> None:
-        if estimate and self._estimators:
+        if estimate and self.estimators:
             self.estimate(slot, step)
-        self.inner.steer(slot, step, estimate and not self._estimators)
-        for index, avoider in enumerate(self._avoiders):
-            if index < len(self.ids) and self.active[index] and self.present[index]:
-                self.command[:, index] = avoider.commanded(avoider.command(self._tables[index], slot, step), slot)
+        super().steer(slot, step, estimate and not self.estimators)
+        for index, avoider in enumerate(self.avoiders[: len(self.ids)]):
+            if self.active[index] and self.present[index]:
+                self.command[:, index] = avoider.commanded(avoider.command(self.tables[index], slot, step), slot)
 
     def fly(self, slot: int) -> None:
-        if not (self._estimators or self._avoiders):
-            self.inner.fly(slot)
+        if not (self.estimators or self.avoiders):
+            super().fly(slot)
             return
         for step in range(self.config.steps):
             self.steer(slot, step)
-            self.inner.move(step)
+            self.move(step)
 
+    def with_own_tables(self, slot: int) -> Swarm:
+        """Not for these.
 
-def plug_ins_of(swarm: AbstractSwarm) -> PluginSwarm | None:
-    """The part of a swarm that calls plug-ins; None: all of it is built in.
-
-    :param swarm: the swarm, however often wrapped.
-    """
-    while isinstance(swarm, SwarmWrapper) and not isinstance(swarm, PluginSwarm):
-        swarm = swarm.inner
-    return swarm if isinstance(swarm, PluginSwarm) else None
+        :raises ValueError: always: agents have tables of their own already.
+        """
+        raise ValueError("with_own_tables: agents with plug-ins have tables of their own already")

@@ -1,4 +1,8 @@
-"""The kinds of plug-ins: what policies, estimators and avoiders from other packages have, and what they are given."""
+"""The kinds of plug-ins: what policies, estimators and avoiders from other packages have, and what they are given.
+
+``table`` is what the observer knows, ``slot`` the number of a slot, ``now_ns`` ns since the start of slot 0. Ids count
+from 1; positions are m, velocities m/s, frame map.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
-from dtsa_agent.core.swarms.outcome import SlotOutcome
+from dtsa_agent.core.swarm import SlotOutcome, Swarm
 
 if TYPE_CHECKING:
     from .table import Table
@@ -29,19 +32,10 @@ class Speaks(Protocol):
         """The bytes for the frame that this agent sends in a slot: exactly ``own_bytes`` of them."""
 
     def heard(self, table: Table, slot: int, sender: int, data: bytes) -> None:
-        """Takes in what the same part of another agent has said.
-
-        :param table: what this observer knows, with the frame's state in it.
-        :param slot: the slot in which the frame is heard.
-        :param sender: id of who sent it.
-        :param data: its bytes: not to be trusted more than its sender.
-        """
+        """Takes in what the same part of another agent has said, in a frame whose state the table has already."""
 
     def slot_over(self, table: Table, slot: int, outcome: SlotOutcome) -> None:
-        """A slot is over for this observer.
-
-        :param outcome: what it could tell; collisions are silence to receivers that cannot tell.
-        """
+        """A slot is over for this observer; collisions are silence to receivers that cannot tell."""
 
 
 class Policy(Protocol):
@@ -58,11 +52,8 @@ class Policy(Protocol):
 class Genie(Protocol):
     """Who sends next, said by one who looks into all agents: a bound to compare with. Made once, for agent 0."""
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> Sequence[int]:
-        """The ids that send in a slot.
-
-        :param swarm: all agents: true states and everybody's table, to be read only.
-        """
+    def senders(self, swarm: Swarm, slot: int) -> Sequence[int]:
+        """The ids that send in a slot; ``swarm``: true states and everybody's table, to be read only."""
 
 
 class Radio(Protocol):
@@ -82,13 +73,7 @@ class Unslotted(Protocol):
     """
 
     def wake(self, table: Table, now_ns: int, radio: Radio) -> int:
-        """Acts at an instant; first called at 0.
-
-        :param table: what this agent knew when the slot began.
-        :param now_ns: ns since the start of slot 0.
-        :param radio: its radio.
-        :returns: when to be called again, ns, later than now.
-        """
+        """Acts at an instant, first at 0, with the table of the slot's start; returns when to be called again, ns."""
 
 
 class Listens(Unslotted, Protocol):
@@ -102,35 +87,22 @@ class Listens(Unslotted, Protocol):
         """What the radio does that holds a frame and has just listened.
 
         :param busy: whether it has found the air in use, or sends itself.
-        :param now_ns: ns since the start of slot 0.
         :param sent_ns: ns, when it began its last frame; 0: none yet.
         :returns: ns until it listens again; 0: it begins now, if the air is free.
         """
 
     def sent(self, table: Table, now_ns: int) -> int:
-        """The radio has begun to send.
-
-        :param table: what this agent knows.
-        :param now_ns: ns since the start of slot 0.
-        :returns: when ``wake`` is to be called, ns, later than that.
-        """
+        """The radio has begun to send at ``now_ns``; returns when ``wake`` is to be called, ns, later than that."""
 
 
 class PacketRadio(Radio, Protocol):
     """The radio of an agent whose policy has packets of its own. It sends nothing while it still sends another."""
 
     def send(self, note: bytes = b"", to: int = 0) -> bool:
-        """As for all, with some bytes that precede the frame.
-
-        :param note: the bytes.
-        :param to: id of the one agent that takes the frame in; 0: all do.
-        """
+        """As for all, with some bytes that precede the frame; ``to``: id of the only agent that takes it in, 0: all."""
 
     def say(self, note: bytes) -> bool:
-        """Begins to send a packet without a frame.
-
-        :param note: its bytes.
-        """
+        """Begins to send a packet without a frame."""
 
     def frame(self) -> bytes:
         """The agent's frame, with its state at the start of the slot, for packets of the policy's own.
@@ -139,10 +111,9 @@ class PacketRadio(Radio, Protocol):
         """
 
     def take_in(self, frame: bytes, slot: int) -> None:
-        """The agent hears a frame that its policy has put together from packets.
+        """The agent hears a frame, as its sender's :meth:`frame` gave it in a slot, that its policy has put together.
 
-        :param frame: the whole frame, as its sender's :meth:`frame` gave it.
-        :param slot: the slot in which it did. It may be over for long: a round may take many slots.
+        The slot may be over for long: a round may take many slots.
         """
 
 
@@ -150,13 +121,9 @@ class Reacts(Unslotted, Protocol):
     """An unslotted policy that acts on each packet as it arrives, for example a token ring."""
 
     def received(self, table: Table, now_ns: int, sender: int, note: bytes) -> int:
-        """A packet has arrived, as far as the air lets this agent hear it.
+        """A packet has arrived, as far as the air lets this agent hear it; ``note``: its bytes without the frame.
 
-        :param table: what this agent knew when the slot began.
-        :param now_ns: ns since the start of slot 0.
-        :param sender: id of who sent it.
-        :param note: its bytes, without the frame.
-        :returns: when ``wake`` is to be called next, in place of what was asked for before, ns, later than now.
+        Returns when ``wake`` is to be called next, in place of what was asked for before, ns, later than now.
         """
 
 

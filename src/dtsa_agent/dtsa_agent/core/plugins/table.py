@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm
+from dtsa_agent.core.swarm import Swarm
 
 
 class Table:
@@ -15,24 +15,7 @@ class Table:
     Positions are m, velocities m/s, frame map, with shape (3, N); agent ``id`` is column ``id - 1``.
     """
 
-    __slots__ = (
-        "agent",
-        "config",
-        "estimate_position",
-        "estimate_velocity",
-        "goal",
-        "in_ap",
-        "last_turn",
-        "own_position",
-        "own_velocity",
-        "scenario",
-        "sent_intent",
-        "sent_position",
-        "sent_slot",
-        "sent_velocity",
-    )
-
-    def __init__(self, swarm: AbstractSwarm, row: int) -> None:
+    def __init__(self, swarm: Swarm, row: int) -> None:
         self.agent = int(swarm.observer[row]) + 1  # id of the observer, 0: one that hears everything
         self.config = swarm.config
         self.scenario = swarm.scenario

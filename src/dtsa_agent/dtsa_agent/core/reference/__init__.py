@@ -4,18 +4,21 @@ Everything that agents must agree on stands here once, and once more in C (``lib
 give the same frames, tables, decisions, digests and times, bit for bit; tests hold them together.
 docs/reference/equations.md leads from an equation to both.
 
-Nothing in here needs NumPy, a compiler or the rest of the core. One file, one subject:
+Throughout, ``slot`` is the number of a slot, ``self_index`` and ``k`` are ids - 1, ``step`` is a control instant within
+a slot, ``rules`` is what all agree on, ``memory`` and ``table`` are those of the agent that acts. Positions are m,
+velocities m/s, frame map; times ns of the agent's own clock.
+
+Nothing that is installed imports it; tests and ``dtsa_dev`` do. One file, one subject:
 
 * :mod:`.arithmetic`: what the bits of a result depend on, and why
 * :mod:`.rules`: the settings that all agents share
 * :mod:`.frame`, :mod:`.frame_extended`: what is on the air
 * :mod:`.table`, :mod:`.gossip`: what an agent knows of the others
 * :mod:`.estimators`: where the others are by now
-* :mod:`.priority`, :mod:`.selection`, :mod:`.policies`: who sends
+* :mod:`.policies`: who sends, by priorities and counters
 * :mod:`.lease`: the policy that needs no equal tables
 * :mod:`.agent`: one agent in a slot
-* :mod:`.avoiders`, :mod:`.soft_problem`, :mod:`.vehicle`: where it flies
-* :mod:`.alignment`, :mod:`.timebase`, :mod:`.tag`: which slot it is, and whose frame it was
+* :mod:`.timebase`, :mod:`.tag`: which slot it is, and whose frame it was
 
-``core.reference_swarm`` makes a swarm of it that `simulate --core reference` flies.
+It needs no NumPy, but for :mod:`.stepper`, which makes a swarm of it for flights beside the compiled one.
 """

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from dtsa_agent.core.frame import ExtendedFrame, Frame
 from dtsa_agent.core.reference.lease.decide import decide as decide_lease
 from dtsa_agent.core.reference.lease.issue import Said, say
 from dtsa_agent.core.reference.lease.listen import end_slot, listen
@@ -16,11 +17,10 @@ from dtsa_agent.core.reference.lease.memory import Memory
 
 from . import gossip, policies
 from .arithmetic import ZERO, Vector, minus, norm
-from .frame import PROFILE_EXTENDED, WRONG_HEADER, Frame, Refused, decode, encode
-from .frame_extended import SECTION_BYTES, SECTIONS, ExtendedFrame, decode_extended, encode_extended
-from .policies import NOBODY, Weights
+from .frame import PROFILE_EXTENDED, WRONG_HEADER, Refused, decode, encode
+from .frame_extended import SECTION_BYTES, SECTIONS, decode_extended, encode_extended
+from .policies import NOBODY, Choice, Weights
 from .rules import EXTENDED, LEAVES, OFF, ON, PAPER, Rules
-from .selection import Choice
 from .table import Table
 
 
@@ -55,10 +55,7 @@ class Agent:
         return norm(minus(self.goal, self.position)) > self.rules.r_min
 
     def decide(self, slot: int) -> Choice:
-        """Who sends in a slot, in the agent's eyes; if it is itself, it sends.
-
-        :param slot: the slot that begins.
-        """
+        """Who sends in a slot, in the agent's eyes; if it is itself, it sends."""
         self.weights = Weights()
         self.choice = self._decide(slot)
         self.sends = self.choice.index == self.index and self.present != OFF
@@ -76,10 +73,7 @@ class Agent:
         return policies.choose(self.table, slot, self.rules, self.weights)
 
     def frame(self, slot: int) -> bytes:
-        """The frame that the agent sends in a slot.
-
-        :param slot: the slot.
-        """
+        """The frame that the agent sends in a slot."""
         rules = self.rules
         c_r = rules.c_r if self.far_from_goal() else 0
         intent = None if rules.profile == PAPER else self.command
@@ -98,10 +92,7 @@ class Agent:
         return encode_extended(frame, rules.position_step)
 
     def end(self, slot: int) -> None:
-        """The slot is over: counters and silence, after :meth:`remember_own` and all that was heard.
-
-        :param slot: the slot.
-        """
+        """The slot is over: counters and silence, after :meth:`remember_own` and all that was heard."""
         if self.rules.policy != "lease":
             if self.choice.index >= 0:
                 self.table.note_turn(self.choice.index, slot)
@@ -114,9 +105,6 @@ class Agent:
         """A sender knows what it said, whether or not anybody heard it: its own entry is the last sent state.
 
         A frame in an OPEN turn is left out: others may send there, too, and gossip says whether it was heard.
-
-        :param slot: the slot that is over.
-        :param sent: the agent's own frame in it, empty if it was silent.
         """
         if sent and self.choice.reason != "open" and self.table.rows[self.index].sent_slot != slot:
             self.table.learn(decode(sent, self.rules.position_step), slot)
@@ -137,9 +125,6 @@ class Foreign(Exception):
 def parse(data: bytes, slot: int, rules: Rules) -> tuple[Frame | ExtendedFrame, int]:
     """What the air carried, and the slot in which it was sent: the present one, or the one before.
 
-    :param data: the bytes heard.
-    :param slot: the present slot.
-    :param rules: what all agree on.
     :raises RemoteProtocolError: if they are no frame of the swarm's kind.
     :raises Foreign: for a frame of an unknown agent or of another time.
     """
@@ -161,13 +146,7 @@ def parse(data: bytes, slot: int, rules: Rules) -> tuple[Frame | ExtendedFrame, 
 
 
 def hear(receivers: Sequence[Receiver], frame: Frame | ExtendedFrame, sampled: int, rules: Rules) -> None:
-    """Some observers take in a frame.
-
-    :param receivers: those that received it.
-    :param frame: what it said.
-    :param sampled: the slot in which it was sent, see :func:`parse`.
-    :param rules: what all agree on.
-    """
+    """Some observers take in a frame."""
     for receiver in receivers:
         own = frame.own if isinstance(frame, ExtendedFrame) else frame
         row = receiver.table.rows[own.sender - 1]

@@ -60,8 +60,6 @@ def sum_in_lanes(values: Sequence[float]) -> float:
     """The sum of some numbers, in the one order that all agents use.
 
     Four running sums take every fourth value each; what does not fill a group of four goes to the first of them.
-
-    :param values: the numbers, in the order of ids.
     """
     lanes = [0.0, 0.0, 0.0, 0.0]
     whole = len(values) // 4 * 4
@@ -74,8 +72,6 @@ def arcsin(x: float) -> float:
     """The arcsine, rad, with the same bits on every machine.
 
     Near 1 the polynomial would need many terms; there arcsin x = pi / 2 - 2 arcsin sqrt((1 - x) / 2) is used.
-
-    :param x: -1 to 1.
     """
     a = abs(x)
     steep = a > 0.5
@@ -90,12 +86,7 @@ def arcsin(x: float) -> float:
 
 
 def quantise(value: float, step: float, bits: int) -> int:
-    """A number in whole steps, as a signed integer of some bits: rounded half to even, saturated, never wrapped.
-
-    :param value: the number; infinite ones saturate.
-    :param step: one step, in the number's unit.
-    :param bits: bits of the integer, its sign among them.
-    """
+    """A number in whole steps, as a signed integer of some bits: rounded half to even, saturated, never wrapped."""
     top = (1 << (bits - 1)) - 1
     steps = value / step
     if steps > top:
@@ -106,11 +97,7 @@ def quantise(value: float, step: float, bits: int) -> int:
 
 
 def signed(value: int, bits: int) -> int:
-    """The signed integer whose two's complement is ``value``.
-
-    :param value: its lowest bits count.
-    :param bits: how many bits it has.
-    """
+    """The signed integer whose two's complement is ``value``."""
     top = 1 << (bits - 1)
     return ((value & (2 * top - 1)) ^ top) - top
 
@@ -121,10 +108,7 @@ def bits_of(x: float) -> int:
 
 
 def mix64(x: int) -> int:
-    """64 bits that look random, from any 64 bits (splitmix64).
-
-    :param x: a whole number; its lowest 64 bits count, two's complement below zero.
-    """
+    """64 bits that look random, from any 64 bits (splitmix64)."""
     x = (x + 0x9E3779B97F4A7C15) & _WORD
     x = ((x ^ x >> 30) * 0xBF58476D1CE4E5B9) & _WORD
     x = ((x ^ x >> 27) * 0x94D049BB133111EB) & _WORD
@@ -132,8 +116,5 @@ def mix64(x: int) -> int:
 
 
 def share_of(draw: int) -> float:
-    """A draw as a number from 0 up to 1: its highest 53 bits.
-
-    :param draw: 64 bits, see :func:`mix64`.
-    """
+    """A draw as a number from 0 up to 1: its highest 53 bits."""
     return (draw >> 11) * 2.0**-53

@@ -15,31 +15,17 @@ DECAY_STEPS = 4096  # beyond this many control periods a vehicle has settled at 
 
 
 def age_s(row: Row, rules: Rules, slot: int, step: int = 0) -> float:
-    """Age of a known state, (i - m) t_s in eq:estimate, s; 0 for an agent never heard of.
-
-    :param row: what is known of the agent.
-    :param rules: what all agree on.
-    :param slot: the slot i.
-    :param step: index of the control instant within it, 0 to S - 1.
-    """
+    """Age of a known state, (i - m) t_s in eq:estimate, s; 0 for an agent never heard of."""
     return 0.0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.slot_s + step * rules.dt
 
 
 def hold(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Vector]:
-    """Position and velocity as last heard.
-
-    :param slot: number of the slot.
-    :param step: index of the control instant within it, 0 to S - 1.
-    """
+    """Position and velocity as last heard."""
     return row.position, row.velocity
 
 
 def linear(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Vector]:
-    """On with the velocity last heard: p + (i - m) t_s v (eq:estimate).
-
-    :param slot: number of the slot.
-    :param step: index of the control instant within it, 0 to S - 1.
-    """
+    """On with the velocity last heard: p + (i - m) t_s v (eq:estimate)."""
     age, p, v = age_s(row, rules, slot, step), row.position, row.velocity
     return (p[0] + v[0] * age, p[1] + v[1] * age, p[2] + v[2] * age), v
 
@@ -48,9 +34,6 @@ def intent(row: Row, rules: Rules, slot: int, step: int = 0) -> tuple[Vector, Ve
     """Towards the commanded velocity c, as an unsaturated vehicle answers it.
 
     After k control periods: velocity c + (v - c) q^k, position p + c a + (v - c) dt (q + .. + q^k).
-
-    :param slot: number of the slot.
-    :param step: index of the control instant within it, 0 to S - 1.
     """
     age = age_s(row, rules, slot, step)
     ago = 0 if row.sent_slot < 0 else (slot - row.sent_slot) * rules.steps + step
@@ -71,9 +54,6 @@ def decay_table(tau: float, dt: float) -> tuple[tuple[float, ...], tuple[float, 
     """How an unsaturated vehicle approaches its command: q^k (1), and dt (q + .. + q^k) (s), for k = 0, 1, ...
 
     q = 1 - dt / tau is the vehicle's own integrator. By multiplication alone, so that all agents compute the same bits.
-
-    :param tau: time constant of the velocity response, s.
-    :param dt: control period, s.
     """
     q = max(0.0, 1.0 - dt / tau)
     powers, ways = [], []

@@ -13,11 +13,10 @@ Little-endian; the layout is docs/reference/protocol.md's table::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
+from dtsa_agent.core.frame import Frame
 
-from .arithmetic import ZERO, Vector, quantise, signed
+from .arithmetic import ZERO, quantise, signed
 
 VERSION = 1
 PROFILE_PAPER, PROFILE_PAPER_INTENT, PROFILE_EXTENDED = 0, 1, 2
@@ -32,21 +31,6 @@ WRONG_HEADER = "unknown version or profile"
 WRONG_FIELD = "field out of range"
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """What one agent says in one slot (profile ``paper``).
-
-    Values are those of the air after :func:`decode`: quantised (2 mm, 1 cm/s) and saturated, never wrapped.
-    """
-
-    sender: int  # id, 1 .. 65535
-    slot: int  # slot in which the state was sampled
-    c_r: int  # transmission parameter (eq:remaining_t_slots), 0: arrived
-    position: Vector  # m, frame map
-    velocity: Vector  # m/s, frame map
-    intent: Vector | None = None  # m/s, commanded velocity; None: not carried
-
-
 class Refused(RemoteProtocolError):
     """Bytes that are no frame."""
 
@@ -57,8 +41,6 @@ class Refused(RemoteProtocolError):
 def encode(frame: Frame, position_step: float, profile: int | None = None) -> bytes:
     """The bytes of a frame; of profile ``extended`` its first 23.
 
-    :param frame: its fields; what does not fit saturates.
-    :param position_step: m, one step of a coordinate, as the swarm has agreed.
     :param profile: default: ``paper``, or ``paper-intent`` for a frame with an intent.
     :raises LocalProtocolError: if a field is not a number or an id is out of range.
     """
@@ -89,8 +71,6 @@ def _pack_speeds(speeds: tuple[float, ...]) -> bytes:
 def decode(data: bytes, position_step: float) -> Frame:
     """The fields of a frame of any profile that all profiles have.
 
-    :param data: the bytes heard.
-    :param position_step: m, one step of a coordinate, as the swarm has agreed.
     :raises Refused: if they are no frame.
     """
     if len(data) < 1:

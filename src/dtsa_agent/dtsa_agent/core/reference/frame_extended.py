@@ -12,9 +12,8 @@ The layout is docs/reference/protocol.md's table::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.core.frame import ExtendedFrame, Gossip
 
 from .arithmetic import Vector, quantise, signed
 from .frame import (
@@ -23,7 +22,6 @@ from .frame import (
     PROFILE_EXTENDED,
     WRONG_FIELD,
     WRONG_HEADER,
-    Frame,
     Refused,
     decode,
     encode,
@@ -40,43 +38,8 @@ OPEN = 255  # lessee of a turn that is open to all who wake
 VELOCITY_STEP = 0.02  # m/s, of gossip
 
 
-@dataclass(frozen=True, slots=True)
-class Gossip:
-    """What the sender of a frame last heard of somebody else."""
-
-    agent: int  # id, 1 .. 254
-    age: int  # slots since the state was sampled, 1 .. 127
-    moving: bool  # its c_r was not 0
-    position: Vector  # m, frame map; 4 mm on the air at the default extent
-    velocity: Vector  # m/s, frame map; 2 cm/s on the air
-
-
-@dataclass(frozen=True, slots=True)
-class ExtendedFrame:
-    """What one agent says in one slot (profile ``extended``).
-
-    ``own.c_r`` is 0 or 1 on the air. Gossip, a section of 11 leases, the relay and what is handed on far ahead take one
-    of three places each.
-    """
-
-    own: Frame
-    c_s: int = 0  # consecutive ids before the sender that it thinks dead, 0 .. 253
-    leaving: bool = False  # the sender leaves with this frame; c_s does not count
-    probation: bool = False  # the sender uses its anchors only
-    gossip: tuple[Gossip, ...] = ()
-    leases: bytes = b""  # a byte a turn: 0 none, id of the lessee, OPEN
-    relay: tuple[tuple[int, int], ...] = ()  # (slots ahead, 1 .. 24, ascending; lessee), at most 8
-    far: tuple[int, ...] = ()  # slots ahead, 25 .. 104, ascending, of turns that are handed on to `far_lessee`
-    far_lessee: int = 0  # id, 1 .. 254; 0: nothing is handed on far ahead
-
-
 def gossip_fits(position: Vector, velocity: Vector, position_step: float) -> bool:
-    """Whether gossip can say a state without saturating: it has two bits less than the sender's own, at twice the step.
-
-    :param position: m.
-    :param velocity: m/s.
-    :param position_step: m, one step of a coordinate in frames.
-    """
+    """Whether gossip can say a state without saturating: it has two bits less than the own state."""
     far = ((1 << 13) - 2) * (2.0 * position_step)
     fast = ((1 << 9) - 2) * VELOCITY_STEP
     return all(abs(x) <= far for x in position) and all(abs(x) <= fast for x in velocity)
@@ -85,8 +48,6 @@ def gossip_fits(position: Vector, velocity: Vector, position_step: float) -> boo
 def encode_extended(frame: ExtendedFrame, position_step: float) -> bytes:
     """The bytes of an extended frame.
 
-    :param frame: its fields; what does not fit saturates.
-    :param position_step: m, one step of a coordinate, as the swarm has agreed.
     :raises LocalProtocolError: if a field is out of range, or the sections do not fit.
     """
     if not _sayable(frame):
@@ -151,8 +112,6 @@ def _pack_gossip(entry: Gossip, step: float) -> bytes:
 def decode_extended(data: bytes, position_step: float) -> ExtendedFrame:
     """The fields of an extended frame.
 
-    :param data: the bytes heard, without a tag.
-    :param position_step: m, one step of a coordinate, as the swarm has agreed.
     :raises Refused: if they are no frame of profile ``extended``.
     """
     own = decode(data, position_step)

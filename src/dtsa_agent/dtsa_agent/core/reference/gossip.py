@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from .frame import Frame
-from .frame_extended import GOSSIP_AGE_MAX, OPEN, SECTIONS, ExtendedFrame, Gossip, gossip_fits
+from dtsa_agent.core.frame import ExtendedFrame, Frame, Gossip
+
+from .frame_extended import GOSSIP_AGE_MAX, OPEN, SECTIONS, gossip_fits
 from .rules import Rules
 from .table import Table
 
@@ -13,12 +14,6 @@ def collect(table: Table, self_index: int, slot: int, room: int, rules: Rules) -
 
     The first mends single losses at once; the others reach receivers that heard nothing for a while. What is left of
     the room carries the next newest.
-
-    :param table: what the sender knows.
-    :param self_index: its own number, id - 1: nobody gossips about itself.
-    :param slot: the slot in which it sends.
-    :param room: number of free sections.
-    :param rules: what all agree on.
     """
     later = 2 + rules.agents // 16
     chosen: list[int] = []
@@ -32,11 +27,7 @@ def collect(table: Table, self_index: int, slot: int, room: int, rules: Rules) -
 
 
 def newest_of_age(table: Table, self_index: int, slot: int, age: int, chosen: list[int], rules: Rules) -> list[int]:
-    """The newest state of somebody not yet chosen that is ``age`` slots old or older and can be said; or nobody's.
-
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
-    """
+    """The newest state of somebody not yet chosen that is ``age`` slots old or older and can be said; or nobody's."""
     fit = [
         k
         for k, row in enumerate(table.rows)
@@ -53,24 +44,13 @@ def learn(table: Table, sampled: int, entry: Gossip, rules: Rules) -> None:
     """A state that somebody else heard replaces an older one only, and never the observer's entry for itself.
 
     One at the codec's limit may be a wrong one and is not believed.
-
-    :param table: what the receiver knows.
-    :param sampled: the slot of the state.
-    :param entry: the state.
-    :param rules: what all agree on.
     """
     if table.observer != entry.agent:
         confirm(table, sampled, entry, rules)
 
 
 def confirm(table: Table, sampled: int, entry: Gossip, rules: Rules) -> None:
-    """:func:`learn`, of the observer's entry for itself, too: somebody has heard it.
-
-    :param table: what the receiver knows.
-    :param sampled: the slot of the state.
-    :param entry: the state.
-    :param rules: what all agree on.
-    """
+    """:func:`learn`, of the observer's entry for itself, too: somebody has heard it."""
     if sampled < 0 or table.rows[entry.agent - 1].sent_slot >= sampled:
         return
     if gossip_fits(entry.position, entry.velocity, rules.position_step):
@@ -80,10 +60,7 @@ def confirm(table: Table, sampled: int, entry: Gossip, rules: Rules) -> None:
 
 
 def known(frame: ExtendedFrame, slot: int, rules: Rules) -> bool:
-    """Whether a frame speaks of agents of this swarm only, and gives turns away in its sender's own turn only.
-
-    :param slot: the slot in which it was sent.
-    """
+    """Whether a frame speaks of agents of this swarm only, and gives turns away in its sender's own turn only."""
     n, own_turn = rules.agents, slot >= 0 and slot % rules.agents == frame.own.sender - 1
     lessees = (*frame.leases, *(lessee for _, lessee in frame.relay))
     return (

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from dtsa_agent.core.frame import Frame
+
 from .arithmetic import ZERO, Vector, bits_of, mix64
-from .frame import Frame
 
 
 @dataclass(slots=True)
@@ -22,10 +23,7 @@ class Row:
     digest: int = 0  # of this row, 32 bits
 
     def h(self, slot: int) -> int:
-        """Slots since the agent's last turn, h (eq:secondary).
-
-        :param slot: the slot i that begins.
-        """
+        """Slots since the agent's last turn, h (eq:secondary)."""
         return slot - 1 - self.last_turn
 
 
@@ -33,8 +31,6 @@ class Row:
 class Table:
     """What one observer knows.
 
-    :param observer: id of the agent whose table it is, 0: of one that hears everything.
-    :param start: where all agents start, m.
     :param known_goals: where those that rest are taken to stand, m; None: nobody knows that.
     """
 
@@ -56,9 +52,6 @@ class Table:
         """Takes in the state that an agent has sent.
 
         Whoever says c_r = 0 leaves A_p; where all know its target it is then taken to stand there, at rest.
-
-        :param frame: what it said.
-        :param sampled: the slot of that state.
         """
         row, rests = self.rows[frame.sender - 1], frame.c_r == 0
         row.position = self.known_goals[frame.sender - 1] if rests and self.known_goals is not None else frame.position
@@ -70,11 +63,7 @@ class Table:
         self._digest_row(frame.sender - 1)
 
     def note_turn(self, index: int, slot: int) -> None:
-        """An agent was taken for the sender of a slot: its counter h begins anew (eq:secondary).
-
-        :param index: the agent's place, id - 1.
-        :param slot: the slot.
-        """
+        """An agent was taken for the sender of a slot: its counter h begins anew (eq:secondary)."""
         row = self.rows[index]
         if row.last_turn < slot:
             row.last_turn = slot

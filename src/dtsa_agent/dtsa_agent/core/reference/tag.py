@@ -25,11 +25,7 @@ class Keyed(Protocol):
 
 
 def keyed(key: bytes, session: int) -> Keyed:
-    """BLAKE2s with a key, begun with the session: what all tags of a flight have in common.
-
-    :param key: 16 to 32 secret bytes.
-    :param session: number of the flight, 8 bytes, little-endian.
-    """
+    """BLAKE2s with a key, begun with the session: what all tags of a flight have in common."""
     import hashlib  # brings OpenSSL along: 0.6 MB that an agent in flight does without
 
     return hashlib.blake2s(session.to_bytes(8, "little"), key=key, digest_size=LENGTH, person=_PERSON)
@@ -38,9 +34,7 @@ def keyed(key: bytes, session: int) -> Keyed:
 def tag(begun: Keyed, slot: int, data: bytes) -> bytes:
     """The 4 bytes that follow a frame.
 
-    :param begun: see :func:`keyed`.
     :param slot: the slot in which it is sent, 8 bytes, little-endian; it is not taken from the frame.
-    :param data: the frame with what plug-ins append to it.
     """
     mac = begun.copy()
     mac.update(slot.to_bytes(8, "little"))

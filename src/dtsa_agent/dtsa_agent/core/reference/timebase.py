@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from dtsa_agent.core.errors import ConfigError
 
-from .alignment import ClockAligner
 from .arithmetic import mix64
 
 LISTENING, ALONE, JOINED = "listening", "alone", "joined"
@@ -29,13 +28,79 @@ RESTARTED = "restarted"  # its time was taken over; whatever was known about tur
 FOREIGN = "foreign"  # of an earlier time: its sender will come to us
 
 
+class ClockAligner:
+    """Turns arrival offsets of heard frames into small shifts of the own slots.
+
+    After every ``receptions`` usable offsets the own slots move by ``gain`` times their median. A median
+    shrugs off single delays, and since everybody moves towards everybody else, the swarm agrees on a common
+    time that drifts with the mean of its clocks. A correction of the frequency as well is not needed at
+    crystal accuracy and lets the common time run away.
+
+    The caller keeps its own slot time: ``slot_start += aligner.hear(offset)``.
+
+    :param receptions: offsets per correction, 1 or more.
+    :param gain: share of the median by which the slots move, above 0, up to 1.
+    :param limit_ns: ns; offsets beyond this, either way, are not trusted (a late frame, another swarm) and
+        are counted.
+    :raises ConfigError: when a parameter is out of range.
+    """
+
+    __slots__ = ("_limit_ns", "_offsets", "_receptions", "_share", "corrections", "ignored", "ignored_in_a_row")
+
+    def __init__(self, receptions: int = 9, gain: float = 0.5, limit_ns: int = 1_000_000) -> None:
+        if receptions < 1:
+            raise ConfigError("align_receptions", receptions, "a whole number of 1 or more")
+        if not 0.0 < gain <= 1.0:
+            raise ConfigError("align_gain", gain, "a number above 0, up to 1")
+        if limit_ns <= 0:
+            raise ConfigError("align_limit_ns", limit_ns, "a number of ns above 0")
+        self._receptions = receptions
+        # In 1/65536: the correction is integer arithmetic, the same on every machine.
+        self._share = max(1, round(gain * 65536))
+        self._limit_ns = limit_ns
+        self._offsets: list[int] = []
+        #: Corrections made so far.
+        self.corrections = 0
+        #: Offsets that were not trusted so far.
+        self.ignored = 0
+        #: Of these, how many came one after the other up to now: a clock that is off by more than the limit
+        #: shows here.
+        self.ignored_in_a_row = 0
+
+    def hear(self, offset_ns: int) -> int:
+        """Take in one frame and return by how much the own slots move now, ns (0 most of the time).
+
+        :param offset_ns: ns, when the frame arrived minus when the own clock expected it; positive: the
+            sender is later.
+        """
+        if not -self._limit_ns <= offset_ns <= self._limit_ns:
+            self.ignored += 1
+            self.ignored_in_a_row += 1
+            return 0
+        self.ignored_in_a_row = 0
+        offsets = self._offsets
+        offsets.append(offset_ns)
+        if len(offsets) < self._receptions:
+            return 0
+        offsets.sort()
+        middle = len(offsets) // 2
+        twice = offsets[middle] + offsets[~middle]
+        offsets.clear()
+        self.corrections += 1
+        # Rounded half away from zero, so that both directions weigh the same.
+        size = (abs(twice) * self._share + 65536) // 131072
+        return size if twice >= 0 else -size
+
+    def reset(self) -> None:
+        """Forget the offsets collected so far (after the own slots have been set anew)."""
+        self._offsets.clear()
+        self.ignored_in_a_row = 0
+
+
 class TimeBase:
     """The slots of one agent on its own clock.
 
-    :param agents: number of agents N.
     :param anchor_every: M; everybody alive is heard within M N slots where nothing is lost.
-    :param slot_ns: length of a slot, ns.
-    :param agent: own id.
     :param seed: seed of the run; with the id it decides how long to wait in silence.
     :param aligner: keeps the slots of a group together; default: a :class:`ClockAligner`.
     :raises ConfigError: when a parameter is out of range.
@@ -69,20 +134,14 @@ class TimeBase:
         self.restarts = 0
 
     def start(self, now_ns: int) -> int:
-        """Begin to listen; returns when to call :meth:`wake` at the latest, ns.
-
-        :param now_ns: ns, own clock.
-        """
+        """Begin to listen; returns when to call :meth:`wake` at the latest, ns."""
         self.state = LISTENING
         self._aligner.reset()
         self._deadline_ns = now_ns + self._wait_ns
         return self._deadline_ns
 
     def wake(self, now_ns: int) -> bool:
-        """Whether slots begin now because nothing has been heard for long; True once.
-
-        :param now_ns: ns, own clock.
-        """
+        """Whether slots begin now because nothing has been heard for long; True once."""
         if self.state != LISTENING or self._deadline_ns is None or now_ns < self._deadline_ns:
             return False
         # Not slot 0: that is for agents that are told to start together and may speak at once.
@@ -91,23 +150,16 @@ class TimeBase:
         return True
 
     def slot(self, now_ns: int) -> int | None:
-        """The slot at a time; None while listening.
-
-        :param now_ns: ns, own clock.
-        """
+        """The slot at a time; None while listening."""
         return None if self.state == LISTENING else (now_ns - self._origin_ns) // self._slot_ns
 
     def slot_start_ns(self, slot: int) -> int:
-        """When a slot starts, ns, own clock. It may still move a little with what is heard.
-
-        :param slot: number of the slot.
-        """
+        """When a slot starts, ns, own clock. It may still move a little with what is heard."""
         return self._origin_ns + slot * self._slot_ns
 
     def hear(self, slot: int, start_ns: int) -> str:
         """Take in a frame; returns ALIGNED, RESTARTED or FOREIGN.
 
-        :param slot: slot that the frame says it was sent in.
         :param start_ns: ns, own clock, when its transmission started: arrival minus airtime and link delays.
         """
         origin = start_ns - slot * self._slot_ns  # where the sender's slot 0 lies

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.frame import EXTENT_M, PROFILE_EXTENDED, PROFILE_PAPER, PROFILE_PAPER_INTENT, TAG_LENGTH
-from dtsa_agent.core.reference.frame import EXTENDED_SENDER_MAX, FRAME_MAX, LENGTHS
-from dtsa_agent.core.registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow
+from dtsa_agent.core.frame import (
+    EXTENT_M,
+    FRAME_MAX,
+    LENGTHS,
+    MAX_EXTENDED_AGENTS,
+    PROFILE_EXTENDED,
+    PROFILE_PAPER,
+    PROFILE_PAPER_INTENT,
+    TAG_LENGTH,
+)
+from dtsa_agent.core.registry import ESTIMATORS, POLICIES, SELECTIONS, EstimatorRow, PolicyRow, Registry
 
 from .declaration import Settings, check, setting
 from .flight_models import AVOIDERS, flight_model
-from .plugin_options import check_plug_in_options
 
 FRAMES = ("auto", "paper", "extended")
 SHAPES = ("circle", "ellipse", "ellipsoid")
 SCENARIOS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
 MAX_AGENTS = 1024
 MOST_ROUNDS = 15  # from one anchor that nobody gives away to the next: so far lease bytes reach
-MAX_EXTENDED_AGENTS = EXTENDED_SENDER_MAX  # ids have 8 bits in extended frames
+
+_REGISTRIES: tuple[Registry[Any], ...] = (POLICIES, ESTIMATORS, AVOIDERS)
+_ACCEPTED: set[str] = set()  # options of plug-ins that did not fly: to look for those takes milliseconds
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -158,8 +169,7 @@ class SwarmConfig(Settings):
         POLICIES.row(self.policy)
         ESTIMATORS.row(self.estimator)
         flight_model(self.avoider, self.options)
-        parts = {"policy": self.policy, "estimator": self.estimator, "avoider": self.avoider}
-        check_plug_in_options(self.options, parts)
+        self._check_plug_in_options()
         if self.policy_row.extended and self.frame == "paper":
             raise ConfigError("frame", self.frame, f"auto or extended with policy {self.policy}")
         self._check_agents()
@@ -167,14 +177,26 @@ class SwarmConfig(Settings):
             raise ConfigError("places", self.places, f"the numbers 1 to {self.agents}, each once, in any order")
         self._check_own_bytes()
 
-    def _check_agents(self) -> None:
-        """Whether ids fit into frames and into the policy.
+    def _check_plug_in_options(self) -> None:
+        """Check that plug-ins declare the options with a dot, also those of plug-ins that do not fly."""
+        for key in self.options:
+            owner = key.rpartition(".")[0]
+            flying = [one for one in _REGISTRIES if getattr(self, one.kind) == owner and owner not in one.rows]
+            if not owner or (not flying and key in _ACCEPTED):
+                continue
+            owners = flying or [one for one in _REGISTRIES if owner in one.plug_in_names()]
+            if not owners:
+                names = ", ".join(sorted({name for one in _REGISTRIES for name in one.plug_in_names()}))
+                raise ConfigError("options", key, f"the name of a plug-in before the dot; {names}")
+            declared = {f"{owner}.{option}" for one in owners for option in _declared(owner, one.factory(owner))}
+            if key not in declared:
+                nothing = f"none: {owner} declares no options (class attribute options)"
+                raise ConfigError("options", key, ", ".join(sorted(declared)) or nothing)
+            if not flying:
+                _ACCEPTED.add(key)
 
-        :raises ConfigError: with the number that is possible.
-        """
-        most = self.policy_row.most_agents
-        if most is not None and self.agents > most:
-            raise ConfigError("agents", self.agents, f"1 to {most} with policy {self.policy}")
+    def _check_agents(self) -> None:
+        """Check that ids fit into frames."""
         if self.extended and self.agents > MAX_EXTENDED_AGENTS:
             allowed = f"1 to {MAX_EXTENDED_AGENTS} with extended frames, whose ids have 8 bits"
             others = [row.name for row in POLICIES.rows.values() if not row.extended]
@@ -182,10 +204,7 @@ class SwarmConfig(Settings):
             raise ConfigError("agents", self.agents, f"{allowed}; up to {MAX_AGENTS} with {instead}")
 
     def _check_own_bytes(self) -> None:
-        """Whether frames with what plug-ins append to them fit into a packet.
-
-        :raises ConfigError: with the number of bytes that would fit.
-        """
+        """Check that frames with what plug-ins append to them fit into a packet."""
         profile = PROFILE_EXTENDED if self.extended else PROFILE_PAPER_INTENT
         room = FRAME_MAX - LENGTHS[profile] - (TAG_LENGTH if self.auth else 0)
         if self.own_bytes > room:
@@ -267,3 +286,27 @@ class SwarmConfig(Settings):
     def steps(self) -> int:
         """Control instants in one slot."""
         return max(1, math.ceil(self.slot_ms / self.control_ms - 1e-9))
+
+
+def _declared(name: str, factory: Any) -> Iterable[str]:
+    options: Any = getattr(factory, "options", ())
+    if not isinstance(options, (tuple, list, set, frozenset)) or not all(isinstance(word, str) for word in options):
+        raise ConfigError(f"{name}.options", options, 'a tuple of names, as ("error_m", "rounds")')
+    return options
+
+
+def agreed_settings(config: SwarmConfig, mode: str) -> dict[str, Any]:
+    """The settings that all processes of a flight must share, as plain values.
+
+    :param mode: lockstep, realtime, or udp: over a network.
+    """
+    values = {**config.to_dict(), "steps": config.steps, "mode": mode}
+    return dict(json.loads(json.dumps(values, sort_keys=True, default=str)))
+
+
+def settings_hash(settings: Mapping[str, Any]) -> int:
+    """A number of 64 bits that two sets of settings, as plain values, share only if they are equal."""
+    import hashlib  # brings OpenSSL along: 0.6 MB that an agent in flight does without
+
+    text = json.dumps(settings, sort_keys=True, separators=(",", ":"))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")

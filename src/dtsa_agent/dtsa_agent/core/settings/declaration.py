@@ -16,9 +16,6 @@ from typing import Any, TypeVar
 
 from dtsa_agent.core.errors import ConfigError, range_text
 
-#: What a setting holds. ``vector``: three numbers; ``values``: numbers by name; ``file``: the path of one;
-#: ``structure``: files only.
-KINDS = ("int", "float", "bool", "text", "vector", "values", "file", "structure")
 #: The default of a setting that has none.
 REQUIRED: Any = dataclasses.MISSING
 
@@ -26,7 +23,7 @@ _KIND_OF_TYPE = {"int": "int", "float": "float", "bool": "bool", "str": "text", 
 _NUMBERS = {"int": "a whole number", "float": "a number"}
 _WORDS = {"bool": "true or false", "text": "a text", "values": "name=number, separated by commas"}
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
-_TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
+_BOOLS = {**dict.fromkeys(("true", "yes", "on", "1"), True), **dict.fromkeys(("false", "no", "off", "0"), False)}
 
 Choices = tuple[Any, ...] | Callable[[], tuple[Any, ...]]
 T = TypeVar("T", bound="Settings")
@@ -34,40 +31,23 @@ T = TypeVar("T", bound="Settings")
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One setting: all that is needed to check it, to ask for it and to explain it.
+    """One setting: all that is needed to check it, to ask for it and to explain it."""
 
-    :param name: name of the dataclass's field.
-    :param kind: one of :data:`KINDS`.
-    :param default: value used when nothing is given; None if there is none.
-    :param help: one line for the user.
-    :param unit: unit of the numbers; empty or "1": none.
-    :param minimum: smallest number allowed, or None.
-    :param maximum: largest number allowed, or None.
-    :param words: the values allowed, or a function that gives them; empty: any value of the kind and the range.
-    :param open_choices: other words are allowed too: they name plug-ins.
-    :param required: there is no default.
-    :param optional: None is allowed: the value then follows from the other settings.
-    :param changeable: may change in flight.
-    :param custom: the settings class checks it itself.
-    :param section: the settings class of a nested section, or None.
-    :param group: heading under which the documentation lists it.
-    """
-
-    name: str
-    kind: str
-    default: Any
-    help: str
-    unit: str = ""
-    minimum: float | None = None
+    name: str  # of the dataclass's field
+    kind: str  # int, float, bool, text; vector: three numbers; values: numbers by name; file: a path; structure: others
+    default: Any  # value used when nothing is given; None if there is none
+    help: str  # one line for the user
+    unit: str = ""  # of the numbers; empty or "1": none
+    minimum: float | None = None  # smallest number allowed
     maximum: float | None = None
-    words: Choices = ()
-    open_choices: bool = False
-    required: bool = False
-    optional: bool = False
-    changeable: bool = False
-    custom: bool = False
-    section: type[Settings] | None = None
-    group: str = ""
+    words: Choices = ()  # the values allowed, or a function that gives them; empty: any of the kind and the range
+    open_choices: bool = False  # other words are allowed too: they name plug-ins
+    required: bool = False  # there is no default
+    optional: bool = False  # None is allowed: the value then follows from the other settings
+    changeable: bool = False  # in flight
+    custom: bool = False  # the settings class checks it itself
+    section: type[Settings] | None = None  # the settings class of a nested section
+    group: str = ""  # heading under which the documentation lists it, and those that follow
 
     @property
     def choices(self) -> tuple[Any, ...]:
@@ -77,7 +57,7 @@ class Setting:
     @property
     def description(self) -> str:
         """The help text with the unit and the words allowed."""
-        text = f"{self.help} ({self.unit})" if self.unit and self.unit != "1" else self.help
+        text = f"{self.help} ({self.unit})" if self.unit not in ("", "1") else self.help
         return f"{text}: {', '.join(map(str, self.choices))}" if self.choices else text
 
     @property
@@ -114,8 +94,8 @@ class Setting:
     def check(self, value: Any, name: str | None = None) -> Any:
         """The value as the configuration keeps it: whole numbers become floats where floats are meant.
 
-        :param value: what the user gave; NumPy scalars are welcome, True is not a number.
-        :param name: how the user calls the setting, if not by its own name.
+        NumPy scalars are welcome, True is not a number. ``name``: how the user calls the setting, if not so itself.
+
         :raises ConfigError: if it has the wrong type or is out of range.
         """
         if value is None and self.optional:
@@ -125,19 +105,19 @@ class Setting:
             value = value.item()
         if self.kind in _NUMBERS:
             return self._number(value, name)
-        if self.kind == "bool" and not isinstance(value, bool):
-            raise ConfigError(name, value, self.allowed)
-        if self.kind == "text" and not (
-            isinstance(value, str) and (not self.words or self.open_choices or value in self.choices)
-        ):
-            raise ConfigError(name, value, self.allowed)
-        if self.kind == "vector":
-            return self._vector(value, name)
         if self.kind == "values":
             return _checked_values(value, name)
         if self.section and not isinstance(value, self.section):
             raise ConfigError(name, value, "names with values")
-        return value
+        if self.kind == "vector":
+            right = isinstance(value, (list, tuple)) and len(value) == 3 and all(map(_is_number, value))
+        elif self.kind == "text":
+            right = isinstance(value, str) and (not self.words or self.open_choices or value in self.choices)
+        else:
+            right = self.kind != "bool" or isinstance(value, bool)
+        if not right:
+            raise ConfigError(name, value, self.allowed)
+        return tuple(map(float, value)) if self.kind == "vector" else value
 
     def _number(self, value: Any, name: str) -> int | float:
         if self.kind == "int" and isinstance(value, float) and value.is_integer():
@@ -151,125 +131,65 @@ class Setting:
             raise ConfigError(name, value, self.allowed)
         return float(value) if self.kind == "float" else int(value)
 
-    def _vector(self, value: Any, name: str) -> tuple[float, float, float]:
-        if not isinstance(value, (list, tuple)) or len(value) != 3 or not all(map(_is_number, value)):
-            raise ConfigError(name, value, self.allowed)
-        return float(value[0]), float(value[1]), float(value[2])
-
     def parse(self, text: str) -> Any:
-        """The value that a text means. Its range is checked by the configuration itself.
-
-        :param text: as the user typed it.
-        :raises ConfigError: if it is of another kind.
-        """
+        """The value that a text means. Its range is checked by the configuration itself."""
+        readers: dict[str, Callable[[str], Any]] = {
+            "text": str, "file": str, "int": int, "float": float, "values": parse_values,
+            "bool": lambda text: _BOOLS[text.lower()],
+        }  # fmt: skip
         try:
-            if self.kind in ("text", "file"):
-                return text
-            if self.kind == "int":
-                return int(text)
-            if self.kind == "float":
-                return float(text)
-            if self.kind == "values":
-                return parse_values(text)
-            if self.kind == "bool" and text.lower() in _TRUE + _FALSE:
-                return text.lower() in _TRUE
-        except ValueError:
-            pass
-        raise ConfigError(self.name, text, self.allowed)
+            return readers[self.kind](text)
+        except (KeyError, ValueError):
+            raise ConfigError(self.name, text, self.allowed) from None
 
     def read(self, text: str) -> Any:
-        """The value that a text means, checked.
-
-        :param text: as the user typed it.
-        :raises ConfigError: if it is none, or not allowed.
-        """
+        """The value that a text means, checked."""
         try:
             return self.check(self.parse(text))
         except ConfigError:
             raise ConfigError(self.name, text, self.allowed) from None
 
 
-def setting(
-    default: Any,
-    help: str,
-    *,
-    unit: str = "",
-    minimum: float | None = None,
-    maximum: float | None = None,
-    choices: Choices = (),
-    open_choices: bool = False,
-    changeable: bool = False,
-    custom: bool = False,
-    kind: str = "",
-    section: type[Settings] | None = None,
-    group: str = "",
-) -> Any:
-    """A field of a settings class. What the other parameters mean: :class:`Setting`.
-
-    :param default: its default value, :data:`REQUIRED`, or for a section None: its own defaults.
-    :param help: one line for the user.
-    :param kind: one of :data:`KINDS`; empty: what the field's annotation says.
-    :param group: heading in the documentation, for this field and those that follow.
-    """
+def setting(default: Any, help: str, *, kind: str = "", choices: Choices = (), **more: Any) -> Any:
+    """A field of a settings class; without ``kind`` that of its annotation. ``more``: fields of :class:`Setting`."""
     if not isinstance(choices, tuple) and not callable(choices):
         raise TypeError(f"choices: a tuple or a function, not {choices!r}")
-    metadata = {
-        "help": help,
-        "unit": unit,
-        "minimum": minimum,
-        "maximum": maximum,
-        "words": choices,
-        "open_choices": open_choices,
-        "changeable": changeable,
-        "custom": custom,
-        "kind": kind,
-        "section": section,
-        "group": group,
-    }
+    metadata = {"setting": Setting("", kind, None, help, words=choices, **more)}
     if isinstance(default, dict):
         return dataclasses.field(default_factory=dict, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
 
 
 def nested(section: type[Settings], help: str, group: str = "") -> Any:
-    """A field that holds a section of settings, by default with that section's defaults.
-
-    :param section: its settings class.
-    :param help: one line for the user.
-    :param group: heading in the documentation.
-    """
-    metadata = {"help": help, "kind": "structure", "section": section, "group": group}
+    """A field that holds a section of settings, by default with that section's defaults."""
+    metadata = {"setting": Setting("", "structure", None, help, section=section, group=group)}
     return dataclasses.field(default_factory=section, metadata=metadata)
-
-
-def settings_of(cls: type) -> tuple[Setting, ...]:
-    """The settings of a settings class, in the order of its fields.
-
-    :param cls: a dataclass whose fields are made with :func:`setting` or :func:`nested`.
-    """
-    found = _described.get(cls)
-    if found is None:
-        result: list[Setting] = []
-        for spec in dataclasses.fields(cls):
-            if spec.metadata:
-                result.append(_setting(spec, result[-1].group if result else ""))
-        found = _described[cls] = tuple(result)
-    return found
 
 
 _described: dict[type, tuple[Setting, ...]] = {}  # what settings_of has found, by class
 
 
-def _setting(spec: dataclasses.Field[Any], group: str) -> Setting:
-    meta, type_name = dict(spec.metadata), str(spec.type)
-    base = type_name.split("|")[0].strip()
-    kind = meta.pop("kind") or _KIND_OF_TYPE.get(base) or ("values" if base.startswith("Mapping") else "structure")
-    default: Any = None if spec.default is dataclasses.MISSING else spec.default
-    if spec.default_factory is not dataclasses.MISSING:
-        default = spec.default_factory()
-    required = spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING
-    meta["group"] = meta["group"] or group
-    return Setting(spec.name, kind, default, required=required, optional="None" in type_name, **meta)
+def settings_of(cls: type) -> tuple[Setting, ...]:
+    """The settings of a settings class, in the order of its fields."""
+    if cls in _described:
+        return _described[cls]
+    result: list[Setting] = []
+    for spec in dataclasses.fields(cls):
+        own = spec.metadata.get("setting")
+        if own is None:
+            continue
+        base = str(spec.type).split("|")[0].strip()
+        kind = own.kind or _KIND_OF_TYPE.get(base) or ("values" if base.startswith("Mapping") else "structure")
+        default = spec.default if spec.default_factory is dataclasses.MISSING else spec.default_factory()
+        result.append(
+            dataclasses.replace(
+                own, name=spec.name, kind=kind, default=None if default is REQUIRED else default,
+                required=default is REQUIRED, optional="None" in str(spec.type),
+                group=own.group or (result[-1].group if result else ""),
+            )
+        )  # fmt: skip
+    _described[cls] = tuple(result)
+    return _described[cls]
 
 
 class Settings:
@@ -298,21 +218,15 @@ class Settings:
 
     @classmethod
     def from_dict(cls: type[T], values: Mapping[str, Any]) -> T:
-        """Builds settings from plain values.
+        """Builds settings from plain values by name; those that are left out keep their defaults.
 
-        :param values: names and values; settings that are left out keep their defaults.
         :raises ConfigError: for unknown names and values that are not allowed.
         """
         return build(cls, values)
 
 
 def build(cls: type[T], values: Mapping[str, Any]) -> T:
-    """What :meth:`Settings.from_dict` does, for classes that read their values in a way of their own first.
-
-    :param cls: the settings class.
-    :param values: names and values.
-    :raises ConfigError: for unknown names and values that are not allowed.
-    """
+    """What :meth:`Settings.from_dict` does, for classes that read their values in a way of their own first."""
     known = {spec.name: spec for spec in settings_of(cls)}
     given = dict(names_with_values(values, "settings"))
     for name, value in given.items():
@@ -329,11 +243,7 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
 
 
 def check(config: Any) -> None:
-    """Checks all settings of a settings object and stores them as :meth:`Setting.check` gives them.
-
-    :param config: the object, in its ``__post_init__``.
-    :raises ConfigError: naming the field, the value and what is allowed.
-    """
+    """Checks all settings of an object, in its ``__post_init__``, and stores what :meth:`Setting.check` gives."""
     for spec in settings_of(type(config)):
         if not spec.custom:
             value = getattr(config, spec.name)
@@ -344,10 +254,7 @@ def check(config: Any) -> None:
 
 @contextmanager
 def named(prefix: str) -> Iterator[None]:
-    """Errors of settings within are named with a prefix and a dot.
-
-    :param prefix: where the settings stand, as ``robots.cf3``.
-    """
+    """Errors of settings within are named with a prefix and a dot: where the settings stand, as ``robots.cf3``."""
     try:
         yield
     except ConfigError as error:
@@ -355,12 +262,7 @@ def named(prefix: str) -> Iterator[None]:
 
 
 def names_with_values(value: object, name: str) -> Mapping[str, Any]:
-    """The value, if it is a mapping.
-
-    :param value: what the user gave.
-    :param name: what it is called.
-    :raises ConfigError: if it is none.
-    """
+    """The value, if it is a mapping; else a ConfigError."""
     if not isinstance(value, Mapping):
         raise ConfigError(name, value, "names with values")
     return value
@@ -391,10 +293,7 @@ def _checked_values(value: object, name: str) -> dict[str, float]:
 
 
 def parse_values(text: str) -> dict[str, float]:
-    """Reads ``name=number, name=number``.
-
-    :raises ValueError: if it is not of this form.
-    """
+    """Reads ``name=number, name=number``; ValueError: it is not of this form."""
     result = {}
     for part in filter(None, (piece.strip() for piece in text.split(","))):
         name, equals, value = part.partition("=")

@@ -13,28 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.binding import AVOID
-from dtsa_agent.core.compiled import MISSING
-from dtsa_agent.core.compiled import kernel as _kernel
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.reference.arithmetic import Vector
-from dtsa_agent.core.registry import Registry, check_kernel
+from dtsa_agent.core.kernel import NAMES, ffi, lib, memory
+from dtsa_agent.core.registry import Registry
 
 from .declaration import REQUIRED, Settings, check, setting, settings_of
 
 Array = NDArray[np.float64]
 
-# Numbers of the avoiders in libdtsa (dtsa.h).
-KINDS = ("orca", "potential", "bvc", "none")
-check_kernel("avoiders", KINDS)
+KINDS = NAMES["avoiders"]  # of libdtsa, in the order of their numbers
 
 
 @dataclass(frozen=True, slots=True)
 class AvoiderParams(Settings):
-    """Parameters of the avoiders; which of them count depends on the avoider.
-
-    :raises ConfigError: for values outside their range.
-    """
+    """Parameters of the avoiders; which of them count depends on the avoider."""
 
     v_max: float = setting(1.5, "largest commanded speed", unit="m/s", minimum=0.01, maximum=20)
     gain: float = setting(2.0, "K_P: speed towards the goal per distance to it", unit="1/s", minimum=0.01, maximum=100)
@@ -68,40 +60,24 @@ class AvoiderParams(Settings):
 
 @dataclass(frozen=True, slots=True)
 class VehicleParams(Settings):
-    """Point mass that follows a velocity command: a = clip((v_cmd - v) / tau, a_max).
-
-    :raises ConfigError: for values outside their range.
-    """
+    """Point mass that follows a velocity command: a = clip((v_cmd - v) / tau, a_max)."""
 
     tau: float = setting(0.25, "time constant of the velocity response", unit="s", minimum=0.01, maximum=10)
     a_max: float = setting(2.0, "largest acceleration (norm)", unit="m/s^2", minimum=0.01, maximum=200)
 
     def step(self, dt: float, position: Array, velocity: Array, command: Array) -> None:
-        """Moves vehicles on by one step; ``position`` and ``velocity`` are updated in place.
-
-        :param dt: step, s; not longer than ``tau``.
-        :param position: (3,) or (3, N), m, frame map.
-        :param velocity: same shape, m/s.
-        :param command: commanded velocity, same shape, m/s.
-        """
-        if not MISSING:
-            states = (np.asarray(array, dtype=np.float64).tobytes() for array in (position, velocity, command))
-            both = np.frombuffer(_kernel.vehicle_step(self.tau, self.a_max, dt, *states))
-            position[...], velocity[...] = both.reshape(2, *position.shape)
-            return
-        from dtsa_agent.core.reference import vehicle  # nodes start without it
-
-        p, v, c = (np.atleast_2d(array.T) for array in (position, velocity, command))
-        moved = [vehicle.step(self.tau, self.a_max, dt, *map(_vector, now)) for now in zip(p, v, c, strict=True)]
-        p[:], v[:] = [place for place, _ in moved], [speed for _, speed in moved]
+        """Moves vehicles, (3,) or (3, N), on by dt s, not longer than ``tau``: position and velocity in place."""
+        p, v, c = (np.array(values, dtype=np.float64, order="C") for values in (position, velocity, command))
+        if not p.shape == v.shape == c.shape or p.shape[0] != 3:
+            raise ValueError(f"position, velocity, command: shapes {p.shape}, {v.shape} and {c.shape}")
+        params = ffi.new("vehicle_params *", (self.tau, self.a_max))
+        lib.vehicle_step_all(params, dt, p.size // 3, memory(p, writable=True), memory(v, writable=True), memory(c))
+        position[...], velocity[...] = p, v
 
 
 @dataclass(frozen=True, slots=True)
 class FlightModel(Settings):
-    """An avoider with its parameters, a vehicle, and the room an exchange of places needs.
-
-    :raises ConfigError: for an unknown avoider or values outside their range.
-    """
+    """An avoider with its parameters, a vehicle, and the room an exchange of places needs."""
 
     name: str = setting(REQUIRED, "what the setting avoider calls it")
     avoider_kind: str = setting(REQUIRED, "the avoider in the compiled kernel", choices=KINDS)
@@ -118,66 +94,6 @@ class FlightModel(Settings):
     def kind(self) -> int:
         """The avoider's number in the compiled kernel."""
         return KINDS.index(self.avoider_kind)
-
-    def command(
-        self,
-        self_index: int,
-        position: Array,
-        velocity: Array,
-        goal: Array,
-        others_position: Array,
-        others_velocity: Array,
-        age_s: Array | None = None,
-        *,
-        plain: bool = False,
-    ) -> Array:
-        """Commanded velocity of one agent, (3,), m/s, frame map.
-
-        :param self_index: the agent's place in the arrays of the others (its id - 1); that entry is ignored.
-        :param position: own true position, (3,), m, frame map.
-        :param velocity: own true velocity, (3,), m/s.
-        :param goal: where it wants to go, (3,), m.
-        :param others_position: where it believes all agents to be, (3, N), m; what is not finite is ignored.
-        :param others_velocity: their velocities, (3, N), m/s.
-        :param age_s: age of each one's state, (N,), s; None: no margins.
-        :param plain: the avoider of the specification, not the compiled one.
-        """
-        if plain or MISSING:
-            return self._plain_command(self_index, position, velocity, goal, others_position, others_velocity, age_s)
-        given = (position, velocity, goal, others_position, others_velocity)
-        p, v, target, others_p, others_v = (np.asarray(array, dtype=np.float64).tobytes() for array in given)
-        ages = None if age_s is None else np.asarray(age_s, dtype=np.float64).tobytes()
-        params = AVOID.image(self.avoider.to_dict())
-        found = _kernel.avoid_command(self.kind, params, self_index, p, v, target, others_p, others_v, ages)
-        command: Array = np.frombuffer(found).copy()
-        return command
-
-    def _plain_command(
-        self,
-        own: int,
-        position: Array,
-        velocity: Array,
-        goal: Array,
-        others_p: Array,
-        others_v: Array,
-        age: Array | None,
-    ) -> Array:
-        from dtsa_agent.core.reference import avoiders
-
-        count = others_p.shape[1]
-        ages = [0.0] * count if age is None else age.tolist()
-        near = [
-            avoiders.Neighbour(k + 1, _vector(others_p[:, k]), _vector(others_v[:, k]), ages[k])
-            for k in range(count)
-            if k != own
-        ]
-        scene = avoiders.Scene(own + 1, _vector(position), _vector(velocity), _vector(goal), near)
-        return np.array(avoiders.command(self.avoider_kind, scene, avoiders.Avoidance(**self.avoider.to_dict())))
-
-
-def _vector(values: Array) -> Vector:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
 
 
 _ORCA = AvoiderParams(v_max=1.5, radius=0.336, horizon=1.0, softness=30.0, bias=0.2)
@@ -213,12 +129,10 @@ FLIGHT_MODELS: Mapping[str, FlightModel] = AVOIDERS.rows
 
 
 def flight_model(name: str, options: Mapping[str, float] | None = None) -> FlightModel:
-    """A named flight model, possibly with some values replaced.
+    """A named flight model, possibly with some values of avoider, vehicle, ``spacing`` or ``min_radius`` replaced.
 
-    :param name: a name of :data:`AVOIDERS`, or of an avoider plug-in.
-    :param options: values by the names of the fields of :class:`AvoiderParams` and :class:`VehicleParams`, or
-        ``spacing`` and ``min_radius``.
-        Names with a dot belong to plug-ins and are not looked at.
+    Names with a dot belong to plug-ins and are not looked at.
+
     :raises ConfigError: for unknown names and values outside their range.
     """
     model = AVOIDERS.row(name)

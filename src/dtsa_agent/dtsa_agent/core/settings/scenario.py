@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError
 
 from .config import SwarmConfig
-from .course import Course, Plan
 from .flight_models import flight_model
 
 Array = NDArray[np.float64]
@@ -22,20 +21,12 @@ STREAM_SCENARIO, STREAM_POLICY, STREAM_CHANNEL, STREAM_CLOCKS, STREAM_RADIOS, ST
 
 
 def generator(seed: int, stream: int, *more: int) -> np.random.Generator:
-    """A random generator for one purpose of one run.
-
-    :param seed: the run's seed.
-    :param stream: one of the ``STREAM_`` constants.
-    :param more: further indices, e.g. an agent's id.
-    """
+    """A random generator for one purpose of one run: one of the ``STREAM_`` constants, and further indices."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, *more])))
 
 
 def policy_key(seed: int) -> int:
-    """By which policies draw lots, 63 bits.
-
-    :param seed: the run's seed.
-    """
+    """By which policies draw lots, 63 bits."""
     return int(generator(seed, STREAM_POLICY).integers(0, 2**63))
 
 
@@ -49,20 +40,75 @@ def plug_in_random(config: SwarmConfig, agent: int, name: str) -> np.random.Gene
     return generator(config.seed, STREAM_PLUG_INS, agent, *name.encode())
 
 
-class Pilots(Protocol):
-    """What a scenario looks at and sets: a part of :class:`~dtsa_agent.core.swarms.abstract_swarm.SwarmState`."""
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The goals of all agents, known before the flight."""
 
-    config: SwarmConfig
-    course: Course | None
-    shared: bool
-    rows: NDArray[np.intp]
-    local: NDArray[np.int32]
-    sent_slot: NDArray[np.int64]
-    position: Array
-    goal: Array
-    known_goal: Array
-    final: NDArray[np.uint8]
-    active: NDArray[np.uint8]
+    start: Array  # (3, N), m, frame map: where each waits for its first slot
+    goals: Array  # (K, 3, N), m: where each flies to, one after the other; the last one is its target
+    begin: NDArray[np.int64]  # (N,) first slot in which each flies
+    pause: NDArray[np.int64]  # (N,) slots that each rests at a goal before it flies on to the next
+    moving: NDArray[np.bool_]  # (N,) who flies at all
+    r_min: float  # m, closer than this an agent has arrived
+
+    @property
+    def way(self) -> Array:
+        """Length of the straight lines from goal to goal, (N,), m."""
+        points = np.concatenate((self.start[None], self.goals))
+        return np.asarray(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)).sum(axis=0))
+
+
+class Course:
+    """How far some agents, (L,) indices ``local``, are with their plans.
+
+    From the slot's number and an agent's own position alone: an agent runs this for itself, the simulator and the
+    metrics for all. The same numbers in, the same goals out.
+    """
+
+    def __init__(self, plan: Plan, local: NDArray[np.int32]) -> None:
+        self._start = plan.start[:, local]
+        self._goals = plan.goals[:, :, local]
+        self._begin, self._pause = plan.begin[local], plan.pause[local]
+        self._moving = plan.moving[local]
+        self._r_min = plan.r_min
+        self._columns = np.arange(len(local))
+        self.leg = np.full(len(local), -1, dtype=np.int64)  # index of the present goal, -1: waits for its first slot
+        self._since = np.full(len(local), -1, dtype=np.int64)  # slot of arrival at the present goal, -1: under way
+        self.goal: Array = self._start.copy()  # (3, L) m, frame map, where each flies to now
+        self.changed = np.full(len(local), -1, dtype=np.int64)  # slot in which that became its goal
+
+    def reset(self) -> None:
+        """Back to the start of the flight."""
+        self.leg[:] = self._since[:] = self.changed[:] = -1
+        self.goal = self._start.copy()
+
+    @property
+    def active(self) -> NDArray[np.bool_]:
+        """The agents that fly now, (L,); the others hover."""
+        return np.asarray(self._moving & (self.leg >= 0))
+
+    @property
+    def final(self) -> NDArray[np.bool_]:
+        """The agents that have no further goal after the present one, (L,)."""
+        return np.asarray(~self._moving | (self.leg == len(self._goals) - 1))
+
+    def advance(self, slot: int, position: Array) -> bool:
+        """Takes note of where the agents are, (3, L) m, when a slot begins; returns whether any goal has changed."""
+        onward = (self.leg < 0) & (self._begin <= slot)
+        if len(self._goals) > 1:
+            offset = position - self.goal
+            under_way = (self.leg >= 0) & (self.leg < len(self._goals) - 1)
+            arrived = under_way & (np.sqrt((offset * offset).sum(axis=0)) <= self._r_min)
+            self._since[arrived & (self._since < 0)] = slot
+            onward |= under_way & (self._since >= 0) & (slot - self._since >= self._pause)
+        if not onward.any():
+            return False
+        self.leg[onward] += 1
+        self._since[onward] = -1
+        self.changed[onward] = slot
+        chosen = self._goals[np.maximum(self.leg, 0), :, self._columns].T
+        self.goal = np.where(self.leg >= 0, chosen, self._start)
+        return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,17 +127,13 @@ class Scenario:
     policy_key: int | None = None  # by which policies draw lots; None: it is made when it is needed
 
     def course(self, local: NDArray[np.int32]) -> Course | None:
-        """The state of a flight along the plan; None without a plan.
-
-        :param local: (L,) indices (id - 1) of the agents to follow.
-        """
+        """The state of a flight along the plan, of the agents with indices ``local``; None without a plan."""
         return None if self.plan is None else Course(self.plan, local)
 
-    def advance(self, slot: int, swarm: Pilots) -> None:
-        """Sets goals and activity of the swarm's local agents for a slot; called before the slot begins.
+    def advance(self, slot: int, swarm: Any) -> None:
+        """Sets goals and activity of a :class:`~dtsa_agent.core.swarm.Swarm` for the slot that is about to begin.
 
-        :param slot: the slot that is about to begin.
-        :param swarm: the agents; only the own state of each is looked at.
+        Only the own state of each agent is looked at.
         """
         course = swarm.course
         if course is None or self.plan is None:
@@ -141,8 +183,7 @@ def make_scenario(config: SwarmConfig) -> Scenario:
             single = count - 1 if count % 2 else pairs[chosen[config.movers // 2]][0]
             target[:, single] = _far_point(config, places[:, single])
             moving[single] = True
-    # Micrometres: whatever the last bit of a cosine is on some machine, all agents start from the same
-    # numbers.
+    # Micrometres: whatever the last bit of a cosine is on some machine, all agents start from the same numbers.
     start, target = (np.ascontiguousarray(np.round(planes, 6)[:, order]) for planes in (places, target))
     plain = Scenario(start, target, moving[order])
     check_extent(config, plain)  # waypoints lie between the starts
@@ -160,10 +201,8 @@ FIELD_MARGIN_M = 2.0  # m, room to avoid each other beyond the outermost start o
 
 
 def check_extent(config: SwarmConfig, scenario: Scenario) -> None:
-    """Whether frames can say where everybody will be.
+    """Check that frames can say where everybody will be.
 
-    :param config: its extent.
-    :param scenario: starts and goals.
     :raises ConfigError: naming the extent that would do.
     """
     points = [scenario.start, scenario.target, *([] if scenario.plan is None else scenario.plan.goals)]
@@ -206,10 +245,7 @@ WAYPOINT_GAP = 0.9  # m, between a waypoint and everybody's last goal, and among
 
 
 def _waypoints(config: SwarmConfig, plain: Scenario, random: np.random.Generator) -> Array:
-    """Random points for all agents, (stops, 3, N):
-
-    within the start shape, up to 0.5 m above and below its middle.
-    """
+    """Random points for all agents, (stops, 3, N), within the start shape, up to 0.5 m above and below its middle."""
     ax, ay, _ = half_axes(config)
     points = np.repeat(plain.start[None], config.stops, axis=0)
     for stop in range(config.stops):
@@ -217,11 +253,8 @@ def _waypoints(config: SwarmConfig, plain: Scenario, random: np.random.Generator
         for k in np.flatnonzero(plain.moving):
             gap = WAYPOINT_GAP
             while True:
-                angle, r, z = (
-                    2 * math.pi * random.random(),
-                    math.sqrt(random.random()),
-                    random.uniform(-0.5, 0.5),
-                )
+                angle, r = 2 * math.pi * random.random(), math.sqrt(random.random())
+                z = random.uniform(-0.5, 0.5)
                 point = np.round([ax * r * math.cos(angle), ay * r * math.sin(angle), z], 6)
                 if min(float(np.sqrt(((point - other) ** 2).sum())) for other in taken) >= gap:
                     break

@@ -23,7 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
 
-from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core import Swarm
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.crazyflie.state.conversions import rotate
@@ -56,10 +56,10 @@ class StationNode(RealtimeNode):
     :param command_hz: rate of the commands, Hz; at most one a slot.
     """
 
-    def __init__(self, node: Node, swarm: AbstractSwarm, *args: Any, command_hz: float, **more: Any) -> None:
+    def __init__(self, node: Node, swarm: Swarm, *args: Any, command_hz: float, **more: Any) -> None:
         every = max(1, round(1.0 / command_hz / swarm.config.slot_s))
         self._vehicles = ExternalVehicles(swarm, every, self._command)
-        super().__init__(node, self._vehicles, *args, **more)
+        super().__init__(node, swarm, *args, **more)
         count = len(self.swarm.ids)
         self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
@@ -129,6 +129,9 @@ class StationNode(RealtimeNode):
     def _open(self, slot: int) -> None:
         self._sense()
         super()._open(slot)
+
+    def _fly(self, slot: int) -> None:
+        self._vehicles.fly(slot)
 
 
 @dataclass(frozen=True, slots=True)

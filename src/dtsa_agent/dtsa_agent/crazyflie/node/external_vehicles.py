@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core.swarms.abstract_swarm import AbstractSwarm, SwarmWrapper
+from dtsa_agent.core.swarm import Swarm
 
 HOLD_GAIN = 1.0  # 1/s, for agents that hover: real air does not leave them where they are
 HOLD_MPS = 0.3
@@ -16,27 +16,23 @@ NOWHERE_M = 1e-3
 PUSH_M = 0.3  # farther than this at once nobody makes way
 
 
-class ExternalVehicles(SwarmWrapper):
-    """A swarm that steers vehicles which are flown by somebody else.
+class ExternalVehicles:
+    """Vehicles that a swarm steers and somebody else flies.
 
-    :param inner: the swarm; positions and velocities are written into it from outside.
+    :param swarm: the agents; positions and velocities are written into it from outside.
     :param every: slots between two commands.
     :param send: takes the commanded velocities, (3, L), m/s, frame map.
     """
 
-    def __init__(self, inner: AbstractSwarm, every: int, send: Callable[[NDArray[np.float64]], None]) -> None:
-        super().__init__(inner)
-        self._every, self._send = every, send
-        self._hold = self.scenario.start[:, self.local].copy()  # (3, L) m, frame map
+    def __init__(self, swarm: Swarm, every: int, send: Callable[[NDArray[np.float64]], None]) -> None:
+        self.swarm, self._every, self._send = swarm, every, send
+        self._hold = swarm.scenario.start[:, swarm.local].copy()  # (3, L) m, frame map
         self._stopping = False
 
     def place(self, position: NDArray[np.float64]) -> None:
-        """Takes in where the vehicles are.
-
-        :param position: (3, L) m, frame map.
-        """
-        self.position[:] = position
-        self.track[:] = position
+        """Takes in where the vehicles are, (3, L) m, frame map."""
+        self.swarm.position[:] = position
+        self.swarm.track[:] = position
 
     def stop_here(self) -> None:
         """From now on nobody flies to its goal: all come to rest, and nobody above another one.
@@ -46,30 +42,30 @@ class ExternalVehicles(SwarmWrapper):
         self._stopping = True
 
     def fly(self, slot: int) -> None:
+        """Sends the commands of a slot."""
         if slot % self._every:
             return
-        self._steer(slot)
-        still = self.active == 0
-        if still.any():
-            away = self._hold[:, still] - self.position[:, still]
-            self.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
-        self._send(self.command)
-
-    def _steer(self, slot: int) -> None:
-        goal = self.goal.copy()  # the protocol still counts with it
+        swarm = self.swarm
+        goal = swarm.goal.copy()  # the protocol still counts with it
         if self._stopping:
-            self.goal[:] = self.position + self._way()
-        self.steer(slot, 0)
-        self.goal[:] = goal
+            swarm.goal[:] = swarm.position + self._way()
+        swarm.steer(slot, 0)
+        swarm.goal[:] = goal
+        still = swarm.active == 0
+        if still.any():
+            away = self._hold[:, still] - swarm.position[:, still]
+            swarm.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
+        self._send(swarm.command)
 
     def _way(self) -> NDArray[np.float64]:
         """Where each goes to make way for those that are near horizontally, at whatever height, (3, L) m."""
-        apart = self.position[:2, :, None] - self.position[:2, None, :]
+        position = self.swarm.position
+        apart = position[:2, :, None] - position[:2, None, :]
         distance = np.linalg.norm(apart, axis=0)
         index = np.arange(distance.shape[0])
         above = (distance < NOWHERE_M) & (index[:, None] != index)  # one right above the other: by their numbers
         apart[0] += np.where(above, np.sign(index[:, None] - index) * NOWHERE_M, 0.0)
         distance = np.maximum(np.linalg.norm(apart, axis=0), NOWHERE_M)
-        way = np.zeros_like(self.position)
+        way = np.zeros_like(position)
         way[:2] = (apart / distance * np.maximum(SPREAD_M - distance, 0.0)).sum(axis=2)
         return way * np.minimum(1.0, PUSH_M / np.maximum(np.linalg.norm(way, axis=0), NOWHERE_M))

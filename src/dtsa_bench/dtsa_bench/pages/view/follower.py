@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm, make_scenario
+from dtsa_agent.core import Swarm, make_scenario
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
@@ -74,7 +74,7 @@ class Follower:
         self._pairs = np.triu_indices(self.agents, 1)
         self._track.begin(run_info(self._track.name, run, self.scenario) | self._more)
 
-    def _make_tables(self, run: RunConfig) -> AbstractSwarm | None:
+    def _make_tables(self, run: RunConfig) -> Swarm | None:
         if run.swarm.agents > BELIEFS:
             return None
         try:

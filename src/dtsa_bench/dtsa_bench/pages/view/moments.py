@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import REASONS, AbstractSwarm, Scenario
+from dtsa_agent.core import REASONS, Scenario, Swarm
 from dtsa_bench.pages.html import flatten, pack
 from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim import Change, ChannelConfig
@@ -124,7 +124,7 @@ class Moments:
     def take(
         self,
         slot: int,
-        tables: AbstractSwarm | None,
+        tables: Swarm | None,
         chosen: NDArray[Any],
         digest: NDArray[Any] | None,
         absent: Collection[int] = (),
@@ -167,7 +167,7 @@ class Moments:
         self._compared = self._same = 0
         return Moment(slot, json.dumps(content, separators=(",", ":")), heard, believed)
 
-    def _mean_ages(self, slot: int, tables: AbstractSwarm | None) -> NDArray[np.uint16]:
+    def _mean_ages(self, slot: int, tables: Swarm | None) -> NDArray[np.uint16]:
         """(N,) tenths of slots since the others last heard each mover, mean over those that expect it to move."""
         ages = np.full(self.agents, UNKNOWN, np.uint16)
         if tables is None:

@@ -26,8 +26,7 @@ from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.agents.pacing import MOST_EARLY, too_long_ns
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
-from dtsa_agent.core.frame import decode_frame
-from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.frame import decode_extended, decode_frame
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import authenticator
 from dtsa_bench.pages.html import pack

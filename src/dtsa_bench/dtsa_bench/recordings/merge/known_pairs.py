@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from dtsa_agent.air.record import SlotRecord
-from dtsa_agent.core import AbstractSwarm, SwarmConfig
+from dtsa_agent.core import Swarm, SwarmConfig
 
 
 def all_known_after(config: SwarmConfig) -> int:
@@ -38,7 +38,7 @@ class KnownPairs:
         """Results count from a slot on; who was never heard is as old as they are."""
         self._first = slot
 
-    def follow(self, slot: int, here: Sequence[int], tables: AbstractSwarm) -> None:
+    def follow(self, slot: int, here: Sequence[int], tables: Swarm) -> None:
         """Takes in the end of a slot."""
         for observer in here:
             sent = tables.sent_slot[self._row[observer]].tolist()

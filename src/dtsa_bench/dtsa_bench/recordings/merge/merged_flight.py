@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.air.record import SlotRecord
-from dtsa_agent.core import AbstractSwarm, SwarmConfig, make_scenario
+from dtsa_agent.core import Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_bench.runs.config import REALTIME, RunConfig, RunLimits, from_swarm
 from dtsa_bench.runs.metrics import FlightMetrics
@@ -35,7 +35,7 @@ class Moment:
     """The end of a slot."""
 
     slot: int
-    tables: AbstractSwarm  # what the agents know, a row for each that has a bag
+    tables: Swarm  # what the agents know, a row for each that has a bag
     position: NDArray[np.float64]  # m, (3, N), frame map, true; NaN where it is not known
     counted: NDArray[np.bool_]  # (N,) agents whose ages and errors the results take
     results: bool  # whether the results count the slot
@@ -133,7 +133,7 @@ def _places(records: Records, slot: int, agents: int) -> NDArray[np.float64]:
     return places
 
 
-def _forget(tables: AbstractSwarm, observers: Sequence[int], lives: Mapping[Life, AgentBag], slot: int) -> None:
+def _forget(tables: Swarm, observers: Sequence[int], lives: Mapping[Life, AgentBag], slot: int) -> None:
     """A process that has ended knows nothing any more: what it knew last does not grow old."""
     for (agent, _), bag in lives.items():
         if bag.slots and bag.slots[-1].slot == slot:

@@ -1,7 +1,6 @@
 """An outside observer that reads every frame of policy ``lease`` and holds the agents to the protocol's rules.
 
-It knows what was sent, not what was heard, and shares no code with the agents that run: what an anchor is, and which
-turns a frame's lease bytes speak of, it asks the specification.
+It knows what was sent, not what was heard, and shares no code with the agents that run.
 """
 
 from __future__ import annotations
@@ -9,11 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dtsa_agent.core.errors import RemoteProtocolError
-from dtsa_agent.core.frame_extended import decode_extended
-from dtsa_agent.core.reference.lease.memory import Memory
-from dtsa_agent.core.reference.rules import Rules
+from dtsa_agent.core.frame import decode_extended
 
 OPEN = 255
+
+
+def is_anchor(slot: int, agents: int, every: int) -> bool:
+    """Whether a slot is an anchor of its owner: (R + T mod N) mod M = 0; a main one with K M for M."""
+    return (slot // agents + slot % agents) % every == 0
 
 
 @dataclass(slots=True)
@@ -36,11 +38,29 @@ class Ledger:
     plain_collisions: int = 0  # any other slot with two senders
     leased_slots: int = 0
     broken: list[str] = field(default_factory=list)  # rules that were broken, in words
-    _rules: Memory = field(init=False, compare=False, repr=False)
 
-    def __post_init__(self) -> None:
-        main = self.main_every or self.anchor_every
-        self._rules = Memory(Rules(agents=self.agents, slot_s=1.0, anchor_every=self.anchor_every, main_every=main))
+    def _is_anchor(self, slot: int) -> bool:
+        """Whether nobody but its owner may give a slot away."""
+        return is_anchor(slot, self.agents, self.anchor_every)
+
+    def _is_main(self, slot: int) -> bool:
+        """Whether a slot is its owner's whatever happens."""
+        return is_anchor(slot, self.agents, self.main_every or self.anchor_every)
+
+    def _turns_of_leases(self, slot: int, c_s: int, room: int) -> list[int]:
+        """The turns that the lease bytes of a frame speak of, in order.
+
+        T + j N - i for j = 1 .. K M, and within each j for i = c_s .. 0; anchors of others (i > 0) are left out, and of
+        the sender's own turns (i = 0) those from its next main anchor on.
+        """
+        turns, own = [], True
+        for j in range(1, (self.main_every or self.anchor_every) + 1):
+            for i in range(c_s, -1, -1):
+                turn = slot + j * self.agents - i
+                own = own and not (i == 0 and self._is_main(turn))
+                if not self._is_anchor(turn) if i > 0 else own:
+                    turns.append(turn)
+        return turns[:room]
 
     def slot(self, slot: int, frames: dict[int, bytes]) -> None:
         """Takes in one slot."""
@@ -65,7 +85,7 @@ class Ledger:
 
     def _taken_back(self, slot: int, data: bytes | None) -> bool:
         """Whether the owner sends in an anchor, no main one, in probation: it may have given it away before."""
-        if data is None or not self._rules.is_anchor(slot) or self._rules.is_main(slot):
+        if data is None or not self._is_anchor(slot) or self._is_main(slot):
             return False
         return decode_extended(data).probation
 
@@ -104,11 +124,11 @@ class Ledger:
         leases = frame.leases
         if leases and slot % self.agents != sender - 1:
             self.broken.append(f"slot {slot}: agent {sender} gives turns away in somebody else's turn")
-        for turn, lessee in zip(self._rules.turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
+        for turn, lessee in zip(self._turns_of_leases(slot, frame.c_s, len(leases)), leases, strict=False):
             if not lessee:
                 continue
             owner = turn % self.agents + 1
-            if self._rules.is_main(turn) or turn <= slot:
+            if self._is_main(turn) or turn <= slot:
                 self.broken.append(f"slot {slot}: agent {sender} gives away turn {turn}")
             entries, handed = self.issued.setdefault(turn, []), self.handed.get(turn, {})
             if any(issuer == sender and lessee in lessees(handed, first) for issuer, first in entries):
@@ -127,7 +147,7 @@ class Ledger:
         before = {sender, *given, *chain}  # who was given it and does not know it yet, relays one of these
         if lessee in before or all(last_lessee(chain, first) != sender for first in given):
             return
-        if lessee in (OPEN, turn % self.agents + 1) or self._rules.is_main(turn):
+        if lessee in (OPEN, turn % self.agents + 1) or self._is_main(turn):
             self.broken.append(f"slot {slot}: agent {sender} hands turn {turn} on to {lessee}")
         elif sender not in chain:
             self.handed.setdefault(turn, {})[sender] = (lessee, slot)

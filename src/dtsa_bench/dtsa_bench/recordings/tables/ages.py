@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm, Scenario, make_scenario
+from dtsa_agent.core import Scenario, Swarm, make_scenario
 from dtsa_agent.core.errors import DtsaError
 from dtsa_bench.recordings.bag.run import RecordedRun, recorded_config
 from dtsa_bench.runs.config import RunConfig
@@ -96,14 +96,14 @@ def observed(run: RecordedRun) -> Iterator[Observed]:
         )
 
 
-def _tables(run: RecordedRun, config: RunConfig, scenario: Scenario) -> AbstractSwarm:
+def _tables(run: RecordedRun, config: RunConfig, scenario: Scenario) -> Swarm:
     """Tables like those of the agents: one that hears everything, or one an agent."""
     heard_by_all = run.frames.lost.sum() == 0 and run.frames.collided.sum() == 0
     return metrics_tables(config, scenario, everyone=not heard_by_all)
 
 
 def _steps(
-    run: RecordedRun, tables: AbstractSwarm, metrics: FlightMetrics | None, hearing: Hearing | None = None
+    run: RecordedRun, tables: Swarm, metrics: FlightMetrics | None, hearing: Hearing | None = None
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
     """Feed the recorded frames to the tables, and the metrics with what they then know.
 
@@ -138,7 +138,7 @@ def _steps(
 
 
 def _means(
-    run: RecordedRun, tables: AbstractSwarm, metrics: FlightMetrics, moving: NDArray[np.bool_], hearing: Hearing
+    run: RecordedRun, tables: Swarm, metrics: FlightMetrics, moving: NDArray[np.bool_], hearing: Hearing
 ) -> Ages:
     """Follow a run; means over the observers."""
     count, agents = len(run.slots), run.agents

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dtsa_agent.core import AgentGroup, make_scenario
-from dtsa_agent.core.frame_extended import decode_extended
+from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.plugins.entry_points import make_swarm
 from dtsa_agent.keys import with_key
 from dtsa_bench.runs.config import RunConfig

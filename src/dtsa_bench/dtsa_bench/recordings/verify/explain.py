@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 
 from dtsa_agent.core import REASONS, RemoteProtocolError, decode_frame
-from dtsa_agent.core.frame import EXTENT_M, TAG_LENGTH
-from dtsa_agent.core.frame_extended import EXTENDED_LENGTH, ExtendedFrame, decode_extended
-from dtsa_agent.core.reference.frame import LENGTHS
+from dtsa_agent.core.frame import EXTENDED_LENGTH, EXTENT_M, LENGTHS, TAG_LENGTH, ExtendedFrame, decode_extended
 from dtsa_bench.recordings.bag.errors import BagError
 from dtsa_bench.recordings.bag.reader import Bag, Message
 from dtsa_bench.recordings.bag.run import extent_of

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.agents.authentication import TAG_LENGTH, Authenticator
+from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
 from dtsa_agent.core.errors import RemoteProtocolError
-from dtsa_agent.core.frame import Frame, decode_frame, encode_frame
-from dtsa_agent.core.frame_extended import ExtendedFrame, decode_extended, encode_extended
+from dtsa_agent.core.frame import ExtendedFrame, Frame, decode_extended, decode_frame, encode_extended, encode_frame
 from dtsa_agent.keys import VARIABLE
 
 from .result import Difference, Mismatch, Result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dtsa_agent.core import AbstractSwarm, SwarmConfig
+from dtsa_agent.core import Swarm, SwarmConfig
 
 from .knowledge import ages, error_about_self, moves
 
@@ -31,7 +31,7 @@ class ThresholdAloha:
         self._random = np.random.default_rng([config.seed, 20070])
         self._head_start = self._random.random(config.agents)  # ages at the beginning, in thresholds
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
         """Ids of all whose draw says so; several collide."""
         draws = self._random.random(swarm.config.agents)
         under_way = moves(swarm)
@@ -58,7 +58,7 @@ class Dominance:
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         del config, agent
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
         """One id: equal errors go by the longest silence, as an id and a counter would follow in the bits."""
         n = np.arange(swarm.config.agents)
         error = np.where(swarm.present > 0, error_about_self(swarm, slot), -1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig
+from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 
 from .knowledge import ages, counts, moves, squared_errors, whittle_index
 
@@ -19,7 +19,7 @@ class GenieAge:
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         del config, agent
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
         """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
         weight = np.where(counts(swarm), ages(swarm, slot), 0.0).sum(axis=0)
         best = int(weight.argmax())
@@ -43,7 +43,7 @@ class Whittle:
         if not 0.0 <= self._loss < 1.0:
             raise ConfigError("whittle.loss", self._loss, "0 to below 1")
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
         """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
         index = whittle_index(ages(swarm, slot) + 1.0, self._loss)
         weight = np.where(counts(swarm), index, 0.0).sum(axis=0)
@@ -61,7 +61,7 @@ class GenieError:
     def __init__(self, config: SwarmConfig, agent: int) -> None:
         del config, agent
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
         """One id; in slots in which nobody has anything to say it is the slot's owner under TDMA."""
         pairs = counts(swarm)
         if not pairs.any():

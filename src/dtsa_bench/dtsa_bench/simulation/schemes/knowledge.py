@@ -7,14 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm
+from dtsa_agent.core import Swarm
 from dtsa_agent.core.plugins.table import Table
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 
-def moves(swarm: AbstractSwarm) -> Mask:
+def moves(swarm: Swarm) -> Mask:
     """Which agents are under way: (N,), present and further than r_min from where they fly to.
 
     :param swarm: all agents.
@@ -35,7 +35,7 @@ def has_arrived(table: Table, r_min: float) -> bool:
     return math.dist(table.own_position, table.goal) <= r_min
 
 
-def counts(swarm: AbstractSwarm) -> Mask:
+def counts(swarm: Swarm) -> Mask:
     """Which pairs count: (N, N), observer by agent: the agent moves, or the observer still takes it for a mover.
 
     :param swarm: all agents, each with a table of its own.
@@ -47,7 +47,7 @@ def counts(swarm: AbstractSwarm) -> Mask:
     return np.asarray(pairs)
 
 
-def ages(swarm: AbstractSwarm, slot: int) -> Floats:
+def ages(swarm: Swarm, slot: int) -> Floats:
     """Ages at the start of a slot: (N, N) slots, observer by agent; 0: heard in the slot that has just ended.
 
     :param swarm: all agents, each with a table of its own.
@@ -56,7 +56,7 @@ def ages(swarm: AbstractSwarm, slot: int) -> Floats:
     return (slot - 1 - swarm.sent_slot).astype(np.float64)
 
 
-def squared_errors(swarm: AbstractSwarm, slot: int) -> Floats:
+def squared_errors(swarm: Swarm, slot: int) -> Floats:
     """Squared errors of all estimates at the start of a slot: (N, N) m^2, observer by agent.
 
     :param swarm: all agents, each with a table of its own.
@@ -67,7 +67,7 @@ def squared_errors(swarm: AbstractSwarm, slot: int) -> Floats:
     return np.asarray((off * off).sum(axis=1))
 
 
-def error_about_self(swarm: AbstractSwarm, slot: int) -> Floats:
+def error_about_self(swarm: Swarm, slot: int) -> Floats:
     """How far each agent is from where its last frame, moved on, puts it: (N,) m. Each can tell that by itself.
 
     :param swarm: all agents, each with a table of its own.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm, SwarmConfig
+from dtsa_agent.core import Swarm, SwarmConfig
 
 from .knowledge import moves
 
@@ -31,13 +31,13 @@ class Sense:
         self._ranks = config.options.get("sense.ranks", 4.0)
         self._turn = np.full(config.agents, -1, dtype=np.int64)  # slot of each one's last turn, as all have sensed it
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
         """The owner's id, or those of the lowest rank: several collide."""
         chosen = self._chosen(swarm, slot)
         self._turn[chosen] = slot
         return [int(k) + 1 for k in chosen]
 
-    def _chosen(self, swarm: AbstractSwarm, slot: int) -> NDArray[np.int64]:
+    def _chosen(self, swarm: Swarm, slot: int) -> NDArray[np.int64]:
         """Indices of those that send."""
         n = np.arange(swarm.config.agents)
         owner = slot % len(n)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.plugins.table import Table
-from dtsa_agent.core.swarms.outcome import SlotOutcome
+from dtsa_agent.core.swarm import SlotOutcome
 
 _TIMEOUTS = (3, 8)  # frames of reports a slot is kept for: drawn from 3 to 7
 _LEAST = 4  # slots to choose from, even if some are in use

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dtsa_agent.core import AbstractSwarm, ConfigError, SwarmConfig
+from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 
 from .knowledge import moves, squared_errors
 
@@ -40,7 +40,7 @@ class ThresholdAoii:
         #: (N,) slots for which somebody has been wrong about each agent.
         self.age = np.zeros(config.agents, dtype=np.int64)
 
-    def senders(self, swarm: AbstractSwarm, slot: int) -> list[int]:
+    def senders(self, swarm: Swarm, slot: int) -> list[int]:
         """Ids of all whose draw says so; several collide. While nobody is under way, the slot's owner under TDMA."""
         draws = self._random.random(swarm.config.agents)
         under_way, there = moves(swarm), swarm.present > 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dtsa_agent.core.reference.arithmetic import mix64, share_of
 from dtsa_agent.core.reference.frame_extended import OPEN
-from dtsa_agent.core.reference.selection import Choice
+from dtsa_agent.core.reference.policies import Choice
 
 from .memory import HANDED, NEVER, Memory
 
@@ -12,13 +12,7 @@ _OPEN_DRAW = 0x4F50454E  # "OPEN": these draws are none of another policy's
 
 
 def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> Choice:
-    """Who is expected to send in a slot; if that is oneself, one sends.
-
-    :param memory: what the agent remembers.
-    :param self_index: its own number, id - 1.
-    :param slot: the slot that begins.
-    :param far_from_goal: it has something to say (eq:remaining_t_slots).
-    """
+    """Who is expected to send in a slot; if that is oneself, one sends."""
     if not memory.started:
         memory.start(slot)
     memory.roll(self_index, slot)
@@ -47,10 +41,7 @@ def decide(memory: Memory, self_index: int, slot: int, far_from_goal: bool) -> C
 
 
 def watch_goal(memory: Memory, slot: int, far_from_goal: bool) -> None:
-    """Notes since when the agent is idle, or that it wakes.
-
-    :param slot: number of the slot.
-    """
+    """Notes since when the agent is idle, or that it wakes."""
     if not far_from_goal:
         if memory.idle_since == NEVER:
             memory.idle_since = slot
@@ -62,11 +53,7 @@ def watch_goal(memory: Memory, slot: int, far_from_goal: bool) -> None:
 
 
 def own_right_is_near(memory: Memory, self_index: int, slot: int) -> bool:
-    """Whether the agent may send by a right of its own within the next N / 2 slots.
-
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
-    """
+    """Whether the agent may send by a right of its own within the next N / 2 slots."""
     for turn in range(slot + 1, slot + memory.rules.agents // 2 + 1):
         lease = memory.leases.get(turn)
         if lease is not None and lease.lessee == self_index + 1:
@@ -81,9 +68,6 @@ def takes_open(memory: Memory, self_index: int, slot: int) -> bool:
 
     w agents woke lately; a frames of its own in OPEN turns were not known to be heard. So many that woke together get
     out of each other's way.
-
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
     """
     if memory.woke == NEVER or own_right_is_near(memory, self_index, slot):
         return False

@@ -6,14 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from dtsa_agent.core.reference.arithmetic import minus, norm
-from dtsa_agent.core.reference.frame_extended import (
-    FAR_REACH,
-    LEASE_ROOM,
-    OPEN,
-    RELAY_IDS,
-    RELAY_REACH,
-    SECTION_BYTES,
-)
+from dtsa_agent.core.reference.frame_extended import FAR_REACH, LEASE_ROOM, OPEN, RELAY_IDS, RELAY_REACH, SECTION_BYTES
 from dtsa_agent.core.reference.table import Table
 
 from .memory import HANDED, MISSED, ROUNDS, Lease, Memory
@@ -60,15 +53,7 @@ class Electorate:
 
 
 def say(memory: Memory, self_index: int, table: Table, slot: int, final: bool, leaves: bool) -> Said:
-    """What the agent's frame says about turns; the turns that it gives away are noted.
-
-    :param memory: what the agent remembers.
-    :param self_index: its own number, id - 1.
-    :param table: its table.
-    :param slot: the slot in which it sends.
-    :param final: it knows that no further goal is scheduled for it.
-    :param leaves: it will be switched off after its next own turn.
-    """
+    """What the agent's frame says about turns; the turns that it gives away are noted."""
     own_turn = memory.owner(slot) == self_index
     leaving = memory.leaving = own_turn and leaves
     claims = memory.rules.adoption and not memory.probation and not leaving
@@ -84,11 +69,7 @@ def say(memory: Memory, self_index: int, table: Table, slot: int, final: bool, l
 
 
 def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
-    """c_s: the number of consecutive ids before an agent that it thinks dead.
-
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
-    """
+    """c_s: the number of consecutive ids before an agent that it thinks dead."""
     n, count = memory.rules.agents, 0
     while count < n - 1 and memory.absent((self_index - 1 - count) % n, slot):
         count += 1
@@ -96,12 +77,7 @@ def count_absent_before(memory: Memory, self_index: int, slot: int) -> int:
 
 
 def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: bool) -> Electorate:
-    """Who may be given a turn, and who else there is.
-
-    :param final: the agent itself knows that no further goal is scheduled for it.
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
-    """
+    """Who may be given a turn, and who else there is."""
     rows, agents = table.rows, range(memory.rules.agents)
     presumed = [is_presumed(memory, table, k, slot) for k in agents]
     alive = [k == self_index or presumed[k] or memory.alive(k) for k in agents]
@@ -122,20 +98,13 @@ def electorate(memory: Memory, self_index: int, table: Table, slot: int, final: 
 
 
 def is_presumed(memory: Memory, table: Table, k: int, slot: int) -> bool:
-    """Whether nothing is known of an agent but where it starts and wants to be: in the first round.
-
-    :param k: index of the agent, 0 to N - 1.
-    :param slot: number of the slot.
-    """
+    """Whether nothing is known of an agent but where it starts and wants to be: in the first round."""
     first_round = memory.born == 0 and slot < memory.rules.agents
     return first_round and table.known_goals is not None and table.rows[k].sent_slot < 0
 
 
 def sets_out(memory: Memory, table: Table, k: int) -> bool:
-    """Whether an agent has something to say when it starts (eq:remaining_t_slots).
-
-    :param k: index of the agent, 0 to N - 1.
-    """
+    """Whether an agent has something to say when it starts (eq:remaining_t_slots)."""
     assert table.known_goals is not None
     return norm(minus(table.known_goals[k], table.start[k])) > memory.rules.r_min
 
@@ -169,8 +138,6 @@ def depth(memory: Memory, who: Electorate, slot: int, final: bool) -> int:
 
     A mover gives away those up to its next anchor, where less than a third moves, all that rest are settled and no
     frames are lost. Where frames are lost, who has just arrived gives nothing away: it says so again.
-
-    :param slot: number of the slot.
     """
     rules = memory.rules
     if not who.members or memory.deaf:
@@ -222,8 +189,6 @@ def issue(
 
     :param c_s: number of agents before me whose turns I give away.
     :param own_depth: how many own turns at most; None: as :func:`depth` says.
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
     :returns: a byte a turn, up to the last that is given away.
     """
     who = electorate(memory, self_index, table, slot, final)
@@ -258,10 +223,7 @@ def issue(
 
 
 def look_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
-    """For each agent the slots to come in which it is known to send.
-
-    :param slot: number of the slot.
-    """
+    """For each agent the slots to come in which it is known to send."""
     rights: list[list[int]] = [[] for _ in range(memory.rules.agents)]
     for turn in range(slot + 1, slot + memory.window):
         sender = memory.scheduled(turn)
@@ -271,10 +233,7 @@ def look_ahead(memory: Memory, who: Electorate, slot: int) -> list[list[int]]:
 
 
 def foresee(memory: Memory, self_index: int, who: Electorate, turns: range) -> None:
-    """Who will send in the turns to come: as far as is known; else whom a settled owner or a mover will choose.
-
-    :param self_index: index of the agent itself, 0 to N - 1.
-    """
+    """Who will send in the turns to come: as far as is known; else whom a settled owner or a mover will choose."""
     for turn in turns:
         sender, owner = memory.scheduled(turn), memory.owner(turn)
         spare = turn not in memory.leases and who.settled[owner] and is_spare(memory, who, turn)
@@ -304,8 +263,6 @@ def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
     p and n are the distances from the turn to the agent's previous and next slot, as far as they are known or foreseen;
     p is N + 1 at most. p n is what the turn takes off the sum of its ages; n is cut off, because more leases will come
     in between: m is N_p, or 3/4 of it where movers give turns away, too, so that there the wait decides.
-
-    :param k: index of the agent, 0 to N - 1.
     """
     longest, most = memory.rules.agents + 1, who.members
     if who.lends:
@@ -318,7 +275,6 @@ def worth(memory: Memory, who: Electorate, k: int, turn: int) -> int:
 def choose_lessee(memory: Memory, who: Electorate, turn: int, but: int = -1) -> int:
     """To whom a turn is worth most, the lowest id of several; -1: nobody is able.
 
-    :param turn: the turn to be given away.
     :param but: index of an agent that is not asked.
     """
     able = [k for k in range(memory.rules.agents) if who.able[k] and k != but]
@@ -333,7 +289,6 @@ def hand_on(memory: Memory, self_index: int, table: Table, slot: int, final: boo
     that are worth much more to somebody else. The turn's owner, which has given it away, is left out.
 
     :param leases: the frame's lease bytes; with more than one section of them there is no room for a far lessee.
-    :param self_index: index of the agent itself, 0 to N - 1.
     :returns: the turns handed on; at most eight within the relay's reach, the others to one agent.
     """
     handed: list[int] = []
@@ -374,10 +329,7 @@ def relay(
 ) -> tuple[tuple[int, int], ...]:
     """Leases that an agent hands on now, and the next ones that it knows of: who missed them learns of them in time.
 
-    :param handed: turns that are handed on.
     :param own_is_said: the frame's lease bytes speak of the own turns already.
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
     :returns: (slots ahead, lessee), at most eight.
     """
     turns = list(handed)

@@ -5,23 +5,15 @@ docs/reference/protocol.md, "States and events of an agent".
 
 from __future__ import annotations
 
+from dtsa_agent.core.frame import ExtendedFrame, Gossip
 from dtsa_agent.core.reference import gossip
-from dtsa_agent.core.reference.frame_extended import ExtendedFrame, Gossip
 from dtsa_agent.core.reference.table import Table
 
 from .memory import DEAF, GONE, MISSED, NEVER, Memory
 
 
 def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: ExtendedFrame, wakes: bool) -> None:
-    """Takes in a frame of somebody else.
-
-    :param memory: what the agent remembers.
-    :param self_index: its own number, id - 1.
-    :param table: its table.
-    :param slot: the slot in which the frame was sent.
-    :param frame: what it said.
-    :param wakes: its sender was not in A_p and is now.
-    """
+    """Takes in a frame of somebody else."""
     if not memory.started:
         return
     sender = frame.own.sender - 1
@@ -49,12 +41,7 @@ def listen(memory: Memory, self_index: int, table: Table, slot: int, frame: Exte
 
 
 def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame, was_absent: bool) -> None:
-    """Probation begins where another agent may take this one for dead, and ends where that agent has heard it.
-
-    :param was_absent: the sender was thought dead until now.
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
-    """
+    """Probation begins where another agent may take this one for dead, and ends where that agent has heard it."""
     distance = (frame.own.sender - 1 - self_index) % memory.rules.agents
     if not memory.rules.adoption or frame.leaving:
         return
@@ -68,11 +55,7 @@ def judge_claim(memory: Memory, self_index: int, slot: int, frame: ExtendedFrame
 
 
 def hear_gossip(memory: Memory, self_index: int, table: Table, alive: int, entry: Gossip) -> None:
-    """Somebody says that an agent lived in a slot.
-
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param alive: number of the slot in which it lived.
-    """
+    """Somebody says that an agent lived in a slot."""
     k = entry.agent - 1
     if k == self_index:
         if memory.woke != NEVER and alive >= memory.woke:
@@ -83,12 +66,7 @@ def hear_gossip(memory: Memory, self_index: int, table: Table, alive: int, entry
 
 
 def end_slot(memory: Memory, self_index: int, slot: int, sent: bool, reason: str) -> None:
-    """The slot is over.
-
-    :param sent: the agent itself sent in it.
-    :param reason: why it decided as it did.
-    :param self_index: index of the agent itself, 0 to N - 1.
-    """
+    """The slot is over."""
     if sent:
         if reason == "open":
             memory.attempts = min(memory.attempts + 1, 255)
@@ -100,10 +78,7 @@ def end_slot(memory: Memory, self_index: int, slot: int, sent: bool, reason: str
 
 
 def note_silence(memory: Memory, slot: int) -> None:
-    """Silence where somebody was expected that is not known to be gone.
-
-    :param slot: number of the slot.
-    """
+    """Silence where somebody was expected that is not known to be gone."""
     k = memory.expected
     if k < 0 or memory.missed[k] >= MISSED or memory.absent(k, slot):
         return
@@ -118,9 +93,6 @@ def end_probation(memory: Memory, self_index: int, slot: int) -> None:
     """Probation ends after an own main anchor: leases of an earlier life reach no farther.
 
     With adoption others may have given turns away, too; everybody who might has spoken twice after 2 K M N slots.
-
-    :param self_index: index of the agent itself, 0 to N - 1.
-    :param slot: number of the slot.
     """
     if memory.owner(slot) == self_index and memory.is_main(slot):
         memory.anchored = True

@@ -58,8 +58,6 @@ class Memory:
         """Slots without a sign of life after which an agent is thought absent: six times as many as it may be silent.
 
         Who rests may speak in its main anchors only, and so may who was never heard.
-
-        :param k: index of the agent, 0 to N - 1.
         """
         rests = self.resting[k] or self.heard[k] == NEVER
         return max(1000, 6 * (self.rules.main_every if rests else self.rules.anchor_every) * self.rules.agents)
@@ -89,18 +87,11 @@ class Memory:
         return (slot // n + slot % n) % self.rules.main_every == 0
 
     def alive(self, k: int) -> bool:
-        """Whether an agent was heard of lately.
-
-        :param k: index of the agent, 0 to N - 1.
-        """
+        """Whether an agent was heard of lately."""
         return self.heard[k] >= 0 and self.now - self.heard[k] <= self.patience(k)
 
     def absent(self, k: int, slot: int) -> bool:
-        """Whether an agent is thought dead: no sign of life for long, or it said that it leaves.
-
-        :param k: index of the agent, 0 to N - 1.
-        :param slot: number of the slot.
-        """
+        """Whether an agent is thought dead: no sign of life for long, or it said that it leaves."""
         sign = self.born if self.heard[k] == NEVER else self.heard[k]
         return slot - sign > self.patience(k)
 
@@ -121,10 +112,6 @@ class Memory:
         agent itself has given away or handed on never is its own again. Of two that gave the turn away, which adoption
         alone can cause, the smaller lessee stays, so that all who know both agree.
 
-        :param self_index: the agent's number.
-        :param sender: id of who says it.
-        :param turn: the slot that is given away.
-        :param lessee: id or OPEN.
         :param issuer: id of who gave it away, 0: the sender relays it.
         """
         if not self.now < turn < self.now + self.window or self.is_main(turn):
@@ -146,10 +133,6 @@ class Memory:
 
         T + j N - i for j = 1 .. K M, and within each j for i = c_s .. 0; anchors of others (i > 0) are left out, and of
         the sender's own turns (i = 0) those from its next main anchor on.
-
-        :param slot: T, the slot of the frame, the sender's own turn.
-        :param c_s: number of agents before the sender that it gives turns away for.
-        :param room: at most so many turns.
         """
         turns, own = [], True
         for j in range(1, self.rules.main_every + 1):
@@ -177,10 +160,7 @@ class Memory:
             self.woke = slot
 
     def roll(self, self_index: int, slot: int) -> None:
-        """A slot begins: earlier turns are over; the estimates of how many woke and of missed frames fall.
-
-        :param self_index: index of the agent itself, 0 to N - 1.
-        """
+        """A slot begins: earlier turns are over; the estimates of how many woke and of missed frames fall."""
         for turn in [turn for turn in self.leases if turn < slot]:
             del self.leases[turn]
         self.now = self.heard[self_index] = slot

@@ -15,7 +15,7 @@ from dtsa_msgs.msg import Process, Slot
 from nav_msgs.msg import Odometry
 
 from dtsa_agent.core.errors import RemoteProtocolError
-from dtsa_agent.core.swarms.abstract_swarm import FRAME_MAX
+from dtsa_agent.core.swarm import FRAME_MAX
 from dtsa_agent.ros.common.graph import names
 
 UNREADABLE = "unreadable"  # not a message of its topic's type

@@ -1,7 +1,4 @@
-"""The sums over a flight in plain Python: for swarms on the specification, whose tables the compiled ones do not see.
-
-The same numbers, bit for bit: sums go over agents in the order of their ids. What they mean: docs/reference/metrics.md.
-"""
+"""The sums over a flight in plain Python, which the compiled ones equal bit for bit: in the order of agents' ids."""
 
 from __future__ import annotations
 
@@ -11,25 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.core import AbstractSwarm
-
-from .wakings import DELAYS, Wakings
+from dtsa_agent.core import Swarm
+from dtsa_bench.runs.wakings import DELAYS, Wakings
 
 Array = NDArray[np.float64]
 CRASHED, ARRIVED = 1, 2  # bits of what PlainSums.update returns
 
 
 class PlainSums:
-    """True distances, paths flown, ages and errors of estimates of one flight.
-
-    :param start: (3, N) m, frame map.
-    :param target: (3, N) m.
-    :param moving: (N,) who has to arrive.
-    :param news_from: ages and errors are taken from this number of slots on.
-    :param collision_m: m, nearer than this two agents crash.
-    :param r_min: m, nearer than this to its target an agent has arrived.
-    :param wakings: who has got a goal; what is heard of them is counted in it.
-    """
+    """Distances, paths, ages and errors of one flight; parameters are those of ``FlightSums``."""
 
     def __init__(
         self,
@@ -53,20 +40,11 @@ class PlainSums:
         self._error_sum = self._error_max = 0.0
 
     def drop(self, index: int) -> None:
-        """A mover that is lost counts no more.
-
-        :param index: its index, 0 to N - 1.
-        """
+        """A mover that is lost counts no more."""
         self._moving[index] = False
 
-    def update(self, slot: int, track: Array, tables: AbstractSwarm | None) -> int:
-        """Takes in a slot that has just ended.
-
-        :param slot: number of slots flown.
-        :param track: (S, 3, N) m, true positions at its control instants.
-        :param tables: what the agents know; None: ages are left out.
-        :returns: CRASHED, ARRIVED or both.
-        """
+    def update(self, slot: int, track: Array, tables: Swarm | None) -> int:
+        """Takes in a slot that has just ended. Returns CRASHED, ARRIVED or both."""
         crashed = [self._take_instant(slot, _columns(instant)) for instant in track]
         now = self._last
         away = [
@@ -97,7 +75,7 @@ class PlainSums:
         self._last = now
         return nearest2 < self._collision_m * self._collision_m
 
-    def _take_table(self, slot: int, tables: AbstractSwarm, row: int, truth: list[list[float]]) -> None:
+    def _take_table(self, slot: int, tables: Swarm, row: int, truth: list[list[float]]) -> None:
         observer, errors = int(tables.observer[row]), 0.0
         weight = len(truth) - 1 if observer < 0 else 1
         believed = _columns(tables.estimate_position[row])
@@ -113,7 +91,7 @@ class PlainSums:
             self._error_max = max(self._error_max, error)
         self._error_sum += errors * weight
 
-    def _take_wakings(self, last: int, tables: AbstractSwarm, row: int) -> None:
+    def _take_wakings(self, last: int, tables: Swarm, row: int) -> None:
         wakings, observer, sent = self._wakings, int(tables.observer[row]), tables.sent_slot[row].tolist()
         if observer >= 0 and wakings.gone[observer]:
             return
