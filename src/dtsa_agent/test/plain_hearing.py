@@ -28,10 +28,7 @@ class SlotTime(TimeBase):
     :param trust_ns: ns by which a frame may be off its slot and still say what time it is.
     """
 
-    __slots__ = ("_aligner_of_own", "corrected")
-
     def __init__(self, config: SwarmConfig, agent: int, trust_ns: int = 1_000_000) -> None:
-        self._aligner_of_own = ClockAligner(limit_ns=trust_ns)
         #: How often the time of the own group was taken anew.
         self.corrected = 0
         super().__init__(
@@ -40,7 +37,7 @@ class SlotTime(TimeBase):
             slot_ns=config.slot_ns,
             agent=agent,
             seed=config.seed,
-            aligner=self._aligner_of_own,
+            aligner=ClockAligner(limit_ns=trust_ns),
         )
 
     def hear(self, slot: int, start_ns: int) -> str:
@@ -50,8 +47,8 @@ class SlotTime(TimeBase):
         :param start_ns: ns, own clock, when its transmission started.
         """
         outcome = super().hear(slot, start_ns)
-        if outcome == ALIGNED and self._aligner_of_own.ignored_in_a_row >= _DOUBTS:
-            self._aligner_of_own.reset()
+        if outcome == ALIGNED and self.aligner.ignored_in_a_row >= _DOUBTS:
+            self.aligner.reset()
             self.state = LISTENING  # for this frame
             super().hear(slot, start_ns)
             self.corrected += 1
@@ -60,7 +57,7 @@ class SlotTime(TimeBase):
     @property
     def corrections(self) -> int:
         """How often the own slots have been moved a little."""
-        return self._aligner_of_own.corrections
+        return self.aligner.corrections
 
 
 class Taken(NamedTuple):

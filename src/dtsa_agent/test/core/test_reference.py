@@ -22,9 +22,10 @@ from dtsa_agent.core import (
     decode_frame,
     encode_frame,
 )
-from dtsa_agent.core.frame import ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
+from dtsa_agent.core.frame import TAG_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.reference import arithmetic, frame, frame_extended, policies, tag, timebase
+from dtsa_agent.core.reference import arithmetic, frame, frame_extended, policies, timebase
+from dtsa_agent.core.reference.frame import tag
 from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_agent.core.registry import REASONS
 
@@ -248,15 +249,15 @@ def test_the_same_is_heard_at_the_same_times_in_the_same_slots(seed: int) -> Non
         assert lib.dtsa_timebase_slot(compiled, now) == plain.slot(now)
         assert lib.dtsa_timebase_slot_start(compiled, slot) == plain.slot_start_ns(slot)
         assert (STATES[compiled.state], compiled.restarts) == (plain.state, plain.restarts)
-    ours, theirs = compiled.aligner, plain._aligner
+    ours, theirs = compiled.aligner, plain.aligner
     assert (ours.corrections, ours.ignored) == (theirs.corrections, theirs.ignored)
 
 
 @given(st.binary(min_size=16, max_size=32), st.integers(0, 2**64 - 1), st.integers(0, 2**40), st.binary(max_size=300))
 def test_frames_get_the_same_tags(key: bytes, session: int, slot: int, data: bytes) -> None:
-    said = ffi.new("uint8_t[]", tag.LENGTH)
+    said = ffi.new("uint8_t[]", TAG_LENGTH)
     lib.dtsa_tag(key, len(key), session, slot, data, len(data), said)
-    assert bytes(said) == tag.tag(tag.keyed(key, session), slot, data)
+    assert bytes(said) == tag(key, session, slot, data)
     sealed = data + bytes(said)
     assert lib.dtsa_open(key, len(key), session, slot, 0, sealed, len(sealed)) == len(data)
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_agent.core import ConfigError
+from dtsa_agent.core.kernel import ffi, lib
 from dtsa_agent.core.reference.timebase import (
     ALIGNED,
     ALONE,
@@ -91,7 +91,6 @@ def test_alone_until_somebody_of_the_same_time_is_heard() -> None:
     assert b.state == JOINED
 
 
-@pytest.mark.parametrize("name", ["agents", "anchor_every", "slot_ns", "agent"])
-def test_settings_that_are_refused(name: str) -> None:
-    with pytest.raises(ConfigError, match=name):
-        TimeBase(**{"agents": 4, "anchor_every": 5, "slot_ns": SLOT, "agent": 1, name: 0})
+@pytest.mark.parametrize("wrong", [(0, 5, SLOT, 1), (4, 0, SLOT, 1), (4, 5, 0, 1), (4, 5, SLOT, 0)])
+def test_settings_that_are_refused(wrong: tuple[int, int, int, int]) -> None:
+    assert not lib.dtsa_timebase_init(ffi.new("dtsa_timebase *"), *wrong, 1)

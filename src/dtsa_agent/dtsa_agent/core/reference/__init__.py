@@ -12,13 +12,13 @@ Nothing that is installed imports it; tests and ``dtsa_dev`` do. One file, one s
 
 * :mod:`.arithmetic`: what the bits of a result depend on, and why
 * :mod:`.rules`: the settings that all agents share
-* :mod:`.frame`, :mod:`.frame_extended`: what is on the air
+* :mod:`.frame`, :mod:`.frame_extended`: what is on the air, and whose it was
 * :mod:`.table`, :mod:`.gossip`: what an agent knows of the others
 * :mod:`.estimators`: where the others are by now
 * :mod:`.policies`: who sends, by priorities and counters
 * :mod:`.lease`: the policy that needs no equal tables
 * :mod:`.agent`: one agent in a slot
-* :mod:`.timebase`, :mod:`.tag`: which slot it is, and whose frame it was
+* :mod:`.timebase`: which slot it is
 
 It needs no NumPy, but for :mod:`.stepper`, which makes a swarm of it for flights beside the compiled one.
 """

@@ -3,12 +3,10 @@
 Agents that hear the same must decide the same, so they must compute the same, to the last bit, on every machine:
 
 * Numbers are IEEE 754 doubles. The four operations and the square root are rounded correctly everywhere; nothing else
-is
-  used. ``sin``, ``acos``, ``exp`` and ``pow`` differ in their last bit from one C library to the next.
+  is used. ``sin``, ``acos``, ``exp`` and ``pow`` differ in their last bit from one C library to the next.
 * No operation is fused with another: ``a * b + c`` is rounded twice.
 * Sums have a fixed order, because addition is not associative. Dot products go x, y, z from the left. Long sums have
-four
-  lanes (:func:`sum_in_lanes`), as a processor with vectors computes them.
+  four lanes (:func:`sum_in_lanes`), as a processor with vectors computes them.
 * The arcsine is a polynomial of our own (:func:`arcsin`).
 * What goes over the air is whole steps (:func:`quantise`), so all receivers start from the same numbers.
 * Chance is a hash (:func:`mix64`) of the run's key, the slot and the agent: all can compute it, and it has no state.

@@ -13,6 +13,8 @@ Little-endian; the layout is docs/reference/protocol.md's table::
 
 from __future__ import annotations
 
+from hashlib import blake2s
+
 from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
 from dtsa_agent.core.frame import Frame
 
@@ -93,3 +95,13 @@ def decode(data: bytes, position_step: float) -> Frame:
         raise Refused(WRONG_FIELD, data)
     intent = None if profile == PROFILE_PAPER else (speeds[3], speeds[4], speeds[5])
     return Frame(sender, slot, c_r, (x, y, z), (speeds[0], speeds[1], speeds[2]), intent)
+
+
+def tag(key: bytes, session: int, slot: int, data: bytes) -> bytes:
+    """The 4 bytes that follow a frame where frames are authenticated (docs/how-to/security.md).
+
+    A truncated code over session, slot and frame: BLAKE2s with a key. The slot is the one in which it is sent, not what
+    the frame says; by the person tags of other software, or of another version of this one, are none of ours.
+    """
+    said = session.to_bytes(8, "little") + slot.to_bytes(8, "little") + data
+    return blake2s(said, key=key, digest_size=4, person=b"dtsa v1").digest()

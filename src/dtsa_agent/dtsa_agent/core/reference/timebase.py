@@ -16,7 +16,7 @@ part.
 
 from __future__ import annotations
 
-from dtsa_agent.core.errors import ConfigError
+from dataclasses import dataclass, field
 
 from .arithmetic import mix64
 
@@ -28,44 +28,23 @@ RESTARTED = "restarted"  # its time was taken over; whatever was known about tur
 FOREIGN = "foreign"  # of an earlier time: its sender will come to us
 
 
+@dataclass(slots=True)
 class ClockAligner:
-    """Turns arrival offsets of heard frames into small shifts of the own slots.
+    """Turns arrival offsets of heard frames into small shifts of the own slots: ``slot_start += aligner.hear(offset)``.
 
     After every ``receptions`` usable offsets the own slots move by ``gain`` times their median. A median
     shrugs off single delays, and since everybody moves towards everybody else, the swarm agrees on a common
     time that drifts with the mean of its clocks. A correction of the frequency as well is not needed at
     crystal accuracy and lets the common time run away.
-
-    The caller keeps its own slot time: ``slot_start += aligner.hear(offset)``.
-
-    :param receptions: offsets per correction, 1 or more.
-    :param gain: share of the median by which the slots move, above 0, up to 1.
-    :param limit_ns: ns; offsets beyond this, either way, are not trusted (a late frame, another swarm) and
-        are counted.
-    :raises ConfigError: when a parameter is out of range.
     """
 
-    __slots__ = ("_limit_ns", "_offsets", "_receptions", "_share", "corrections", "ignored", "ignored_in_a_row")
-
-    def __init__(self, receptions: int = 9, gain: float = 0.5, limit_ns: int = 1_000_000) -> None:
-        if receptions < 1:
-            raise ConfigError("align_receptions", receptions, "a whole number of 1 or more")
-        if not 0.0 < gain <= 1.0:
-            raise ConfigError("align_gain", gain, "a number above 0, up to 1")
-        if limit_ns <= 0:
-            raise ConfigError("align_limit_ns", limit_ns, "a number of ns above 0")
-        self._receptions = receptions
-        # In 1/65536: the correction is integer arithmetic, the same on every machine.
-        self._share = max(1, round(gain * 65536))
-        self._limit_ns = limit_ns
-        self._offsets: list[int] = []
-        #: Corrections made so far.
-        self.corrections = 0
-        #: Offsets that were not trusted so far.
-        self.ignored = 0
-        #: Of these, how many came one after the other up to now: a clock that is off by more than the limit
-        #: shows here.
-        self.ignored_in_a_row = 0
+    receptions: int = 9  # offsets per correction
+    gain: float = 0.5  # share of the median by which the slots move
+    limit_ns: int = 1_000_000  # ns; offsets beyond this, either way, are not trusted: a late frame, another swarm
+    corrections: int = 0  # made so far
+    ignored: int = 0  # offsets that were not trusted so far
+    ignored_in_a_row: int = 0  # ... up to now: a clock that is off by more than the limit shows here
+    offsets: list[int] = field(default_factory=list)
 
     def hear(self, offset_ns: int) -> int:
         """Take in one frame and return by how much the own slots move now, ns (0 most of the time).
@@ -73,27 +52,25 @@ class ClockAligner:
         :param offset_ns: ns, when the frame arrived minus when the own clock expected it; positive: the
             sender is later.
         """
-        if not -self._limit_ns <= offset_ns <= self._limit_ns:
+        if not -self.limit_ns <= offset_ns <= self.limit_ns:
             self.ignored += 1
             self.ignored_in_a_row += 1
             return 0
         self.ignored_in_a_row = 0
-        offsets = self._offsets
-        offsets.append(offset_ns)
-        if len(offsets) < self._receptions:
+        self.offsets.append(offset_ns)
+        if len(self.offsets) < self.receptions:
             return 0
-        offsets.sort()
-        middle = len(offsets) // 2
-        twice = offsets[middle] + offsets[~middle]
-        offsets.clear()
+        ordered, self.offsets = sorted(self.offsets), []
+        middle = len(ordered) // 2
+        twice = ordered[middle] + ordered[~middle]
         self.corrections += 1
-        # Rounded half away from zero, so that both directions weigh the same.
-        size = (abs(twice) * self._share + 65536) // 131072
+        # In 1/65536, rounded half away from zero: the same on every machine, and both directions weigh the same.
+        size = (abs(twice) * max(1, round(self.gain * 65536)) + 65536) // 131072
         return size if twice >= 0 else -size
 
     def reset(self) -> None:
         """Forget the offsets collected so far (after the own slots have been set anew)."""
-        self._offsets.clear()
+        self.offsets.clear()
         self.ignored_in_a_row = 0
 
 
@@ -103,40 +80,26 @@ class TimeBase:
     :param anchor_every: M; everybody alive is heard within M N slots where nothing is lost.
     :param seed: seed of the run; with the id it decides how long to wait in silence.
     :param aligner: keeps the slots of a group together; default: a :class:`ClockAligner`.
-    :raises ConfigError: when a parameter is out of range.
     """
 
-    __slots__ = ("_aligner", "_deadline_ns", "_origin_ns", "_round_ns", "_slot_ns", "_wait_ns", "restarts", "state")
-
     def __init__(
-        self,
-        *,
-        agents: int,
-        anchor_every: int,
-        slot_ns: int,
-        agent: int,
-        seed: int = 0,
+        self, *, agents: int, anchor_every: int, slot_ns: int, agent: int, seed: int = 0,
         aligner: ClockAligner | None = None,
-    ) -> None:
-        for name, value in (("agents", agents), ("anchor_every", anchor_every), ("slot_ns", slot_ns), ("agent", agent)):
-            if value < 1:
-                raise ConfigError(name, value, "a whole number of 1 or more")
+    ) -> None:  # fmt: skip
         self._slot_ns = slot_ns
         self._round_ns = anchor_every * agents * slot_ns
         # Spread over a whole round of anchors, so that one is the first and the others hear it while they still listen.
         self._wait_ns = self._round_ns + _mixed(seed, agent) % self._round_ns
-        self._aligner = ClockAligner() if aligner is None else aligner
         self._deadline_ns: int | None = None
         self._origin_ns = 0  # start of slot 0 by the own clock
-        #: LISTENING, ALONE or JOINED.
-        self.state = LISTENING
-        #: How often another time was taken over.
-        self.restarts = 0
+        self.aligner = ClockAligner() if aligner is None else aligner
+        self.state = LISTENING  # or ALONE, JOINED
+        self.restarts = 0  # how often another time was taken over
 
     def start(self, now_ns: int) -> int:
         """Begin to listen; returns when to call :meth:`wake` at the latest, ns."""
         self.state = LISTENING
-        self._aligner.reset()
+        self.aligner.reset()
         self._deadline_ns = now_ns + self._wait_ns
         return self._deadline_ns
 
@@ -169,12 +132,12 @@ class TimeBase:
         ahead = self._origin_ns - origin
         if abs(ahead) < self._slot_ns // 2:
             # Slot starts move towards the sender's: a frame that came later than expected moves them back.
-            self._origin_ns += self._aligner.hear(-ahead)
+            self._origin_ns += self.aligner.hear(-ahead)
             self.state = JOINED
             return ALIGNED
         if ahead < 0:
             return FOREIGN
-        self._aligner.reset()
+        self.aligner.reset()
         self._origin_ns, self.state = origin, JOINED
         self.restarts += 1
         return RESTARTED
