@@ -1,15 +1,17 @@
-"""Starts and targets: antipodal pairs, the same in every process."""
+"""Starts, targets and goals one after the other: where they lead, and that everybody computes the same."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core import Scenario, Swarm, SwarmConfig, make_scenario
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.settings.scenario import half_axes
+from dtsa_agent.core.settings.scenario import Course, Plan, half_axes
 
 
 @settings(max_examples=50, deadline=None)
@@ -107,3 +109,170 @@ def test_odd_numbers_of_movers_fly_in_every_scenario(kind: str, agents: int, mov
     for places in (scenario.start, scenario.target):
         gaps = np.linalg.norm(places[:, :, None] - places[:, None], axis=0) + 9 * np.eye(agents)
         assert gaps.min() > 0.5
+
+
+KINDS = ("exchange", "staggered", "waypoints", "streams", "stop-and-go")
+
+
+def scenario(**changes: Any) -> Scenario:
+    return make_scenario(SwarmConfig(**{"agents": 12, **changes}))
+
+
+def closest(points: np.ndarray) -> float:
+    """Smallest distance between two columns of (3, N)."""
+    distance = np.linalg.norm(points[:, :, None] - points[:, None, :], axis=0)
+    return float(distance[~np.eye(points.shape[1], dtype=bool)].min())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), agents=st.integers(2, 40), data=st.data())
+def test_nobody_starts_or_ends_too_close(kind: str, seed: int, agents: int, data: st.DataObject) -> None:
+    moving = 2 * data.draw(st.integers(0, agents // 2))
+    made = scenario(scenario=kind, seed=seed, agents=agents, moving=moving)
+    assert int(made.moving.sum()) == moving
+    assert closest(made.start) > 0.6
+    assert closest(made.target) > 0.6
+    assert np.array_equal(made.target[:, ~made.moving], made.start[:, ~made.moving])
+    again = scenario(scenario=kind, seed=seed, agents=agents, moving=moving)
+    assert np.array_equal(made.start, again.start)
+    if made.plan is not None and again.plan is not None:
+        assert np.array_equal(made.plan.goals, again.plan.goals)
+        assert np.array_equal(made.plan.begin, again.plan.begin)
+
+
+def test_the_exchange_is_the_same_whatever_else_there_is() -> None:
+    plain, staggered = scenario(seed=4), scenario(seed=4, scenario="staggered")
+    assert np.array_equal(plain.start, staggered.start)
+    assert np.array_equal(plain.target, staggered.target)
+    assert plain.plan is None
+
+
+def test_pairs_start_one_after_the_other() -> None:
+    made = scenario(scenario="staggered", stagger_slots=70, moving=8, seed=3)
+    assert made.plan is not None
+    begin = made.plan.begin[made.moving]
+    assert sorted(begin.tolist()) == [0, 0, 70, 70, 140, 140, 210, 210]
+    for k in np.flatnonzero(made.moving):
+        mate = np.flatnonzero((made.start == made.target[:, [k]]).all(axis=0))[0]
+        assert made.plan.begin[k] == made.plan.begin[mate]
+
+
+def test_streams_cross_at_right_angles() -> None:
+    made = scenario(scenario="streams", agents=14, moving=12, jitter_m=0)
+    way = (made.target - made.start)[:, made.moving]
+    lengths = np.abs(way).max(axis=0)
+    assert np.allclose(lengths, lengths[0])
+    assert int((way[0] > 1).sum()) == int((way[1] > 1).sum()) == 6
+    assert not way[2].any()
+    along_x = made.start[:, made.moving][:, way[0] > 1]
+    along_y = made.start[:, made.moving][:, way[1] > 1]
+    assert along_x[0].max() < along_y[0].min() - 1.0
+    assert along_y[1].max() < along_x[1].min() - 1.0
+
+
+def test_waypoints_lie_in_the_shape_and_away_from_where_others_end() -> None:
+    made = scenario(scenario="waypoints", agents=10, moving=6, stops=4, seed=9)
+    assert made.plan is not None
+    assert made.plan.goals.shape == (5, 3, 10)
+    radius = np.linalg.norm(made.start[:2], axis=0).max()
+    for goals in made.plan.goals[:-1]:
+        mine = goals[:, made.moving]
+        assert np.linalg.norm(mine[:2], axis=0).max() <= radius + 0.1
+        assert np.abs(mine[2]).max() <= 0.5
+        gaps = np.linalg.norm(mine[:, :, None] - made.target[:, None, :], axis=0)
+        assert gaps.min() >= 0.85
+        assert closest(mine) >= 0.85
+    assert np.array_equal(made.plan.goals[-1], made.target)
+
+
+def test_stop_and_go_shuttles_and_ends_where_the_number_of_legs_leads() -> None:
+    for stops, home in ((1, True), (2, False), (3, True)):
+        made = scenario(scenario="stop-and-go", stops=stops, seed=2)
+        assert np.array_equal(made.target, made.start) == home
+        assert made.plan is not None
+        line = np.linalg.norm(made.plan.goals[0] - made.start, axis=0)
+        assert np.allclose(made.plan.way, (stops + 1) * line)
+
+
+def plan(legs: int, begin: int = 0, pause: int = 0) -> Plan:
+    goals = np.zeros((legs, 3, 1))
+    goals[:, 0, 0] = np.arange(1, legs + 1)
+    return Plan(np.zeros((3, 1)), goals, np.array([begin]), np.array([pause]), np.array([True]), 0.3)
+
+
+def test_an_agent_rests_at_its_goals_and_then_goes_on() -> None:
+    course = Course(plan(3, begin=5, pause=4), np.array([0], dtype=np.int32))
+    legs, finals = [], []
+    for slot in range(30):
+        # It needs three slots to a goal, and is pushed out of it for one slot while it rests.
+        leg = int(course.leg[0])
+        there = slot - int(course.changed[0]) >= 3
+        x = (leg + 1.0 if there else leg + 0.5) if leg >= 0 else 0.0
+        if there and slot - int(course.changed[0]) == 5:
+            x += 0.4
+        changed = course.advance(slot, np.array([[x], [0.0], [0.0]]))
+        assert changed == (course.changed[0] == slot)
+        legs.append(int(course.leg[0]))
+        finals.append(bool(course.final[0]))
+        assert bool(course.active[0]) == (slot >= 5)
+    assert legs == [-1] * 5 + [0] * 7 + [1] * 7 + [2] * 11
+    assert finals == [leg == 2 for leg in legs]
+
+
+def test_each_agent_alone_computes_what_all_together_compute() -> None:
+    made = scenario(scenario="stop-and-go", agents=6, pause_slots=20, seed=1)
+    assert made.plan is not None
+    together = made.course(np.arange(6, dtype=np.int32))
+    alone = [made.course(np.array([k], dtype=np.int32)) for k in range(6)]
+    assert together is not None
+    random = np.random.default_rng(0)
+    for slot in range(200):
+        near = random.random(6) < 0.1
+        position = np.where(near, together.goal, together.goal + 5.0)
+        together.advance(slot, position)
+        for k, course in enumerate(alone):
+            assert course is not None
+            course.advance(slot, position[:, [k]])
+            assert np.array_equal(course.goal[:, 0], together.goal[:, k])
+    assert together.final.all()
+
+
+def test_the_swarm_gets_goals_activity_and_what_all_know() -> None:
+    config = SwarmConfig(agents=6, scenario="staggered", stagger_slots=10, moving=4, policy="tdma")
+    for shared in (True, False):
+        swarm = Swarm(config, shared_table=shared)
+        made = swarm.scenario
+        assert made.plan is not None
+        late = int(np.flatnonzero(made.plan.begin == 10)[0])
+        for slot in range(30):
+            made.advance(slot, swarm)
+            senders = swarm.begin(slot)
+            data = swarm.frame(senders[0])
+            swarm.fly(slot)
+            swarm.hear(slot, data)
+            swarm.end(slot)
+            begun = slot >= 10
+            assert np.array_equal(swarm.goal[:, late], (made.target if begun else made.start)[:, late])
+            assert np.array_equal(swarm.known_goal[:, late], (made.target if begun else made.start)[:, late])
+            said = begun and swarm.sent_slot[0 if shared else late, late] >= 10
+            assert bool(swarm.final[late]) == begun
+            if slot == 9 or (begun and not said):
+                assert not swarm.active[late]
+        assert swarm.active[late]
+        assert not swarm.active[~made.moving].any()
+        swarm.reset()
+        assert swarm.course is not None
+        assert (swarm.course.leg == -1).all()
+        assert np.array_equal(swarm.known_goal, made.target)
+
+
+def test_where_goals_are_not_known_who_rests_is_where_it_said() -> None:
+    config = SwarmConfig(agents=4, scenario="waypoints", policy="tdma", r_min=0.5)
+    swarm = Swarm(config, shared_table=True)
+    swarm.scenario.advance(0, swarm)
+    swarm.position[:, 0] = swarm.goal[:, 0] + np.array([0.3, 0.0, 0.0])
+    data = swarm.frame(swarm.begin(0)[0])
+    swarm.hear(0, data)
+    assert not swarm.in_ap[0, 0]
+    assert np.abs(swarm.sent_position[0, :, 0] - swarm.position[:, 0]).max() <= 0.001
