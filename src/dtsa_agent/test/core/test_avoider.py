@@ -70,23 +70,6 @@ def test_orca_minimises_the_soft_problem(case: Case, params: AvoiderParams, aged
     assert command(model, case, age) == pytest.approx(plain_avoiders.command(model, case, age), abs=1e-9)
 
 
-def test_orca_agrees_with_hildreth_sweeps() -> None:
-    """Another way to the same minimum: coordinate ascent of the dual."""
-    model = FLIGHT_MODELS["orca"]
-    params, rho = model.avoider, model.avoider.softness
-    for seed in range(20):
-        case = make_case(seed, 12, 1.2)
-        v = plain_avoiders.turned_wish(case, params)
-        normals, bounds = plain_avoiders.orca_half_spaces(case, params, np.zeros(12))
-        dual = np.zeros(len(bounds))
-        for _ in range(3000):
-            for j, n in enumerate(normals):
-                new = max(0.0, dual[j] + (bounds[j] - n @ v - dual[j] / rho) / (1 + 1 / rho))
-                v = v + (new - dual[j]) * n
-                dual[j] = new
-        assert command(model, case) == pytest.approx(plain_avoiders.limited(v, params.v_max), abs=1e-6)
-
-
 @pytest.mark.parametrize("name", MODELS)
 @settings(max_examples=100, deadline=None)
 @given(case=cases, aged=st.booleans(), rate=st.sampled_from([0.0, 0.1]))

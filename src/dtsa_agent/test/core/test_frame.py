@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 
 import pytest
 from hypothesis import given
@@ -52,6 +51,7 @@ def test_round_trip_is_within_half_a_step(frame: Frame) -> None:
     data = encode_frame(frame)
     assert len(data) == (19 if frame.intent is None else 23) <= 30
     back = decode_frame(data)
+    assert encode_frame(back) == data
     assert (back.sender, back.slot, back.c_r) == (frame.sender, frame.slot, frame.c_r)
     assert all(abs(a - b) <= 0.001 + 1e-12 for a, b in zip(frame.position, back.position, strict=True))
     assert all(abs(a - b) <= 0.005 + 1e-12 for a, b in zip(frame.velocity, back.velocity, strict=True))
@@ -65,12 +65,6 @@ def test_what_decodes_encodes_to_the_same_bytes(data: bytes) -> None:
     except RemoteProtocolError:
         return
     assert encode_frame(frame) == data
-
-
-@given(frames)
-def test_every_decoded_frame_is_canonical(frame: Frame) -> None:
-    data = encode_frame(frame)
-    assert encode_frame(decode_frame(data)) == data
 
 
 @pytest.mark.parametrize("huge", [1e9, 1e300, math.inf])
@@ -103,11 +97,6 @@ def test_what_is_no_frame_is_refused() -> None:
         decode_frame(good[:1] + b"\0\0" + good[3:])
     with pytest.raises(RemoteProtocolError, match="range"):
         decode_frame(good[:-1] + bytes([good[-1] | 0xF0]))
-
-
-def test_positions_are_little_endian_steps_of_two_millimetres() -> None:
-    data = encode_frame(Frame(5, 6, 1, (0.1, -0.1, 1.998), (0.0, 0.0, 0.0)))
-    assert struct.unpack_from("<3h", data, 8) == (50, -50, 999)
 
 
 @given(st.integers(1, 254), st.integers(0, 2**32 - 1), st.booleans(), st.binary(max_size=20))
