@@ -20,7 +20,6 @@ from dtsa_agent.air.serial.settings import SerialSettings
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp.settings import UdpSettings
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Setting, Settings, settings_of
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, KINDS, AvoiderParams, FlightModel, VehicleParams
@@ -144,11 +143,6 @@ def _modems() -> str:
     return f"{table(head, rows)}\nSources:\n\n{listed}"
 
 
-def _policies() -> str:
-    rows = [(f"`{row.name}`", row.decides, row.under_loss) for row in POLICIES.rows.values()]
-    return table(("policy", "who sends in a slot", "on a channel that loses frames"), rows)
-
-
 def _vehicle() -> str:
     from dtsa_agent.ros.odometry_vehicle import VehicleSettings  # needs ROS
 
@@ -254,7 +248,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "positions": partial(settings_table, PositionSettings),
     "on_board": partial(settings_table, OnBoardSettings),
     "safety": partial(settings_table, SafetySettings),
-    "policies": _policies,
     "radios": _radios,
     "faults": _faults,
     "records": _records,
