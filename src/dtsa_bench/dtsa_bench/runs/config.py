@@ -82,8 +82,5 @@ class RunConfig(Settings):
 
 
 def from_swarm(swarm: SwarmConfig) -> dict[str, int]:
-    """Settings of the channel that follow from the swarm's.
-
-    :param swarm: the swarm's settings.
-    """
+    """Settings of the channel that follow from the swarm's."""
     return {name: getattr(swarm, name) for name in FROM_SWARM}

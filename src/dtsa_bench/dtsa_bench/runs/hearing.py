@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,41 +23,28 @@ _ROUNDS = 2  # as many slots as this times N pass before somebody must have been
 
 
 class Hearing:
-    """Counts frames, where they arrived, and where they were taken in.
+    """Counts frames of N agents, where they arrived, and where they were taken in."""
 
-    :param agents: number of agents N.
-    """
-
-    def __init__(self, agents: int) -> None:
+    def __init__(self, agents: int, slots: int = 0, sent: int = 0, delivered: int = 0, taken_in: int = 0) -> None:
         self._agents = agents
-        self.slots = self.sent = self.delivered = self.taken_in = 0
+        self.slots, self.sent, self.delivered, self.taken_in = slots, sent, delivered, taken_in
 
     def slot(self, frames: int, received: NDArray[Any]) -> None:
-        """A slot is over.
-
-        :param frames: number of frames sent in it.
-        :param received: (F, N) 1: the frame arrived there.
-        """
+        """Count a slot that is over; received is (F, N), 1 where a frame arrived."""
         self.slots += 1
         self.sent += frames
         self.delivered += int(np.count_nonzero(received))
 
     def take_in(self, mask: NDArray[Any]) -> None:
-        """A frame was taken in.
-
-        :param mask: (N,) 1: by whom.
-        """
+        """Count a frame that agents took in; mask is (N,)."""
         self.taken_in += int(np.count_nonzero(mask))
 
     def settle(self, not_taken_in: Mapping[str, int]) -> None:
-        """What the agents say of what they refused, which nobody else can know if their keys differ.
-
-        :param not_taken_in: number of messages and frames kept out by the agents, by reason.
-        """
+        """Subtract what agents say that they refused, by reason: only they know if their keys differ."""
         self.taken_in = max(0, min(self.taken_in, self.delivered - not_taken_in.get(REFUSED, 0)))
 
     def problem(self, not_taken_in: Mapping[str, int] | None = None) -> str:
-        """Why nobody heard anybody, or why most frames were of no use; empty: neither is so.
+        """Say why no agent heard another, or why most frames were of no use; empty: neither is so.
 
         :param not_taken_in: number of messages and frames kept out by the agents, by reason.
         """
@@ -69,24 +56,20 @@ class Hearing:
             return f"nobody heard anybody: {self.sent} frames were sent, and none arrived"
         kept_out = f"of {self.delivered} frames that arrived {self.delivered - self.taken_in} were not taken in"
         start = "most frames were of no use" if self.taken_in else "nobody heard anybody"
-        return f"{start}: {kept_out}{_reasons(not_taken_in or {})}"
+        counts = not_taken_in or {}
+        known = [(counts.get(name, counts.get(f"frame {name}", 0)), why) for name, why in _WHY.items()]
+        text = ", ".join(f"{count} {why}" for count, why in known if count)
+        return f"{start}: {kept_out}" + (f"; the agents' processes count {text}" if text else "")
 
 
 class Unheard:
-    """What a page is told of it: once, and again when the kind of the problem changes.
-
-    :param slot_ns: ns, length of a slot.
-    """
+    """What a page is told of it: once, and again when the kind of the problem changes."""
 
     def __init__(self, slot_ns: int) -> None:
         self._first, self._told = _PATIENCE_NS // slot_ns, ""
 
     def news(self, slot: int, problem: str) -> str:
-        """The problem if it has to be told now; otherwise empty.
-
-        :param slot: the slot that starts.
-        :param problem: of :meth:`Hearing.problem`.
-        """
+        """Return a :meth:`Hearing.problem` at the start of a slot if it has to be told now; otherwise nothing."""
         kind = problem.partition(":")[0]
         if slot < self._first or kind == self._told:
             return ""
@@ -95,25 +78,12 @@ class Unheard:
 
 
 def of_datagrams(agents: int, slots: int, sent: int, heard: int, not_taken_in: Mapping[str, int]) -> Hearing:
-    """What agents on a network say of all the frames that reached them.
-
-    :param agents: number of agents that were there.
-    :param slots: slots that one of them has flown.
-    :param sent: number of datagrams that they have sent.
-    :param heard: number of datagrams that they have taken in.
-    :param not_taken_in: number of those that they have not, by reason.
-    """
-    found = Hearing(agents)
-    found.slots, found.sent, found.taken_in = slots, sent, heard
-    found.delivered = heard + sum(not_taken_in.get(name, 0) for name in _WHY)
-    return found
+    """Return what agents on a network say: datagrams sent, taken in, and those not taken in by reason."""
+    return Hearing(agents, slots, sent, heard + sum(not_taken_in.get(name, 0) for name in _WHY), heard)
 
 
 def recorded_problem(bag: str | Path) -> str:
-    """What the summary of a flight says of it; empty if there is none beside the bag.
-
-    :param bag: its file, in the flight's directory ``bag``.
-    """
+    """Return what the summary of a flight says of it; empty if there is none beside its directory ``bag``."""
     try:
         found = json.loads((Path(bag).resolve().parent.parent / "summary.json").read_text(encoding="utf-8"))
         said = found.get("unheard")
@@ -123,12 +93,5 @@ def recorded_problem(bag: str | Path) -> str:
 
 
 def sentence(problem: str) -> str:
-    """A problem as a sentence; empty: none."""
+    """Return a problem as a sentence; empty: none."""
     return f"{problem[:1].upper()}{problem[1:]}." if problem else ""
-
-
-def _reasons(not_taken_in: Mapping[str, int]) -> str:
-    counts = {name: not_taken_in.get(name, not_taken_in.get(f"frame {name}", 0)) for name in _WHY}
-    known: Iterable[str] = (f"{count} {_WHY[name]}" for name, count in counts.items() if count)
-    text = ", ".join(known)
-    return f"; the agents' processes count {text}" if text else ""

@@ -82,7 +82,6 @@ class FlightMetrics:
     def update(self, slot: int, track: Array, tables: Swarm | None, outcome: int, lengths: Iterable[int] = ()) -> str:
         """Takes in a slot that has just ended.
 
-        :param slot: its number; slots come one after the other from 0.
         :param track: (S, 3, N) m, frame map: true positions at its control instants, the last at its end.
         :param tables: what the agents (or :func:`metrics_tables`) know after ``end(slot)``; None: ages are left out.
         :param outcome: the channel's verdict on it, IDLE, SUCCESS or COLLISION.
@@ -122,11 +121,10 @@ class FlightMetrics:
         return self.end
 
     def lose(self, agent: int, hovers: bool = True) -> None:
-        """An agent fell out of the flight, and its way counts no more.
+        """Leave out an agent that fell out of the flight: its path counts no more.
 
-        :param agent: its id.
-        :param hovers: its vehicle hovers where it was last known; otherwise nobody knows where it is, and distances
-            to it are left out until it is back.
+        :param hovers: its vehicle hovers where it was last known; otherwise its place is not known, and distances to
+            it are left out until it is back.
         """
         if not hovers:
             self._last = self._last.copy()
@@ -137,12 +135,7 @@ class FlightMetrics:
         self._sums.drop(agent - 1)
 
     def regain(self, agent: int) -> None:
-        """An agent that fell out takes part again: it flies, and has to arrive.
-
-        Its way stays unknown, and its state stays out of the ages.
-
-        :param agent: its id.
-        """
+        """Count an agent again that fell out: it has to arrive; its path stays unknown, its state out of the ages."""
         self.lost.discard(agent)
         self._wakings.gone[agent - 1] = 0
         self.awaited.discard(agent)

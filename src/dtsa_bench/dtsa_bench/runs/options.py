@@ -23,10 +23,7 @@ _TITLES = {"swarm": "the swarm", "channel": "the radio channel", "limits": "the 
 
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Adds an option for every setting of a run, and `--channel FILE` for what does not fit into one option.
-
-    :param parser: the command's parser.
-    """
+    """Adds an option for every setting of a run, and `--channel FILE` for what does not fit into one option."""
     for section, cls, derived in _SECTIONS:
         groups: dict[str, Any] = {}
         for setting in settings_of(cls):
@@ -44,11 +41,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_mode_options(parser: argparse.ArgumentParser) -> Any:
-    """Adds the options of flights in real time.
-
-    :param parser: the command's parser.
-    :returns: their group, for further options.
-    """
+    """Adds the options of flights in real time; returns their group, for further options."""
     group = parser.add_argument_group("real time")
     add_options(group, RunConfig, "run")
     add_options(group, ClockConfig, "clocks", "clock-", skip=("seed",))
@@ -58,8 +51,6 @@ def add_mode_options(parser: argparse.ArgumentParser) -> Any:
 def add_options(group: Any, cls: type[Settings], section: str, prefix: str = "", skip: Iterable[str] = ()) -> None:
     """Adds an option for every setting of a settings class that fits into one.
 
-    :param group: parser, or group of its options.
-    :param cls: the settings class.
     :param section: what :func:`given` calls these options.
     :param prefix: stands before the setting's name in the option's.
     :param skip: settings that become no option.
@@ -78,9 +69,6 @@ def _offer(group: Any, setting: Setting, section: str, prefix: str, skip: tuple[
 def given(args: argparse.Namespace, cls: type[Settings], section: str) -> dict[str, Any]:
     """The values of those options of :func:`add_options` that were given, by name.
 
-    :param args: parsed options.
-    :param cls: the settings class.
-    :param section: as for :func:`add_options`.
     :raises ConfigError: for a text that is no value of its setting's kind.
     """
     found = {}
@@ -112,10 +100,8 @@ def _shown(value: object) -> str:
 
 
 def run_config(args: argparse.Namespace, **fixed: Any) -> RunConfig:
-    """The run that the options describe.
+    """The run that the options describe; fixed settings of the swarm win over them.
 
-    :param args: parsed options.
-    :param fixed: settings of the swarm that win over the options.
     :raises ConfigError: naming the option, the value and what is allowed.
     """
     values = {section: given(args, cls, section) for section, cls, _ in _SECTIONS}
@@ -149,7 +135,6 @@ def number(text: str, name: str, minimum: float, maximum: float, unit: str = "s"
 def processes(text: str | None) -> int | None:
     """The number of processes that an option says; None: one a core.
 
-    :param text: what was given to the option; None: nothing.
     :raises ConfigError: if it is no such number.
     """
     return None if text is None else whole_number(text, "jobs", 1, 1024)
@@ -158,7 +143,6 @@ def processes(text: str | None) -> int | None:
 def named_values(words: Iterable[str]) -> dict[str, Any]:
     """What `--set NAME=VALUE` says, by name, with underscores; values are YAML.
 
-    :param words: all that were given.
     :raises ConfigError: for one that is none.
     """
     import yaml

@@ -11,13 +11,7 @@ def end_process(
     patience_s: float,
     ask: signal.Signals = signal.SIGINT,
 ) -> bool:
-    """Asks a process to end, as Ctrl-C does if nothing else is wanted, and kills it if it does not.
-
-    :param process: the process; may have ended already.
-    :param patience_s: s.
-    :param ask: the signal.
-    :returns: whether it has ended by itself.
-    """
+    """Ask a process to end and kill it if it does not in time; return whether it has ended by itself."""
     if process.poll() is None:
         process.send_signal(ask)
     try:

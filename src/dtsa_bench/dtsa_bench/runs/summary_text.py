@@ -12,18 +12,12 @@ from .metrics import COMPLETED, CRASHED
 
 
 def describe(summary: Mapping[str, Any]) -> str:
-    """A summary in a few lines.
-
-    :param summary: plain values by key.
-    """
+    """A summary in a few lines."""
     return "".join(f"{name:25}{text}\n" for name, text in result_rows(summary))
 
 
 def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """All results as rows of name and text.
-
-    :param summary: plain values by key.
-    """
+    """All results as rows of name and text."""
     rows = []
     for key, value in summary.items():
         if isinstance(value, dict):
@@ -37,10 +31,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def setting_rows(run: RunConfig) -> list[tuple[str, str]]:
-    """All settings of a run as rows of name and text, those of swarm, channel and limits one after the other.
-
-    :param run: the run.
-    """
+    """All settings of a run as rows of name and text, those of swarm, channel and limits one after the other."""
     sections: tuple[tuple[str, Settings], ...] = (("swarm", run.swarm), ("channel", run.air), ("limits", run.limits))
     return [
         (f"{section}.{spec.name}", _with_unit(getattr(settings, spec.name), spec.unit))
@@ -50,10 +41,7 @@ def setting_rows(run: RunConfig) -> list[tuple[str, str]]:
 
 
 def what_flew(run: RunConfig) -> str:
-    """A run in one line: its policy, estimator, avoider, agents, what they do, and the seed.
-
-    :param run: the run.
-    """
+    """A run in one line: its policy, estimator, avoider, agents, what they do, and the seed."""
     swarm = run.swarm
     moving = "all" if swarm.movers == swarm.agents else str(swarm.movers)
     return (
@@ -63,11 +51,7 @@ def what_flew(run: RunConfig) -> str:
 
 
 def what_came_of_it(summary: Mapping[str, Any], run: RunConfig) -> list[tuple[str, str]]:
-    """The results that are asked for first, as rows of name and text; what is not known is left out.
-
-    :param summary: plain values by key.
-    :param run: the run.
-    """
+    """The results that are asked for first, as rows of name and text; what is not known is left out."""
     known = {name: value for name, value in summary.items() if value is not None}
     rows = [("outcome", _outcome(known))]
     for name, key in (("ages", "age"), ("from waking", "waking_age")):

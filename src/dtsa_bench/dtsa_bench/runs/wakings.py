@@ -44,18 +44,11 @@ class Wakings:
         return None if self._course is None else self._course.final
 
     def begin(self, slot: int) -> None:
-        """The first slot that is counted: who flies already counts as woken in it.
-
-        :param slot: its number.
-        """
+        """Start to count at a slot: an agent that flies already counts as woken in it."""
         self.woken[self.woken >= 0] = np.maximum(self.woken[self.woken >= 0], slot)
 
     def follow(self, slot: int, position: NDArray[np.float64]) -> None:
-        """A slot begins: some get a goal.
-
-        :param slot: its number.
-        :param position: (3, N) m, frame map: where all are.
-        """
+        """Note the agents that get a goal as a slot begins; positions are (3, N) m in frame map."""
         course, plan = self._course, self._plan
         if course is None or plan is None or not course.advance(slot, position):
             return
@@ -69,12 +62,7 @@ class Wakings:
         self.count += int(who.sum())
 
     def summary(self, sums: dict[str, Any], slots: int, slot_ms: float) -> dict[str, Any]:
-        """The results as plain values; None where nobody got a goal.
-
-        :param sums: of the flight.
-        :param slots: number of slots flown.
-        :param slot_ms: ms, length of a slot.
-        """
+        """Return the results of a flight of so many slots as plain values; None where no agent got a goal."""
         news = sums["waking_count"]
         waiting = slots - self.woken[(self.woken >= 0) & (self.heard == 0)]  # at least so long
         delays = np.sort(np.concatenate((np.repeat(np.arange(DELAYS), self.delays), waiting)))
