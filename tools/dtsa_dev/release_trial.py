@@ -16,7 +16,7 @@ import numpy as np
 import dtsa
 from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.commands.cli import main
-from dtsa_bench.experiments.sweep.spec import run_config
+from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.simulation.simulate import simulate
 
 SWEEP = "title: t\ntext: t\nbase: {agents: 6, timeout_s: 5}\naxes: {policy: [tdma, dtsa], loss: [0.0, 0.1]}\nseeds: 2\n"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import REASONS
 from dtsa_bench.drawing.card import as_html, as_text
-from dtsa_bench.experiments.sweep.spec import run_config as _run_config
+from dtsa_bench.experiments.sweep import run_config as _run_config
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.runs.metrics import CRASHED
 from dtsa_bench.runs.summary_text import result_rows, setting_rows, what_came_of_it, what_flew

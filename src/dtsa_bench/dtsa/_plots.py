@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.drawing.flight_paths import paint
 from dtsa_bench.drawing.style import QUIET, colours, panels, style
-from dtsa_bench.experiments.figures import charts
-from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES
+from dtsa_bench.experiments import charts
+from dtsa_bench.experiments.tables import CRASHED, MEASURES
 
 from ._flight import Flight
 from ._recording import Recording

@@ -10,15 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.drawing.card import as_html, as_text
-from dtsa_bench.experiments.batch.journal import Journal
-from dtsa_bench.experiments.batch.pool import run_all
-from dtsa_bench.experiments.sweep.aggregate import Table, collected, write_table
-from dtsa_bench.experiments.sweep.columns import COMMON, VALUES
-from dtsa_bench.experiments.sweep.spec import Sweep, load_preset, make_sweep
-from dtsa_bench.experiments.sweep.text import table_html, table_text
-from dtsa_bench.experiments.sweep.work import work_of
+from dtsa_bench.experiments.batch import Journal, run_all
+from dtsa_bench.experiments.provenance import code_digest
+from dtsa_bench.experiments.sweep import Sweep, load_preset, make_sweep
+from dtsa_bench.experiments.tables import SweepTable, table_html, table_text, write_results
 
-from ._frames import data_frame
 from ._plugins import registered
 
 if TYPE_CHECKING:
@@ -37,7 +33,7 @@ class SweepResult:
     axes: tuple[str, ...]
     out: Path | None  # directory in which results.csv and results.json are; None: nothing was written
     command: str  # the call that makes it again
-    _table: Table
+    _table: SweepTable
     _code: str
 
     def __repr__(self) -> str:
@@ -52,7 +48,7 @@ class SweepResult:
     def _title(self) -> str:
         sweep = self._table.sweep
         seeds = f"{len(sweep.seeds)} seeds" if len(sweep.seeds) > 1 else "1 seed"
-        return f"Sweep {self.name}: {self._table.runs} flights, {len(sweep.cells)} settings, {seeds}"
+        return f"Sweep {self.name}: {len(self._table.rows)} flights, {len(sweep.cells)} settings, {seeds}"
 
     def _rows(self) -> list[tuple[str, str]]:
         base = ", ".join(f"{name} {value}" for name, value in self._table.sweep.spec.base.items())
@@ -76,12 +72,8 @@ class SweepResult:
         return [place / name for name in write_paper(self._table, place, figures, self._code, self.command)]
 
     def runs(self) -> pd.DataFrame:
-        """A row a flight: the axes, seed, status, reason, collided, and its results with their units in the names.
-
-        :raises ConfigError: if pandas is missing.
-        """
-        columns = [*self.axes, *COMMON, *VALUES]
-        return data_frame({name: [row[name] for row in self._table.rows] for name in columns})
+        """A row a flight: the axes, seed, status, reason, collided, and its results with their units in the names."""
+        return self._table.runs_frame()
 
     def table(self) -> pd.DataFrame:
         """A row a combination of the axes: the axes, how the flights ended, and means with their 95 % intervals.
@@ -89,12 +81,8 @@ class SweepResult:
         `runs`, `failed` and `timed_out` count flights; `crashed` is the share of those flown, with Wilson's interval in
         `crashed_low` and `crashed_high`. A measure has `<name>`, `<name>_low` and `<name>_high` (bootstrap over the
         seeds), and `<name>_count`: distances, efficiencies and times are those of completed flights without a crash.
-
-        :raises ConfigError: if pandas is missing.
         """
-        rows = [group.flat() for group in self._table.groups]
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        return data_frame({name: [row[name] for row in rows] for name in names})
+        return self._table.groups_frame()
 
 
 def _refuse_registered(plan: Sweep, field: str, value: object) -> None:
@@ -158,12 +146,11 @@ def sweep(
         if progress is not None:
             progress(runs)
 
-    work = work_of(plan)
-    if out is None:
-        table = Table(plan, collected(plan, run_all(plan, work, jobs=jobs, progress=advance)))
+    code, place = code_digest(plan.batch.plug_ins), None if out is None else Path(out)
+    if place is None:
+        table = SweepTable(plan, run_all(plan.batch, jobs=jobs, advance=advance))
     else:
-        with closing(Journal(Path(out), plan, work.code())) as journal:
-            table = Table(plan, collected(plan, run_all(plan, work, journal, jobs=jobs, progress=advance)))
-        write_table(Path(out), table, work.code())
-    place = None if out is None else Path(out)
-    return SweepResult(plan.name, plan.axes, place, f"dtsa.sweep({said})", table, work.code())
+        with closing(Journal(place, plan.batch)) as journal:
+            table = SweepTable(plan, run_all(plan.batch, journal, jobs=jobs, advance=advance))
+        write_results(place, table, code)
+    return SweepResult(plan.name, plan.axes, place, f"dtsa.sweep({said})", table, code)

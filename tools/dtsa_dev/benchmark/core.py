@@ -25,7 +25,7 @@ from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.frame import Frame, decode_frame, encode_frame
 from dtsa_agent.core.kernel import lib, memory
 from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS
-from dtsa_bench.experiments.sweep.spec import run_config
+from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.simulation.simulate import simulate
 
 from . import Row

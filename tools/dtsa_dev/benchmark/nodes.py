@@ -24,7 +24,7 @@ from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Loop, Stop
 from dtsa_agent.ros.common.process.node_process import init_ros, node_options, run_node
-from dtsa_bench.experiments.sweep.spec import run_config
+from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.flights.flight import fly, run_environment

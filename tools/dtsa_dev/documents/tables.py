@@ -202,28 +202,25 @@ def _records() -> str:
 
 def _league() -> str:
     """The tables of league 1: all scores, ages by cell, and what each entry sets."""
-    from dtsa_bench.experiments.league.cells import league
-    from dtsa_bench.experiments.league.entry import read_entry
-    from dtsa_bench.experiments.league.table import HEADS, LeagueTable
+    from dtsa_bench.experiments.league import HEADS, LeagueTable, league, read_entries
 
-    entries = [read_entry(path) for path in sorted((EVIDENCE / "league-1").glob("*.json"))]
-    scores = LeagueTable(league(entries[0]["league"]), entries)
+    scores = LeagueTable(league(), read_entries(EVIDENCE / "league-1.json"))
     flown = [
         (
             entry["name"],
             ", ".join(f"`{key}: {value}`" for key, value in entry["scheme"].items()),
-            " ".join(str(entry["package"][key] or "") for key in ("distribution", "version")),
+            *(entry[key] for key in ("package", "commit", "date")),
         )
         for entry in scores.entries
     ]
-    flights = sum(entry["summary"]["flights"] for entry in entries)
+    flights = sum(found.lost.total for found in scores.scores)
     return "\n".join([
-        f"{len(entries)} entries, {flights:,} flights. 95 % intervals in brackets.\n",
+        f"{len(flown)} entries, {flights:,} flights ([all of them](league-1.json)). 95 % intervals in brackets.\n",
         table(HEADS, scores.lines()),
         "Age in each cell, ms; in brackets the lost flights, if any:\n",
         table(("scheme", *scores.cells), scores.cell_lines()),
-        table(("cell", "what it is"), [[cell.name, cell.text] for cell in scores.league.cells]),
-        table(("entry", "sets", "package"), flown),
+        table(("cell", "what it is"), [[name, cell["text"]] for name, cell in scores.league.cells.items()]),
+        table(("entry", "sets", "package", "commit", "flown"), flown),
     ])  # fmt: skip
 
 

@@ -47,7 +47,7 @@ class OneLineParser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does; an option that there is not is named before one that is missing."""
         known = self._option_string_actions
-        for word in () if self.commands else args or ():
+        for word in () if self._subparsers else args or ():
             option = word.partition("=")[0]
             if option.startswith("--") and option not in (*known, "--"):
                 self.error(f"option {word}: unknown{hint(option, known)}")

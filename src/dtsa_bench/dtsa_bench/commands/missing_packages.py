@@ -16,7 +16,7 @@ _HOW = {
     ),
     **dict.fromkeys(("serial", "cobs"), "pip install pyserial cobs"),
     "yaml": "apt install python3-yaml, or pip install pyyaml",
-    **dict.fromkeys(("numpy", "scipy", "matplotlib", "rich", "joblib"), "apt install python3-{0}, or pip install {0}"),
+    **dict.fromkeys(("numpy", "scipy", "matplotlib", "rich"), "apt install python3-{0}, or pip install {0}"),
 }
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dtsa_bench.runs.program import program
 
 if TYPE_CHECKING:
-    from dtsa_bench.experiments.sweep.spec import Sweep
+    from dtsa_bench.experiments.sweep import Sweep
 
 DESCRIPTION = """\
 Flies every combination of a sweep's axes with every seed, without ROS, on all cores or on a Dask cluster, and
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fly what is missing, then sum up."""
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.experiments.sweep import spec
+    from dtsa_bench.experiments import sweep as spec
 
     if args.list:
         for name in spec.preset_names():
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _sweeps(args: argparse.Namespace) -> list[Sweep]:
     from dtsa_agent.core.errors import ConfigError
-    from dtsa_bench.experiments.sweep import spec
+    from dtsa_bench.experiments import sweep as spec
     from dtsa_bench.runs.options import named_values, whole_number
 
     changes = {
@@ -102,42 +102,31 @@ def _sweeps(args: argparse.Namespace) -> list[Sweep]:
 
 
 def _one(sweep: Sweep, directory: Path, args: argparse.Namespace) -> int:
-    from dtsa_bench.experiments.batch.progress import run_batch
-    from dtsa_bench.experiments.sweep.aggregate import Table, collected, write_table
-    from dtsa_bench.experiments.sweep.text import claims_text, table_text
-    from dtsa_bench.experiments.sweep.work import work_of
+    from dtsa_bench.experiments.batch import FAILED, run_in
+    from dtsa_bench.experiments.provenance import code_digest
+    from dtsa_bench.experiments.tables import SweepTable, table_text, write_results
     from dtsa_bench.runs.options import processes
 
-    begun, work = time.monotonic(), work_of(sweep)
-    rows = collected(sweep, run_batch(sweep, work, directory, jobs=processes(args.jobs), cluster=args.cluster))
-    table = Table(sweep, rows)
-    write_table(directory, table, work.code())
+    begun, code, say = time.monotonic(), code_digest(sweep.batch.plug_ins), (lambda _: None) if args.json else print
+    table = SweepTable(sweep, run_in(directory, sweep.batch, jobs=processes(args.jobs), cluster=args.cluster))
+    write_results(directory, table, code)
     flown = time.monotonic() - begun
-    if args.json:
-        print((directory / "results.json").read_text(encoding="utf-8"), end="")
-    else:
-        print(table_text(table, shutil.get_terminal_size((0, 0)).columns))
-        if claims := claims_text(table):
-            print(f"\n{claims}\n")
     command = f"{program()} {shlex.join(sys.argv[1:])}"
+    say(table_text(table, shutil.get_terminal_size((0, 0)).columns))
     if args.paper:
         from dtsa_bench.experiments.paper import write_paper
 
-        files = write_paper(table, directory / "paper", args.paper, work.code(), command)
-        if not args.json:
-            print(f"paper: {directory / 'paper'}: {', '.join(files)}")
+        files = write_paper(table, directory / "paper", args.paper, code, command)
+        say(f"paper: {directory / 'paper'}: {', '.join(files)}")
     if not args.no_report:
         from dtsa_bench.pages.report.tables import write_report
 
-        path = write_report(table, directory, work.code(), command)
-        if not args.json:
-            print(f"report: {path}")
-    if not args.json:
-        print(f"{sweep.name}: {len(rows)} runs in {flown:.1f} s, {time.monotonic() - begun:.1f} s with the report")
-    failed = sum(row["status"] == "failed" for row in rows)
-    if failed:
-        print(
-            f"dtsa: {failed} runs failed: {next(row['reason'] for row in rows if row['status'] == 'failed')}",
-            file=sys.stderr,
-        )
-    return 1 if failed else 0
+        say(f"report: {write_report(table, directory, code, command)}")
+    seconds = f"{flown:.1f} s, {time.monotonic() - begun:.1f} s with the report"
+    say(f"{sweep.name}: {len(table.rows)} runs in {seconds}")
+    if args.json:
+        print((directory / "results.json").read_text(encoding="utf-8"), end="")
+    reasons = [row["reason"] for row in table.rows if row["status"] == FAILED]
+    if reasons:
+        print(f"dtsa: {len(reasons)} runs failed: {reasons[0]}", file=sys.stderr)
+    return 1 if reasons else 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,38 +13,30 @@ import numpy as np
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench import __version__
 from dtsa_bench.drawing.style import save_described
-from dtsa_bench.experiments.batch.made_with import made_with
-from dtsa_bench.experiments.batch.table import write_results, write_whole
-from dtsa_bench.experiments.figures.drawn import draw
-from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES, Table
-from dtsa_bench.experiments.sweep.latex import latex_table
-from dtsa_bench.experiments.sweep.spec import Sweep
+
+from .batch import write_whole
+from .charts import draw
+from .provenance import made_with
+from .sweep import Sweep
+from .tables import CRASHED, MEASURES, SweepTable, latex_table
 
 FORMATS = ("pdf", "svg", "png")
 
 
 def check_format(form: str) -> None:
-    """Raises ConfigError unless figures can be written in this format.
-
-    :param form: one of `FORMATS`.
-    :raises ConfigError: for another one.
-    """
+    """Raise ConfigError unless figures can be written in this format."""
     if form not in FORMATS:
         raise ConfigError("paper", form, ", ".join(FORMATS))
 
 
-def write_paper(table: Table, directory: Path, form: str, code: str, command: str) -> list[str]:
-    """Writes figures, `table.tex` (booktabs), `table.csv` (a row a group) and `table.json` (how all was made).
+def write_paper(table: SweepTable, directory: Path, form: str, code: str, command: str) -> list[str]:
+    """Write figures, `table.tex` (booktabs), `table.csv` (a row a group) and `table.json` (how all was made).
 
     Figures and the LaTeX table hold how they were made in themselves; a CSV file has no place for it that all readers
-    skip.
+    skip. Return the names of the files.
 
-    :param table: the sweep's groups.
-    :param directory: where; made if needed.
-    :param form: of the figures, one of `FORMATS`.
     :param code: digest of the code that flew.
     :param command: how the sweep was started.
-    :returns: names of the files.
     :raises ConfigError: for another format, or a directory that cannot be made.
     """
     check_format(form)
@@ -52,28 +45,30 @@ def write_paper(table: Table, directory: Path, form: str, code: str, command: st
     except OSError as error:
         raise ConfigError("out", str(directory), f"a directory that can be made ({error.strerror})") from error
     sweep, origin = table.sweep, _origin(table, code, command)
-    said = [f"{name}: {text}" for name, text in origin.items()]
+    comments = [f"{name}: {text}" for name, text in origin.items()]
     names = []
     for spec in _figures(sweep):
         path = directory / f"{spec['name']}.{form}"
         title = f"{sweep.title}: {spec['name']}"
-        save_described(draw(table, spec), path, title, "; ".join(said), f"dtsa {__version__}")
+        save_described(draw(table, spec), path, title, "; ".join(comments), f"dtsa {__version__}")
         names.append(path.name)
-    known = {name for name in MEASURES if any(group.mean(name).count for group in table.groups)} | {CRASHED}
-    measures = [name for name in _measures(sweep) if name in known]
-    write_whole(directory / "table.tex", latex_table(table, measures, said))
-    rows = [group.flat() for group in table.groups if group.rows]
-    content = {**origin, "seeds": list(sweep.seeds), "settings": sweep.source}
-    write_results(directory, "table", list(dict.fromkeys(name for row in rows for name in row)), rows, content)
+    # Crashes, ages, and what the sweep's figures show; of a sweep without figures, distances.
+    shown = [name for spec in sweep.figures for name in spec.get("y", ())] or ["min_distance_m"]
+    measures = table.known([name for name in dict.fromkeys(("age_mean_slots", *shown)) if name in MEASURES])
+    write_whole(directory / "table.tex", latex_table(table, [CRASHED, *measures], comments))
+    frame = table.groups_frame()
+    write_whole(directory / "table.csv", frame[frame["runs"] > 0].to_csv(index=False, na_rep="nan"))
+    content = {**origin, "seeds": list(sweep.seeds), "settings": sweep.spec.to_dict()}
+    write_whole(directory / "table.json", json.dumps(content, indent=1, default=str) + "\n")
     return [*names, "table.tex", "table.csv", "table.json"]
 
 
-def _origin(table: Table, code: str, command: str) -> dict[str, str]:
+def _origin(table: SweepTable, code: str, command: str) -> dict[str, str]:
     """How it was made, by name."""
     sweep, made = table.sweep, made_with()
     changed = ", with changes" if made["tree_changed"] else ""
     return {
-        "sweep": f"{sweep.name}, {table.runs} flights, {len(sweep.cells)} settings",
+        "sweep": f"{sweep.name}, {len(table.rows)} flights, {len(sweep.cells)} settings",
         "command": command,
         "seeds": seeds_text(sweep.seeds),
         "written": str(made["date"]),
@@ -85,10 +80,7 @@ def _origin(table: Table, code: str, command: str) -> dict[str, str]:
 
 
 def seeds_text(seeds: Sequence[int]) -> str:
-    """Seeds in words: from the first to the last where none is left out.
-
-    :param seeds: the seeds.
-    """
+    """Return seeds in words: from the first to the last where none is left out."""
     if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[0] + len(seeds))):
         return f"{seeds[0]} to {seeds[-1]}"
     return ", ".join(map(str, seeds))
@@ -109,9 +101,3 @@ def _figures(sweep: Sweep) -> Sequence[Mapping[str, Any]]:
 
 def _numbers(levels: Sequence[object]) -> bool:
     return len(set(levels)) > 1 and all(isinstance(n, (int, float)) and not isinstance(n, bool) for n in levels)
-
-
-def _measures(sweep: Sweep) -> list[str]:
-    """Crashes, ages, and what the sweep's figures show; of a sweep without figures, distances."""
-    shown = [name for spec in sweep.figures for name in spec.get("y", ())] or ["min_distance_m"]
-    return list(dict.fromkeys((CRASHED, "age_mean_slots", *shown)))

@@ -1,7 +1,4 @@
-"""Intervals for what a sweep measured:
-
-shares with Wilson, means with a seeded bootstrap. See docs/reference/metrics.md.
-"""
+"""Intervals for what a sweep measured: Wilson for shares, a seeded bootstrap for means (docs/reference/metrics.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
 LEVEL = 0.95  # of every interval in reports, unless said otherwise
 RESAMPLES = 4000
@@ -47,9 +43,8 @@ class Mean:
 
 
 def median_interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, float]:
-    """Two of the values between which the true median lies, whatever the distribution (sign test).
+    """Return two of the values between which the true median lies, whatever the distribution (sign test).
 
-    :param values: (n,) independent values of any one unit.
     :param level: probability that it does, at least; with fewer than six values it is less than 0.95.
     :raises ValueError: without values.
     """
@@ -63,11 +58,8 @@ def median_interval(values: Sequence[float], level: float = LEVEL) -> tuple[floa
 
 
 def wilson(count: int, total: int, level: float = LEVEL) -> Share:
-    """The share k / n with the interval of Wilson (1927), which stays honest at 0 of n and n of n.
+    """Return the share count / total with the interval of Wilson (1927), which stays honest at 0 of n and n of n.
 
-    :param count: k, how many runs did it.
-    :param total: n, how many runs there were.
-    :param level: probability that the interval holds the true share.
     :raises ValueError: unless 0 <= k <= n and 0 < level < 1.
     """
     if not 0 <= count <= total:
@@ -87,44 +79,15 @@ def wilson(count: int, total: int, level: float = LEVEL) -> Share:
 
 
 def bootstrap_mean(values: Iterable[float], level: float = LEVEL, resamples: int = RESAMPLES) -> Mean:
-    """The mean with a percentile bootstrap interval. The resampling is seeded: equal values, equal interval.
-
-    :param values: (n,) one value a run, of any one unit; those that are not finite are left out.
-    :param level: probability of the interval.
-    :param resamples: number of resamples.
-    """
-    data = _finite(values)
+    """Return the mean of the finite values with a percentile bootstrap interval; equal values give equal intervals."""
+    data = np.asarray(list(values), dtype=np.float64)
+    data = data[np.isfinite(data)]
     if not len(data):
         return Mean(math.nan, math.nan, math.nan, 0)
     mean = float(data.mean())
     if len(data) == 1:
         return Mean(mean, mean, mean, 1)
-    means = _resampled_means(data, resamples)
+    random = np.random.Generator(np.random.PCG64(_SEED))
+    means = data[random.integers(0, len(data), (resamples, len(data)))].mean(axis=1)
     low, high = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
     return Mean(mean, float(low), float(high), len(data))
-
-
-def paired_difference(first: Sequence[float], second: Sequence[float], level: float = LEVEL) -> Mean:
-    """Mean of ``second - first`` over pairs, with a bootstrap interval over the pairs.
-
-    Two schemes that flew the same seeds flew the same scenarios: their difference is known far better than
-    each mean.
-
-    :param first: values of one scheme, one a seed.
-    :param second: values of the other, in the same order; a pair counts where both are finite.
-    :param level: probability of the interval.
-    :raises ValueError: if the lengths differ.
-    """
-    if len(first) != len(second):
-        raise ValueError(f"pairs: got {len(first)} and {len(second)} values; allowed: as many of each")
-    return bootstrap_mean(np.asarray(second, dtype=float) - np.asarray(first, dtype=float), level)
-
-
-def _finite(values: Iterable[float]) -> NDArray[np.float64]:
-    data = np.asarray(list(values), dtype=np.float64)
-    return data[np.isfinite(data)]
-
-
-def _resampled_means(data: NDArray[np.float64], resamples: int) -> NDArray[np.float64]:
-    random = np.random.Generator(np.random.PCG64(_SEED))
-    return np.asarray(data[random.integers(0, len(data), (resamples, len(data)))].mean(axis=1))

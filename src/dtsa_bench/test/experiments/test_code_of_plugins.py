@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from dtsa_agent.core.registry import POLICIES
-from dtsa_bench.experiments.batch import code
+from dtsa_bench.experiments import provenance
 
 RULE = """
 from {helper} import turn
@@ -60,9 +59,8 @@ def sweep(directory: Path, policy: str = "mine") -> tuple[str, list[float], str]
     command = [sys.executable, "-m", "dtsa_bench", *words]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert ended.returncode == 0, ended.stderr
-    rows = [json.loads(line) for line in (directory / "runs" / "runs.jsonl").read_text().splitlines()]
-    ages = [row["summary"]["age_mean_slots"] for row in rows]
-    return ended.stderr, ages, json.loads((directory / "runs" / "sweep.json").read_text())["code"]
+    content = json.loads((directory / "runs" / "results.json").read_text())
+    return ended.stderr, [row["age_mean_slots"] for row in content["runs"]], content["code"]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -74,9 +72,8 @@ def test_a_plug_in_that_has_changed_between_two_sweeps_flies_again(layout: str, 
     assert again == first
     helper.write_text(SLOWER)
     said, changed, _ = sweep(tmp_path)
-    assert "2 runs of other code are put aside and done again" in said
+    assert "2 runs of other code are left aside" in said
     assert all(new > old for new, old in zip(changed, first, strict=True))
-    assert len(list((tmp_path / "runs").glob("runs-of-code-*.jsonl"))) == 1
 
 
 def test_a_plug_in_that_does_not_fly_does_not_count(tmp_path: Path) -> None:
@@ -87,45 +84,20 @@ def test_a_plug_in_that_does_not_fly_does_not_count(tmp_path: Path) -> None:
 
 
 def test_versions_of_python_and_numpy_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    digests = {code.code_digest()}
-    monkeypatch.setattr(code.np, "__version__", "0.0")
-    digests.add(code.code_digest())
-    monkeypatch.setattr(code.platform, "python_version", lambda: "3.0.0")
-    digests.add(code.code_digest())
+    digest = provenance.code_digest.__wrapped__
+    digests = {digest()}
+    monkeypatch.setattr(provenance.np, "__version__", "0.0")
+    digests.add(digest())
+    monkeypatch.setattr(provenance.platform, "python_version", lambda: "3.0.0")
+    digests.add(digest())
     assert len(digests) == 3
 
 
 def test_data_and_the_compiled_kernel_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     package = tmp_path / "counted_package"
-    package.mkdir()
-    seen = set()
-    for name in ("__init__.py", "weights.npz", "_kernel.abi3.so"):
-        (package / name).write_text("")
-        code._content_of.cache_clear()
-        seen.add(code._content_of("counted_package", None))
-    assert len(seen) == 3
-    (package / "__pycache__").mkdir()
-    (package / "__pycache__" / "x.pyc").write_text("")
-    (package / ".swap").write_text("")
-    code._content_of.cache_clear()
-    assert code._content_of("counted_package", None) in seen
-    code._content_of.cache_clear()
-
-
-def test_a_plug_in_that_a_notebook_registers_is_known_by_its_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has no file: as in a script that is not a module, `__main__` has no specification."""
-    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None, raising=False)
-    monkeypatch.setattr(POLICIES, "_plug_ins", {})
-    monkeypatch.setattr(POLICIES, "registered", set())
-
-    def digest(period: int, shift: int) -> str:
-        names: dict[str, object] = {"__name__": "__main__"}
-        text = f"class Mine:\n    period = {period}\n    def __init__(self, config, agent):\n        pass\n"
-        text += f"    def choose(self, table, slot):\n        return (slot + {shift}) % self.period + 1\n"
-        exec(text, names)
-        POLICIES.register("mine", names["Mine"])
-        return code.code_digest(frozenset({("policy", "mine")}))
-
-    assert digest(6, 0) == digest(6, 0)
-    assert len({digest(6, 0), digest(6, 1), digest(7, 0)}) == 3
+    (package / "__pycache__").mkdir(parents=True)
+    counted = [package / name for name in ("__init__.py", "weights.npz", "_kernel.abi3.so")]
+    for path in (*counted, package / "__pycache__" / "x.pyc", package / ".swap"):
+        path.write_text("")
+    assert sorted(provenance._files_of("counted_package")) == sorted(counted)

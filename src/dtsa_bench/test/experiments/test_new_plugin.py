@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from dtsa_agent.core import ConfigError
+from dtsa_bench.experiments import sweep as spec
 from dtsa_bench.experiments.plugin_template import write_package
-from dtsa_bench.experiments.sweep import spec
 
 
 def test_the_package_installs_passes_its_test_and_flies(tmp_path: Path) -> None:
@@ -78,4 +78,4 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
 def test_the_league_can_be_flown() -> None:
     """Every scheme of the preset exists, and every cell is valid."""
     sweep = spec.load_preset("league", seeds=1)
-    assert len(list(sweep.tasks())) == 10 * 4 * 15
+    assert len(sweep.tasks) == 10 * 4 * 15

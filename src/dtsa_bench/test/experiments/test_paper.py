@@ -15,14 +15,11 @@ from PIL import Image
 
 import dtsa
 from dtsa_bench.commands.cli import main
-from dtsa_bench.experiments.batch import made_with
-from dtsa_bench.experiments.batch.pool import run_all
+from dtsa_bench.experiments import provenance
+from dtsa_bench.experiments.batch import run_all
 from dtsa_bench.experiments.paper import seeds_text
-from dtsa_bench.experiments.sweep.aggregate import MEASURES, Table, collected
-from dtsa_bench.experiments.sweep.latex import escaped
-from dtsa_bench.experiments.sweep.spec import make_sweep
-from dtsa_bench.experiments.sweep.text import SHOWN, table_html, table_text
-from dtsa_bench.experiments.sweep.work import work_of
+from dtsa_bench.experiments.sweep import make_sweep
+from dtsa_bench.experiments.tables import MEASURES, SHOWN, SweepTable, latex_text, table_html, table_text
 
 AXES = {"loss": [0.0, 0.2], "scheme": {"a_b & 100 %": {"policy": "tdma"}, "lease <b>": {"policy": "lease"}}}
 BASE = {"agents": 6, "timeout_s": 6.0}
@@ -34,9 +31,9 @@ def swept() -> dtsa.SweepResult:
 
 
 @pytest.fixture(scope="module")
-def table() -> Table:
+def table() -> SweepTable:
     plan = make_sweep({"axes": AXES, "base": BASE, "seeds": 3}, "small")
-    return Table(plan, collected(plan, run_all(plan, work_of(plan), jobs=1)))
+    return SweepTable(plan, run_all(plan.batch))
 
 
 def test_each_file_says_how_it_was_made(swept: dtsa.SweepResult, tmp_path: Path) -> None:
@@ -81,13 +78,13 @@ def test_the_csv_file_is_the_table(swept: dtsa.SweepResult, tmp_path: Path) -> N
 def test_the_latex_table_has_a_row_a_setting_and_special_signs(swept: dtsa.SweepResult, tmp_path: Path) -> None:
     swept.write_paper(tmp_path)
     text = (tmp_path / "table.tex").read_text()
-    rows = [line for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
+    rows = [line for line in text.splitlines() if line.endswith(r"\\") and "shortstack" not in line]
     assert len(rows) == 4
-    assert {len(re.findall(r"(?<!\\)&", row)) for row in rows} == {1 + 2 * 3}
-    assert rows[0].startswith(r"0.0 & a\_b \& 100 \% & 0/3 & {\footnotesize(0--56 \%)} & ")
+    assert {len(re.findall(r"(?<!\\)&", row)) for row in rows} == {1 + 3}
+    assert rows[0].startswith(r"0.0 & a\_b \& 100 \% & 0/3 {\footnotesize(0--56 \%)} & ")
     assert rows[1].startswith(r"0.0 & lease $<$b$>$ & ")
     assert text.count(r"\addlinespace") == 1
-    assert escaped("\\~^{x}#$|") == r"\textbackslash{}\textasciitilde{}\textasciicircum{}\{x\}\#\$$|$"
+    assert latex_text("\\~^{x}#$|") == r"\textbackslash{}\textasciitilde{}\textasciicircum{}\{x\}\#\$$|$"
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no LaTeX here")
@@ -103,7 +100,7 @@ def test_latex_compiles_the_table(swept: dtsa.SweepResult, tmp_path: Path) -> No
     assert "Overfull" not in done.stdout
 
 
-def test_the_terminal_shows_every_interval_whatever_its_width(table: Table) -> None:
+def test_the_terminal_shows_every_interval_whatever_its_width(table: SweepTable) -> None:
     wide = table_text(table)
     assert len(wide.splitlines()) == 5
     for width in (80, 120):
@@ -124,17 +121,17 @@ def test_the_terminal_shows_every_interval_whatever_its_width(table: Table) -> N
 
 def test_measures_that_no_flight_has_take_no_column() -> None:
     plan = make_sweep({"axes": {"loss": [0.0]}, "base": {**BASE, "timeout_s": 0.3}, "seeds": 2}, "short")
-    short = Table(plan, collected(plan, run_all(plan, work_of(plan), jobs=1)))
+    short = SweepTable(plan, run_all(plan.batch))
     assert "age slots" in table_text(short)
     assert "dist m" not in table_text(short)  # of completed flights alone
     assert set(SHOWN) <= set(MEASURES)
 
 
-def test_notebooks_show_a_table_with_a_line_for_each_interval(table: Table) -> None:
-    page = ElementTree.fromstring(table_html(table).replace("<table class=groups>", "<table>"))
-    assert len(page.findall("tr")) == 5
+def test_notebooks_show_a_table_with_a_line_for_each_interval(table: SweepTable) -> None:
+    page = ElementTree.fromstring(table_html(table))
+    assert len(page.findall(".//tr")) == 5
     assert len(page.findall(".//svg")) == 4 * (1 + len(SHOWN))
-    assert [cell.text for cell in page.findall("tr")[2].findall("td")[:2]] == ["0.0", "lease <b>"]
+    assert [cell.text for cell in page.findall(".//tr")[2].findall("td")[:2]] == ["0.0", "lease <b>"]
     assert "... 3 more settings" in table_html(table, most=1)
 
 
@@ -183,5 +180,5 @@ def test_the_commit_of_somebody_elses_repository_is_not_ours(tmp_path: Path, mon
     git = ["git", "-C", str(tmp_path), "-c", "user.name=x", "-c", "user.email=x@y"]
     for words in (["init", "-q"], ["add", "own.py"], ["commit", "-q", "-m", "own"]):
         subprocess.run([*git, *words], check=True)
-    monkeypatch.setattr(made_with, "_SOURCES", str(tmp_path))
-    assert made_with.made_with()["commit"] == "unknown"
+    monkeypatch.setattr(provenance, "_HERE", tmp_path)
+    assert provenance.made_with()["commit"] == "unknown"

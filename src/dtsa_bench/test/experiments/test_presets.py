@@ -1,4 +1,4 @@
-"""Integration: the sweeps that come with the package, and what their reports claim."""
+"""Integration: the sweeps that come with the package, and their reports."""
 
 from __future__ import annotations
 
@@ -6,16 +6,13 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from dtsa_agent.core.registry import POLICIES
 from dtsa_bench.commands import cli
-from dtsa_bench.experiments.sweep import spec
-from dtsa_bench.experiments.sweep.aggregate import Table, collected
-from dtsa_bench.experiments.sweep.claims import FAILS, HOLDS, OPEN, PARTLY, claims_of, clean_up_to
-from dtsa_bench.experiments.sweep.work import fly_one
+from dtsa_bench.experiments import sweep as spec
+from dtsa_bench.experiments.tables import SweepTable
 from dtsa_bench.pages.report.tables import write_report
 
 NAMED = (
@@ -31,30 +28,16 @@ VOCABULARIES = {
 }
 
 
-def flown(sweep: spec.Sweep) -> Table:
-    return Table(sweep, collected(sweep, {task.key: fly_one(task) for task in sweep.tasks()}))
-
-
-def invented(sweep: spec.Sweep, value: Any) -> Table:
-    """A table of results that a function of (labels, seed) makes up."""
-    rows = []
-    for index, cell in enumerate(sweep.cells):
-        for seed in sweep.seeds:
-            row = {
-                "cell": index,
-                "seed": seed,
-                "status": "completed",
-                "reason": "",
-                "collided": False,
-                "slots_total": 100,
-                "slots_success": 90,
-                **cell.labels,
-            }
-            row.update(value(cell.labels, seed))
-            if row["collided"]:
-                row["status"] = "crashed"
-            rows.append(row)
-    return Table(sweep, rows)
+def invented(sweep: spec.Sweep) -> SweepTable:
+    """A table of results that are made up."""
+    finished = {}
+    for task in sweep.tasks:
+        collided, slots = task.seed % 2 == 0, {"total": 100, "success": 90, "collision": 0, "idle": 10}
+        summary = {"collided": collided, "min_distance_m": 0.3 + 0.001 * (task.seed % 7), "efficiency_mean": 0.9,
+                   "completion_time_s": 5.0, "age_mean_slots": 4.0 + task.seed % 3, "estimate_error_mean_m": 0.01,
+                   "slots": slots}  # fmt: skip
+        finished[task.key] = {"status": "crashed" if collided else "completed", "reason": "", "summary": summary}
+    return SweepTable(sweep, finished)
 
 
 def test_all_presets_are_there_and_every_run_of_them_is_possible() -> None:
@@ -65,7 +48,7 @@ def test_all_presets_are_there_and_every_run_of_them_is_possible() -> None:
         assert min(sweep.seeds) >= 1001  # never those of tuning
         assert sweep.title
         assert sweep.figures
-        assert len({task.key for task in sweep.tasks()}) == len(sweep.cells) * len(sweep.seeds)
+        assert len({task.key for task in sweep.tasks}) == len(sweep.cells) * len(sweep.seeds)
         for cell in sweep.cells:
             cell.run(sweep.seeds[-1])
 
@@ -121,9 +104,9 @@ def test_the_papers_figures_have_its_settings() -> None:
 
 
 def test_the_genie_by_error_flies_where_access_decides() -> None:
-    plain, bounds = (spec.load_preset(name).source for name in ("access", "access-bounds"))
-    assert bounds["axes"]["swarm"] == plain["axes"]["swarm"]
-    assert bounds["base"] == plain["base"]
+    plain, bounds = (spec.load_preset(name).spec for name in ("access", "access-bounds"))
+    assert bounds.axes["swarm"] == plain.axes["swarm"]
+    assert bounds.base == plain.base
 
 
 @pytest.mark.parametrize("name", ["limits", "idle", "loss", "grid"])
@@ -143,67 +126,10 @@ def test_gossip_and_genies_fly_in_the_settings_of_the_preset_beside_which_they_s
     assert {cell.labels["scheme"] for cell in bounds.cells} == {"TDMA + gossip", "genie (age)", "genie (error)"}
 
 
-def test_the_published_ordering_appears_and_its_cause_is_named() -> None:
-    claims = claims_of(flown(spec.load_preset("paper-18", seeds=8)))
-    assert len(claims) == 9
-    distance = [claim for claim in claims if "minimum distance" in claim.paper]
-    assert [claim.verdict for claim in distance] == [HOLDS] * 3
-    assert all("gain is the extrapolation's" in claim.why for claim in distance)
-
-
-def test_verdicts_follow_the_intervals() -> None:
-    sweep = spec.load_preset("paper-12", seeds=6)
-    gains = {2: 0.1, 6: -0.1, 12: 0.0}
-
-    def value(labels: dict[str, Any], seed: int) -> dict[str, float]:
-        gain = gains[labels["moving"]] if labels["scheme"] == "DTSA, linear" else 0.0
-        noise = 0.01 * (-1) ** seed if labels["scheme"] == "TDMA, hold" else 0.0
-        return {"min_distance_m": 0.3 + gain + noise, "efficiency_mean": 0.9, "completion_time_s": 5.0 - gain}
-
-    claims = {claim.paper: claim for claim in claims_of(invented(sweep, value))}
-    verdicts = [c.verdict for paper, c in claims.items() if "minimum distance" in paper]
-    assert verdicts == [HOLDS, FAILS, OPEN]
-    times = [c.verdict for paper, c in claims.items() if "completion time" in paper]
-    assert times == [HOLDS, FAILS, OPEN]
-    scheduler = next(c for paper, c in claims.items() if paper.startswith("2 moving") and "minimum" in paper)
-    assert "This part is the scheduler's" in scheduler.why
-
-
-def test_limits_count_to_the_first_crash_and_say_how_many_crash() -> None:
-    sweep = spec.load_preset("limits", seeds=30)
-    last = {("TDMA, hold", 10): 18, ("DTSA, linear", 10): 60, ("TDMA, hold", 20): 8, ("DTSA, linear", 20): 24}
-
-    def value(labels: dict[str, Any], seed: int) -> dict[str, Any]:
-        limit = last.get((labels["scheme"], labels["slot_ms"]), 100)
-        agents = labels["agents"]
-        share = 2 if limit == 60 else 15 if agents <= limit + 2 else 30
-        crashed = agents > limit and seed - 1001 < share
-        return {"collided": crashed, "min_distance_m": 0.3, "efficiency_mean": 0.9, "completion_time_s": 5.0}
-
-    table = invented(sweep, value)
-    groups = {g.labels["agents"]: g for g in table.where(scheme="TDMA, hold", slot_ms=10)}
-    assert clean_up_to(groups) == 18
-    claims = {claim.paper: claim for claim in claims_of(table) if claim.paper}
-    assert [claim.verdict for claim in claims.values()] == [HOLDS, PARTLY, FAILS, FAILS]
-    first = claims["TDMA works up to 18 at 10 ms slots, and not beyond"]
-    assert first.measured == "TDMA, hold: no crash up to 18; crashed: 15/30 with 20, 30/30 with 22"
-    assert any(claim.measured == "10 ms: oracle: crashed: none of 30 each, up to 100" for claim in claims_of(table))
-
-
 @pytest.mark.parametrize("name", NAMED)
 def test_every_preset_ends_in_a_report_that_needs_no_network(name: str, tmp_path: Path) -> None:
-    def value(labels: dict[str, Any], seed: int) -> dict[str, Any]:
-        return {
-            "collided": seed % 2 == 0,
-            "min_distance_m": 0.3 + 0.001 * (seed % 7),
-            "efficiency_mean": 0.9,
-            "completion_time_s": 5.0,
-            "age_mean_slots": 4.0 + seed % 3,
-            "estimate_error_mean_m": 0.01,
-        }
-
     sweep = spec.load_preset(name, seeds=3)
-    path = write_report(invented(sweep, value), tmp_path, "code", "tools/dtsa sweep")
+    path = write_report(invented(sweep), tmp_path, "code", "tools/dtsa sweep")
     page = path.read_text(encoding="utf-8")
     assert page.count("<svg") == len(sweep.figures)
     # Names of XML vocabularies are no addresses that anything is loaded from.

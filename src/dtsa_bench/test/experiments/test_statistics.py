@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_bench.experiments.statistics import bootstrap_mean, median_interval, paired_difference, wilson
+from dtsa_bench.experiments.statistics import bootstrap_mean, median_interval, wilson
 
 
 @pytest.mark.parametrize(
@@ -65,15 +65,3 @@ def test_the_bootstrap_is_seeded_and_leaves_out_what_is_no_number() -> None:
     assert bootstrap_mean([]).count == 0
     assert math.isnan(bootstrap_mean([]).value)
     assert bootstrap_mean([3.0]).low == bootstrap_mean([3.0]).high == 3.0
-
-
-def test_pairs_tell_what_means_hide() -> None:
-    random = np.random.default_rng(2)
-    scenario = random.normal(10.0, 5.0, 30)
-    first, second = scenario, scenario + random.normal(0.3, 0.1, 30)
-    difference = paired_difference(first.tolist(), second.tolist())
-    assert 0.2 < difference.low < 0.3 < difference.high < 0.4
-    assert bootstrap_mean(first).high > bootstrap_mean(second).low
-    assert paired_difference([1.0, math.nan], [2.0, 5.0]).count == 1
-    with pytest.raises(ValueError, match="as many"):
-        paired_difference([1.0], [1.0, 2.0])

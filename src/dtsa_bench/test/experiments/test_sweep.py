@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,11 @@ import yaml
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_bench.commands.cli import main
 from dtsa_bench.drawing.style import INK
-from dtsa_bench.experiments.batch import cluster as dask
-from dtsa_bench.experiments.batch import journal, pool
-from dtsa_bench.experiments.batch.code import PROJECT
-from dtsa_bench.experiments.sweep import spec
-from dtsa_bench.experiments.sweep.aggregate import Table, collected
-from dtsa_bench.experiments.sweep.work import work_of
+from dtsa_bench.experiments import batch
+from dtsa_bench.experiments import sweep as spec
+from dtsa_bench.experiments.batch import Journal
+from dtsa_bench.experiments.provenance import PROJECT
+from dtsa_bench.experiments.tables import SweepTable
 
 CONTENT: dict[str, Any] = {
     "title": "small",
@@ -47,13 +46,13 @@ def stable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{key: value for key, value in row.items() if key != "wall_time_s"} for row in rows]
 
 
-def fly(directory: Path, plan: spec.Sweep, **options: Any) -> list[dict[str, Any]]:
-    work = work_of(plan)
-    book = journal.Journal(directory, plan, work.code())
-    try:
-        return collected(plan, pool.run_all(plan, work, book, **options))
-    finally:
-        book.close()
+def fly(directory: Path, plan: spec.Sweep, **options: Any) -> SweepTable:
+    with closing(Journal(directory, plan.batch)) as journal:
+        return SweepTable(plan, batch.run_all(plan.batch, journal, **options))
+
+
+def lines_of(directory: Path) -> list[str]:
+    return (directory / "runs.jsonl").read_text(encoding="utf-8").splitlines()
 
 
 def test_axes_are_combined_and_names_may_be_of_any_section() -> None:
@@ -110,26 +109,26 @@ def test_files_that_are_no_sweeps_are_refused(tmp_path: Path) -> None:
 
 def test_cores_change_nothing(tmp_path: Path) -> None:
     plan = sweep()
-    here, cores = fly(tmp_path / "a", plan), fly(tmp_path / "b", plan, jobs=2)
+    here, cores = fly(tmp_path / "a", plan).rows, fly(tmp_path / "b", plan, jobs=2).rows
     assert len(here) == 24
     assert stable(here) == stable(cores)
     assert [row["seed"] for row in here[:6]] == list(plan.seeds)
 
 
 def test_chunks_hold_every_run_once_and_keep_all_workers_busy() -> None:
-    tasks = list(sweep(axes={"agents": [4, 8, 60]}, seeds=30).tasks())
-    chunks = pool.chunks_of(tasks, 3)
+    tasks = sweep(axes={"agents": [4, 8, 60]}, seeds=30).tasks
+    chunks = batch.chunks_of(tasks, 3)
     assert [task for chunk in chunks for task in chunk] == tasks
     assert len(chunks) >= 12
     single = max(task.cost for task in tasks)
-    assert all(sum(task.cost for task in chunk) <= max(pool.CHUNK_COST, single) for chunk in chunks)
-    assert pool.chunks_of([], 2) == []
+    assert all(sum(task.cost for task in chunk) <= max(batch.CHUNK_COST, single) for chunk in chunks)
+    assert batch.chunks_of([], 2) == []
 
 
 def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = sweep()
-    whole = fly(tmp_path / "whole", plan)
-    monkeypatch.setattr(pool, "CHUNK_COST", 1.0)
+    whole = fly(tmp_path / "whole", plan).rows
+    monkeypatch.setattr(batch, "CHUNK_COST", 1.0)
 
     def stop(runs: int, cost: float) -> None:
         seen.append(runs)
@@ -138,54 +137,47 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.Mo
 
     seen: list[int] = []
     with pytest.raises(KeyboardInterrupt):
-        fly(tmp_path / "parts", plan, progress=stop)
-    path = tmp_path / "parts" / "runs.jsonl"
-    assert len(path.read_text().splitlines()) == 7
-    with path.open("a") as file:
+        fly(tmp_path / "parts", plan, advance=stop)
+    assert len(lines_of(tmp_path / "parts")) == 7
+    with (tmp_path / "parts" / "runs.jsonl").open("a") as file:
         file.write('{"key": "torn')  # a kill in the middle of a line
     flown: list[int] = []
-    again = fly(tmp_path / "parts", plan, progress=lambda runs, cost: flown.append(runs))
+    again = fly(tmp_path / "parts", plan, advance=lambda runs, cost: flown.append(runs)).rows
     assert sum(flown) == 24 - 7
     assert stable(again) == stable(whole)
     flown.clear()
-    assert fly(tmp_path / "parts", plan, progress=lambda runs, cost: flown.append(runs)) == again
+    assert fly(tmp_path / "parts", plan, advance=lambda runs, cost: flown.append(runs)).rows == again
     assert not flown
 
 
-def test_rows_of_other_code_and_of_other_sweeps_are_never_mixed_in(tmp_path: Path) -> None:
+def test_rows_of_other_code_and_of_other_sweeps_are_never_mixed_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plan = sweep(seeds=1)
-    fly(tmp_path, plan)
-    book = journal.Journal(tmp_path, plan, "other")
-    assert book.put_aside == 4
-    assert not book.rows()
-    assert list(tmp_path.glob("runs-of-code-*.jsonl"))
-    with pytest.raises(DtsaError, match="other"):
-        pool.run_all(plan, work_of(plan), book)
-    book.close()
+    whole = stable(fly(tmp_path, plan).rows)
+    with monkeypatch.context() as patched:
+        patched.setattr(batch, "code_digest", lambda plug_ins: "other")
+        with closing(Journal(tmp_path, plan.batch)) as journal:
+            assert (journal.other_code, journal.rows) == (4, {})
+            journal.append([{"key": plan.tasks[0].key, "status": "completed", "seed": 1, "summary": {}}])
+        digests = iter(["other", "worker's"])
+        patched.setattr(batch, "code_digest", lambda plug_ins: next(digests))
+        with pytest.raises(DtsaError, match=r"other code .worker's"):
+            batch.run_all(plan.batch)
+    with closing(Journal(tmp_path, plan.batch)) as journal:
+        assert (journal.other_code, len(journal.rows)) == (1, 4)
+    assert stable(fly(tmp_path, plan).rows) == whole
     with pytest.raises(ConfigError, match="small"):
-        journal.Journal(tmp_path, spec.make_sweep(CONTENT, "big"), "other")
-
-
-def test_rows_that_are_put_aside_again_join_those_from_before(tmp_path: Path) -> None:
-    plan = sweep(seeds=1)
-    row = {"key": "a", "status": "completed", "seed": 1, "summary": {}}
-    for code in ("old", "new", "old", "new"):
-        with closing(journal.Journal(tmp_path, plan, code)) as book:
-            book.append([{**row, "code": code}])
-    assert len(list(journal.read_rows(tmp_path / "runs-of-code-old.jsonl"))) == 2
-    (tmp_path / "sweep.json").unlink()  # whose rows these are is not known
-    with closing(journal.Journal(tmp_path, plan, "new")) as book:
-        assert book.put_aside == 1
-    assert (tmp_path / "runs-of-code-unknown.jsonl").exists()
+        Journal(tmp_path, spec.make_sweep(CONTENT, "big").batch)
 
 
 def test_all_code_that_flies_is_in_the_digest() -> None:
     """What a run imports of this project is in its packages."""
     text = f"""
 import sys
-from dtsa_bench.experiments.sweep import spec, work
-plan = spec.make_sweep({CONTENT!r}, "small")
-assert work.fly_one(next(plan.tasks()))["status"] != "failed"
+from dtsa_bench.experiments import sweep
+plan = sweep.make_sweep({CONTENT!r}, "small")
+assert sweep.fly(plan.tasks[0])[0] != "failed"
 print(*sorted({{name.partition(".")[0] for name in sys.modules if name.startswith("dtsa")}}))
 """
     ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120, check=True)
@@ -195,10 +187,10 @@ print(*sorted({{name.partition(".")[0] for name in sys.modules if name.startswit
 def test_changed_settings_are_flown_anew_and_equal_ones_are_kept(tmp_path: Path) -> None:
     fly(tmp_path, sweep(seeds=2))
     flown: list[int] = []
-    fly(tmp_path, sweep(seeds=3), progress=lambda runs, cost: flown.append(runs))
+    fly(tmp_path, sweep(seeds=3), advance=lambda runs, cost: flown.append(runs))
     assert sum(flown) == 4
     flown.clear()
-    fly(tmp_path, sweep(seeds=2, base={"agents": 8, "timeout_s": 0.6}), progress=lambda r, c: flown.append(r))
+    fly(tmp_path, sweep(seeds=2, base={"agents": 8, "timeout_s": 0.6}), advance=lambda r, c: flown.append(r))
     assert sum(flown) == 8
 
 
@@ -214,13 +206,11 @@ def test_failures_are_rows_with_a_reason_and_are_tried_again(tmp_path: Path, mon
 
     monkeypatch.setattr(simulate, "simulate", sometimes)
     plan = sweep()
-    rows = fly(tmp_path, plan)
-    table = Table(plan, rows)
-    group = table.where(policy="dtsa", channel="clear")[0]
+    group = fly(tmp_path, plan).where(policy="dtsa", channel="clear")[0]
     assert (len(group.rows), group.flown, group.failed, group.crashed.total) == (6, 3, 3, 3)
-    assert group.left_out()["failed (RuntimeError: out of luck)"] == 3
+    assert group.left_out["failed (RuntimeError: out of luck)"] == 3
     monkeypatch.setattr(simulate, "simulate", real)
-    assert all(row["status"] != "failed" for row in fly(tmp_path, plan))
+    assert all(row["status"] != "failed" for row in fly(tmp_path, plan).rows)
 
 
 def test_crashes_and_timeouts_are_left_out_of_means_and_counted(tmp_path: Path) -> None:
@@ -229,15 +219,15 @@ def test_crashes_and_timeouts_are_left_out_of_means_and_counted(tmp_path: Path) 
         seeds=12,
         axes={"agents": [8, 14], "timeout_s": [0.5, 20.0]},
     )
-    table = Table(plan, fly(tmp_path, plan))
+    table = fly(tmp_path, plan)
     late = table.where(agents=8, timeout_s=0.5)[0]
-    assert late.left_out() == {"timed out": 12}
+    assert late.left_out == {"timed out": 12}
     assert late.mean("min_distance_m").count == 0
     assert late.mean("age_mean_slots").count == 12
     risky = table.where(agents=14, timeout_s=20.0)[0]
     crashed = sum(row["collided"] for row in risky.rows)
     assert crashed > 0
-    assert risky.left_out().get("crashed", 0) == crashed == risky.crashed.count
+    assert risky.left_out.get("crashed", 0) == crashed == risky.crashed.count
     assert risky.mean("min_distance_m").count == 12 - crashed
     kept = [row["min_distance_m"] for row in risky.rows if not row["collided"]]
     assert not kept or risky.mean("min_distance_m").value == pytest.approx(sum(kept) / len(kept))
@@ -283,7 +273,7 @@ def test_the_command_writes_everything(tmp_path: Path, capsys: pytest.CaptureFix
 def test_wrong_words_end_with_one_line_and_code_2(
     words: list[str], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask, "PATIENCE_S", 1.0)
+    monkeypatch.setattr(batch, "PATIENCE_S", 1.0)
     if field == "cluster":
         pytest.importorskip("distributed")
     try:
@@ -304,7 +294,7 @@ def start(out: Path, *words: str) -> subprocess.Popen[bytes]:
         start_new_session=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "DTSA_TRIAL": str(out)},
     )
 
 
@@ -317,17 +307,14 @@ def wait_for_rows(path: Path, count: int, process: subprocess.Popen[bytes]) -> N
     raise AssertionError(f"no {count} rows in {path}")
 
 
-def group_members(group: int) -> list[int]:
-    """Processes of a process group."""
+def processes_of(directory: Path) -> list[int]:
+    """Processes whose environment names a directory: those of a sweep, its workers too."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
-            try:
-                state, _, pgrp = entry.joinpath("stat").read_text().rpartition(")")[2].split()[:3]
-            except OSError:
-                continue
-            if int(pgrp) == group and state != "Z":
-                found.append(int(entry.name))
+            with suppress(OSError):
+                if f"DTSA_TRIAL={directory}".encode() in entry.joinpath("environ").read_bytes().split(b"\0"):
+                    found.append(int(entry.name))
     return found
 
 
@@ -343,7 +330,7 @@ def test_however_a_sweep_ends_nothing_runs_on_and_its_rows_stay(how: str, tmp_pa
         error = process.communicate(timeout=60)[1].decode()
         assert process.returncode == (-signal.SIGKILL if how == "killed" else 130)
         end = time.monotonic() + 20
-        while (left := group_members(process.pid)) and time.monotonic() < end:
+        while (left := processes_of(tmp_path)) and time.monotonic() < end:
             time.sleep(0.1)
         assert not left
     finally:
@@ -352,7 +339,7 @@ def test_however_a_sweep_ends_nothing_runs_on_and_its_rows_stay(how: str, tmp_pa
     if how != "killed":
         assert "goes on from there" in error
         assert "Traceback" not in error
-    assert len(list(journal.read_rows(tmp_path / "runs.jsonl"))) >= 5
+    assert len(lines_of(tmp_path)) >= 5
 
 
 def test_a_worker_process_that_dies_costs_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -363,14 +350,32 @@ def test_a_worker_process_that_dies_costs_no_result(tmp_path: Path, monkeypatch:
         if not victims:
             children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
             names = {int(pid): Path(f"/proc/{pid}/cmdline").read_text() for pid in children}
-            victims.append(next(pid for pid, name in names.items() if "LokyProcess" in name))
+            victims.append(next(pid for pid, name in names.items() if "batch.serve" in name))
             os.kill(victims[0], signal.SIGKILL)
 
-    monkeypatch.setattr(pool, "CHUNK_COST", 20_000.0)
-    rows = fly(tmp_path, plan, jobs=2, progress=kill_one)
+    monkeypatch.setattr(batch, "CHUNK_COST", 20_000.0)
+    rows = fly(tmp_path, plan, jobs=2, advance=kill_one).rows
     assert victims
     assert len(rows) == 800
     assert all(row["status"] != "failed" for row in rows)
+
+
+def test_a_sweep_needs_no_shared_memory(tmp_path: Path) -> None:
+    """As on a machine whose /dev/shm is missing, full or read-only, where no semaphore can be made."""
+    words = ["sweep", "--preset", "trajectories", "--seeds", "2", "--jobs", "2", "--no-report", "--out", str(tmp_path)]
+    code = f"""
+import _multiprocessing, sys
+class Semaphore(_multiprocessing.SemLock):
+    def __new__(cls, *args, **more):
+        raise OSError(28, "No space left on device")
+_multiprocessing.SemLock = Semaphore
+from dtsa_bench.commands.cli import main
+sys.exit(main({words!r}))
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert len(lines_of(tmp_path)) == 6
 
 
 @pytest.fixture
@@ -430,7 +435,7 @@ def test_a_worker_of_a_cluster_that_dies_costs_no_result(
     with Client(address, set_as_default=False) as client:
         client.wait_for_workers(2, timeout=60)
     plan = sweep(seeds=100)
-    monkeypatch.setattr(pool, "CHUNK_COST", 20_000.0)
+    monkeypatch.setattr(batch, "CHUNK_COST", 20_000.0)
     done: list[int] = []
 
     def kill_one(runs: int, cost: float) -> None:
@@ -438,11 +443,11 @@ def test_a_worker_of_a_cluster_that_dies_costs_no_result(
         if len(done) == 3:
             workers[0].kill()
 
-    rows = fly(tmp_path / "cluster", plan, cluster=address, progress=kill_one)
+    rows = fly(tmp_path / "cluster", plan, cluster=address, advance=kill_one).rows
     assert len(done) > 3
     assert workers[0].wait() == -signal.SIGKILL
     assert len(rows) == 400
-    here = fly(tmp_path / "here", sweep(seeds=5))
+    here = fly(tmp_path / "here", sweep(seeds=5)).rows
     picked = [row for row in stable(rows) if row["seed"] < 1006]
     assert picked == stable(here)
 
@@ -456,4 +461,4 @@ def test_rows_that_cannot_be_written_end_in_one_line(tmp_path: Path) -> None:
     assert ended.returncode == 1
     assert ended.stderr.count("\n") == 1
     assert "runs.jsonl cannot be written (File too large)" in ended.stderr
-    assert 0 < len(list(journal.read_rows(tmp_path / "runs.jsonl"))) < 27
+    assert 0 < len(lines_of(tmp_path)) < 28

@@ -19,8 +19,9 @@ from dtsa_agent.core.settings.flight_models import FLIGHT_MODELS, AvoiderParams,
 from dtsa_agent.crazyflie.safety.rules import SafetySettings
 from dtsa_agent.crazyflie.settings.config import parse_swarm
 from dtsa_bench.crazyflies.simulated import FleetConfig
-from dtsa_bench.experiments.sweep import aggregate, spec
-from dtsa_bench.experiments.sweep.columns import RESERVED
+from dtsa_bench.experiments import sweep as spec
+from dtsa_bench.experiments.sweep import RESERVED
+from dtsa_bench.experiments.tables import MEASURES
 from dtsa_bench.runs.config import LOCKSTEP, MODES, RunConfig, RunLimits
 from dtsa_channel_sim import ChannelConfig, ClockConfig
 
@@ -269,7 +270,7 @@ def test_axes_are_not_called_like_columns_of_the_results(axis: str) -> None:
 
 
 def test_all_columns_of_the_results_are_reserved() -> None:
-    assert set(aggregate.MEASURES) <= RESERVED
+    assert set(MEASURES) <= RESERVED
     settings_names = {spec.name for cls in (SwarmConfig, ChannelConfig, RunLimits) for spec in settings_of(cls)}
     assert RESERVED & settings_names == {"seed"}
 

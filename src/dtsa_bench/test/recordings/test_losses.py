@@ -15,7 +15,7 @@ from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands.cli import main
-from dtsa_bench.experiments.sweep.spec import make_sweep
+from dtsa_bench.experiments.sweep import make_sweep
 from dtsa_bench.recordings.bag.run import load_run
 from dtsa_bench.recordings.losses import HEARD, LOST, UNKNOWN, fit_links, learn, observe
 from dtsa_bench.recordings.merge.agent_bag import read
@@ -215,4 +215,4 @@ def test_a_sweep_carries_what_the_file_says(tmp_path, capsys):
     for cell in sweep.cells:
         flight = simulate(RunConfig.from_dict(cell.run(1).to_dict())).summary()
         assert flight["slots"]["total"] > 0
-    assert len({task.key for task in sweep.tasks()}) == 2
+    assert len({task.key for task in sweep.tasks}) == 2

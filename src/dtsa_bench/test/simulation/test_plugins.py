@@ -20,8 +20,8 @@ from dtsa_agent.core.plugins import entry_points as plugins
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.flight_models import flight_model
 from dtsa_bench.commands.cli import main
-from dtsa_bench.experiments.batch.task import Task
-from dtsa_bench.experiments.sweep import spec, work
+from dtsa_bench.experiments import sweep as spec
+from dtsa_bench.experiments.batch import Task, attempt
 from dtsa_bench.simulation.simulate import simulate
 
 EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "dtsa_plugins"
@@ -120,8 +120,8 @@ def test_nodes_find_plugins_too_and_agree_with_the_simulator(
 def test_sweeps_take_plugins_by_name_and_their_failures_are_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     sweep = spec.load_file(EXAMPLE / "sweep.yaml", seeds=1)
     assert {cell.labels["policy"] for cell in sweep.cells} == {"tdma", "dtsa", "least-known"}
-    tasks = [task for task in sweep.tasks() if task.settings["policy"] == "least-known"]
-    rows = [work.fly_one(task) for task in tasks]
+    tasks = [task for task in sweep.tasks if task.settings["policy"] == "least-known"]
+    rows = [attempt(task, spec.fly) for task in tasks]
     assert len(rows) == 4
     assert {row["status"] for row in rows} <= {"completed", "crashed"}
     assert all(row["summary"]["policy"] == "least-known" for row in rows)
@@ -129,7 +129,7 @@ def test_sweeps_take_plugins_by_name_and_their_failures_are_rows(monkeypatch: py
     import dtsa_plugins
 
     monkeypatch.setattr(dtsa_plugins.LeastKnown, "choose", lambda self, view, slot: 1 // 0)
-    row = work.fly_one(tasks[0])
+    row = attempt(tasks[0], spec.fly)
     assert row["status"] == "failed"
     assert "ZeroDivisionError" in row["reason"]
     monkeypatch.setattr(dtsa_plugins.LeastKnown, "choose", lambda self, view, slot: 99)
@@ -180,7 +180,7 @@ def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(kind: str
     run = spec.run_config({"agents": 4, "timeout_s": 0.2, **settings})
     with pytest.raises(PluginError, match=said):
         simulate(run)
-    row = work.fly_one(Task("key", 0, 1, {"agents": 4, "timeout_s": 0.2, **settings}, 1.0))
+    row = attempt(Task("key", 0, 1, {"agents": 4, "timeout_s": 0.2, **settings}, 1.0), spec.fly)
     assert row["status"] == "failed"
     assert row["reason"].startswith(f"PluginError: {kind} wrong")
 

@@ -20,7 +20,7 @@ from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.crazyflie.settings.config import StationSettings, SwarmSettings
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_bench.crazyflies.missions.mission_flight import fly_crazyflies
-from dtsa_bench.experiments.sweep.spec import run_config
+from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.flights.flight import FlightOptions, check_options
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.schemes.knowledge import whittle_index

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core import REASONS
-from dtsa_bench.experiments.sweep.spec import run_config
+from dtsa_bench.experiments.sweep import run_config
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import Flight, may_share, simulate
 

@@ -11,18 +11,15 @@ from pathlib import Path
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
-from dtsa_bench.experiments.batch.table import write_whole
+from dtsa_bench.experiments.batch import write_whole
 
 _FILES = Path(__file__).resolve().parent / "files"
 _ALLOWED = "letters, digits and hyphens, beginning with a letter, as in my-policy"
 
 
 def write_package(name: str, directory: Path) -> list[Path]:
-    """Writes the package.
+    """Write the package to a directory that does not exist yet; return its files.
 
-    :param name: what the policy will be called: letters, digits and hyphens.
-    :param directory: where the package goes; must not exist.
-    :returns: its files.
     :raises ConfigError: for a name that cannot be used, and a directory that exists or cannot be made.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name) or len(name) > 40 or keyword.iskeyword(name):
@@ -49,10 +46,7 @@ def write_package(name: str, directory: Path) -> list[Path]:
 
 
 def _check_free(name: str, module: str) -> None:
-    """Whether the package would be in the way of another one.
-
-    :raises ConfigError: naming it.
-    """
+    """Raise ConfigError if the package would be in the way of another one."""
     if module in sys.stdlib_module_names:
         raise ConfigError("NAME", name, f"another name: {module} is a module of Python's own")
     for taken in (module, f"dtsa_{module}"):

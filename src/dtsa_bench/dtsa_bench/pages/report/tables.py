@@ -9,13 +9,10 @@ from pathlib import Path
 from markupsafe import Markup
 
 from dtsa_bench.drawing.style import save, themed
-from dtsa_bench.experiments.batch.table import write_whole
-from dtsa_bench.experiments.figures.drawn import draw
-from dtsa_bench.experiments.league import figures
-from dtsa_bench.experiments.league.table import HEADS, LeagueTable
+from dtsa_bench.experiments.charts import draw, league_scores
+from dtsa_bench.experiments.league import HEADS, LeagueTable
 from dtsa_bench.experiments.statistics import LEVEL, wilson
-from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES, Table, label_of
-from dtsa_bench.experiments.sweep.text import parts
+from dtsa_bench.experiments.tables import CRASHED, SweepTable, label_of
 from dtsa_bench.pages.html import render_page, write_page
 
 
@@ -48,7 +45,7 @@ def figure_part(svg: str, caption: str) -> Part:
     return Part(svg=Markup(themed(svg)), text=caption)
 
 
-def write_report(table: Table, directory: Path, code: str, command: str = "") -> Path:
+def write_report(table: SweepTable, directory: Path, code: str, command: str = "") -> Path:
     """Draw all figures of a sweep into ``figures``, and write ``report.html``; `code`: fingerprint of what flew."""
     sweep, seeds = table.sweep, table.sweep.seeds
     drawn = [
@@ -56,13 +53,13 @@ def write_report(table: Table, directory: Path, code: str, command: str = "") ->
         for spec in sweep.figures
     ]
     facts = [
-        f"{table.runs} of {len(sweep.cells) * len(seeds)} flights",
+        f"{len(table.rows)} of {len(sweep.cells) * len(seeds)} flights",
         f"{len(sweep.cells)} settings",
         f"{len(seeds)} seeds ({seeds[0]}{f' to {seeds[-1]}' if len(seeds) > 1 else ''})",
         f"code {code}",
     ]
     left_out = sorted(table.left_out().items())
-    text = f"Left out of distances, efficiencies and times (as in the paper), of {table.runs} flights:"
+    text = f"Left out of distances, efficiencies and times (as in the paper), of {len(table.rows)} flights:"
     none = "No flight was left out: all were completed without a crash."
     notes = [note.format(level=100 * LEVEL, seeds=len(seeds), most=100 * wilson(0, len(seeds)).high) for note in _NOTES]
     sections = [
@@ -74,16 +71,16 @@ def write_report(table: Table, directory: Path, code: str, command: str = "") ->
     return write_tables(directory / "report.html", sweep.title, sections, sweep.text, facts, command)
 
 
-def _groups(table: Table) -> Part:
-    measures = [name for name in MEASURES if any(group.mean(name).count for group in table.groups)]
+def _groups(table: SweepTable) -> Part:
+    measures = table.known()
     heads = [*table.sweep.axes, "crashed", "timed out", "failed", *map(label_of, measures), "counted"]
     rows = []
-    for group in (group for group in table.groups if group.rows):
+    for group in table.flown:
         mark = Markup('<span class="bad">{}</span>' if group.crashed.count else '<span class="good">{}</span>')
         rows.append([
             *(str(group.labels[axis]) for axis in table.sweep.axes),
-            mark.format(_small(parts(group, CRASHED))), str(group.timed_out or ""), str(group.failed or ""),
-            *(_small(parts(group, name)) for name in measures),
+            mark.format(_small(group.texts(CRASHED))), str(group.timed_out or ""), str(group.failed or ""),
+            *(_small(group.texts(name)) for name in measures),
             f"{group.mean('min_distance_m').count}/{len(group.rows)}",
         ])  # fmt: skip
     return Part("All settings", heads=heads, rows=rows)
@@ -95,42 +92,28 @@ def _small(shown: tuple[str, str]) -> str:
     return Markup("{} <small>{}</small>").format(value, interval) if interval else value
 
 
-def write_league(table: LeagueTable, directory: Path, command: str = "") -> list[Path]:
-    """Write ``league.html``, ``league.csv``, ``league.tex`` and the figures (PNG and SVG) of a league; its files."""
-    league, first = table.league, table.entries[0]
-    comment = f"{league.title}: {len(table.entries)} entries, {first['seeds']} seeds, cells {league.digest}"
-    write_whole(directory / "league.csv", table.csv())
-    write_whole(directory / "league.tex", table.latex([comment, *([command] if command else [])]))
-    flights = sum(entry["summary"]["flights"] for entry in table.entries)
+def write_league(table: LeagueTable, directory: Path, command: str = "") -> Path:
+    """Write ``league.html`` and its figure (PNG and SVG) to a directory that exists; return the page's path."""
+    league, flights = table.league, sum(found.lost.total for found in table.scores)
     trial = "" if table.complete else " Not all cells and seeds were flown: this is a trial, not a result."
-    lead = (
-        f"{len(table.entries)} entries, {flights} flights with {first['seeds']} seeds, {len(table.cells)} cells.{trial}"
-    )
+    lead = f"{len(table.entries)} entries, {flights} flights, {len(table.cells)} cells.{trial}"
+    entries = [
+        [
+            entry["name"],
+            ", ".join(f"{key}: {value}" for key, value in entry["scheme"].items()),
+            *(str(entry[key]) for key in ("package", "commit", "date")),
+        ]
+        for entry in table.entries
+    ]
     sections = [
         Part(heads=HEADS, rows=table.lines()),
-        figure_part(save(figures.scores(table), directory / "figures", "scores"), _SCORES),
-        Part("Cells", heads=("cell", "what it is"),
-             rows=[(cell.name, cell.text) for cell in league.cells if cell.name in table.cells]),
-        figure_part(save(figures.cells(table), directory / "figures", "cells"), _CELLS),
-        Part("Entries", heads=("scheme", "settings", "package", "licence", "author", "code", "digest"),
-             rows=_entries(table)),
+        figure_part(save(league_scores(table), directory / "figures", "scores"), _SCORES),
+        Part("Cells", heads=("cell", "what it is"), rows=[(name, league.cells[name]["text"]) for name in table.cells]),
+        Part("Ages", _CELLS, heads=("scheme", *table.cells), rows=table.cell_lines()),
+        Part("Entries", heads=("scheme", "settings", "package", "commit", "flown"), rows=entries),
         Part("How to read this", list=_LEAGUE_NOTES),
-    ]  # fmt: skip
-    write_tables(directory / "league.html", league.title, sections, lead, command=command)
-    pictures = [f"figures/{name}.{form}" for name in ("scores", "cells") for form in ("png", "svg")]
-    return [directory / name for name in ("league.html", "league.csv", "league.tex", *pictures)]
-
-
-def _entries(table: LeagueTable) -> list[list[str]]:
-    rows = []
-    for entry in table.entries:
-        package = entry["package"]
-        settings = ", ".join(f"{key}: {value}" for key, value in entry["scheme"].items())
-        named = " ".join(str(part) for part in (package.get("distribution"), package.get("version")) if part)
-        people = [package.get(key) or "not given" for key in ("license", "author")]
-        code, digest = entry["made_with"]["code"], entry["digest"][:16]
-        rows.append([entry["name"], settings, named or "not given", *people, code, digest])
-    return rows
+    ]
+    return write_tables(directory / "league.html", league.title, sections, lead, command=command)
 
 
 _NOTES = (
@@ -143,14 +126,11 @@ _NOTES = (
     "everything, does not crash.",
 )
 _SCORES = "95 % intervals; grey: bounds, which know more than any radio could tell, and have no rank."
-_CELLS = "Geometric mean of a cell's flights; a lost flight counts with ten rounds of TDMA."
+_CELLS = "Age in each cell, ms: geometric mean of its flights; in brackets the lost ones, if any."
 _LEAGUE_NOTES = (
     "Lost: crashed, not complete in time, or a cell that the scheme cannot fly. In brackets: 95 % intervals (Wilson).",
     "Age: age from waking on, geometric mean over all flights, lost ones included with the cell's age of a lost "
-    "flight. So schemes that lose their hardest flights gain nothing by it.",
-    "Rank: an entry is ahead of another if it lost fewer flights of the same seeds; where that is not decided, if it "
-    "has less age on them. All tests are corrected together (Holm, 5 %). The order is by how many entries are ahead, "
-    "then by lost flights and age. In brackets: the ranks that the tests leave open.",
-    "Sums were made again from the flights of the entries. Whether the flights are right, “league check” says.",
+    "flight, ten rounds of TDMA. So schemes that lose their hardest flights gain nothing by it.",
+    "Rank: by lost flights times age. Whether the flights are right, “league check” says.",
     "A bound looks into all agents. Nobody can fly it.",
 )

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from dtsa_bench.drawing import palette
 from dtsa_bench.drawing.flight_paths import paint
 from dtsa_bench.drawing.style import CYCLE, INK, legend_above, panels
-from dtsa_bench.experiments.sweep.aggregate import Table
 from dtsa_bench.simulation.simulate import Flight, simulate
+
+from .tables import SweepTable
 
 Spec = Mapping[str, Any]
 TRUE, ESTIMATED, RECEIVED = palette.SERIES[2], INK, palette.SERIES[4]
 
 
-def _flights(table: Table, spec: Spec) -> list[tuple[str, Flight]]:
+def _flights(table: SweepTable, spec: Spec) -> list[tuple[str, Flight]]:
     """One flight of the first seed for each level of ``facets``, flown again with a trace."""
     facets = table.levels(spec["facets"])
     groups = [table.where(**{spec["facets"]: facet})[0] for facet in facets]
@@ -33,7 +34,7 @@ def _movers(flight: Flight) -> NDArray[np.int64]:
     return np.flatnonzero(flight.scenario.moving)
 
 
-def trajectories(table: Table, spec: Spec) -> Figure:
+def trajectories(table: SweepTable, spec: Spec) -> Figure:
     """Paths of the movers from above (fig:12_exp_traj): a panel a level of ``facets``, one seed in all."""
     flights = _flights(table, spec)
     figure, axes = panels(len(flights), width=3.3, height=3.6)
@@ -52,7 +53,7 @@ def trajectories(table: Table, spec: Spec) -> Figure:
     return figure
 
 
-def estimate(table: Table, spec: Spec) -> Figure:
+def estimate(table: SweepTable, spec: Spec) -> Figure:
     """A part of a path: flown, as another agent estimated it, and what that one received (fig:estimated)."""
     flights = _flights(table, spec)
     figure, axes = panels(len(flights) + 1, width=3.6, height=3.3, columns=2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any
 
@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
 from dtsa_bench.drawing.style import (
+    CYCLE,
     GRID,
     INK,
     MARKERS,
@@ -24,8 +25,12 @@ from dtsa_bench.drawing.style import (
     colours,
     legend_above,
     panels,
+    style,
 )
-from dtsa_bench.experiments.sweep.aggregate import CRASHED, MEASURES, Group, Table, label_of
+
+from .flight_figures import estimate, trajectories
+from .league import LeagueTable
+from .tables import CRASHED, MEASURES, Group, SweepTable, label_of
 
 Spec = Mapping[str, Any]
 _GOOD_TO_BAD = LinearSegmentedColormap.from_list("good-bad", ["#e8f4ee", "#f6e3b4", "#dd8a6f", "#a8402b"])
@@ -38,19 +43,16 @@ AXIS_LABELS = {
 }  # fmt: skip
 
 
-def point(group: Group, measure: str) -> tuple[float, float, float]:
-    """Value and interval of a measure of a group; shares in percent are 0 to 1."""
-    if measure == CRASHED:
-        share = group.crashed
-        return (share.value, share.low, share.high) if share.total else (math.nan, math.nan, math.nan)
-    mean = group.mean(measure)
-    return mean.value, mean.low, mean.high
+def _group(table: SweepTable, labels: Mapping[str, Any]) -> Group | None:
+    """The only group with these labels that has rows; None if there is none or more than one."""
+    groups = [group for group in table.where(**labels) if group.rows]
+    return groups[0] if len(groups) == 1 else None
 
 
-def one(table: Table, labels: Mapping[str, Any], measure: str) -> tuple[float, float, float]:
-    """The point of the only group with these labels; not a number if there is none or more than one."""
-    groups = table.select(labels, lambda group: bool(group.rows))
-    return point(groups[0], measure) if len(groups) == 1 else (math.nan, math.nan, math.nan)
+def _points(table: SweepTable, labels: Mapping[str, Any], axis: str, measure: str) -> np.ndarray[Any, Any]:
+    """Values and ends of intervals over the levels of an axis, (n, 3); not a number where there is no such group."""
+    groups = (_group(table, {axis: level, **labels}) for level in table.levels(axis))
+    return np.array([group.point(measure) if group else (math.nan,) * 3 for group in groups])
 
 
 def _whiskers(points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -59,11 +61,8 @@ def _whiskers(points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.nan_to_num(np.maximum(np.stack((value - low, high - value)), 0.0))
 
 
-def bars(table: Table, spec: Spec) -> Figure:
-    """Grouped bars:
-
-    a panel for each measure, a group for each level of ``x``, a bar for each of ``series``.
-    """
+def bars(table: SweepTable, spec: Spec) -> Figure:
+    """Grouped bars: a panel a measure, a group for each level of ``x``, a bar for each of ``series``."""
     measures, xs = list(spec["y"]), table.levels(spec["x"])
     series = table.levels(spec["series"]) if "series" in spec else [None]
     shades = colours(xs if series == [None] else series)
@@ -73,8 +72,7 @@ def bars(table: Table, spec: Spec) -> Figure:
     for axis, measure in zip(axes, measures, strict=True):
         width = 0.8 / len(series)
         for number, name in enumerate(series):
-            labels = {} if name is None else {spec["series"]: name}
-            data = np.array([one(table, {spec["x"]: x, **labels}, measure) for x in xs])
+            data = _points(table, {} if name is None else {spec["series"]: name}, spec["x"], measure)
             places = np.arange(len(xs)) + (number - (len(series) - 1) / 2) * width
             drawn = axis.bar(
                 places, data[:, 0], width * 0.9, color=shades if name is None else shades[number], linewidth=0
@@ -111,7 +109,7 @@ def _dress(axis: Axes, spec: Spec, measure: str, xs: list[Any]) -> None:
         axis.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
-def lines(table: Table, spec: Spec) -> Figure:
+def lines(table: SweepTable, spec: Spec) -> Figure:
     """A line for each of ``series`` over the numbers of ``x``; a panel for each of ``facets`` and measure."""
     facets = table.levels(spec["facets"]) if "facets" in spec else [None]
     series = table.levels(spec["series"]) if "series" in spec else [None]
@@ -125,7 +123,7 @@ def lines(table: Table, spec: Spec) -> Figure:
             labels = ({} if facet is None else {spec["facets"]: facet}) | (
                 {} if name is None else {spec["series"]: name}
             )
-            data = np.array([one(table, {spec["x"]: x, **labels}, measure) for x in xs])
+            data = _points(table, labels, spec["x"], measure)
             known = np.isfinite(data[:, 0])
             place = np.array(xs, dtype=float)[known]
             # Lines that lie on each other stay visible: later ones are thinner.
@@ -153,19 +151,20 @@ def lines(table: Table, spec: Spec) -> Figure:
     return figure
 
 
-def _logarithmic(axis: Axes) -> None:
+def _logarithmic(axes: Axes, which: str = "y") -> None:
     """A logarithmic axis with plain numbers."""
-    axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.yaxis.set_minor_formatter(NullFormatter())
+    axes.set(**{f"{which}scale": "log"})
+    axis = axes.yaxis if which == "y" else axes.xaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _facet(axis: str, value: object) -> str:
     return f"{value} ms slots" if axis == "slot_ms" else str(value)
 
 
-def matrix(table: Table, spec: Spec) -> Figure:
+def matrix(table: SweepTable, spec: Spec) -> Figure:
     """A coloured cell with its number for each of ``rows`` and ``columns``; a panel for each of ``facets``."""
     facets = table.levels(spec["facets"]) if "facets" in spec else [None]
     rows, columns, measure = table.levels(spec["rows"]), table.levels(spec["columns"]), spec["y"][0]
@@ -177,7 +176,7 @@ def matrix(table: Table, spec: Spec) -> Figure:
         height=1.05 + 0.36 * len(rows),
         columns=2,
     )
-    finite = [value for g in table.groups if g.rows and math.isfinite(value := point(g, measure)[0])]
+    finite = [value for group in table.flown if math.isfinite(value := group.point(measure)[0])]
     top = 1.0 if measure == CRASHED else max(finite, default=1.0)
     bottom = 0.0 if measure == CRASHED else min(finite, default=0.0)
     for axis, facet in zip(axes, facets, strict=True):
@@ -185,12 +184,12 @@ def matrix(table: Table, spec: Spec) -> Figure:
         values = np.full((len(rows), len(columns)), math.nan)
         for (i, row), (j, column) in product(enumerate(rows), enumerate(columns)):
             labels = {spec["rows"]: row, spec["columns"]: column, **fixed}
-            groups = table.select(labels, lambda group: bool(group.rows))
-            if len(groups) != 1:
+            group = _group(table, labels)
+            if group is None:
                 continue
-            values[i, j] = point(groups[0], measure)[0]
+            values[i, j] = group.point(measure)[0]
             dark = (values[i, j] - bottom) / ((top - bottom) or 1.0) > 0.62
-            text = _cell_text(groups[0], measure)
+            text = _cell_text(group, measure)
             axis.text(j, i, text, ha="center", va="center", fontsize=8.5, color=ON_DARK if dark else ON_LIGHT)
         axis.pcolormesh(
             np.arange(len(columns) + 1) - 0.5,
@@ -226,3 +225,43 @@ def _cell_text(group: Group, measure: str) -> str:
         return str(group.crashed)
     value = group.mean(measure).value
     return f"{value:.{MEASURES[measure].digits}f}" if math.isfinite(value) else "–"
+
+
+_DRAW: dict[str, Callable[[SweepTable, Any], Figure]] = {
+    "bars": bars, "lines": lines, "matrix": matrix, "trajectories": trajectories, "estimate": estimate,
+}  # fmt: skip
+
+
+def draw(table: SweepTable, spec: Spec) -> Figure:
+    """Draw a figure in the house style, as the sweep names it."""
+    with style():
+        return _DRAW[spec["kind"]](table, spec)
+
+
+def league_scores(table: LeagueTable) -> Figure:
+    """Lost flights and age of each entry with 95 % intervals, and its time on the air; the best above."""
+    with style():
+        names = [entry["name"] for entry in table.entries]
+        bounds = [entry["bound"] for entry in table.entries]
+        figure, axes = panels(3, width=3.6, height=1.0 + 0.24 * len(names), columns=3)
+        shown = (
+            ("lost flights", [(s.lost.value, s.lost.low, s.lost.high) for s in table.scores]),
+            ("age from waking on [ms]", [s.age_ms for s in table.scores]),
+            ("time on the air", [(s.load,) * 3 for s in table.scores]),
+        )
+        for axis, (title, points) in zip(axes, shown, strict=True):
+            for number, (value, low, high) in enumerate(points):
+                shade = QUIET if bounds[number] else CYCLE[1]
+                axis.plot((low, high), (number, number), color=shade, linewidth=1.6, solid_capstyle="butt")
+                axis.plot(value, number, "o", color=shade, markersize=4.5)
+            axis.grid(axis="y", visible=False)
+            axis.xaxis.set_major_locator(MaxNLocator(5))
+            axis.set_title(title)
+            axis.set_ylim(len(names) - 0.4, -0.6)
+            axis.set_yticks(range(len(names)), names if axis is axes[0] else [""] * len(names))
+        axes[0].xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes[2].xaxis.set_major_formatter(PercentFormatter(1.0))
+        _logarithmic(axes[1], "x")
+        for bound, name in zip(bounds, axes[0].get_yticklabels(), strict=True):
+            name.set_color(QUIET if bound else INK)
+    return figure

@@ -1,33 +1,43 @@
-"""What a sweep flies: a base, axes that are combined with each other, and seeds.
-
-Read from YAML; see docs/how-to/sweep.md.
-"""
+"""What a sweep flies: a base, axes that are combined with each other, and seeds. See docs/how-to/sweep.md."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.plugins.entry_points import plug_ins_named
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig
 from dtsa_agent.core.settings.declaration import Settings, check, setting, settings_of
 from dtsa_agent.yaml_file import read_yaml
-from dtsa_bench.experiments.batch.task import Task, key_of
 from dtsa_bench.runs.config import FROM_SWARM, RunConfig, RunLimits, from_swarm
 from dtsa_channel_sim import ChannelConfig, MeasuredLosses
 
-from .columns import RESERVED
+from .batch import Batch, Row, Task, key_of
 
-PRESETS = Path(__file__).resolve().parent.parent / "presets"
+PRESETS = Path(__file__).resolve().parent / "presets"
 FIGURE_KINDS = ("bars", "lines", "matrix", "trajectories", "estimate")
-#: Seeds of reports start here; those below are for tuning and tests.
-FIRST_SEED = 1001
-
+FIRST_SEED = 1001  # of reports; those below are for tuning and tests
+#: Results of one run as columns, in this order; ``slots_...`` are parts of ``slots`` in the summary.
+VALUES = (
+    "min_distance_m", "efficiency_mean", "completion_time_s", "flight_time_s", "age_mean_slots",
+    "age_max_slots", "age_mean_ms", "age_max_ms", "waking_age_mean_slots", "waking_age_max_slots",
+    "waking_age_mean_ms", "waking_age_max_ms", "wakings", "wakings_unheard", "first_heard_median_slots",
+    "first_heard_95_slots", "first_heard_max_slots", "frames_per_s", "bytes_per_s", "channel_load",
+    "estimate_error_mean_m", "estimate_error_max_m", "slots_total", "slots_success", "slots_collision", "slots_idle",
+    "agreement_share", "equal_tables_share", "first_divergence_slot", "wall_time_s",
+)  # fmt: skip
+COMMON = ("seed", "status", "reason", "collided")
+#: Names that no axis may have.
+RESERVED = frozenset(
+    ("key", "cell", "summary", "runs", "timed_out", "left_out", "crashed", "wasted_share", *COMMON, *VALUES)
+)
 # Settings by section. Those of the channel that follow from the swarm's are left out.
 _SECTIONS = {
     "swarm": tuple(spec.name for spec in settings_of(SwarmConfig)),
@@ -72,14 +82,14 @@ class Cell:
     settings: dict[str, Any]  # flat names -> values
 
     def run(self, seed: int) -> RunConfig:
-        """The run with one seed.
+        """Return the run with one seed.
 
         :raises ConfigError: if the settings do not fit together.
         """
         return run_config({**self.settings, "seed": seed})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Sweep:
     """Cells, seeds, and what the report shows of them."""
 
@@ -89,24 +99,36 @@ class Sweep:
     cells: tuple[Cell, ...]
     seeds: tuple[int, ...]
     axes: tuple[str, ...]
-    figures: tuple[Mapping[str, Any], ...] = ()
-    spec: SweepSpec = field(default_factory=SweepSpec)  # as it was read, with what the command line changed
+    figures: tuple[Mapping[str, Any], ...]
+    spec: SweepSpec  # as it was read, with what the command line changed
 
-    @property
-    def source(self) -> dict[str, Any]:
-        """The sweep's file as plain values, with what the command line changed."""
-        return self.spec.to_dict()
-
-    def tasks(self) -> Iterator[Task]:
-        """All runs, cell by cell."""
+    @cached_property
+    def tasks(self) -> list[Task]:
+        """All runs, cell by cell, with ascending seeds in each."""
+        tasks = []
         for index, cell in enumerate(self.cells):
             for seed in self.seeds:
                 settings = {**cell.settings, "seed": seed}
-                yield Task(key_of(settings), index, seed, settings, cost_of(settings))
+                tasks.append(Task(key_of(settings), index, seed, settings, cost_of(settings)))
+        return tasks
+
+    @cached_property
+    def batch(self) -> Batch:
+        """The runs, with the plug-ins that they name."""
+        named = {named for cell in self.cells for named in plug_ins_named(cell.run(self.seeds[0]).swarm)}
+        return Batch(self.name, self.tasks, fly, frozenset(named))
+
+
+def fly(task: Task) -> tuple[str, Row]:
+    """Fly one run; return how it ended, and its summary."""
+    from dtsa_bench.simulation.simulate import simulate
+
+    summary = simulate(run_config(task.settings)).summary()
+    return summary["end"], summary
 
 
 def cost_of(settings: Mapping[str, Any]) -> float:
-    """A rough guess of the work in a run, see :class:`~dtsa_bench.experiments.batch.task.Task`."""
+    """Return a rough guess of the work in a run, about 1 us of a core."""
     agents = float(settings.get("agents", 12))
     slot_ms = float(settings.get("slot_ms", 10.0))
     slots = min(float(settings.get("timeout_s", 60.0)), 3.0 + agents / 5) * 1000.0 / slot_ms
@@ -118,12 +140,12 @@ def cost_of(settings: Mapping[str, Any]) -> float:
 
 
 def run_config(settings: Mapping[str, Any]) -> RunConfig:
-    """A run from flat names: settings of the swarm, of the channel and of the limits side by side.
+    """Return a run from flat names: settings of the swarm, of the channel and of the limits side by side.
 
     :param settings: values by name; ``seed`` is that of the swarm and of the channel.
     :raises ConfigError: for names that do not exist and values that are not allowed.
     """
-    parts: dict[str, dict[str, Any]] = {"swarm": {}, "channel": {}, "limits": {}}
+    parts: dict[str, dict[str, Any]] = {section: {} for section in _SECTIONS}
     for name, value in settings.items():
         section = section_of(name)
         if section is None:
@@ -135,7 +157,7 @@ def run_config(settings: Mapping[str, Any]) -> RunConfig:
 
 
 def section_of(name: str) -> str | None:
-    """The section of a flat name: swarm, channel or limits; None if there is no such setting."""
+    """Return the section of a flat name: swarm, channel or limits; None: there is no such setting."""
     return next((section for section, names in _SECTIONS.items() if name in names), None)
 
 
@@ -145,10 +167,8 @@ def preset_names() -> list[str]:
 
 
 def load_preset(name: str, **changes: Any) -> Sweep:
-    """A sweep that comes with the package.
+    """Return a sweep that comes with the package; changes are those of :func:`make_sweep`.
 
-    :param name: one of :func:`preset_names`.
-    :param changes: as for :func:`make_sweep`.
     :raises ConfigError: if there is none of that name.
     """
     if name not in preset_names():
@@ -157,10 +177,8 @@ def load_preset(name: str, **changes: Any) -> Sweep:
 
 
 def load_file(path: str | Path, **changes: Any) -> Sweep:
-    """A sweep described in a YAML file.
+    """Return the sweep in a YAML file; changes are those of :func:`make_sweep`.
 
-    :param path: the file.
-    :param changes: as for :func:`make_sweep`.
     :raises ConfigError: if it cannot be read, or does not describe a sweep.
     """
     content = read_yaml(path, "file")
@@ -177,29 +195,33 @@ def make_sweep(
     first_seed: int | None = None,
     base: Mapping[str, Any] | None = None,
 ) -> Sweep:
-    """A sweep from the content of its YAML file. Every run is checked here, before anything flies.
+    """Return a sweep from the content of its YAML file. Every run is checked here, before anything flies.
 
-    :param content: what the file says.
-    :param name: of the sweep.
     :param seeds: number of seeds, instead of the file's.
-    :param first_seed: first of the seeds.
     :param base: settings that win over the file's base.
     :raises ConfigError: naming what is not usable.
     """
     spec = SweepSpec.from_dict(content)
     chosen = _seeds(spec.seeds, seeds, first_seed)
     spec = dataclasses.replace(spec, base={**spec.base, **(base or {})}, seeds=list(chosen))
-    levels = [_settings_of_levels(axis, values) for axis, values in spec.axes.items()]
-    cells = tuple(_cells(spec.base, list(spec.axes), levels))
+    levels = [
+        [(label, own) for label, own in values.items()]
+        if isinstance(values, dict)
+        else [(value, {axis: value}) for value in values]
+        for axis, values in spec.axes.items()
+    ]
+    cells = []
+    for combination in itertools.product(*levels):
+        labels = dict(zip(spec.axes, (label for label, _ in combination), strict=True))
+        cells.append(Cell(labels, {**spec.base, **{k: v for _, own in combination for k, v in own.items()}}))
     _check(cells, chosen[0])
-    return Sweep(name, spec.title or name, spec.text.strip(), cells, chosen, tuple(spec.axes), spec.figures, spec)
+    title, axes = spec.title or name, tuple(spec.axes)
+    return Sweep(name, title, spec.text.strip(), tuple(cells), chosen, axes, spec.figures, spec)
 
 
-def _check(cells: Sequence[Cell], seed: int) -> None:
-    """Checks every run, and puts into its settings what files of losses say: who flies it may not have the files.
+def _check(cells: list[Cell], seed: int) -> None:
+    """Check every run; put what files of losses say into its settings, because a worker may not have the files.
 
-    :param cells: the cells.
-    :param seed: any seed.
     :raises ConfigError: naming what is not usable.
     """
     known: dict[tuple[Any, Any], dict[str, Any]] = {}  # by file and length of a slot
@@ -215,16 +237,6 @@ def _check(cells: Sequence[Cell], seed: int) -> None:
             cell.settings["losses"] = known.setdefault(key, found.to_dict())
 
 
-def _cells(
-    common: Mapping[str, Any], axes: Sequence[str], levels: Sequence[dict[str, dict[str, Any]]]
-) -> Iterator[Cell]:
-    for combination in itertools.product(*(level.items() for level in levels)):
-        settings: dict[str, Any] = dict(common)
-        for _, values in combination:
-            settings.update(values)
-        yield Cell({axis: label for axis, (label, _) in zip(axes, combination, strict=True)}, settings)
-
-
 def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
     """Levels of an axis: a list of values of the setting it is named after, or names with settings each."""
     if axis in RESERVED:
@@ -238,19 +250,15 @@ def _levels(axis: str, values: object) -> list[Any] | dict[str, dict[str, Any]]:
     raise ConfigError(f"axes.{axis}", values, "a list of values, or names with settings each")
 
 
-def _settings_of_levels(axis: str, levels: list[Any] | dict[str, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
-    """What each level of an axis sets."""
-    return levels if isinstance(levels, dict) else {value: {axis: value} for value in levels}
-
-
-def _seeds(value: object, count: int | None, first: int | None) -> tuple[int, ...]:
-    listed = isinstance(value, list)
-    if listed and count is None and first is None:
-        # type: ignore[union-attr]
-        if not value or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in value):
-            raise ConfigError("seeds", value, "a number of seeds, or a list of whole numbers")
-        return tuple(value)  # type: ignore[arg-type]
-    number = count if count is not None else (len(value) if listed else value)  # type: ignore[arg-type]
+def _seeds(given: object, count: int | None, first: int | None) -> tuple[int, ...]:
+    """Seeds that a file lists, or a number of them from the first one on."""
+    if isinstance(given, list):
+        if not given or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in given):
+            raise ConfigError("seeds", given, "a number of seeds, or a list of whole numbers")
+        if count is None and first is None:
+            return tuple(given)
+        given = len(given)
+    number = given if count is None else count
     if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= 1_000_000:
         raise ConfigError("seeds", number, "1 to 1000000")
     start = FIRST_SEED if first is None else first
