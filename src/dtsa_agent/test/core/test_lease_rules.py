@@ -7,55 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lease_helpers import FAR, is_anchor, still
+from lease_helpers import FAR, STATEMENTS, Air, is_anchor, make
 
-from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.frame import ExtendedFrame, decode_extended, encode_extended
-from dtsa_agent.core.reference.stepper import ReferenceSwarm
+from dtsa_agent.core.frame import ExtendedFrame
 
-STATEMENTS = pytest.mark.parametrize("statement", [Swarm, ReferenceSwarm], ids=["C", "Python"])
 MAIN = 15  # K M of the default settings
 
 
-class Flight:
-    """Agents of one statement that stand still; the first ``movers`` have something to say."""
-
-    def __init__(self, statement: Any, agents: int, movers: int, **settings: Any) -> None:
-        config = SwarmConfig(agents=agents, **{"policy": "lease", "avoider": "none", **settings})
-        self.swarm = statement(config, still(agents))
-        self.swarm.active[:] = 0
-        self.swarm.goal[0, :movers] = FAR
-        self.agents, self.slot = agents, 0
-        self.sent: list[tuple[int, ...]] = []  # ids by slot
-        self.frames: dict[int, ExtendedFrame] = {}
-        self.chosen: list[list[int]] = []  # by slot: whom each expects
-
-    def run(self, slots: int, deaf: dict[int, set[int]] | None = None, changed: Any = None) -> Flight:
-        """Flies.
-
-        :param deaf: ids of those that each agent does not hear, by id.
-        :param changed: makes another frame of a slot's frame, for all that hear it.
-        """
-        for slot in range(self.slot, self.slot + slots):
-            senders = self.swarm.begin(slot)
-            self.sent.append(tuple(k + 1 for k in senders))
-            self.chosen.append(self.swarm.chosen.tolist())
-            if len(senders) == 1:
-                sender = senders[0] + 1
-                frame = self.frames[slot] = decode_extended(self.swarm.frame(senders[0]))
-                said = changed(slot, frame) if changed else frame
-                mask = [k != sender and sender not in (deaf or {}).get(k, ()) for k in range(1, self.agents + 1)]
-                assert self.swarm.hear(slot, encode_extended(said), np.array(mask, dtype=np.uint8))
-            self.swarm.end(slot)
-        self.slot += slots
-        return self
-
-    def own(self, agent: int, first: int) -> list[int]:
-        """Slots from the first on in which an agent sent."""
-        return [slot for slot in range(first, self.slot) if self.sent[slot] == (agent,)]
+def fly(statement: Any, agents: int, movers: int, **settings: Any) -> Air:
+    return Air(make(agents, movers, statement=statement, **settings))
 
 
-def claim(flight: Flight, of: int, by: int) -> int:
+def claim(flight: Air, of: int, by: int) -> int:
     """Agent ``by`` says once that it thinks the ids before it dead, back to ``of``; the slot of that frame."""
     slots: list[int] = []
 
@@ -63,7 +26,7 @@ def claim(flight: Flight, of: int, by: int) -> int:
         if frame.own.sender != by or slots:
             return frame
         slots.append(slot)
-        return replace(frame, c_s=(by - of) % flight.agents, leases=bytes(len(frame.leases)))
+        return replace(frame, c_s=(by - of) % len(flight.swarm.ids), leases=bytes(len(frame.leases)))
 
     while not slots:
         flight.run(1, changed=lie)
@@ -71,38 +34,17 @@ def claim(flight: Flight, of: int, by: int) -> int:
 
 
 @STATEMENTS
-def test_who_is_in_probation_claims_nobody_dead(statement: Any) -> None:
-    flight = Flight(statement, 6, 6).run(60)
+def test_without_adoption_nobody_is_claimed(statement: Any) -> None:
+    flight = fly(statement, 6, 6, adoption=False).run(60)
     flight.swarm.present[3] = 0
     flight.run(1600)
-    assert {flight.frames[slot].c_s for slot in flight.own(5, 1500)} == {1}  # it gives away the turns of agent 4
-    at = claim(flight, of=5, by=6)
-    flight.run(2 * MAIN * 6, deaf={5: {6}})  # nobody who would know better is heard
-    said = [flight.frames[slot] for slot in flight.own(5, at)]
-    in_probation = [frame for frame in said if frame.probation]
-    assert len(in_probation) >= 3
-    assert {frame.c_s for frame in in_probation} == {0}
-    assert not any(lease for frame in in_probation for lease in frame.leases)
-
-
-@STATEMENTS
-@pytest.mark.parametrize("settings", [{"adoption": False}, {}])
-def test_without_adoption_and_when_leaving_nobody_is_claimed(statement: Any, settings: dict[str, Any]) -> None:
-    flight = Flight(statement, 6, 6, **settings).run(60)
-    flight.swarm.present[3] = 0
-    flight.run(1600)
-    if settings:
-        assert {frame.c_s for frame in flight.frames.values()} == {0}
-    flight.swarm.present[4] = 2
-    flight.run(30)
-    (leaving,) = [frame for frame in flight.frames.values() if frame.leaving]
-    assert leaving.c_s == 0
+    assert {frame.c_s for frame in flight.frames.values()} == {0}
 
 
 @STATEMENTS
 def test_who_was_claimed_waits_until_everybody_has_spoken_twice(statement: Any) -> None:
     """2 K M N slots after the claim, where the next one alive is not heard to say otherwise."""
-    flight = Flight(statement, 6, 6).run(200)
+    flight = fly(statement, 6, 6).run(200)
     at = claim(flight, of=5, by=6)
     flight.run(3 * MAIN * 6, deaf={5: {6}})
     other = [slot for slot in flight.own(5, at) if not is_anchor(slot, 6)]
@@ -114,7 +56,7 @@ def test_who_was_claimed_waits_until_everybody_has_spoken_twice(statement: Any) 
 @STATEMENTS
 def test_who_missed_four_turns_is_given_none(statement: Any) -> None:
     """Long before it is thought dead."""
-    flight = Flight(statement, 12, 3).run(600)
+    flight = fly(statement, 12, 3).run(600)
     assert any(1 in frame.leases for slot, frame in flight.frames.items() if slot > 500)
     flight.swarm.present[0] = 0
     flight.run(MAIN * 12 + 120)  # until then frames repeat what was given away before
@@ -126,7 +68,7 @@ def test_who_missed_four_turns_is_given_none(statement: Any) -> None:
     assert not any(1 in frame.leases or 1 in [lessee for _, lessee in frame.relay] for frame in frames)
 
 
-def handed_on(flight: Flight) -> int:
+def handed_on(flight: Air) -> int:
     """Number of turns handed on by those to whom they were given, none to its owner, while some rest and some move."""
     handed = 0
     for stage in range(12):
@@ -151,19 +93,19 @@ def handed_on(flight: Flight) -> int:
 
 @STATEMENTS
 def test_no_turn_is_handed_on_to_its_owner(statement: Any) -> None:
-    assert handed_on(Flight(statement, 12, 6)) > 20
+    assert handed_on(fly(statement, 12, 6)) > 20
 
 
 @STATEMENTS
 @pytest.mark.parametrize("without", [{"open_every": 0}, {"adoption": False}], ids=["OPEN turns", "adoption"])
 def test_without_open_turns_or_adoption_nobody_hands_turns_on(statement: Any, without: dict[str, Any]) -> None:
-    assert handed_on(Flight(statement, 12, 6, **without)) == 0
+    assert handed_on(fly(statement, 12, 6, **without)) == 0
 
 
 @STATEMENTS
 def test_a_relay_of_somebody_else_changes_no_entry(statement: Any) -> None:
     """Of a turn leased to one mover, an agent that has nothing to do with it says that it is another's."""
-    flight = Flight(statement, 12, 2).run(600)
+    flight = fly(statement, 12, 2).run(600)
     told: list[tuple[int, int]] = []  # turn, its lessee
 
     def lie(slot: int, frame: ExtendedFrame) -> ExtendedFrame:
@@ -185,7 +127,7 @@ def test_a_relay_of_somebody_else_changes_no_entry(statement: Any) -> None:
 
 @STATEMENTS
 def test_who_hears_nobody_gives_no_turns_of_the_dead_away(statement: Any) -> None:
-    flight = Flight(statement, 6, 6).run(60)
+    flight = fly(statement, 6, 6).run(60)
     flight.swarm.present[3] = 0
     flight.run(1600)
     assert any(any(flight.frames[slot].leases) for slot in flight.own(5, 1500))  # turns of agent 4
@@ -199,7 +141,7 @@ def test_who_hears_nobody_gives_no_turns_of_the_dead_away(statement: Any) -> Non
 @STATEMENTS
 def test_an_own_entry_holds_nothing_that_was_sent_in_an_open_turn_unheard(statement: Any) -> None:
     """Two that wake in one slot take the first OPEN turn, and nobody hears them."""
-    flight = Flight(statement, 24, 4).run(600)
+    flight = fly(statement, 24, 4).run(600)
     woke, both = flight.slot, [11, 17]
     flight.swarm.goal[0, both] = FAR
     while len(flight.run(1).sent[-1]) < 2:
@@ -212,7 +154,7 @@ def test_an_own_entry_holds_nothing_that_was_sent_in_an_open_turn_unheard(statem
 
 @STATEMENTS
 def test_a_relay_leaves_out_own_turns_that_the_same_frame_names(statement: Any) -> None:
-    flight = Flight(statement, 12, 3).run(600)
+    flight = fly(statement, 12, 3).run(600)
     naming = {slot: frame for slot, frame in flight.frames.items() if any(frame.leases)}
     assert len(naming) > 50
     for slot, frame in naming.items():
