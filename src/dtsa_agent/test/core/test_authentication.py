@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from slot_helpers import one_slot
 
 from dtsa_agent.core import ConfigError, LocalProtocolError, Swarm, SwarmConfig
-from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator, is_pattern
+from dtsa_agent.core.authentication import TAG_LENGTH, Authenticator
 
 KEY = bytes(range(32))
 RANDOM_KEY = "7c1f0a93e4d25b6880b13f96c2de470a"
-FUZZ_FRAMES = 1_000_000
 
 
 @given(st.binary(min_size=1, max_size=56), st.integers(0, 2**40), st.integers(0, 2**64 - 1))
@@ -86,13 +86,6 @@ def test_keys_that_are_a_pattern_are_refused(key: bytes) -> None:
         Authenticator.from_hex(key.hex())
 
 
-@given(st.binary(min_size=16, max_size=32).filter(lambda key: len(set(key)) > 8))
-def test_keys_with_a_pattern_nowhere_are_taken(key: bytes) -> None:
-    assert is_pattern(key + key)
-    if not is_pattern(key):
-        Authenticator.from_hex(key.hex())
-
-
 def test_of_ten_thousand_frames_of_another_run_with_the_same_key_none_is_taken() -> None:
     """Slots count from 0 in each flight: only the session tells one from another."""
     flight, other = (Authenticator(KEY, session) for session in (0x1234_5678_9ABC, 0x1234_5678_9ABD))
@@ -105,68 +98,32 @@ def test_of_ten_thousand_frames_of_another_run_with_the_same_key_none_is_taken()
     assert flight.open(other.seal(b"frame", 3), 3) == b"frame"
 
 
+@given(
+    st.integers(0, 11), st.lists(st.tuples(st.integers(0, 59), st.integers(1, 255)), max_size=3), st.integers(0, 60),
+    st.binary(max_size=60),
+)  # fmt: skip
+@pytest.mark.parametrize("policy", ["tdma", "lease"])
+def test_damaged_frames_are_refused_with_a_key_and_break_no_table_without_one(
+    policy: str, pick: int, changes: list[tuple[int, int]], cut: int, tail: bytes
+) -> None:
+    """A longer trial: the soak `fuzz`."""
+    auth, swarm = Authenticator(KEY), Swarm(SwarmConfig(agents=12, moving=6, policy=policy, avoider="none"))
+    frames = [auth.seal(*one_slot(swarm, slot).values(), slot) for slot in range(12)]
+    data = bytearray(frames[pick])
+    for place, mask in changes:
+        data[place % len(data)] ^= mask
+    data = data[:cut] + tail
+    assert auth.open(bytes(data), pick) is None or bytes(data) in frames
+    swarm.begin(12)
+    swarm.hear(12, bytes(data[:-TAG_LENGTH]))
+    swarm.end(12)
+    for slot in range(13, 30):
+        one_slot(swarm, slot)
+    assert np.isfinite([swarm.sent_position, swarm.sent_velocity]).all()
+    assert np.isfinite(swarm.position).all()
+
+
 @pytest.mark.parametrize("length", [0, 57])
 def test_frames_that_do_not_fit(length: int) -> None:
     with pytest.raises(LocalProtocolError, match="cannot be sealed"):
         Authenticator(KEY).seal(bytes(length), 1)
-
-
-def mutated(random: np.random.Generator, frames: list[bytes], count: int) -> list[bytes]:
-    """Noise, and real frames with a few changed bytes, cut off or drawn out."""
-    noise = random.bytes(64 * count)
-    kinds, picks, lengths = (random.integers(0, top, count) for top in (4, len(frames), 64))
-    places, masks = random.integers(0, 60, (3, count)), random.integers(1, 256, (3, count))
-    result = []
-    for i in range(count):
-        piece = noise[64 * i : 64 * i + int(lengths[i])]
-        if kinds[i] == 0:
-            result.append(piece)
-            continue
-        frame = bytearray(frames[picks[i]])
-        for place, mask in zip(places[: kinds[i], i], masks[: kinds[i], i], strict=True):
-            frame[place % len(frame)] ^= int(mask)
-        result.append(bytes(frame) if kinds[i] < 3 else bytes(frame[: lengths[i]]) + piece[:4])
-    return result
-
-
-def recorded(policy: str, auth: Authenticator) -> tuple[Swarm, list[bytes]]:
-    """A swarm after 200 slots, and the sealed frames that it sent."""
-    swarm = Swarm(SwarmConfig(agents=12, moving=6, policy=policy, avoider="none"))
-    frames = []
-    for slot in range(200):
-        swarm.scenario.advance(slot, swarm)
-        for sender in swarm.begin(slot):
-            frames.append(auth.seal(swarm.frame(sender), slot))
-            swarm.hear(slot, swarm.frame(sender))
-        swarm.fly(slot)
-        swarm.end(slot)
-    return swarm, frames
-
-
-@pytest.mark.parametrize("policy", ["tdma", "lease"])
-def test_fuzz_a_million_frames(policy: str) -> None:
-    """With a key none is accepted, without one none raises or breaks a table."""
-    auth = Authenticator(KEY)
-    swarm, frames = recorded(policy, auth)
-    random = np.random.default_rng(4)
-    authentic = set(frames)
-    rejected = heard = 0
-    for _ in range(FUZZ_FRAMES // 100_000 // 2):
-        for data in mutated(random, frames, 100_000):
-            frame = auth.open(data, 200)
-            assert frame is None or data in authentic
-            rejected += frame is None
-            swarm.hear(200, data[:-TAG_LENGTH])
-            heard += 1
-    assert rejected == heard == FUZZ_FRAMES // 2
-    assert auth.rejected == rejected
-    assert swarm.malformed + swarm.foreign > heard * 0.9
-    swarm.end(200)
-    assert np.isfinite(swarm.sent_position).all()
-    assert np.isfinite(swarm.sent_velocity).all()
-    assert swarm.sent_slot.max() <= 200
-    for slot in range(201, 300):
-        swarm.begin(slot)
-        swarm.fly(slot)
-        swarm.end(slot)
-    assert np.isfinite(swarm.position).all()

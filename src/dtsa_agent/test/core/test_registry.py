@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from slot_helpers import one_slot
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, registry
 from dtsa_agent.core.agents.joining import check_joinable
@@ -16,15 +17,10 @@ from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.core.settings.flight_models import AVOIDERS, AvoiderParams, flight_model
 
 
-def flown(policy: str, shared: bool, slots: int = 60) -> Swarm:
+def flown(policy: str, shared: bool) -> Swarm:
     swarm = Swarm(SwarmConfig(agents=6, moving=4, policy=policy, seed=3), shared_table=shared)
-    for slot in range(slots):
-        swarm.scenario.advance(slot, swarm)
-        senders = swarm.begin(slot)
-        swarm.fly(slot)
-        if len(senders) == 1:
-            swarm.hear(slot, swarm.frame(senders[0]))
-        swarm.end(slot)
+    for slot in range(60):
+        one_slot(swarm, slot)
     return swarm
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from slot_helpers import one_slot
 
 from dtsa_agent.core import REASONS, ConfigError, Swarm, SwarmConfig, encode_frame, make_scenario
 from dtsa_agent.core.frame import Frame
@@ -15,20 +16,9 @@ from dtsa_agent.core.frame import Frame
 COLLISION_FREE = ("tdma", "dtsa", "age")
 
 
-def one_slot(swarm: Swarm, slot: int, mask: np.ndarray | None = None) -> list[int]:
-    """One slot on a channel where simultaneous frames destroy each other; returns the senders' ids."""
-    swarm.scenario.advance(slot, swarm)
-    senders = swarm.begin(slot)
-    swarm.fly(slot)
-    if len(senders) == 1:
-        swarm.hear(slot, swarm.frame(senders[0]), mask)
-    swarm.end(slot)
-    return [swarm.ids[index] for index in senders]
-
-
 def fly(slots: int, **settings: Any) -> tuple[Swarm, list[list[int]]]:
     swarm = Swarm(SwarmConfig(**settings))
-    return swarm, [one_slot(swarm, slot) for slot in range(slots)]
+    return swarm, [list(one_slot(swarm, slot)) for slot in range(slots)]
 
 
 @pytest.mark.parametrize("agents", [2, 3, 12, 18, 40])
@@ -53,7 +43,7 @@ def test_never_two_senders_and_everyone_agrees(policy: str, agents: int, data: s
         )
     )
     for slot in range(min(700, 6 * agents + 250)):
-        senders = one_slot(swarm, slot)
+        senders = list(one_slot(swarm, slot))
         assert len(senders) <= 1
         assert (swarm.chosen == swarm.chosen[0]).all()
         assert (swarm.digest == swarm.digest[0]).all()
@@ -70,28 +60,6 @@ def test_one_shared_table_changes_nothing_without_loss(policy: str, estimator: s
         assert np.array_equal(own.track, shared.track)
         assert np.array_equal(own.digest, shared.digest)
         assert np.array_equal(own.reason, shared.reason)
-
-
-@pytest.mark.parametrize("policy", COLLISION_FREE)
-def test_agents_in_processes_of_their_own_fly_the_same(policy: str) -> None:
-    """One Swarm of six against six Swarms of one that share bytes only."""
-    config = SwarmConfig(agents=6, moving=4, policy=policy, seed=2)
-    whole, parts = Swarm(config), [Swarm(config, local=[k]) for k in range(1, 7)]
-    for slot in range(400):
-        expected = one_slot(whole, slot)
-        sent = []
-        for part in parts:
-            part.scenario.advance(slot, part)
-            if part.begin(slot):
-                sent.append((part.ids[0], part.frame(0)))
-            part.fly(slot)
-        assert [sender for sender, _ in sent] == expected
-        for part in parts:
-            for sender, data in sent:
-                part.hear(slot, data, np.array([sender != part.ids[0]]))
-            part.end(slot)
-        assert np.array_equal(np.concatenate([part.position for part in parts], axis=1), whole.position)
-        assert [int(part.digest[0]) for part in parts] == whole.digest.tolist()
 
 
 def test_tdma_is_the_id_modulo_n() -> None:
@@ -161,7 +129,7 @@ def test_arrived_agents_leave_a_p_and_return_when_they_are_pushed_away() -> None
 
 def test_an_empty_a_p_uses_the_return_slots_only() -> None:
     swarm = Swarm(SwarmConfig(agents=5, moving=0, policy="dtsa"))
-    senders = [one_slot(swarm, slot) for slot in range(205)]
+    senders = [list(one_slot(swarm, slot)) for slot in range(205)]
     used = [slot for slot, who in enumerate(senders) if who]
     assert used == [0, 1, 2, 3, 4, *range(19, 205, 20)]
     assert {senders[slot][0] for slot in used[5:]} == {1, 2, 3, 4, 5}
@@ -270,37 +238,17 @@ def test_absent_agents_neither_send_nor_fly() -> None:
         one_slot(swarm, slot)
     swarm.present[2] = 0
     place = swarm.position[:, 2].copy()
-    senders = [one_slot(swarm, slot) for slot in range(8, 24)]
+    senders = [list(one_slot(swarm, slot)) for slot in range(8, 24)]
     assert [3] not in senders
     assert [] in senders
     assert np.array_equal(swarm.position[:, 2], place)
-
-
-def test_listeners_keep_the_tables_of_those_they_stand_for() -> None:
-    config = SwarmConfig(agents=6, policy="tdma")
-    swarm, listener = Swarm(config), Swarm(config, local=[], observers=[2, 5])
-    random = np.random.default_rng(0)
-    for slot in range(60):
-        swarm.begin(slot)
-        sender = slot % 6
-        mask = (random.random(6) < 0.7).astype(np.uint8)
-        mask[sender] = 0
-        data = swarm.frame(sender)
-        swarm.fly(slot)
-        swarm.hear(slot, data, mask)
-        swarm.end(slot)
-        own = np.array([sender in (1,) or mask[1], sender in (4,) or mask[4]], dtype=np.uint8)
-        listener.hear(slot, data, own)
-        listener.end(slot)
-    assert np.array_equal(listener.sent_position, swarm.sent_position[[1, 4]])
-    assert np.array_equal(listener.in_ap, swarm.in_ap[[1, 4]])
 
 
 def test_reset_repeats_the_flight() -> None:
     swarm, first = fly(100, agents=6, policy="dtsa", seed=8)
     place = swarm.position.copy()
     swarm.reset()
-    assert [one_slot(swarm, slot) for slot in range(100)] == first
+    assert [list(one_slot(swarm, slot)) for slot in range(100)] == first
     assert np.array_equal(swarm.position, place)
 
 
