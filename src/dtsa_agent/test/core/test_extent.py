@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from dtsa_agent.core import ConfigError, Scenario, Swarm, SwarmConfig, decode_frame, encode_frame, make_scenario
 from dtsa_agent.core.frame import (
     EXTENT_M,
-    POSITION_STEP,
     ExtendedFrame,
     Frame,
     Gossip,
@@ -46,14 +45,6 @@ def test_what_lies_within_the_extent_comes_back_to_half_a_step(
     assert np.abs(np.subtract(heard.own.position, own.position)).max() <= half
     assert np.abs(np.subtract(heard.gossip[0].position, item.position)).max() <= 2 * half
     assert np.abs(np.subtract(heard.gossip[0].velocity, v)).max() <= 0.01 + 1e-9
-
-
-def test_the_default_extent_has_steps_of_two_millimetres_to_the_bit() -> None:
-    assert SwarmConfig().extent_m == EXTENT_M
-    assert position_step(EXTENT_M) == POSITION_STEP == 0.002
-    frame = Frame(3, 70, 1, (1.0, -2.5, 65.534), (1.0, 0.0, 0.0))
-    assert encode_frame(frame) == encode_frame(frame, EXTENT_M)
-    assert decode_frame(encode_frame(frame)).position == (1.0, -2.5, 65.534)
 
 
 def far_swarm(extent: float, **more: object) -> Swarm:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core import Swarm, SwarmConfig, _kernel
-from dtsa_agent.core.kernel import ffi, fields_of, lib, memory
+from dtsa_agent.core.kernel import ffi, lib, memory
 
 HEADER = Path(str(_kernel.__file__)).parents[1] / "libdtsa" / "include" / "dtsa.h"
 
@@ -104,10 +104,3 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
     for bad, error in ((np.zeros((2, 2))[:, 0], ValueError), (frozen, ValueError), (np.zeros(2, "f4"), KeyError)):
         with pytest.raises(error):
             memory(bad, writable=True)
-
-
-def test_a_structure_takes_what_has_its_names() -> None:
-    config = SwarmConfig(agents=7, open_every=3)
-    assert fields_of("dtsa_lease_config", config, share=0.5) == {
-        "anchor_every": 5, "open_every": 3, "adoption": True, "depth_rate": 0.2, "share": 0.5, "main_every": 15,
-    }  # fmt: skip

@@ -190,11 +190,3 @@ def test_more_bytes_than_fit_are_refused_and_a_broken_promise_is_the_plug_ins_fa
     swarm = make_swarm(config())
     with pytest.raises(PluginError, match="policy counting, say: gave 3 bytes, declared 4"):
         swarm.begin(0)
-
-
-def test_frames_of_built_in_parts_carry_nothing_more() -> None:
-    for policy, length in (("tdma", 19), ("lease", 56)):
-        assert SwarmConfig(policy=policy).own_bytes == 0
-        swarm = Swarm(SwarmConfig(agents=3, policy=policy))
-        swarm.begin(0)
-        assert len(swarm.frame(0)) == length

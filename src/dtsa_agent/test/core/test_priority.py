@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from kernel_parts import priority, select
 
 from dtsa_agent.core import REASONS
@@ -46,17 +44,6 @@ def test_equal_velocities_and_equal_places_add_nothing() -> None:
     assert priority([[0, 0, 0], [1, 0, 0]], [[1, 2, 3], [1, 2, 3]], 0.01).tolist() == [0, 0]
     assert priority([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [-1, 0, 0]], 0.01).tolist() == [0, 0]
     assert priority([[5, 5, 5]], [[1, 0, 0]], 0.01).tolist() == [0]
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(2, 30), st.integers(0, 2**32 - 1))
-def test_equal_input_gives_equal_bits_and_a_pair_is_symmetric(count: int, seed: int) -> None:
-    """Wherever the arrays lie in memory; and eta of j and k is eta of k and j."""
-    random = np.random.default_rng(seed)
-    position, velocity = random.normal(size=(2, count, 3))
-    assert np.array_equal(priority(position, velocity, 0.01), priority(position.copy(), velocity.copy(), 0.01))
-    pair = priority(position[:2], velocity[:2], 0.01)
-    assert pair[0] == pair[1]
 
 
 def test_order_of_ids_does_not_matter_to_the_default_reading() -> None:

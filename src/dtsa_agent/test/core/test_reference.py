@@ -190,16 +190,6 @@ def test_who_is_most_urgent_is_found_without_all_priorities(count: int, seed: in
     assert swarm.priority[0][known].tobytes() == np.array(g)[known].tobytes()
 
 
-def test_few_priorities_are_computed() -> None:
-    random, known = np.random.default_rng(1), 0
-    swarm = Swarm(SwarmConfig(agents=18, policy="dtsa", moving=0, boot_round=False), shared_table=True)
-    for _ in range(50):
-        swarm.sent_position[:], swarm.sent_velocity[:] = random.normal(size=(2, 3, 18))
-        swarm.decide(8)
-        known += np.isfinite(swarm.priority).sum()
-    assert 50 <= known < 100
-
-
 def random_frame(random: np.random.Generator, agents: int, slot: int, whole: bool) -> bytes:
     """A frame of somebody for a slot or the one before; now and then one of nobody, of another time, or none."""
     sender = int(random.integers(1, agents + 2)) if random.random() < 0.7 else slot % agents + 1
