@@ -9,6 +9,7 @@ import heapq
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import pytest
 from drifting_clocks import to_channel, to_local
@@ -162,16 +163,14 @@ class OwnClocks:
         self.seen.spread_ns.append(max(times) - min(times))
 
 
-def swarm(
-    agents: int, loss: float, align: bool = True, together: bool = False, schedule: tuple[dict[str, object], ...] = ()
-) -> OwnClocks:
+def swarm(agents: int, loss: float, align: bool = True, together: bool = False, **more: Any) -> OwnClocks:
     """Clocks that show anything at all and drift by up to 50 ppm; agents are switched on within three seconds."""
     draw = random.Random(agents)
     config = SwarmConfig(agents=agents, policy="lease", avoider="none", seed=agents)
     clocks = [
         AgentClock(offset_ns=draw.randrange(10**12), drift_ppb=draw.randint(-50_000, 50_000)) for _ in range(agents)
     ]
-    channel = ChannelConfig(agents=agents, slot_ns=config.slot_ns, seed=1, loss=loss, schedule=schedule)  # type: ignore[arg-type]
+    channel = ChannelConfig(agents=agents, slot_ns=config.slot_ns, seed=1, loss=loss, **more)
     starts = [0 if together else draw.randrange(3 * S) for _ in range(agents)]
     return OwnClocks(config, channel, clocks, starts, align)
 
@@ -201,8 +200,9 @@ def test_two_groups_meet() -> None:
     assert 4 <= sum(agent.base.restarts for agent in run.agents) <= 8
 
 
-def test_ten_minutes_of_drift() -> None:
-    seen = swarm(6, 0.2).run(600 * S)
+@pytest.mark.parametrize(("loss", "burst_length"), [(0.5, 0.0), (0.2, 20.0)])
+def test_ten_minutes_of_drift(loss: float, burst_length: float) -> None:
+    seen = swarm(6, loss, burst_length=burst_length).run(600 * S)
     assert all(0 <= spread <= 200_000 for spread in seen.spread_ns[10:])
     assert [when for when in seen.destroyed if when > 10 * S] == []
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,25 +15,29 @@ FRAMES = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 30 * MS), st.integ
 
 
 def summary(verdicts):
-    return [(v.frame_id, v.sender, v.slot, v.received.tolist(), v.lost, v.collided) for v in verdicts]
+    return [
+        (v.frame_id, v.sender, v.slot, v.start_ns, v.arrival_ns, v.received.tolist(), v.lost, v.collided)
+        for v in verdicts
+    ]
 
 
 def arbiter(**config):
     return Air(Channel(ChannelConfig(agents=6, **config)))
 
 
-@given(FRAMES, st.randoms(use_true_random=False), st.integers(50_000, 5 * MS))
-@settings(max_examples=80, deadline=None)
-def test_order_and_rhythm_do_not_matter(frames, order, step):
+@given(FRAMES, st.randoms(use_true_random=False), st.integers(50_000, 5 * MS), st.sampled_from(["plain", "crazyflie"]))
+@settings(max_examples=140, deadline=None)
+def test_order_and_rhythm_do_not_matter(frames, order, step, radio):
     frames = [(i, *frame) for i, frame in enumerate(dict.fromkeys(frames))]
-    at_once = arbiter(loss=0.2, seed=4)
+    if radio != "plain":  # its line sends frames of one moment in the order in which they were handed over
+        frames = list({frame[1:3]: frame for frame in frames}.values())
+    at_once, stepwise = (arbiter(loss=0.2, seed=4, radio=radio) for _ in range(2))
     for frame in frames:
         at_once.begin(*frame)
     expected = summary(at_once.settle(60 * MS))
     assert len(expected) == len(frames)
     assert at_once.pending == 0
     # Now in random order, each frame just in time for the settling that needs it.
-    stepwise = arbiter(loss=0.2, seed=4)
     order.shuffle(frames)
     result, now = [], 0
     while now < 60 * MS:
@@ -71,25 +73,6 @@ def test_against_overlap_by_pairs(frames):
         expected = [agent not in bad for agent in range(1, 7)]
         assert verdict.received.tolist() == expected
         assert (verdict.start_ns, verdict.end_ns, verdict.arrival_ns) == (start, last, last + 300_000)
-
-
-def test_both_frames_of_a_late_transmission_are_destroyed():
-    line = arbiter()
-    line.begin("late", 1, 10 * MS - 200_000, 60)
-    line.begin("owner", 2, 10 * MS, 24)
-    verdicts = line.settle(20 * MS)
-    assert [v.frame_id for v in verdicts] == ["late", "owner"]
-    assert [v.collided for v in verdicts] == [5, 5]
-    assert [v.slot for v in verdicts] == [0, 1]
-
-
-def test_lockstep_and_time_line_agree():
-    channel, line = Channel(ChannelConfig(agents=6, loss=0.3, seed=9)), arbiter(loss=0.3, seed=9)
-    for slot in range(200):
-        sender = slot % 6 + 1
-        line.begin(slot, sender, slot * 10 * MS + 1 * MS, 30)
-        (verdict,) = line.settle((slot + 1) * 10 * MS)
-        assert np.array_equal(verdict.received, channel.arbitrate(slot, (sender,)).mask(6)[0])
 
 
 SLOTS = st.lists(st.lists(st.integers(1, 6), unique=True, max_size=4), min_size=1, max_size=12)
@@ -187,19 +170,6 @@ def test_memory_does_not_grow():
     assert line.pending < 5
 
 
-def test_a_backlog_costs_nothing():
-    """Frames that wait far ahead are not looked at: what is near stays a handful, one settling after the other."""
-    line = arbiter()
-    for slot in range(2000):
-        line.begin(slot, slot % 6 + 1, slot * MS, 60)
-    settled = 0
-    for slot in range(2000):
-        settled += len(line.settle((slot + 1) * MS))
-        line.busy(1, (slot + 1) * MS)
-        assert len(line._near) < 6
-    assert settled == 2000
-
-
 def test_changes_in_flight_begin_with_the_next_slot():
     channel = Channel(ChannelConfig(agents=6))
     line = Air(channel)
@@ -245,20 +215,3 @@ def test_a_sender_that_ends_as_another_frame_begins_hears_that_frame():
     assert not later.deafens(frame)
     assert OnAir(1, 0, 10, 21).deafens(frame)
     assert OnAir(3, 29, 40, 50).deafens(frame)
-
-
-@pytest.mark.parametrize("g", [0.2, 0.5, 1.0])
-def test_throughput_of_pure_aloha(g):
-    """Frames that begin at random instants: one that no other one overlaps is received, exp(-2 G) of them."""
-    senders, times, length = 40, 8000, 200
-    channel = Channel(ChannelConfig(agents=senders + 1, ramp_up_ns=0))
-    line, on_air_ns = Air(channel), channel.config.airtime.on_air_ns(length)
-    draw = np.random.default_rng(1)
-    starts = np.sort(draw.integers(0, times * on_air_ns, draw.poisson(g * times))).tolist()
-    for k, start in enumerate(starts):
-        line.begin(k, 2 + k % senders, start, length)
-    verdicts = line.settle((times + 1) * on_air_ns)
-    share = sum(v.received[0] for v in verdicts) / len(verdicts)
-    expected = math.exp(-2.0 * g)
-    # Fates of neighbours are not independent: twice the error of independent ones, four standard deviations.
-    assert share == pytest.approx(expected, abs=4.0 * 2.0 * math.sqrt(expected * (1 - expected) / len(verdicts)))

@@ -129,10 +129,15 @@ def test_chain_looked_at_anywhere_is_the_chain_walked(seed, loss, stretch, order
     expected = walked(model, all_words, end)
     by_link = walked(model, all_words * factors[7], end)
     chains = Chains(model, words, factors)
-    slots = order.sample(range(end), 25)
-    for slot in slots:
+    draw = np.random.default_rng(seed)  # measured losses: a chain of its own for each link
+    kept, share = draw.choice([0.0, 0.5, 0.95, 0.999], (agents, agents)), draw.uniform(0.05, 0.9, (agents, agents))
+    measured = GilbertElliott(share, (1 - kept) * share, (1 - kept) * (1 - share))
+    row = GilbertElliott(measured.bad_share[6], measured.enter[6], measured.leave[6])
+    by_measured_link, measured_chains = walked(row, all_words * factors[7], end), Chains(measured, words, factors)
+    for slot in order.sample(range(end), 25):
         assert np.array_equal(chains.receivers(slot)[0], expected[slot])
         assert np.array_equal(chains.links(slot, 7)[0], by_link[slot])
+        assert np.array_equal(measured_chains.links(slot, 7)[0], by_measured_link[slot])
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -186,13 +191,19 @@ def test_links_may_be_asymmetric():
     ]
 
 
-def test_link_loss_comes_on_top_of_noise():
+def test_losses_of_links_come_on_top_of_noise_and_of_what_was_measured():
     slots = 40_000
     matrix = [[0.0, 0.5, 0.2], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    channel = Channel(ChannelConfig(agents=3, loss=0.2, loss_matrix=matrix, seed=1))
-    mask = np.array([received(channel, slot, (1,))[0] for slot in range(slots)])
-    for receiver, loss in ((1, 1 - 0.8 * 0.5), (2, 1 - 0.8 * 0.8)):
-        assert abs(1 - mask[:, receiver].mean() - loss) < 4.5 * math.sqrt(0.25 / slots)
+    good, bad, enter, leave = (np.full((3, 3), value).tolist() for value in (0.1, 1.0, 0.0, 1.0))
+    losses = {"slot_ns": 10_000_000, "enter": enter, "leave": leave, "loss_good": good, "loss_bad": bad}
+    link = {"from": 1, "to": 2, "loss": 0.5}
+    for given_losses, expected in (
+        ({"loss": 0.2, "loss_matrix": matrix}, (1 - 0.8 * 0.5, 1 - 0.8 * 0.8)),
+        ({"loss": 0.2, "losses": losses, "link_loss": (link,)}, (1 - 0.8 * 0.9 * 0.5, 1 - 0.8 * 0.9)),
+    ):
+        channel = Channel(ChannelConfig(agents=3, seed=1, **given_losses))
+        mask = np.array([received(channel, slot, (1,))[0] for slot in range(slots)])
+        assert np.abs(1 - mask[:, 1:].mean(axis=0) - expected).max() < 4.5 * math.sqrt(0.25 / slots)
 
 
 def test_a_change_of_the_loss_holds_from_its_first_slot():
