@@ -237,14 +237,6 @@ def test_a_lossy_link_still_connects(tmp_path: Path) -> None:
             assert pilot.bridge.connect() == []
 
 
-def test_min_connected(tmp_path: Path) -> None:
-    with fake_fleet(tmp_path, 2) as fleet:
-        fleet.fault("close", 1)
-        with flight(settings(fleet, {"min_connected": 2})) as pilot:
-            assert pilot.bridge.connect() == ["cf1"]
-            assert "min_connected is 2" in pilot.bridge.enough()
-
-
 def test_simulated_ones_that_begin_to_listen_later_are_waited_for(tmp_path: Path) -> None:
     """A launch starts them beside the bridge, whose three attempts were over within 40 ms."""
     with fake_fleet(tmp_path, 1) as fleet:

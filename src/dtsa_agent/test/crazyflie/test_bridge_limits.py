@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from pathlib import Path
 
@@ -37,48 +38,7 @@ def test_why_a_duration_is_too_short() -> None:
 
 @pytest.mark.slow
 @pytest.mark.realtime
-def test_in_flight(tmp_path: Path) -> None:
-    pytest.importorskip("cflib")
-    from bridge_helpers import fake_fleet, flight, settings
-
-    from dtsa_agent.crazyflie.state.state_machine import State
-
-    with fake_fleet(tmp_path, 1) as fleet:
-        data = settings(fleet, {"safety": {"link_age_s": 3.0}})
-        with flight(data) as pilot:
-            assert pilot.bridge.connect() == []
-            cf = pilot.bridge.vehicles["cf1"]
-            cf.arm(True)
-            wait_for(lambda: cf.state is State.ARMED)
-            assert "duration 0.30 s is too short" in cf.takeoff(1.0, 0.3)
-            assert "is too short" in cf.takeoff(1.0, 0.0)
-            assert "not finite" in cf.takeoff(math.nan, 3.0)
-            assert not fleet.events(name="takeoff")
-            assert cf.takeoff(1.0, 2.0) == ""
-            wait_for(lambda: cf.state is State.FLYING and cf.last is not None and cf.last.position[2] > 0.95)
-            here = cf.last.position
-            far = (here[0] - 1.0, here[1], here[2])
-            assert "duration 1.00 s is too short for 1.00 m" in cf.go_to(far, 0.0, 1.0, False)
-            assert "is too short for 1.00 m" in cf.go_to((-1.0, 0.0, 0.0), 0.0, 1.0, True)
-            assert not fleet.events(name="go_to")
-            assert cf.go_to((-0.3, 0.0, 0.0), 0.0, 1.0, True) == ""
-            notes: list[str] = []
-            assert cf.land("test", 0.0, 0.2, notes.append) == ""
-            assert len(notes) == 1
-            assert "cf1: landing takes 1." in notes[0]
-            assert "duration 0.20 s is too short" in notes[0]
-            pilot.logged("landing takes 1")
-            wait_for(lambda: cf.state is State.READY)
-        states = [e["state"] for e in fleet.events(1, "state")]
-        assert states[:3] == ["ready to fly", "flying", "landed"]
-        assert not [e for e in fleet.events() if e["event"] in ("hard landing", "crash")]
-        landing = fleet.events(1, "land")[0]["t"]
-        assert fleet.state_event(1, "landed")["t"] - landing > 1.5
-
-
-@pytest.mark.slow
-@pytest.mark.realtime
-def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None:
+def test_what_is_too_short_is_refused_and_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None:
     pytest.importorskip("cflib")
     from bridge_helpers import fake_fleet, flight, settings
 
@@ -100,10 +60,21 @@ def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None
 
             cf.arm(True)
             wait_for(lambda: cf.state is State.ARMED)
+            assert "duration 0.30 s is too short" in cf.takeoff(1.0, 0.3)
+            assert "is too short" in cf.takeoff(1.0, 0.0)
+            assert "not finite" in cf.takeoff(math.nan, 3.0)
+            assert not fleet.events(name="takeoff")
             assert cf.takeoff(1.0, 2.0) == ""
             reaches(1.0)
             wait_for(lambda: cf.state is State.FLYING)
             time.sleep(1.0)  # the take-off is flown to its end
+            here = cf.last.position
+            far = (here[0] - 1.0, here[1], here[2])
+            assert "duration 1.00 s is too short for 1.00 m" in cf.go_to(far, 0.0, 1.0, False)
+            assert "is too short for 1.00 m" in cf.go_to((-1.0, 0.0, 0.0), 0.0, 1.0, True)
+            assert not fleet.events(name="go_to")
+            assert cf.go_to((-0.3, 0.0, 0.0), 0.0, 1.0, True) == ""
+            time.sleep(1.2)
             stream()
             assert cf.notify_setpoints_stop(0) == ""
             wait_for(lambda: fleet.events(name="stream ended"))
@@ -115,13 +86,20 @@ def test_motors_never_stop_between_a_stream_and_an_order(tmp_path: Path) -> None
             assert cf.takeoff(1.3, 1.5) == ""
             reaches(1.3)
             assert cf.state is State.FLYING
-            assert cf.land("test") == ""
+            notes: list[str] = []
+            assert cf.land("test", 0.0, 0.2, notes.append) == ""
+            assert len(notes) == 1
+            assert re.search(r"cf1: landing takes [12]\.", notes[0])
+            assert "duration 0.20 s is too short" in notes[0]
+            pilot.logged("landing takes")
             wait_for(lambda: cf.state is State.READY)
         names = [e["event"] for e in fleet.events(1)]
         assert names.count("takeoff") == 1
-        assert names.count("go_to") >= 3
+        assert names.count("go_to") >= 4
         states = [e["state"] for e in fleet.events(1, "state")]
         assert states[:3] == ["ready to fly", "flying", "landed"]
+        assert not [e for e in fleet.events() if e["event"] in ("hard landing", "crash")]
+        assert fleet.state_event(1, "landed")["t"] - fleet.events(1, "land")[-1]["t"] > 1.5
         # A stream ends when there is something else to fly. Here both packets come at once, over the air they do not.
         ended = [k for k, name in enumerate(names) if name == "stream ended"]
         assert len(ended) >= 2

@@ -2,49 +2,25 @@
 
 from __future__ import annotations
 
-import ctypes
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from cffi import FFI
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dtsa_agent
 
 ONBOARD = Path(dtsa_agent.__file__).parent / "onboard"
+RULES = FFI()
+RULES.cdef("\n".join(line for line in (ONBOARD / "safety.h").read_text().splitlines() if not line.startswith("#")))
 OFF, FLY, HOVER, LAND = range(4)
 WELL, DISABLED, GROUND, CANNOT_FLY, ORDERED, BATTERY, OUTSIDE, UNHEARD, OLD_NEWS, NEWCOMER = range(10)
 STEP_S = 0.01
 LIMITS = {"news_s": 1.0, "rests_s": 3.0, "unheard_s": 0.5, "land_s": 2.0, "well_s": 0.2, "battery_v": 3.2, "sag_s": 0.3}
-
-
-class Safety(ctypes.Structure):
-    """`safety` of safety.h."""
-
-    _fields_ = [("mode", ctypes.c_int), ("reason", ctypes.c_int)] + [
-        (name, ctypes.c_float) for name in ("since_s", "well_s", "sagged_s", "outside_s")
-    ] + [("refused", ctypes.c_int)]  # fmt: skip
-
-
-class Settings(ctypes.Structure):
-    """`safety_settings`."""
-
-    _fields_ = [(name, ctypes.c_float) for name in LIMITS] + [
-        ("low", ctypes.c_float * 3), ("high", ctypes.c_float * 3),
-    ]  # fmt: skip
-
-
-class View(ctypes.Structure):
-    """`safety_view`."""
-
-    _fields_ = [(name, ctypes.c_int) for name in ("enabled", "ordered", "ground", "can_fly", "in_air", "newcomer")] + [
-        ("battery_v", ctypes.c_float), ("position", ctypes.c_float * 3),
-        ("oldest_s", ctypes.c_float), ("rests_s", ctypes.c_float), ("unheard_s", ctypes.c_float),
-    ]  # fmt: skip
 
 
 GOOD: dict[str, Any] = {
@@ -57,29 +33,27 @@ class Guard:
     """The rules, compiled."""
 
     def __init__(self, library: Any) -> None:
-        self._library, self.state = library, Safety()
-        self._settings = Settings(*LIMITS.values(), (-2.0, -2.0, 0.2), (2.0, 2.0, 2.0))
+        self._library, self.state = library, RULES.new("safety *")
+        box = {"low": (-2.0, -2.0, 0.2), "high": (2.0, 2.0, 2.0)}
+        self._settings = RULES.new("safety_settings *", LIMITS | box)
 
     def step(self, seconds: float = STEP_S, **changed: Any) -> int:
         """What it does in the end, after so long."""
-        seen = GOOD | changed
-        view = View(*(tuple(v) if isinstance(v, tuple) else v for v in seen.values()))
+        view = RULES.new("safety_view *", GOOD | changed)
         for _ in range(round(seconds / STEP_S)):
-            self._library.safety_step(
-                ctypes.byref(self.state), ctypes.byref(self._settings), ctypes.byref(view), ctypes.c_float(STEP_S)
-            )
+            self._library.safety_step(self.state, self._settings, view, STEP_S)
         return int(self.state.mode)
 
 
 @pytest.fixture(scope="module", name="library")
-def _library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def _library(tmp_path_factory: pytest.TempPathFactory) -> Any:
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         pytest.skip("no C compiler on this machine")
     out = tmp_path_factory.mktemp("safety") / "safety.so"
     words = [compiler, "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion", "-O2", "-shared", "-fPIC"]
     subprocess.run([*words, "-o", out, ONBOARD / "safety.c"], check=True, timeout=60)
-    return ctypes.CDLL(str(out))
+    return RULES.dlopen(str(out))
 
 
 def test_it_flies_when_all_has_been_well_for_a_while(library: Any) -> None:
@@ -153,8 +127,7 @@ def test_the_ground_wins_until_it_enables_anew(library: Any) -> None:
 
 _ANY = st.floats(allow_nan=True, width=32)
 _SEEN = st.fixed_dictionaries({}, optional={
-    "enabled": st.integers(0, 1), "ordered": st.integers(0, 1), "ground": st.integers(0, 1),
-    "can_fly": st.integers(0, 1), "in_air": st.integers(0, 1), "newcomer": st.integers(0, 1),
+    **{name: st.integers(0, 1) for name in ("enabled", "ordered", "ground", "can_fly", "in_air", "newcomer")},
     "battery_v": st.floats(2.5, 4.25, width=32) | _ANY, "oldest_s": st.floats(-1.0, 3.0, width=32) | _ANY,
     "unheard_s": st.floats(-1.0, 3.0, width=32) | _ANY,
     "position": st.tuples(_ANY, _ANY, _ANY) | st.just((0.0, 0.0, 1.0)),

@@ -79,7 +79,9 @@ def test_real_time_is_seen_in_the_command_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
-def test_a_node_listens_on_loopback_only_and_leaves_nothing_after_kill_9(tmp_path: Path) -> None:
+def test_nodes_listen_on_loopback_only_and_leave_nothing_after_kill_9(
+    tmp_path: Path,
+) -> None:
     with ros_graph(tmp_path) as graph:
         node = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2")
         names = graph.node.get_node_names_and_namespaces
@@ -90,21 +92,16 @@ def test_a_node_listens_on_loopback_only_and_leaves_nothing_after_kill_9(tmp_pat
         assert segments
         clean_shared_memory()
         assert all((SHARED_MEMORY / name).exists() for name in segments), "removed what is in use"
+        live = ("-r", "__ns:=/north", "-p", "agents:=2", "-p", "mode:=realtime")
+        punctual = graph.start("dtsa_channel_sim.ros.channel_node", *live)
+        graph.until(lambda: ("channel", "/north") in names())
+        assert addresses(punctual.pid) == {"127.0.0.1"}
+        assert segments_of(punctual.pid) == set()
         time.sleep(1.1)  # the age below which nothing is touched
         node.send_signal(signal.SIGKILL)
         node.wait()
         clean_shared_memory()
         assert not [name for name in segments if (SHARED_MEMORY / name).exists()]
-
-
-@pytest.mark.ros
-def test_a_node_in_real_time_has_no_port_in_shared_memory(tmp_path: Path) -> None:
-    with ros_graph(tmp_path) as graph:
-        node = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2", "-p", "mode:=realtime")
-        names = graph.node.get_node_names_and_namespaces
-        graph.until(lambda: ("channel", "/swarm") in names())
-        assert addresses(node.pid) == {"127.0.0.1"}
-        assert segments_of(node.pid) == set()
 
 
 def test_a_node_shares_memory_only_if_its_supervisor_does(tmp_path: Path) -> None:

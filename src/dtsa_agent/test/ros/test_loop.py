@@ -46,30 +46,32 @@ def test_a_hang_up_that_is_ignored_stays_ignored(before: signal.Handlers) -> Non
         signal.signal(signal.SIGHUP, usual)
 
 
-def test_what_does_not_end_after_a_signal_says_where_it_stands_and_is_ended() -> None:
-    program = (
-        "import os, signal, time\nfrom dtsa_agent.stop import Stop\n"
-        "def stands_still():\n    time.sleep(60)\n"
-        "with Stop(0.3) as stop:\n    os.kill(os.getpid(), signal.SIGINT)\n{}"
+@pytest.mark.parametrize(
+    ("program", "code", "said"),
+    [
+        (
+            "with Stop(0.3) as stop:\n    interrupt()\n    stands_still(60)",
+            1,
+            "in stands_still",
+        ),
+        ("with Stop(0.3) as stop:\n    interrupt()\ntime.sleep(0.6)", 0, ""),
+        # With the interpreter's lock: nobody sees a signal then, and no other thread runs.
+        ("with Stop(0.3) as stop, stop.in_time():\n    holds_the_lock(50)", 1, "in holds_the_lock"),
+        ("with Stop(30) as stop, stop.in_time():\n    holds_the_lock(0.1)", 0, ""),
+        ("with Stop(0.0) as stop, stop.in_time():\n    holds_the_lock(0.5)", 0, ""),
+    ],
+)
+def test_what_does_not_end_after_a_signal_or_stands_still_says_where_and_is_ended(
+    program: str, code: int, said: str
+) -> None:
+    head = (
+        "import ctypes, os, signal, time\nfrom dtsa_agent.stop import Stop\n"
+        "def interrupt():\n    os.kill(os.getpid(), signal.SIGINT)\n"
+        "def stands_still(seconds):\n    time.sleep(seconds)\n"
+        "def holds_the_lock(seconds):\n    ctypes.PyDLL(None).usleep(int(1e6 * seconds))\n"
     )
-    for then, code, said in (("    stands_still()", 1, "in stands_still"), ("time.sleep(0.6)", 0, "")):
-        words = [sys.executable, "-c", program.format(then)]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=50, check=False)
-        assert done.returncode == code
-        assert said in done.stderr
-        assert bool(done.stderr) == bool(said)
-
-
-def test_a_call_that_stands_still_with_the_interpreters_lock_ends_the_process() -> None:
-    """Nobody sees a signal then, and no other thread runs."""
-    program = (
-        "import ctypes\nfrom dtsa_agent.stop import Stop\n"
-        "def stands_still(seconds):\n    ctypes.PyDLL(None).usleep(int(1e6 * seconds))\n"
-        "with Stop({limit}) as stop, stop.in_time():\n    stands_still({seconds})\n"
-    )
-    for limit, seconds, code, said in ((0.3, 50, 1, "in stands_still"), (30, 0.1, 0, ""), (0.0, 0.5, 0, "")):
-        words = [sys.executable, "-c", program.format(limit=limit, seconds=seconds)]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=40, check=False)
-        assert done.returncode == code
-        assert said in done.stderr
-        assert bool(done.stderr) == bool(said)
+    words = [sys.executable, "-c", head + program]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=50, check=False)
+    assert done.returncode == code
+    assert said in done.stderr
+    assert bool(done.stderr) == bool(said)

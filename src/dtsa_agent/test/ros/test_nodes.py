@@ -23,10 +23,9 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 from std_msgs.msg import Header
 
-from dtsa_agent.core import REASONS, Scenario, Swarm, SwarmConfig, decode_frame, make_scenario
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core import REASONS, Swarm, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.frame import decode_extended
-from dtsa_agent.core.settings.declaration import format_values, parse_values, settings_of
+from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.runs import Run
 from dtsa_agent.ros.common.wire.packing import pack_received, split_frames, unpack_received
@@ -79,9 +78,11 @@ class Channel:
 
 
 @pytest.mark.ros
-def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> None:
+def test_an_agent_answers_slot_by_slot_sends_odometry_and_ends_when_told(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
         channel = Channel(graph)
+        heard: list[Odometry] = []
+        graph.node.create_subscription(Odometry, "/cf2/odom", heard.append, 5)  # reliably, like RViz
         agent = graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3", "-p", "moving:=2", "-p", "seed:=5")
         scenario = make_scenario(SwarmConfig(agents=3, moving=2, seed=5))
         first = channel.ask(0)
@@ -89,7 +90,7 @@ def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> Non
         assert list(first.chosen) == [1]
         assert list(first.length) == [0]
         assert np.array_equal(first.track, scenario.start[:, 1])
-        second = channel.ask(1)
+        second = channel.ask(1, header=Header(stamp=Time(sec=1)))
         assert list(second.chosen) == [2]
         frame = decode_frame(bytes(second.data))
         assert (frame.sender, frame.slot) == (2, 1)
@@ -97,7 +98,17 @@ def test_an_agent_answers_slot_by_slot_and_ends_when_told(tmp_path: Path) -> Non
         channel.publisher.publish(Slot(run=channel.run.number, slot=1, heard_slot=0))
         graph.until(lambda: len(channel.answers) > count)
         assert channel.answers[-1] == second  # asked again: the same answer, nothing has moved
-        channel.end(2)
+        answers = {0: first, 1: second}
+        while not heard:
+            slot = len(answers)
+            answers[slot] = channel.ask(slot, header=Header(stamp=Time(sec=slot)))
+        odometry = heard[0]
+        assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "cf2/base_link")
+        answer = answers[odometry.header.stamp.sec]
+        place, speed = odometry.pose.pose.position, odometry.twist.twist.linear
+        assert [place.x, place.y, place.z] == list(answer.track)
+        assert [speed.x, speed.y, speed.z] == list(answer.velocity)
+        channel.end(len(answers))
         assert end_of(agent) == (0, "")
 
 
@@ -135,25 +146,7 @@ def test_an_agent_started_again_after_kill_9_is_heard_from_whatever_the_dead_one
 
 
 @pytest.mark.ros
-def test_odometry_is_sent_to_who_listens_reliably_like_rviz(tmp_path: Path) -> None:
-    with ros_graph(tmp_path) as graph:
-        channel = Channel(graph)
-        heard: list[Odometry] = []
-        graph.node.create_subscription(Odometry, "/cf2/odom", heard.append, 5)
-        graph.start(AGENT, "-r", "__ns:=/cf2", "-p", "agents:=3", "-p", "moving:=2", "-p", "seed:=5")
-        answers: list[Transmission] = []
-        while not heard:
-            answers.append(channel.ask(len(answers), header=Header(stamp=Time(sec=len(answers)))))
-        first = heard[0]
-        slot = first.header.stamp.sec
-        assert (first.header.frame_id, first.child_frame_id) == ("map", "cf2/base_link")
-        place, speed = first.pose.pose.position, first.twist.twist.linear
-        assert [place.x, place.y, place.z] == list(answers[slot].track)
-        assert [speed.x, speed.y, speed.z] == list(answers[slot].velocity)
-
-
-@pytest.mark.ros
-def test_slots_that_cannot_be_under_way_and_forged_ends_change_nothing(tmp_path: Path) -> None:
+def test_strange_slots_and_forged_ends_change_nothing_and_a_node_ends_when_its_channel_has_gone(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
         channel = Channel(graph)
         agent = graph.start(AGENT, "-p", "id:=1", "-p", "agents:=2")
@@ -174,29 +167,17 @@ def test_slots_that_cannot_be_under_way_and_forged_ends_change_nothing(tmp_path:
             graph.executor.spin_once(timeout_sec=0.05)
         assert channel.ask(1).slot == 1
         graph.until(lambda: sum(channel.processes[-1].dropped) >= 9)
-        channel.end(2)
-        assert end_of(agent)[0] == 0
+        assert agent.poll() is None
         told = channel.processes[-1]
         counts = dict(zip(told.dropped_reason, told.dropped, strict=True))
         assert counts == {"slot": 2, "forged end": 2, "sizes": 2, "range": 1, "other run": 2}
-
-
-@pytest.mark.ros
-def test_a_node_ends_when_its_channel_has_gone(tmp_path: Path) -> None:
-    with ros_graph(tmp_path) as graph:
-        channel = Channel(graph)
-        agent = graph.start(AGENT, "-p", "id:=1", "-p", "agents:=2")
-        channel.ask(0)
-        channel.ask(1)
-        assert agent.poll() is None
         graph.node.destroy_publisher(channel.publisher)
         said = "agent: error: the channel has gone after slot 1 without ending the run\n"
         assert end_of(agent) == (1, said)
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number: int) -> None:
+def test_parameters_are_described_and_ctrl_c_ends_cleanly(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
         agent = graph.start(AGENT, "-p", "id:=3", "-p", "agents:=4", "-p", "slot_ms:=20")
         describe = graph.node.create_client(DescribeParameters, "/cf3/agent/describe_parameters")
@@ -215,7 +196,7 @@ def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number
             if setting.choices:
                 assert ", ".join(setting.choices) in found.additional_constraints
         assert values.values[1].integer_value == 3
-        assert end_of(agent, number) == (0, "")
+        assert end_of(agent, signal.SIGINT) == (0, "")
 
 
 @pytest.mark.ros
@@ -225,6 +206,10 @@ def test_parameters_are_described_and_signals_end_cleanly(tmp_path: Path, number
         (AGENT, ["policy:=fifo"], "agent: error: policy: got 'fifo'; allowed: tdma, dtsa"),
         (AGENT, ["agents:=0"], "agent: error: agents: got 0; allowed: a whole number, 1 to 1024"),
         (AGENT, ["id:=13"], "agent: error: id: got 13; allowed: 1 to 12"),
+        (AGENT, ["air:=smoke"], "agent: error: air: got 'smoke'"),
+        (AGENT, ["air:=udp", "auth:=false"], "agent: error: interface: got ''"),
+        (AGENT, ["air:=udp", "interface:=lo"], "agent: error: auth_session: got 0"),
+        (AGENT, ["air:=udp", "auth:=false", "interface:=lo", "id:=13"], "agent: error: id: got 13"),
         (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
         (HOST, ["policy:=aloha", "shared_table:=true"], "swarm_host: error: shared_table: got True; allowed: false"),
     ],
@@ -336,33 +321,6 @@ def test_an_agent_that_leaves_says_so_even_if_its_next_turn_is_k_m_rounds_away(t
     assert divmod(slots[-1], config.agents) == (config.main_every - 1, 1)  # (R + T mod N) mod (K M) = 0
 
 
-@pytest.mark.parametrize(("policy", "scenario"), [("tdma", "exchange"), ("dtsa", "exchange"), ("age", "stop-and-go")])
-def test_agents_that_shared_a_table_go_on_alone_as_if_they_never_had(policy: str, scenario: str) -> None:
-    config = SwarmConfig(agents=6, policy=policy, scenario=scenario, seed=4)
-    shared, alone = Swarm(config, shared_table=True), Swarm(config)
-    random = np.random.default_rng(1)
-    for slot in range(300):
-        alone.scenario.advance(slot, alone)
-        shared.scenario.advance(slot, shared)
-        senders = alone.begin(slot)
-        assert shared.begin(slot) == senders
-        for name in ("chosen", "reason", "digest", "score", "position", "velocity", "command"):
-            assert np.array_equal(getattr(shared, name), getattr(alone, name)), (slot, name)
-        alone.fly(slot)
-        shared.fly(slot)
-        lossy = slot >= 97
-        if slot == 97:
-            shared = shared.with_own_tables(slot)
-        for index in senders:
-            mask = (random.random(6) < 0.6).astype(np.uint8) if lossy else np.ones(6, dtype=np.uint8)
-            mask[index] = 0
-            alone.hear(slot, alone.frame(index), mask)
-            shared.hear(slot, shared.frame(index), mask if lossy else None)
-        alone.end(slot)
-        shared.end(slot)
-    assert len(set(alone.digest.tolist())) > 1
-
-
 @given(st.integers(1, 70), st.integers(0, 5), st.randoms(use_true_random=False))
 def test_receiver_bits_survive_the_message(agents: int, frames: int, random: object) -> None:
     mask = np.array([[random.random() < 0.5 for _ in range(agents)] for _ in range(frames)], dtype=np.bool_)  # type: ignore[attr-defined]
@@ -377,38 +335,6 @@ def test_frames_survive_the_message(frames: list[bytes]) -> None:
     assert split_frames(b"".join(frames), [len(frame) for frame in frames]) == frames
     with pytest.raises(ValueError, match="bytes of frames"):
         split_frames(b"".join(frames) + b"x", [len(frame) for frame in frames])
-
-
-@given(st.dictionaries(st.from_regex(r"[a-z_]{1,8}", fullmatch=True), st.floats(allow_nan=False, allow_infinity=False)))
-def test_named_values_survive_their_text(values: dict[str, float]) -> None:
-    assert parse_values(format_values(values)) == values
-
-
-@pytest.mark.parametrize(
-    ("name", "text"), [("agents", "1.5"), ("slot_ms", "fast"), ("boot_round", "maybe"), ("options", "tau")]
-)
-def test_texts_of_another_kind_are_refused_by_name(name: str, text: str) -> None:
-    setting = next(setting for setting in settings_of(SwarmConfig) if setting.name == name)
-    with pytest.raises(ConfigError, match=name):
-        setting.parse(text)
-
-
-def test_every_setting_says_what_it_is() -> None:
-    for setting in settings_of(SwarmConfig):
-        assert setting.help
-        assert setting.kind in ("int", "float", "bool", "text", "values", "structure")
-        if setting.kind in ("int", "float"):
-            assert setting.minimum is not None
-            assert setting.maximum is not None
-
-
-def test_a_scenario_is_handed_through() -> None:
-    """What a node flies is what the scenario says, also where it is not the configuration's own."""
-    config = SwarmConfig(agents=2, moving=2)
-    plain = make_scenario(config)
-    other = Scenario(plain.start, plain.start.copy(), plain.moving)
-    swarm = Swarm(config, other)
-    assert np.array_equal(swarm.goal, plain.start)
 
 
 def test_reasons_in_the_message_are_those_of_the_core() -> None:

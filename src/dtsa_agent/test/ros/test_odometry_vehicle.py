@@ -108,24 +108,6 @@ def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_
         graph.until(lambda: len(vehicle.commands) > 1 and not np.any(vehicle.commands[-2:]), vehicle.act)
 
 
-@pytest.mark.ros
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"air": "smoke"}, "air: got 'smoke'"),
-        ({"air": "udp", "auth": "false"}, "interface: got ''"),
-        ({"air": "udp", "interface": "lo"}, "auth_session: got 0"),
-        ({"air": "udp", "auth": "false", "interface": "lo", "id": 13}, "id: got 13"),
-    ],
-)
-def test_what_cannot_be_flown_ends_with_one_line(tmp_path: Path, values: dict[str, object], said: str) -> None:
-    with ros_graph(tmp_path) as graph:
-        code, line = end_of(graph.start(AGENT, *parameters(values)))
-    assert code == 2
-    assert said in line
-    assert len(line.splitlines()) == 1
-
-
 def test_a_vehicle_that_has_to_hover_returns_to_where_that_began(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = OdometryVehicle.__new__(OdometryVehicle)
     vehicle._every, vehicle._hold, sent = 1, None, []

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ from dtsa_msgs.msg import Configuration, RunStatus, Slot, Transmission
 from rcl_interfaces.msg import Log
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.task import Future
 
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
@@ -113,17 +115,11 @@ def test_logs_go_where_they_can(tmp_path: Path, capsys: pytest.CaptureFixture[st
     made.rmdir()
 
 
-@pytest.mark.parametrize(
-    ("agent", "swarm", "namespace", "frame", "clock"),
-    [
-        (3, "/swarm", "/cf3", "cf3/base_link", "/clock"),
-        (3, "/north", "/north/cf3", "north/cf3/base_link", "/north/clock"),
-    ],
-)
-def test_names_of_the_default_swarm_are_short(agent: int, swarm: str, namespace: str, frame: str, clock: str) -> None:
-    assert names.agent_namespace(agent, swarm) == namespace
-    assert names.body_frame(names.agent_namespace(agent, swarm)) == frame
-    assert names.clock_topic(swarm) == clock
+@pytest.mark.parametrize(("swarm", "before"), [("/swarm", ""), ("/north", "/north")])
+def test_names_of_the_default_swarm_are_short(swarm: str, before: str) -> None:
+    assert names.agent_namespace(3, swarm) == f"{before}/cf3"
+    assert names.body_frame(f"{before}/cf3") == f"{before}/cf3/base_link"[1:]
+    assert names.clock_topic(swarm) == f"{before}/clock"
 
 
 @pytest.mark.ros
@@ -163,6 +159,19 @@ def test_late_subscribers_get_settings_and_status(graph: Graph) -> None:
     assert end_of(host)[0] == 0
 
 
+@contextmanager
+def attached_agents(graph: Graph, space: str) -> Iterator[tuple[SwarmNode, Future, Callable[[], None]]]:
+    """Two agents in a node that an ordinary executor serves when it is told to."""
+    node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
+    agents = SwarmNode(node, Swarm(SwarmConfig(agents=2)), space)
+    executor = SingleThreadedExecutor(context=graph.node.context)
+    executor.add_node(node)
+    yield agents, agents.attach(), lambda: executor.spin_once(timeout_sec=0.05)
+    executor.shutdown()
+    agents.loop.close()
+    node.destroy_node()
+
+
 def answers_in(graph: Graph, space: str, attached: bool) -> list[list[object]]:
     """What two agents answer in a run of 30 slots: served by an ordinary executor, or in a process of their own."""
     given: list[Transmission] = []
@@ -178,17 +187,10 @@ def answers_in(graph: Graph, space: str, attached: bool) -> list[list[object]]:
         start_channel()
         graph.until(lambda: process.poll() is not None)
     else:
-        node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
-        agents = SwarmNode(node, Swarm(SwarmConfig(agents=2)), space)
-        over = agents.attach()
-        executor = SingleThreadedExecutor(context=graph.node.context)
-        executor.add_node(node)
-        start_channel()
-        graph.until(over.done, lambda: executor.spin_once(timeout_sec=0.05))
-        assert over.exception() is None
-        executor.shutdown()
-        agents.loop.close()
-        node.destroy_node()
+        with attached_agents(graph, space) as (_, over, serve):
+            start_channel()
+            graph.until(over.done, serve)
+            assert over.exception() is None
     graph.until(lambda: given and given[-1].slot == 30)
     by_slot = {m.slot: [m.slot, list(m.data), list(m.chosen), list(m.digest), list(m.track)] for m in given}
     return [by_slot[slot] for slot in range(31)]
@@ -201,18 +203,10 @@ def test_agents_in_an_ordinary_executor_answer_the_same(graph: Graph) -> None:
 
 @pytest.mark.ros
 def test_an_error_of_attached_agents_is_in_the_future(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
-    node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
-    agents = SwarmNode(node, Swarm(SwarmConfig(agents=2)), "/attached")
-
     def gone(*unused: object) -> None:
         raise LocalProtocolError("the channel has gone")
 
-    monkeypatch.setattr(agents.membership, "idle", gone)
-    over = agents.attach()
-    executor = SingleThreadedExecutor(context=graph.node.context)
-    executor.add_node(node)
-    graph.until(over.done, lambda: executor.spin_once(timeout_sec=0.05))
-    assert isinstance(over.exception(), LocalProtocolError)
-    executor.shutdown()
-    agents.loop.close()
-    node.destroy_node()
+    with attached_agents(graph, "/attached") as (agents, over, serve):
+        monkeypatch.setattr(agents.membership, "idle", gone)
+        graph.until(over.done, serve)
+        assert isinstance(over.exception(), LocalProtocolError)

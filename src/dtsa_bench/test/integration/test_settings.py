@@ -252,7 +252,13 @@ def test_values_are_stored_as_their_kind() -> None:
 
 @pytest.mark.parametrize(
     ("name", "text", "value"),
-    [("count", "7", 7), ("share", "1", 1.0), ("on", "no", False), ("color", "green", "green")],
+    [
+        ("count", "7", 7),
+        ("share", "1", 1.0),
+        ("on", "no", False),
+        ("color", "green", "green"),
+        ("values", "a=1, b=-2.5", {"a": 1.0, "b": -2.5}),
+    ],
 )
 def test_texts_are_read(name: str, text: str, value: Any) -> None:
     spec = next(spec for spec in settings_of(WHOLE) if spec.name == name)
