@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from waiting import wait_for
 
@@ -73,6 +74,22 @@ def fake_fleet(
         yield FakeFleet(process, base, count, truth)
         process.send_signal(signal.SIGINT)
         assert process.wait(10) == 0
+    finally:
+        end_process(process)
+
+
+@contextlib.contextmanager
+def bridge_process(
+    domain: int, config: Path, *parameters: str, output: int | IO[str] = subprocess.PIPE
+) -> Iterator[subprocess.Popen[str]]:
+    """The bridge's node in a process of its own, in a ROS domain."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    command = [sys.executable, "-m", "dtsa_agent.crazyflie.node.bridge_node", "--ros-args"]
+    command += [word for value in (f"config:={config}", *parameters) for word in ("-p", value)]
+    environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
+    process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield process
     finally:
         end_process(process)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.agents.joining import Listeners, Newcomers, check_joinable
-from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.agents.joining import Listeners, Newcomers
 
 MS = 1_000_000
 
@@ -30,14 +29,6 @@ def test_who_hears_nobody_begins_after_one_to_two_rounds_of_anchors() -> None:
         listeners = Listeners(config, [agent], [1000])
         assert not listeners.ready([1000 + rounds - 1])
         assert listeners.ready([1000 + 2 * rounds])
-
-
-@pytest.mark.parametrize("policy", ["dtsa", "age"])
-def test_who_must_have_the_same_table_as_all_cannot_come_late(policy: str) -> None:
-    with pytest.raises(ConfigError, match="policy"):
-        check_joinable(policy)
-    with pytest.raises(ConfigError, match="policy"):
-        Listeners(SwarmConfig(agents=4, policy=policy), [1], [0])
 
 
 @pytest.mark.parametrize("policy", ["tdma", "aloha", "lease"])

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import signal
-import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +18,7 @@ pytest.importorskip("cflib")
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from bridge_helpers import end_process, fake_fleet, settings  # noqa: E402
+from bridge_helpers import bridge_process, fake_fleet, settings  # noqa: E402
 from builtin_interfaces.msg import Duration  # noqa: E402
 from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
 from node_helpers import ServedNode  # noqa: E402
@@ -135,16 +134,7 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
         for k, robot in enumerate(data["robots"].values()):
             robot["initial_position"] = [(1.2, -1.2)[k], 0.0, 0.0]
         config.write_text(yaml.safe_dump(data))
-        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        parameters = {"config": config, "interfaces": "crazyswarm2"}
-        command = [sys.executable, "-m", "dtsa_agent.crazyflie.node.bridge_node", "--ros-args"]
-        command += [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-        process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        program = Program(domain)
-        try:
+        with bridge_process(domain, config, "interfaces:=crazyswarm2") as process, closing(Program(domain)) as program:
             program.client(Empty, "/all/emergency")
             poses, status = program.listen(PoseStamped, "/cf1/pose"), program.listen(Status, "/cf1/status")
             # Parameters: of one, of all, of the robots; what cannot be is refused.
@@ -184,6 +174,3 @@ def test_a_flight_as_its_programs_fly(tmp_path: Path) -> None:
                 f"order /all/start_trajectory: {NO_TRAJECTORIES}",
             ):  # fmt: skip
                 assert words in output
-        finally:
-            program.close()
-            end_process(process)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -20,7 +19,7 @@ pytest.importorskip("cflib")
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from bridge_helpers import FakeFleet, end_process, fake_fleet, settings  # noqa: E402
+from bridge_helpers import FakeFleet, bridge_process, fake_fleet, settings  # noqa: E402
 from builtin_interfaces.msg import Duration  # noqa: E402
 from dtsa_msgs.msg import Position, Status, VelocityWorld  # noqa: E402
 from dtsa_msgs.srv import Arm, GoTo, Land, Takeoff  # noqa: E402
@@ -44,25 +43,8 @@ def swarm(tmp_path: Path) -> Iterator[tuple[FakeFleet, subprocess.Popen[str], Gr
         data = settings(fleet, PATIENT)
         data["robots"]["cf3"]["group_mask"] = 2
         config.write_text(yaml.safe_dump(data))
-        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        command = [
-            sys.executable,
-            "-m",
-            "dtsa_agent.crazyflie.node.bridge_node",
-            "--ros-args",
-            "-p",
-            f"config:={config}",
-        ]
-        process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        graph = Graph(domain)
-        try:
+        with bridge_process(domain, config) as process, closing(Graph(domain)) as graph:
             yield fleet, process, graph
-        finally:
-            graph.close()
-            end_process(process)
 
 
 def up(graph: Graph) -> None:
@@ -221,9 +203,6 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert "safety.heartbeat_s" in result.stderr
     assert "Traceback" not in result.stderr
-
-
-def test_a_bad_command_line_ends_with_exit_code_2() -> None:
     result = run_bridge("config=/nowhere/swarm.yaml")
     assert result.returncode == 2
     assert "config=/nowhere/swarm.yaml" in result.stderr

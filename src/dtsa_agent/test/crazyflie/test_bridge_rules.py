@@ -186,17 +186,9 @@ def test_nothing_is_done_without_need() -> None:
     ("where", "axis"), [((1.56, 0, 0), "x"), ((-1.56, 0, 0), "x"), ((0, 2.36, 0), "y"), ((0, 0, 1.01), "z")]
 )
 def test_geofence_lands(where: tuple[float, float, float], axis: str) -> None:
-    assert verdicts(vehicle(position=where)) == [("cf1", Action.LAND, "geofence")]
-    assert verdicts(vehicle(position=where), geofence=False) == []
-    assert verdicts(vehicle(position=where, state=State.READY)) == []
     (verdict,) = SafetyMonitor(SafetySettings()).check(0.0, [vehicle(position=where)], None)
+    assert (verdict.name, verdict.action, verdict.rule) == ("cf1", Action.LAND, "geofence")
     assert f"in {axis}" in verdict.reason
-
-
-def test_far_outside_the_fence_the_motors_stop() -> None:
-    found = verdicts(vehicle(position=(2.4, 0, 0)))
-    assert found == [("cf1", Action.LAND, "geofence"), ("cf1", Action.STOP, "geofence")]
-    assert verdicts(vehicle(position=(2.4, 0, 0), state=State.LANDING)) == [("cf1", Action.STOP, "geofence")]
 
 
 def test_battery_warns_then_lands_but_not_for_a_moment() -> None:
@@ -214,32 +206,38 @@ def test_battery_warns_then_lands_but_not_for_a_moment() -> None:
     assert check(5.0, 3.1) == [Action.LAND]
 
 
-def test_silence_loses_a_vehicle() -> None:
-    assert verdicts(vehicle(log_age=0.51)) == [("cf1", Action.LOST, "link")]
-    assert verdicts(vehicle(log_age=math.inf, state=State.CONNECTING)) == []
-    assert verdicts(vehicle(log_age=0.51), link_age_s=0.0) == []
+STALE, WRONG = ("cf1", Action.HOLD, "commands"), ("cf1", Action.HOLD, "estimate")
+FENCE, LOST = ("cf1", Action.LAND, "geofence"), ("cf1", Action.LOST, "link")
+FAR = (2.4, 0, 0)
 
 
-def test_stale_commands_hold_then_land() -> None:
-    assert verdicts(vehicle(command_age=0.26)) == [("cf1", Action.HOLD, "commands")]
-    assert verdicts(vehicle(command_age=3.1))[1] == ("cf1", Action.LAND, "commands")
-    assert verdicts(vehicle(command_age=None)) == []
-    assert verdicts(vehicle(command_age=3.1), command_age_s=0.0) == []
-
-
-def test_a_wrong_estimate_holds_then_lands() -> None:
-    hold, land = ("cf1", Action.HOLD, "estimate"), ("cf1", Action.LAND, "estimate")
-    assert verdicts(vehicle(wrong="drifts", wrong_s=ESTIMATE_HOLD_S)) == [hold]
-    assert verdicts(vehicle(wrong="drifts", wrong_s=ESTIMATE_HOLD_S + 0.01)) == [hold, land]
-    assert verdicts(vehicle(wrong="drifts", state=State.LANDING)) == [land]
-    assert verdicts(vehicle(wrong="drifts", state=State.READY)) == verdicts(vehicle(wrong_s=9.0)) == []
-
-
-def test_a_lost_heartbeat_stops_all_that_could_move() -> None:
-    assert verdicts(vehicle(), heartbeat=1.01) == [("", Action.STOP_ALL, "heartbeat")]
-    assert verdicts(vehicle(state=State.READY), heartbeat=1.01) == []
-    assert verdicts(vehicle(), heartbeat=1.01, heartbeat_s=0.0) == []
-    assert verdicts(vehicle(), heartbeat=None) == []
+@pytest.mark.parametrize(
+    ("changes", "others", "expected"),
+    [
+        ({"position": FAR}, {}, [FENCE, ("cf1", Action.STOP, "geofence")]),  # the motors stop
+        ({"position": FAR, "state": State.LANDING}, {}, [("cf1", Action.STOP, "geofence")]),
+        ({"position": FAR}, {"geofence": False}, []),
+        ({"position": (1.56, 0, 0), "state": State.READY}, {}, []),
+        ({"log_age": 0.51}, {}, [LOST]),
+        ({"log_age": math.inf, "state": State.CONNECTING}, {}, []),
+        ({"log_age": 0.51}, {"link_age_s": 0.0}, []),
+        ({"command_age": 0.26}, {}, [STALE]),
+        ({"command_age": 3.1}, {}, [STALE, ("cf1", Action.LAND, "commands")]),
+        ({"command_age": None}, {}, []),
+        ({"command_age": 3.1}, {"command_age_s": 0.0}, []),
+        ({"wrong": "drifts", "wrong_s": ESTIMATE_HOLD_S}, {}, [WRONG]),
+        ({"wrong": "drifts", "wrong_s": ESTIMATE_HOLD_S + 0.01}, {}, [WRONG, ("cf1", Action.LAND, "estimate")]),
+        ({"wrong": "drifts", "state": State.LANDING}, {}, [("cf1", Action.LAND, "estimate")]),
+        ({"wrong": "drifts", "state": State.READY}, {}, []),
+        ({"wrong_s": 9.0}, {}, []),
+        ({}, {"heartbeat": 1.01}, [("", Action.STOP_ALL, "heartbeat")]),
+        ({"state": State.READY}, {"heartbeat": 1.01}, []),
+        ({}, {"heartbeat": 1.01, "heartbeat_s": 0.0}, []),
+        ({}, {"heartbeat": None}, []),
+    ],
+)
+def test_each_trouble_has_its_reaction(changes: dict[str, Any], others: dict[str, Any], expected: list[tuple]) -> None:
+    assert verdicts(vehicle(**changes), **others) == expected
 
 
 def test_two_too_close_both_land_and_the_third_flies_on() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import os
 import re
-import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -204,15 +204,9 @@ def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.Monkey
     # By name; bodies that are no Crazyflies are of no concern.
     got: list[Any] = []
     stamp = SimpleNamespace(sec=5, nanosec=500_000_000)
-    poses = [
-        SimpleNamespace(
-            name=name,
-            pose=SimpleNamespace(
-                position=SimpleNamespace(x=1.0, y=2.0, z=3.0), orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
-            ),
-        )
-        for name in ("wand", "cf2")
-    ]
+    position, orientation = SimpleNamespace(x=1.0, y=2.0, z=3.0), SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    pose = SimpleNamespace(position=position, orientation=orientation)
+    poses = [SimpleNamespace(name=name, pose=pose) for name in ("wand", "cf2")]
     message = SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id="world"), poses=poses)
     _named({"cf2": SimpleNamespace(see=lambda *pose: got.append(pose))}, message, None)  # type: ignore[dict-item]
     assert got == [((1.0, 2.0, 3.0), LEVEL, "world", 5.5)]
@@ -226,7 +220,7 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
     """A publisher at 100 Hz; then an estimate jumps, one freezes, one vehicle is not seen any more; one flies on."""
     pytest.importorskip("cflib")
     pytest.importorskip("dtsa_msgs.srv")
-    from bridge_helpers import end_process, fake_fleet, settings
+    from bridge_helpers import bridge_process, fake_fleet, settings
     from builtin_interfaces.msg import Duration
     from dtsa_msgs.srv import Arm, Takeoff
     from graph_helpers import Graph
@@ -246,12 +240,8 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
             }
             config = tmp_path / "swarm.yaml"
             config.write_text(yaml.safe_dump(settings(fleet, station)))
-            command = [sys.executable, "-m", "dtsa_agent.crazyflie.node.bridge_node"]
-            command += ["--ros-args", "-p", f"config:={config}"]
-            log = (tmp_path / "bridge.log").open("w+")
-            process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT, text=True)
-            graph = Graph(domain)
-            try:
+            log, output = tmp_path / "bridge.log", (tmp_path / "bridge.log").open("w")
+            with output, bridge_process(domain, config, output=output), closing(Graph(domain)) as graph:
                 assert graph.call(Arm, "/all/arm", arm=True).success
                 wait_for(lambda: all(graph.state(k) == "armed" for k in (1, 2, 3)))
                 assert graph.call(Takeoff, "/all/takeoff", height=0.95, duration=Duration(sec=2)).success
@@ -264,7 +254,7 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
                 fleet.fault("unseen", 3)
                 wait_for(lambda: all(graph.state(k) == "ready" for k in (1, 2, 3)))
                 times, track, events = read_truth(fleet.truth)
-                words = (tmp_path / "bridge.log").read_text()
+                words = log.read_text()
                 for cf, reason in (
                     (1, "estimate: the estimate jumps by 2.0. m"),
                     (2, "estimate: the estimated? .*not cha"),
@@ -277,7 +267,3 @@ def test_a_flight_by_motion_capture_and_what_happens_when_it_or_an_estimate_fail
                 assert abs(track[-1, 2, 3] - 0.95) < 0.1  # the fourth one flies on
                 assert not [e for e in events if e["event"] in ("hard landing", "collision", "crash")]
                 assert not [e for e in events if e.get("state") == "locked"]
-            finally:
-                graph.close()
-                end_process(process)
-                log.close()
