@@ -27,10 +27,7 @@ PATIENCE_S = 120.0
 
 
 def node_command(module: str, *arguments: str, logs: bool = False) -> list[str]:
-    """``python -m module --ros-args arguments``, in this environment.
-
-    :param logs: whether the node's log goes to standard error, beside its own last line.
-    """
+    """``python -m module --ros-args arguments``; with ``logs`` its log goes to standard error, before its last line."""
     quiet = [] if logs else ["--disable-stdout-logs"]
     return [sys.executable, "-m", module, "--ros-args", *quiet, *arguments]
 
@@ -49,10 +46,7 @@ class Graph:
         self.processes: list[subprocess.Popen[str]] = []
 
     def start(self, module: str, *arguments: str, logs: bool = False) -> subprocess.Popen[str]:
-        """Starts ``python -m module --ros-args arguments``.
-
-        :param logs: whether the node's log goes to standard error, beside its own last line.
-        """
+        """Starts :func:`node_command`."""
         command = node_command(module, *arguments, logs=logs)
         process = subprocess.Popen(
             command, env=self.environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
@@ -71,11 +65,7 @@ class Graph:
             self.executor.spin_once(timeout_sec=0.05)
 
     def ask(self, client: Client, request: Any) -> Any:
-        """Answer of a service.
-
-        Asked again every few seconds: a server that has not found its client yet drops answers, and on a busy machine
-        that takes a while.
-        """
+        """Answer of a service, asked again every few seconds: one that has not found its client yet drops answers."""
         answers = [client.call_async(request)]
         next_time = time.monotonic() + 5
 
@@ -90,11 +80,7 @@ class Graph:
 
 
 class ServedNode:
-    """A node of a test that a thread serves until it is closed.
-
-    :param domain: ROS domain.
-    :param name: of the node.
-    """
+    """A node of a test that a thread serves until it is closed."""
 
     def __init__(self, domain: int, name: str) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -170,10 +156,7 @@ def _ended(node: Node) -> None:
 
 
 def end_of(process: subprocess.Popen[str], number: int | None = None) -> tuple[int, str]:
-    """Exit code and what was printed to standard error.
-
-    :param number: signal to send first.
-    """
+    """Exit code and what was printed to standard error, after a signal, if one is given."""
     if number is not None:
         process.send_signal(signal.Signals(number))
     _, said = process.communicate(timeout=PATIENCE_S)

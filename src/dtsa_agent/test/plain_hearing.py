@@ -22,10 +22,7 @@ class SlotTime(TimeBase):
 
     The frame that an agent has taken its time from may have left late, by less than half a slot but more than the
     alignment believes. Slot numbers stay as they are then, and so does what is known about turns.
-
-    :param config: the settings that all agents share.
-    :param agent: own id.
-    :param trust_ns: ns by which a frame may be off its slot and still say what time it is.
+    A frame may be off its slot by ``trust_ns`` and still say what time it is.
     """
 
     def __init__(self, config: SwarmConfig, agent: int, trust_ns: int = 1_000_000) -> None:
@@ -41,11 +38,7 @@ class SlotTime(TimeBase):
         )
 
     def hear(self, slot: int, start_ns: int) -> str:
-        """As of :class:`TimeBase`.
-
-        :param slot: slot that the frame says it was sent in.
-        :param start_ns: ns, own clock, when its transmission started.
-        """
+        """As of :class:`TimeBase`."""
         outcome = super().hear(slot, start_ns)
         if outcome == ALIGNED and self.aligner.ignored_in_a_row >= _DOUBTS:
             self.aligner.reset()
@@ -69,15 +62,7 @@ class Taken(NamedTuple):
 
 
 class PlainHearing:
-    """Slots and delays of one agent, by what it hears.
-
-    :param config: the settings that all agents share.
-    :param agent: own id.
-    :param wrapping: opens datagrams.
-    :param flight_ns: ns, from the order to send a frame to its arrival, as supposed.
-    :param clock: the own one.
-    :param trust_ns: ns by which a frame may be off its slot and still say what time it is.
-    """
+    """Slots and delays of one agent, by what it hears; ``flight_ns``: from order to arrival of a frame, as supposed."""
 
     def __init__(
         self,
@@ -98,11 +83,7 @@ class PlainHearing:
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
 
     def take(self, data: bytes, arrival_ns: int) -> Taken:
-        """Takes in a datagram.
-
-        :param data: the datagram.
-        :param arrival_ns: ns, CLOCK_MONOTONIC.
-        """
+        """Takes in a datagram; ``arrival_ns`` is of CLOCK_MONOTONIC."""
         said = self._wrapping.read(data)
         if said.fault:
             return Taken(said.fault)
@@ -133,10 +114,7 @@ class PlainHearing:
         return Taken("", outcome == RESTARTED, said)
 
     def tell(self, slot: int) -> tuple[Peer, ...]:
-        """What the next datagram says of the others.
-
-        :param slot: the slot in which it is sent.
-        """
+        """What the next datagram, sent in this slot, says of the others."""
         return self.delay.tell(lambda agent: self.contacts.hears(agent, slot))
 
     def _is_frame(self, frame: bytes) -> bool:

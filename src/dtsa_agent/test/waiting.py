@@ -10,12 +10,7 @@ T = TypeVar("T")
 
 
 def wait_for(condition: Callable[[], T], patience_s: float = 120.0, what: str = "waited in vain") -> T:
-    """What a condition gives once it holds.
-
-    :param condition: asked again and again.
-    :param patience_s: s of wall time, after which the test fails.
-    :param what: what it says then.
-    """
+    """What a condition gives once it holds; after so many s of wall time the test fails with some words."""
     end = time.monotonic() + patience_s
     while not (found := condition()):
         assert time.monotonic() < end, what

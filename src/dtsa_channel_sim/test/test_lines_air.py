@@ -114,17 +114,6 @@ def test_slots_that_are_long_enough_know_nothing_of_the_line(slots, seed):
     assert one == other
 
 
-def test_in_slots_that_are_too_short_frames_wait_and_then_meet():
-    slot_ns = AIRTIME.shortest_slot_ns(56, guard_ns=0) - 50_000
-    air = line()
-    for slot in range(600):
-        air.begin(slot, slot % 6 + 1, slot * slot_ns, 56)
-    verdicts = air.settle(10_000 * MS)
-    assert all(v.start_ns >= v.frame_id * slot_ns for v in verdicts)
-    assert max(v.start_ns - v.frame_id * slot_ns for v in verdicts) > 0
-    assert sum(v.collided + v.lost for v in verdicts) > 0
-
-
 def test_a_radio_that_waits_begins_and_is_sensed_later():
     air = line()
     air.begin("heard", 1, 0, 56)

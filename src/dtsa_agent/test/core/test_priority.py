@@ -33,13 +33,6 @@ def test_the_angle_counts_over_its_whole_range(angle: float) -> None:
     assert g[1] == pytest.approx(0.1 / 2 * (math.pi - angle) / math.pi, abs=1e-9)
 
 
-def test_head_on_is_urgent_and_flying_apart_is_not() -> None:
-    head_on = priority([[0, 0, 0], [2, 0, 0]], [[1, 0, 0], [-1, 0, 0]], 0.01)
-    apart = priority([[0, 0, 0], [2, 0, 0]], [[-1, 0, 0], [1, 0, 0]], 0.01)
-    assert head_on == pytest.approx([0.01, 0.01])
-    assert apart == pytest.approx([0.0, 0.0], abs=1e-12)
-
-
 def test_equal_velocities_and_equal_places_add_nothing() -> None:
     assert priority([[0, 0, 0], [1, 0, 0]], [[1, 2, 3], [1, 2, 3]], 0.01).tolist() == [0, 0]
     assert priority([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [-1, 0, 0]], 0.01).tolist() == [0, 0]

@@ -62,11 +62,6 @@ def test_one_shared_table_changes_nothing_without_loss(policy: str, estimator: s
         assert np.array_equal(own.reason, shared.reason)
 
 
-def test_tdma_is_the_id_modulo_n() -> None:
-    _, senders = fly(60, agents=5, moving=4, policy="tdma")
-    assert senders == [[slot % 5 + 1] for slot in range(60)]
-
-
 def test_age_is_round_robin_over_a_p() -> None:
     swarm, senders = fly(80, agents=6, moving=2, policy="age", return_every=0)
     movers = sorted(int(k) + 1 for k in np.flatnonzero(swarm.scenario.moving))

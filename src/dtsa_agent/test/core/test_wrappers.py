@@ -15,18 +15,8 @@ from dtsa_agent.core.settings.flight_models import VehicleParams
 from dtsa_agent.crazyflie.node.external_vehicles import HOLD_GAIN, HOLD_MPS, ExternalVehicles
 
 KEY = bytes(range(16))
-ARRAYS = (
-    "position",
-    "velocity",
-    "command",
-    "chosen",
-    "reason",
-    "digest",
-    "score",
-    "sent_position",
-    "sent_slot",
-    "track",
-)
+DECIDED, FLOWN = ("chosen", "reason", "digest", "score"), ("position", "velocity", "command", "track")
+ARRAYS = (*FLOWN, *DECIDED, "sent_position", "sent_slot")
 
 
 def sealed(swarm: Swarm) -> Swarm:

@@ -21,12 +21,22 @@ from dtsa_agent.ros.common.wire.stamps import header_of, ns_of
 from dtsa_agent.ros.common.wire.transmission_fields import TransmissionFields, pack_transmission, read_transmission
 
 MOST, STEPS = 12, 2
-numbers = st.floats(allow_nan=False)
-words = st.integers(0, 2**32 - 1)
+words, stamps = st.integers(0, 2**32 - 1), st.integers(-(2**60), 2**60)
+VALUES = {
+    "B": st.integers(0, 255), "H": st.integers(0, 2**16 - 1), "I": words, "q": st.integers(-(2**63), 2**63 - 1),
+    "d": st.floats(allow_nan=False),
+}  # fmt: skip
 
 
-def sequence(code: str, values: st.SearchStrategy[Any], count: int) -> st.SearchStrategy[array[Any]]:
-    return st.lists(values, min_size=count, max_size=count).map(lambda items: array(code, items))
+def sequences(draw: Any, count: Any, **kinds: str) -> dict[str, array[Any]]:
+    """Arrays of that many values each, or of as many as a strategy draws, by name: names of their kinds."""
+    counts = {name: draw(count) if isinstance(count, st.SearchStrategy) else count for names in kinds.values()
+              for name in names.split()}  # fmt: skip
+    return {
+        name: array(code, draw(st.lists(VALUES[code], min_size=counts[name], max_size=counts[name])))
+        for code, names in kinds.items()
+        for name in names.split()
+    }
 
 
 @st.composite
@@ -34,56 +44,31 @@ def transmissions(draw: Any) -> Transmission:
     """Answers as agents give them in lockstep."""
     n = draw(st.integers(1, MOST))
     lengths = draw(st.lists(st.integers(0, 9), min_size=n, max_size=n))
-    vector = sequence("d", numbers, 3 * n)
-    return Transmission(
-        header=header_of(draw(st.integers(0, 2**60))),
-        run=draw(words),
-        slot=draw(words),
-        agent=draw(sequence("H", st.integers(0, 2**16 - 1), n)),
-        length=array("B", lengths),
-        data=draw(sequence("B", st.integers(0, 255), sum(lengths))),
-        chosen=draw(sequence("H", st.integers(0, 2**16 - 1), n)),
-        reason=draw(sequence("B", st.integers(0, 255), n)),
-        digest=draw(sequence("I", words, n)),
-        score=draw(sequence("d", numbers, n)),
-        steps=STEPS,
-        track=draw(sequence("d", numbers, 3 * STEPS * n)),
-        velocity=draw(vector),
-        command=draw(vector),
-        goal=draw(vector | st.just(array("d"))),
-    )
+    fields = sequences(draw, n, H="agent chosen", B="reason", I="digest", d="score")
+    fields |= sequences(draw, 3 * n, d="velocity command") | sequences(draw, 3 * STEPS * n, d="track")
+    fields |= sequences(draw, draw(st.sampled_from([0, 3 * n])), d="goal") | sequences(draw, sum(lengths), B="data")
+    fields["length"] = array("B", lengths)
+    header = header_of(draw(st.integers(0, 2**60)))
+    return Transmission(header=header, run=draw(words), slot=draw(words), steps=STEPS, **fields)
 
 
 @st.composite
 def slots(draw: Any) -> Slot:
     """Slot messages as channels send them."""
-    n = draw(st.integers(0, 4))
-    octets = st.binary(max_size=20)
-    return Slot(
-        header=header_of(draw(st.integers(-(2**60), 2**60))),
-        run=draw(words),
-        slot=draw(words),
-        phase=draw(st.integers(0, 9)),
-        heard_slot=draw(words),
-        sender=draw(sequence("H", st.integers(0, 2**16 - 1), n)),
-        length=draw(sequence("B", st.integers(0, 255), n)),
-        data=array("B", draw(octets)),
-        received=array("B", draw(octets)),
-    )
+    fields = sequences(draw, draw(st.integers(0, 4)), H="sender", B="length")
+    fields |= sequences(draw, st.integers(0, 20), B="data received")
+    numbers = {name: draw(words) for name in ("run", "slot", "heard_slot")}
+    return Slot(header=header_of(draw(stamps)), phase=draw(st.integers(0, 9)), **numbers, **fields)
 
 
 @st.composite
 def reports(draw: Any) -> Report:
     """Reports of any lengths of their fields, fitting or not."""
-    counts = st.integers(0, 4)
-    words_of = {"H": st.integers(0, 2**16 - 1), "I": words, "q": st.integers(-(2**63), 2**63 - 1), "d": numbers,
-                "B": st.integers(0, 255)}  # fmt: skip
-    kinds = {"agent": "H", "slot": "I", "offset_ns": "q", "length": "B", "chosen": "H", "reason": "B", "digest": "I",
-             "score": "d", "track": "d", "velocity": "d", "command": "d", "goal": "d", "heard_sender": "H",
-             "heard_slot": "I", "heard_in": "I", "heard_ns": "q", "heard_by": "B"}  # fmt: skip
-    fields = {name: draw(sequence(kind, words_of[kind], draw(counts))) for name, kind in kinds.items()}
-    stamp = draw(st.integers(-(2**60), 2**60))
-    return Report(header=header_of(stamp), run=draw(words), steps=draw(st.integers(0, 255)), **fields)
+    fields = sequences(
+        draw, st.integers(0, 4), H="agent chosen heard_sender", I="slot digest heard_slot heard_in",
+        q="offset_ns heard_ns", B="length reason heard_by", d="score track velocity command goal",
+    )  # fmt: skip
+    return Report(header=header_of(draw(stamps)), run=draw(words), steps=draw(VALUES["B"]), **fields)
 
 
 def told_by(fields: ReportFields) -> list[Any]:

@@ -45,10 +45,7 @@ class Channel:
         qos = names.lockstep_qos()
         graph.node.create_subscription(Process, "/swarm/process", self.processes.append, qos)
         self.publisher = graph.node.create_publisher(Slot, "/swarm/slot", qos)
-        graph.node.create_subscription(Transmission, "/swarm/transmission", self._put, qos)
-
-    def _put(self, message: Transmission) -> None:
-        self.answers.append(message)
+        graph.node.create_subscription(Transmission, "/swarm/transmission", self.answers.append, qos)
 
     def call(self) -> Process:
         """Calls until a process tells about itself."""
