@@ -64,20 +64,12 @@ class Initials:
         self.letters[sender] = data
 
 
-class _Point:
-    def __init__(self, name: str, factory: type) -> None:
-        self.name, self.value, self._factory = name, factory.__name__, factory
-
-    def load(self) -> type:
-        return self._factory
-
-
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = {POLICIES.group: [_Point("counting", Counting)], ESTIMATORS.group: [_Point("initials", Initials)]}
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points.get(group, []))
-    for rows in (POLICIES, ESTIMATORS):
+    for rows, name, part in ((POLICIES, "counting", Counting), (ESTIMATORS, "initials", Initials)):
         monkeypatch.setattr(rows, "_plug_ins", {})
+        monkeypatch.setattr(rows, "registered", set())
+        rows.register(name, part)
 
 
 def config(**settings: Any) -> SwarmConfig:

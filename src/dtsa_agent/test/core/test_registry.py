@@ -107,16 +107,9 @@ def test_a_plug_in_named_like_a_built_in_is_refused(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("what", "value"), [("own_bytes", 17), ("own_bytes", -1), ("own_bytes", True), ("port", ("send", "telepathy"))]
 )
-def test_what_a_policy_declares_is_checked(monkeypatch: pytest.MonkeyPatch, what: str, value: Any) -> None:
-    class Point:
-        name, value = "odd", "somebody:Odd"
-
-        def load(self) -> type:
-            return type("Odd", (), {what: value})
-
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [Point()])
+def test_what_a_policy_declares_is_checked(what: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=f"odd.{what}"):
-        POLICIES.row("odd")
+        POLICIES.register("odd", type("Odd", (), {what: value}))
 
 
 def test_flight_models_take_the_kernels_parameters() -> None:

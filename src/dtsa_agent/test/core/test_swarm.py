@@ -195,20 +195,6 @@ def test_aloha_sends_with_probability_one_over_n_p() -> None:
     assert share[1] == pytest.approx(0.387, abs=0.03)
 
 
-def test_a_lost_frame_splits_the_views_and_the_digest_shows_it() -> None:
-    swarm = Swarm(SwarmConfig(agents=6, policy="dtsa", seed=3))
-    for slot in range(10):
-        one_slot(swarm, slot)
-    assert len(set(swarm.digest.tolist())) == 1
-    lost = np.ones(6, dtype=np.uint8)
-    swarm.begin(10)
-    lost[0 if swarm.chosen[0] != 1 else 1] = 0
-    swarm.hear(10, swarm.frame(int(swarm.chosen[0]) - 1), lost)
-    swarm.end(10)
-    swarm.begin(11)
-    assert len(set(swarm.digest.tolist())) == 2
-
-
 def test_frames_from_elsewhere_are_counted_and_change_nothing() -> None:
     swarm, _ = fly(20, agents=4, policy="dtsa")
     before = swarm.sent_position.copy(), swarm.digest.copy(), swarm.sent_slot.copy()

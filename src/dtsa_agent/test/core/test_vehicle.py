@@ -41,12 +41,9 @@ def test_many_vehicles_step_like_single_ones() -> None:
 
 def test_wrong_arrays_are_refused() -> None:
     params = VehicleParams(tau=0.1, a_max=2.0)
-    with pytest.raises(ValueError, match="shapes"):
-        params.step(0.01, np.zeros(3), np.zeros(6), np.zeros(3))
-    with pytest.raises(ValueError, match="shapes"):
-        params.step(0.01, np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(3))
-    with pytest.raises(ValueError, match="shapes"):
-        params.step(0.01, np.zeros(6), np.zeros(6), np.zeros(6))
+    for shapes in (((3,), (6,), (3,)), ((3, 2), (3, 2), (3,)), ((6,), (6,), (6,))):
+        with pytest.raises(ValueError, match="shapes"):
+            params.step(0.01, *map(np.zeros, shapes))
     frozen = np.zeros(3)
     frozen.flags.writeable = False
     with pytest.raises(ValueError, match="read-only"):

@@ -16,8 +16,7 @@ vectors = st.tuples(finite, finite, finite)
 component = st.floats(-1, 1)
 
 
-def log(**values: float) -> dict[str, float]:
-    return dict.fromkeys(conversions.LOG_VARIABLES, 0.0) | {"stateEstimateZ.quat": 0xC0000000} | values
+LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def test_log_block_fits_one_packet() -> None:
@@ -27,25 +26,15 @@ def test_log_block_fits_one_packet() -> None:
 
 
 def test_state_log_is_in_millimetres_and_millivolts() -> None:
-    state = conversions.decode_log(
-        log(
-            **{
-                "stateEstimateZ.x": 1234,
-                "stateEstimateZ.y": -2000,
-                "stateEstimateZ.z": 950,
-                "stateEstimateZ.vx": -1500,
-                "stateEstimateZ.vy": 20,
-                "stateEstimateZ.vz": 7,
-                "pm.vbatMV": 3712,
-                "supervisor.info": 0x1A,
-            }
-        )
-    )
+    numbers = dict.fromkeys(conversions.LOG_VARIABLES, 0.0) | {"stateEstimateZ.quat": 0xC0000000}
+    numbers |= {"pm.vbatMV": 3712, "supervisor.info": 0x1A}
+    measured = {"x": 1234, "y": -2000, "z": 950, "vx": -1500, "vy": 20, "vz": 7}
+    state = conversions.decode_log(numbers | {f"stateEstimateZ.{name}": value for name, value in measured.items()})
     assert state.position == pytest.approx((1.234, -2.0, 0.95))
     assert state.velocity == pytest.approx((-1.5, 0.02, 0.007))
     assert state.battery == pytest.approx(3.712)
     assert state.info == 0x1A
-    assert state.orientation == (0.0, 0.0, 0.0, 1.0)
+    assert state.orientation == LEVEL
 
 
 # Worked out by hand: index of the largest in bits 31-30, then sign and 511 |q| sqrt(2) of the others, x first.
@@ -97,12 +86,7 @@ def test_full_state_is_in_rad_per_second_and_never_overflows() -> None:
 
 def test_full_state_without_attitude_means_level() -> None:
     zero = (0.0, 0.0, 0.0)
-    assert conversions.full_state(zero, zero, zero, (0.0, 0.0, 0.0, 0.0), zero, 0.0).arguments[3] == (
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )
+    assert conversions.full_state(zero, zero, zero, (0.0, 0.0, 0.0, 0.0), zero, 0.0).arguments[3] == LEVEL
 
 
 @settings(deadline=None)

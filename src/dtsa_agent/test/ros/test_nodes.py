@@ -23,7 +23,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 from std_msgs.msg import Header
 
-from dtsa_agent.core import REASONS, Swarm, SwarmConfig, decode_frame, make_scenario
+from dtsa_agent.core import REASONS, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.ros.common.graph import names
@@ -219,38 +219,6 @@ def test_bad_parameters_are_one_line_and_exit_code_2(
         assert code == 2
         assert error.startswith(said)
         assert error.count("\n") == 1
-
-
-@pytest.mark.ros
-def test_a_host_answers_for_all_its_agents_in_one_message(tmp_path: Path) -> None:
-    with ros_graph(tmp_path) as graph:
-        channel = Channel(graph)
-        host = graph.start(HOST, "-p", "agents:=6", "-p", "ids:=[2, 4, 5]", "-p", "seed:=9")
-        config = SwarmConfig(agents=6, seed=9)
-        swarm = Swarm(config, local=[2, 4, 5])
-        frames: dict[int, bytes] = {}
-        for slot in range(12):
-            heard = {
-                "sender": array("H", frames),
-                "length": array("B", map(len, frames.values())),
-                "data": array("B", b"".join(frames.values())),
-            }
-            mask = np.array([[agent in (2, 5) for agent in range(1, 7)]] * len(frames), dtype=np.bool_).reshape(-1, 6)
-            if slot:
-                for frame in frames.values():
-                    swarm.hear(slot - 1, frame, np.array([1, 0, 1], dtype=np.uint8))
-                swarm.end(slot - 1)
-            swarm.begin(slot)
-            answer = channel.ask(slot, **heard, received=array("B", pack_received(mask) if frames else b""))
-            assert list(answer.agent) == [2, 4, 5]
-            assert list(answer.digest) == swarm.digest.tolist()
-            assert list(answer.chosen) == swarm.chosen.tolist()
-            assert np.array_equal(answer.track, swarm.track.ravel())
-            sent = split_frames(bytes(answer.data), answer.length)
-            frames = {agent: frame for agent, frame in zip(answer.agent, sent, strict=True) if frame}
-            swarm.fly(slot)
-        assert swarm.digest[0] != swarm.digest[1]  # agent 4 heard nothing
-        assert end_of(host, signal.SIGTERM)[0] == 0
 
 
 class RealtimeChannel(Channel):

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock, call
 
 import pytest
 from node_helpers import Graph, end_of, ros_graph
@@ -37,37 +38,24 @@ def graph(tmp_path: Path) -> Iterator[Graph]:
         yield made
 
 
-class Recorder:
-    """A logger that keeps what it is told, with levels."""
-
-    def __init__(self) -> None:
-        self.lines: list[tuple[str, str]] = []
-
-    def info(self, text: str) -> None:
-        self.lines.append(("info", text))
-
-    def warning(self, text: str) -> None:
-        self.lines.append(("warning", text))
-
-
 def test_waiting_is_said_at_once_and_then_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
-    logger, now = Recorder(), 100.0
+    logger, now = MagicMock(), 100.0
     monkeypatch.setattr("time.monotonic", lambda: now)
     waiting, times = Waiting(logger), []
     for tenth in range(6000):
         now = 100.0 + 0.1 * tenth
-        before = len(logger.lines)
+        before = len(logger.mock_calls)
         waiting.tell("waiting for cf3")
-        if len(logger.lines) > before:
+        if len(logger.mock_calls) > before:
             times.append(round(now - 100.0))
-    assert logger.lines[0] == ("info", "waiting for cf3")
-    assert {level for level, _ in logger.lines[1:]} == {"warning"}
+    assert logger.mock_calls[0] == call.info("waiting for cf3")
+    assert {level for level, _, _ in logger.mock_calls[1:]} == {"warning"}
     gaps = [later - sooner for sooner, later in pairwise(times)]
     assert gaps == sorted(gaps)
     assert gaps[0] < 10
     assert max(gaps) <= 61
     waiting.tell("waiting for cf4")
-    assert logger.lines[-1] == ("info", "waiting for cf4")
+    assert logger.mock_calls[-1] == call.info("waiting for cf4")
 
 
 class GivenNode:
@@ -75,12 +63,12 @@ class GivenNode:
 
     def __init__(self, **given: object) -> None:
         self._parameter_overrides = {name: SimpleNamespace(value=value) for name, value in given.items()}
-        self.log = Recorder()
+        self.log = MagicMock()
 
     def get_parameters_by_prefix(self, prefix: str) -> dict[str, object]:
         return {"policy": "dtsa"}
 
-    def get_logger(self) -> Recorder:
+    def get_logger(self) -> MagicMock:
         return self.log
 
 
@@ -93,13 +81,13 @@ def test_a_misspelt_parameter_is_refused_or_warned_of(tmp_path: Path, monkeypatc
     monkeypatch.setattr("sys.argv", ["agent", "--ros-args", "--params-file", str(path)])
     node = GivenNode(polcy="lease")  # from a file, which may be for others as well
     check_parameters(node)  # type: ignore[arg-type]
-    assert node.log.lines == [
-        ("warning", "parameter polcy: this node has none of this name; did you mean policy?"),
-        ("warning", f"{path}: nothing in it is for this node; it is for /nobody"),
+    assert node.log.mock_calls == [
+        call.warning("parameter polcy: this node has none of this name; did you mean policy?"),
+        call.warning(f"{path}: nothing in it is for this node; it is for /nobody"),
     ]
     node = GivenNode(policy="lease")
     check_parameters(node)  # type: ignore[arg-type]
-    assert node.log.lines == []
+    assert node.log.mock_calls == []
 
 
 def test_logs_go_where_they_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
