@@ -20,13 +20,7 @@ def test_outcomes_without_loss():
     idle = channel.arbitrate(0, ())
     assert (idle.outcome, idle.senders, idle.mask(4).shape) == (IDLE, (), (0, 4))
     one = channel.arbitrate(1, [3])
-    assert (one.outcome, one.senders, one.received, one.lost, one.collided) == (
-        SUCCESS,
-        (3,),
-        None,
-        None,
-        None,
-    )
+    assert (one.outcome, one.senders, one.received, one.lost, one.collided) == (SUCCESS, (3,), None, None, None)
     assert one.mask(4).tolist() == [[True, True, False, True]]
     assert channel.arbitrate(2, np.array([3])) is one
     two = channel.arbitrate(3, (4, 1))

@@ -173,14 +173,7 @@ def test_set_takes_effect_from_the_next_slot_and_replays():
 def test_set_refuses_and_changes_nothing():
     channel = Channel(ChannelConfig(agents=4, schedule=({"slot": 50, "loss": 0.8},)))
     channel.arbitrate(9, (1,))
-    for bad in (
-        {"loss": 2},
-        {"seed": 3},
-        {"partition": [[1, 9]]},
-        {},
-        {"slot": 9, "jam": True},
-        {"burst_length": 2.0},
-    ):
+    for bad in ({"loss": 2}, {"seed": 3}, {"partition": [[1, 9]]}, {}, {"slot": 9, "jam": True}, {"burst_length": 2.0}):
         with pytest.raises(ConfigError):
             channel.set(**bad)
     assert channel._timeline.at(10).config == channel.config.changed({})

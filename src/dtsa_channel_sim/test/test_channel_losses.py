@@ -182,13 +182,7 @@ def test_links_may_be_asymmetric():
     links = ({"from": 1, "to": [2, 3], "loss": 1.0}, {"from": 4, "to": 1, "loss": 1.0, "both_ways": True})
     channel = Channel(ChannelConfig(agents=5, link_loss=links))
     mask = np.vstack([received(channel, 0, (sender,)) for sender in range(1, 6)]).astype(int)
-    assert mask.tolist() == [
-        [0, 0, 0, 0, 1],
-        [1, 0, 1, 1, 1],
-        [1, 1, 0, 1, 1],
-        [0, 1, 1, 0, 1],
-        [1, 1, 1, 1, 0],
-    ]
+    assert mask.tolist() == [[0, 0, 0, 0, 1], [1, 0, 1, 1, 1], [1, 1, 0, 1, 1], [0, 1, 1, 0, 1], [1, 1, 1, 1, 0]]
 
 
 def test_losses_of_links_come_on_top_of_noise_and_of_what_was_measured():

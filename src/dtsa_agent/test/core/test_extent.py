@@ -110,13 +110,10 @@ def test_what_does_not_fit_is_refused_with_the_extent_that_does(settings: dict[s
         make_scenario(config)
     enough = float(caught.value.allowed.split()[0])
     assert enough == pytest.approx(reach + FIELD_MARGIN_M, rel=0.1)
-    for extent, fits in ((enough, True), (enough - 0.2, False)):
-        other = SwarmConfig(**{**config.to_dict(), "extent_m": extent})
-        if fits:
-            assert np.abs(make_scenario(other).start).max() <= extent - FIELD_MARGIN_M
-        else:
-            with pytest.raises(ConfigError, match="extent_m"):
-                make_scenario(other)
+    roomy, tight = (SwarmConfig(**{**config.to_dict(), "extent_m": extent}) for extent in (enough, enough - 0.2))
+    assert np.abs(make_scenario(roomy).start).max() <= enough - FIELD_MARGIN_M
+    with pytest.raises(ConfigError, match="extent_m"):
+        make_scenario(tight)
 
 
 def test_a_scenario_of_ones_own_has_to_fit_as_well() -> None:

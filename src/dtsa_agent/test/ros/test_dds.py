@@ -79,9 +79,7 @@ def test_real_time_is_seen_in_the_command_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
-def test_nodes_listen_on_loopback_only_and_leave_nothing_after_kill_9(
-    tmp_path: Path,
-) -> None:
+def test_nodes_listen_on_loopback_only_and_leave_nothing_after_kill_9(tmp_path: Path) -> None:
     with ros_graph(tmp_path) as graph:
         node = graph.start("dtsa_channel_sim.ros.channel_node", "-p", "agents:=2")
         names = graph.node.get_node_names_and_namespaces

@@ -49,11 +49,7 @@ def test_a_hang_up_that_is_ignored_stays_ignored(before: signal.Handlers) -> Non
 @pytest.mark.parametrize(
     ("program", "code", "said"),
     [
-        (
-            "with Stop(0.3) as stop:\n    interrupt()\n    stands_still(60)",
-            1,
-            "in stands_still",
-        ),
+        ("with Stop(0.3) as stop:\n    interrupt()\n    stands_still(60)", 1, "in stands_still"),
         ("with Stop(0.3) as stop:\n    interrupt()\ntime.sleep(0.6)", 0, ""),
         # With the interpreter's lock: nobody sees a signal then, and no other thread runs.
         ("with Stop(0.3) as stop, stop.in_time():\n    holds_the_lock(50)", 1, "in holds_the_lock"),

@@ -58,36 +58,29 @@ def test_waiting_is_said_at_once_and_then_ever_more_seldom(monkeypatch: pytest.M
     assert logger.mock_calls[-1] == call.info("waiting for cf4")
 
 
-class GivenNode:
-    """Has one parameter, and was given others."""
-
-    def __init__(self, **given: object) -> None:
-        self._parameter_overrides = {name: SimpleNamespace(value=value) for name, value in given.items()}
-        self.log = MagicMock()
-
-    def get_parameters_by_prefix(self, prefix: str) -> dict[str, object]:
-        return {"policy": "dtsa"}
-
-    def get_logger(self) -> MagicMock:
-        return self.log
+def given_node(**given: object) -> MagicMock:
+    """A node that has one parameter, and was given others."""
+    node = MagicMock(_parameter_overrides={name: SimpleNamespace(value=value) for name, value in given.items()})
+    node.get_parameters_by_prefix.return_value = {"policy": "dtsa"}
+    return node
 
 
 def test_a_misspelt_parameter_is_refused_or_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["agent", "--ros-args", "-p", "polcy:=lease"])
     with pytest.raises(ConfigError, match=r"polcy: got 'lease'; allowed: .*; did you mean policy\?"):
-        check_parameters(GivenNode(polcy="lease"))  # type: ignore[arg-type]
+        check_parameters(given_node(polcy="lease"))
     path = tmp_path / "other.yaml"
     path.write_text("/nobody:\n  ros__parameters:\n    policy: lease\n")
     monkeypatch.setattr("sys.argv", ["agent", "--ros-args", "--params-file", str(path)])
-    node = GivenNode(polcy="lease")  # from a file, which may be for others as well
-    check_parameters(node)  # type: ignore[arg-type]
-    assert node.log.mock_calls == [
+    node = given_node(polcy="lease")  # from a file, which may be for others as well
+    check_parameters(node)
+    assert node.get_logger.return_value.mock_calls == [
         call.warning("parameter polcy: this node has none of this name; did you mean policy?"),
         call.warning(f"{path}: nothing in it is for this node; it is for /nobody"),
     ]
-    node = GivenNode(policy="lease")
-    check_parameters(node)  # type: ignore[arg-type]
-    assert node.log.mock_calls == []
+    node = given_node(policy="lease")
+    check_parameters(node)
+    assert node.get_logger.return_value.mock_calls == []
 
 
 def test_logs_go_where_they_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
