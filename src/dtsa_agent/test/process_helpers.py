@@ -5,16 +5,21 @@ from __future__ import annotations
 import os
 import socket
 import struct
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+
+
+def open_files(pid: int) -> Iterator[str]:
+    """What a process has open; it may close some of it meanwhile."""
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError):
+            yield os.readlink(entry)
 
 
 def addresses(pid: int) -> set[str]:
     """Local addresses of all UDP and TCP sockets of a process."""
-    inodes = set()
-    for entry in Path(f"/proc/{pid}/fd").iterdir():
-        target = os.readlink(entry)
-        if target.startswith("socket:["):
-            inodes.add(target[8:-1])
+    inodes = {target[8:-1] for target in open_files(pid) if target.startswith("socket:[")}
     found = set()
     for table in ("udp", "tcp", "udp6", "tcp6"):
         for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
@@ -27,8 +32,7 @@ def addresses(pid: int) -> set[str]:
 
 def segments_of(pid: int) -> set[str]:
     """Names of the shared memory segments and ports whose locks a process has open: its own."""
-    targets = (os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir())
-    return {Path(target).name[:-3] for target in targets if target.startswith("/dev/shm/fast")}
+    return {Path(target).name[:-3] for target in open_files(pid) if target.startswith("/dev/shm/fast")}
 
 
 def real_time(pid: int) -> bool:

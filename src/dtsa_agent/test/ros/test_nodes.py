@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import time
@@ -14,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from node_helpers import Graph, end_of, ros_graph
+from process_helpers import open_files
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -111,8 +111,7 @@ def test_an_agent_answers_slot_by_slot_sends_odometry_and_ends_when_told(tmp_pat
 
 def ports_of(pid: int) -> list[Path]:
     """The ports in shared memory on which a process listens."""
-    targets = (os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir())
-    return [Path(target[:-3]) for target in targets if "_port" in target and target.endswith("_el")]
+    return [Path(target[:-3]) for target in open_files(pid) if "_port" in target and target.endswith("_el")]
 
 
 def forget_wait(port: Path) -> None:
