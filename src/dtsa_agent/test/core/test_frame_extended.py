@@ -153,6 +153,19 @@ def test_what_is_at_a_limit_can_be_said(change: dict[str, object]) -> None:
     assert plain.decode_extended(data, 0.002) == decode_extended(data)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_gossip_fits_up_to_a_step_before_it_saturates(sign: float) -> None:
+    step, rest = 0.002, (0.0, 0.0, 0.0)
+    far, fast = sign * 2.0 * step * 8190, sign * plain.VELOCITY_STEP * 510
+    for axis in range(3):
+        for value, fits in ((1.0, True), (1.001, False)):
+            at = tuple(far * value if k == axis else 0.0 for k in range(3))
+            by = tuple(fast * value if k == axis else 0.0 for k in range(3))
+            assert plain.gossip_fits(at, rest, step) is fits  # type: ignore[arg-type]
+            assert plain.gossip_fits(rest, by, step) is fits  # type: ignore[arg-type]
+    assert not plain.gossip_fits((float("nan"), 0.0, 0.0), rest, step)
+
+
 @pytest.mark.parametrize(("at", "value"), [
     (0, 0x22), (0, 0x13), (1, 0), (1, 255), (2, 254), (3, 0x2B), (3, 0x29), (3, 0x0F), (34, 0xFF), (39, 9), (37, 0),
     (46, 0), (45, 255), (46, 1), (50, 1),
