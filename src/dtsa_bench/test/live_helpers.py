@@ -5,7 +5,7 @@ and app channel. Dongles in sniffer mode hear what the apps send to each other, 
 exact as in virtual time; only the programs see them as late as this machine is. On a machine that is too busy the
 laboratory is slower than real time: caught up at once, the lost time would be a gap of all links.
 
-    python -m live_helpers SOCKET OUT APP AGENTS|SWARM.json [ground]    # until SIGINT; prints the summary as JSON
+    python -m live_helpers SOCKET OUT APP AGENTS|SWARM.json    # until SIGINT; prints the summary as JSON
 """
 
 from __future__ import annotations
@@ -59,9 +59,7 @@ class LiveLaboratory(Laboratory):
         self, path: Path, dongles: int, app: App, settings: LabSettings, out: Path | None = None, *observers: Observer
     ) -> None:
         stations = tuple(station(settings, agent) for agent in range(1, settings.agents + 1))
-        radio = RadioSettings(
-            dongles=dongles, path=path, stations=stations, loss=settings.loss, seed=settings.seed
-        )  # fmt: skip
+        radio = RadioSettings(dongles=dongles, path=path, stations=stations, loss=settings.loss, seed=settings.seed)
         self.side = RadioSide(radio, self._hear_ground, lambda index, up: self.is_on(index + 1), listen=False)
         self._ticks = 0
         self._stopped = False
@@ -142,11 +140,11 @@ class LiveLaboratory(Laboratory):
 
 
 class LiveOnBoard(OnBoard):
-    """The protocol on board, with dongles on its air; the ground is played here, or by a program there."""
+    """The protocol on board, with dongles on its air; the ground is a program there."""
 
-    def __init__(self, path: Path, dongles: int, swarm: SwarmConfig, out: Path, ground: bool) -> None:
+    def __init__(self, path: Path, dongles: int, swarm: SwarmConfig, out: Path) -> None:
         self._path, self._dongles = path, dongles
-        super().__init__(swarm, LabSettings(boot_s=0.1), out, key_of(swarm), enable_s=8.0 if ground else None)
+        super().__init__(swarm, LabSettings(boot_s=0.1), out, key_of(swarm), enable_s=None)
 
     def _make_laboratory(self, app: App, settings: LabSettings, out: Path | None) -> Laboratory:
         return LiveLaboratory(self._path, self._dongles, app, settings, out, self.observe)
@@ -158,7 +156,7 @@ def main() -> int:
     lab: Any
     if what.endswith(".json"):
         swarm = SwarmConfig.from_dict(json.loads(Path(what).read_text(encoding="utf-8")))
-        flight = LiveOnBoard(Path(place), 3, swarm, Path(out), bool(more))
+        flight = LiveOnBoard(Path(place), 3, swarm, Path(out))
         lab, finish = flight.lab, flight.finish
     else:
         lab = LiveLaboratory(Path(place), 3, read_app(what), LabSettings(agents=int(more[0])))

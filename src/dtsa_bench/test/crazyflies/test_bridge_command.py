@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import runpy
 import signal
@@ -10,8 +9,8 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,10 +26,9 @@ pytest.importorskip("dtsa_msgs.srv")
 from bridge_helpers import fake_fleet
 from bridge_helpers import settings as fleet_settings
 from builtin_interfaces.msg import Duration
-from dtsa_msgs.msg import Status
-from dtsa_msgs.srv import Arm, Land, Takeoff
+from dtsa_msgs.srv import Land
+from ground_helpers import Operator, children_of
 from node_helpers import Graph, ros_graph
-from std_srvs.srv import Empty
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.settings.config import load_swarm
@@ -44,57 +42,64 @@ PATIENT = {"link_age_s": 3.0, "command_age_s": 0.45}  # not what is tested here
 
 
 class Bridge:
-    """A bridge's process, and what it prints."""
+    """A bridge's process, or another one, in a graph; what it prints; and an operator."""
 
-    def __init__(self, environment: dict[str, str], command: Sequence[str]) -> None:
+    def __init__(self, graph: Graph, command: Sequence[str]) -> None:
         self.process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            command, env=graph.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
+        self.operator = Operator(graph, NAMES)
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
-        self.lines.extend(iter(self.process.stdout.readline, ""))
+        with self.process.stdout as stream:
+            self.lines.extend(iter(stream.readline, ""))
 
     def text(self) -> str:
         return "".join(self.lines)
 
-    def end(self, patience: float = 60.0) -> int:
-        code = self.process.wait(patience)
+    def end(self, number: int | None = None) -> int:
+        """Wait for its end, after a signal; the exit code."""
+        if number is not None:
+            self.process.send_signal(number)
+        code = self.process.wait(60.0)
         self._reader.join(10)
         return code
 
-    def children(self) -> list[int]:
-        """Ids of the processes that it has started."""
-        tasks = Path(f"/proc/{self.process.pid}/task")
-        return [int(child) for task in tasks.iterdir() for child in (task / "children").read_text().split()]
-
-
-def bridge(environment: dict[str, str], config: Path, *options: str) -> AbstractContextManager[Bridge]:
-    """That of `dtsa bridge`."""
-    return running(environment, [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), *options])
+    def child(self) -> int:
+        """Id of the process that it has started."""
+        return children_of(self.process.pid)[0]
 
 
 @contextmanager
-def running(environment: dict[str, str], command: Sequence[str]) -> Iterator[Bridge]:
-    started = Bridge(environment, command)
+def running(graph: Graph, command: Sequence[str]) -> Iterator[Bridge]:
+    started = Bridge(graph, command)
     try:
         yield started
     finally:
         started.process.kill()
-        started.process.wait()
-        started._reader.join(10)
-        assert started.process.stdout is not None
-        started.process.stdout.close()
+        started.end()
 
 
-def swarm_yaml(folder: Path, uri: str) -> Path:
-    robots = {name: {"uri": uri.format(k), "initial_position": [0.5 * k, 0.3, 0.0]} for k, name in enumerate(NAMES)}
+@contextmanager
+def bridge(folder: Path, config: Path, *options: str) -> Iterator[Bridge]:
+    """That of `dtsa bridge`, in a graph of its own."""
+    command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), *options]
+    with ros_graph(folder) as graph, running(graph, command) as started:
+        yield started
+
+
+def swarm_yaml(folder: Path, uri: str = "usb://{}", first: int = 0, **common: object) -> Path:
+    """A swarm whose URIs have numbers from the first on."""
+    robots = {
+        name: {"uri": uri.format(first + k), "initial_position": [0.5 * k, 0.3, 0.0]} for k, name in enumerate(NAMES)
+    }
     station = {"toc_cache": str(folder / "cache"), "safety": PATIENT, "min_connected": 2}
     path = folder / "swarm.yaml"
-    path.write_text(yaml.safe_dump({"robots": robots, "station": station}))
+    path.write_text(yaml.safe_dump({"robots": robots, "all": common, "station": station}))
     return path
 
 
@@ -105,51 +110,32 @@ def gone(process: int) -> bool:
         return True
 
 
-class Station:
-    """Calls services and knows the states."""
-
-    def __init__(self, graph: Graph, started: Bridge) -> None:
-        self.graph, self.bridge = graph, started
-        self.states: dict[str, str] = {}
-        for name in NAMES:
-            keep = self._keep(name)
-            graph.node.create_subscription(Status, f"/{name}/status", keep, 10)
-
-    def _keep(self, name: str) -> Callable[[Status], None]:
-        return lambda message: self.states.__setitem__(name, message.state_name)
-
-    def until(self, condition: Callable[[], object]) -> None:
-        self.graph.until(lambda: condition() or self.bridge.process.poll() is not None)
-        assert self.bridge.process.poll() is None, self.bridge.text()
-
-    def all(self, state: str) -> None:
-        self.until(lambda: [self.states.get(name) for name in NAMES] == [state] * len(NAMES))
-
-    def call(self, kind: Any, name: str, **fields: Any) -> None:
-        client = self.graph.node.create_client(kind, name)
-        self.until(client.service_is_ready)
-        future = client.call_async(kind.Request(**fields))
-        self.until(future.done)
-        assert getattr(future.result(), "success", True), future.result()
+@contextmanager
+def hang_ups(handler: Any) -> Iterator[None]:
+    """What this process does about a closed terminal; what it starts inherits that it is ignored, but no function."""
+    before = signal.signal(signal.SIGHUP, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
-def test_take_off_landing_and_ctrl_c(tmp_path: Path) -> None:
+def test_take_off_landing_and_ctrl_c_with_nohup(tmp_path: Path) -> None:
+    """A closed terminal lands nobody then."""
     config = swarm_yaml(tmp_path, "radio://0/80/2M/E7E7E7E70{}")
-    with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--backend", "sim") as started:
-        station = Station(graph, started)
-        station.until(graph.node.create_client(Empty, "/all/emergency").service_is_ready)
+    with hang_ups(signal.SIG_IGN), bridge(tmp_path, config, "--backend", "sim") as started:
+        operator = started.operator
+        operator.until("ready")
         assert re.search(r"2 simulated Crazyflies, protocol \d+; faults: UDP port \d+\n", started.text())
-        (fleet,) = started.children()
-        station.all("ready")
-        station.call(Arm, "/all/arm", arm=True)
-        station.all("armed")
-        station.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
-        station.all("flying")
-        station.call(Land, "/all/land", duration=Duration(sec=2))
-        station.all("ready")
-        started.process.send_signal(signal.SIGINT)
-        assert started.end() == 0, started.text()
+        fleet = started.child()
+        started.process.send_signal(signal.SIGHUP)
+        operator.take_off()
+        started.process.send_signal(signal.SIGHUP)
+        operator.call(Land, "/all/land", duration=Duration(sec=2))
+        operator.until("ready")
+        assert started.end(signal.SIGINT) == 0, started.text()
         assert gone(fleet)
+        assert "landing cf1" not in started.text()
         assert "Traceback" not in started.text()
 
 
@@ -178,33 +164,22 @@ def launched(monkeypatch: pytest.MonkeyPatch, **arguments: str) -> list[SimpleNa
 def test_ctrl_c_in_a_launch_lands_simulated_ones_before_they_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, base = swarm_yaml(tmp_path, "usb://{}"), free_base_port(2)
-    data = yaml.safe_load(config.read_text())
-    for k, robot in enumerate(data["robots"].values()):
-        robot["uri"] = f"udp://127.0.0.1:{base + k}"
-    config.write_text(yaml.safe_dump(data))
+    config = swarm_yaml(tmp_path, "udp://127.0.0.1:{}", free_base_port(2))
     words = {"config": str(config), "simulated": "true", "mission": "false", "interfaces": "dtsa"}
     simulated, node = launched(monkeypatch, **words)
     with (
         ros_graph(tmp_path) as graph,
-        running(graph.environment, simulated.cmd) as fleet,
-        running(graph.environment, node.cmd) as started,
+        running(graph, simulated.cmd) as fleet,
+        running(graph, node.cmd) as started,
     ):
-        station = Station(graph, started)
-        station.all("ready")
-        station.call(Arm, "/all/arm", arm=True)
-        station.all("armed")
-        station.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
-        station.all("flying")
-        for one in (fleet, started):  # a terminal's Ctrl-C is for all
-            one.process.send_signal(signal.SIGINT)
-        assert started.end() == 0, started.text()
+        started.operator.take_off()
+        fleet.process.send_signal(signal.SIGINT)  # a terminal's Ctrl-C is for all
+        assert started.end(signal.SIGINT) == 0, started.text()
         assert "landing cf1, cf2" in started.text()
         assert fleet.process.poll() is None
         (last,) = (over.event for over in node.on_exit if hasattr(over, "event"))
         assert last.process_matcher is simulated
-        fleet.process.send_signal(last.signal_number)
-        assert fleet.end() == 0
+        assert fleet.end(last.signal_number) == 0
 
 
 def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
@@ -217,7 +192,7 @@ def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
         config = tmp_path / "swarm.yaml"
         config.write_text(yaml.safe_dump(data))
         fleet.fault("battery", 2, voltage=3.1)
-        with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--check") as started:
+        with bridge(tmp_path, config, "--check") as started:
             assert started.end() == 1, started.text()
             lines = [line.split(maxsplit=2) for line in started.lines]
         for level, item, words in (
@@ -239,52 +214,16 @@ def test_check_lists_what_a_flight_lacks(tmp_path: Path) -> None:
         assert not [e for e in fleet.events(name="state") if e["state"] in ("flying", "locked")]
 
 
-@contextmanager
-def hang_ups(handler: Any) -> Iterator[None]:
-    """What this process does about a closed terminal; what it starts inherits that it is ignored, but no function."""
-    before = signal.signal(signal.SIGHUP, handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
 def test_a_closed_terminal_lands_all_and_sigterm_is_no_second_ctrl_c(tmp_path: Path) -> None:
-    config = swarm_yaml(tmp_path, "udp://192.0.2.1:{}9")
-    with (
-        hang_ups(lambda *_: None),  # with nohup, as a long run of tests may have been started, they are ignored
-        ros_graph(tmp_path) as graph,
-        bridge(graph.environment, config, "--backend", "sim") as started,
-    ):
-        station = Station(graph, started)
-        station.all("ready")
-        (fleet,) = started.children()
-        station.call(Arm, "/all/arm", arm=True)
-        station.all("armed")
-        station.call(Takeoff, "/all/takeoff", height=0.5, duration=Duration(sec=2))
-        station.all("flying")
+    # With nohup, as a long run of tests may have been started, they are ignored.
+    with hang_ups(lambda *_: None), bridge(tmp_path, swarm_yaml(tmp_path), "--backend", "sim") as started:
+        started.operator.take_off()
+        fleet = started.child()
         started.process.send_signal(signal.SIGHUP)
         wait_for(lambda: "landing cf1, cf2" in started.text())
-        started.process.send_signal(signal.SIGTERM)  # as `ros2 launch` does after five seconds
-        assert started.end() == 0, started.text()
+        assert started.end(signal.SIGTERM) == 0, started.text()  # as `ros2 launch` does after five seconds
         assert "EMERGENCY" not in started.text()
         assert gone(fleet)
-
-
-def test_with_nohup_a_closed_terminal_lands_nobody(tmp_path: Path) -> None:
-    config = swarm_yaml(tmp_path, "udp://192.0.2.1:{}9")
-    with (
-        hang_ups(signal.SIG_IGN),
-        ros_graph(tmp_path) as graph,
-        bridge(graph.environment, config, "--backend", "sim") as started,
-    ):
-        station = Station(graph, started)
-        station.all("ready")
-        started.process.send_signal(signal.SIGHUP)
-        station.call(Arm, "/all/arm", arm=True)
-        station.all("armed")
-        started.process.send_signal(signal.SIGINT)
-        assert started.end() == 0, started.text()
 
 
 NESTED = """
@@ -329,10 +268,9 @@ def test_two_signals_at_once_are_seen() -> None:
 
 
 def test_killed_it_takes_the_simulated_ones_along(tmp_path: Path) -> None:
-    config = swarm_yaml(tmp_path, "usb://{}")
-    with ros_graph(tmp_path) as graph, bridge(graph.environment, config, "--backend", "sim") as started:
+    with bridge(tmp_path, swarm_yaml(tmp_path), "--backend", "sim") as started:
         wait_for(lambda: "simulated Crazyflies" in started.text())
-        (fleet,) = started.children()
+        fleet = started.child()
         started.process.kill()
         wait_for(lambda: gone(fleet))
 
@@ -345,16 +283,13 @@ def test_simulated_ones_take_other_ports_where_others_have_just_taken_theirs(
     monkeypatch.setattr(simulated_process, "free_base_port", lambda count, first=None: next(found))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other, ExitStack() as stack:
         other.bind(("127.0.0.1", taken - 1))
-        path = simulated(swarm_yaml(tmp_path, "usb://{}"), stack)
+        path = simulated(swarm_yaml(tmp_path), stack)
         assert load_swarm(path).robots[0].uri == f"udp://127.0.0.1:{taken + 1}"
 
 
 def test_ctrl_c_while_nobody_answers(tmp_path: Path) -> None:
-    config = swarm_yaml(tmp_path, "udp://127.0.0.1:{}9")
-    content = yaml.safe_load(config.read_text()) | {"all": {"connect_timeout_s": 300, "connect_attempts": 100}}
-    config.write_text(json.dumps(content))
-    with ros_graph(tmp_path) as graph, bridge(graph.environment, config) as started:
+    config = swarm_yaml(tmp_path, "udp://127.0.0.1:{}9", connect_timeout_s=300, connect_attempts=100)
+    with bridge(tmp_path, config) as started:
         wait_for(lambda: "cf2: disconnected -> connecting" in started.text())
-        started.process.send_signal(signal.SIGINT)
-        assert started.end() == 1
+        assert started.end(signal.SIGINT) == 1
         assert "interrupted while connecting" in started.text()

@@ -11,6 +11,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +28,8 @@ pytest.importorskip("dtsa_msgs.srv")
 
 import aiohttp
 from bridge_helpers import FakeFleet, fake_fleet, settings
+from ground_helpers import children_of
+from node_helpers import node_environment
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from waiting import wait_for
@@ -49,8 +53,6 @@ from dtsa_channel_sim.ros.observer import ChannelStatus
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 COUNT = 4
 FLY = [sys.executable, "-m", "dtsa_bench", "fly", "--backend", "cflib", "--no-picture", "--slot-ms", "20"]
-
-
 MIXED = ("--arming", "mixed")  # stock ones, which arm themselves, beside those that wait to be told
 
 
@@ -59,20 +61,37 @@ def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
     return written(settings(fleet, {"safety": safety}), folder)
 
 
-def radio_yaml(folder: Path, **safety: float) -> Path:
-    """The same over two dongles."""
-    robots = {f"cf{k}": {"uri": f"radio://{k % 2}/{40 + 40 * (k % 2)}/2M/E7E7E7E7{k:02X}"} for k in range(1, COUNT + 1)}
-    return written({"robots": robots, "station": {"toc_cache": str(folder / "cache"), "safety": safety}}, folder)
-
-
 def written(data: dict[str, Any], folder: Path) -> Path:
     """The YAML's file."""
     for k, robot in enumerate(data["robots"].values()):
-        angle = 2 * math.pi * k / COUNT
+        angle = 2 * math.pi * k / len(data["robots"])
         robot["initial_position"] = [round(1.2 * math.cos(angle), 3), round(2.0 * math.sin(angle), 3), 0.0]
     path = folder / "swarm.yaml"
     path.write_text(yaml.safe_dump(data))
     return path
+
+
+@contextmanager
+def mission(*words: str) -> Iterator[subprocess.Popen[str]]:
+    """A flight that takes long; it is killed in the end."""
+    command = [*FLY, "--tail-s", "60", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def streaming(fleet: FakeFleet) -> bool:
+    """Whether all follow their agents."""
+    return len(fleet.events(name="streaming")) == fleet.count
+
+
+def nearest_m(track: np.ndarray) -> float:
+    """Of (T, 3, n) places: the smallest distance of two."""
+    gap = np.linalg.norm(track[:, :, :, None] - track[:, :, None, :], axis=1)
+    return float((gap + 10 * np.eye(track.shape[2])).min())
 
 
 def test_everybody_begins_near_where_it_stands_or_nobody_does() -> None:
@@ -157,46 +176,36 @@ async def told_in_flight(url: str) -> set[str]:
 def test_a_bridge_that_dies_leaves_records_and_a_summary(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         out = tmp_path / "out"
-        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(out), "--tail-s", "60", "--view"]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        try:
+        with mission("--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(out), "--view") as process:
             assert process.stderr is not None
             page = asyncio.run(told_in_flight(process.stderr.readline().split()[1]))
-            wait_for(lambda: len(fleet.events(name="streaming")) == COUNT, 60)
-            (bridge,) = (
-                int(child)
-                for task in Path(f"/proc/{process.pid}/task").iterdir()
-                for child in (task / "children").read_text().split()
-                if b"bridge_node" in Path(f"/proc/{child}/cmdline").read_bytes()
-            )
-            os.kill(bridge, signal.SIGKILL)
+            wait_for(lambda: streaming(fleet), 60)
+            for child in children_of(process.pid):
+                if b"bridge_node" in Path(f"/proc/{child}/cmdline").read_bytes():
+                    os.kill(child, signal.SIGKILL)
             _, errors = process.communicate(timeout=60)
-        finally:
-            process.kill()
-            process.wait()
         assert process.returncode == 1
         assert page == {"cf1", "cf2", "cf3", "cf4"}
         assert "bridge" in errors
         assert "not known to have landed: cf1, cf2, cf3, cf4" in errors
         summary = json.loads((out / "summary.json").read_text())
-        mission = json.loads((out / "mission.json").read_text())
-        assert "bridge" in summary["cut_short"] == mission["cut_short"]
+        record = json.loads((out / "mission.json").read_text())
+        assert "bridge" in summary["cut_short"] == record["cut_short"]
         assert summary["slots"]["total"] > 10
-        assert mission["vehicles"]["cf1"]["states"][-1]["state"] == "flying"
+        assert record["vehicles"]["cf1"]["states"][-1]["state"] == "flying"
         assert (out / "bag" / "metadata.yaml").is_file()
         assert (out / "mission_bag" / "metadata.yaml").is_file()
-        assert run_data(out)["mission"]["cut_short"] == mission["cut_short"]
+        assert run_data(out)["mission"]["cut_short"] == record["cut_short"]
 
 
 @pytest.mark.realtime
 def test_take_off_exchange_landing(tmp_path: Path) -> None:
     """Over simulated radios, on which a twentieth of all packets is lost."""
     patient = {"link_age_s": 3.0, "command_age_s": 0.45, "emergency_watchdog": False}  # it would lock them
-    config, out, radio = (
-        radio_yaml(tmp_path, **patient),
-        tmp_path / "out",
-        ("--simulated-radio", str(tmp_path / "radio")),
-    )
+    robots = {f"cf{k}": {"uri": f"radio://{k % 2}/{40 + 40 * (k % 2)}/2M/E7E7E7E7{k:02X}"} for k in range(1, COUNT + 1)}
+    station = {"toc_cache": str(tmp_path / "cache"), "safety": patient}
+    config, out = written({"robots": robots, "station": station}, tmp_path), tmp_path / "out"
+    radio = ("--simulated-radio", str(tmp_path / "radio"))
     with fake_fleet(tmp_path, COUNT, "--config", str(config), *radio, "--radio-loss", "0.05", *MIXED) as fleet:
         command = [*FLY, "--config", str(config), "--out", str(out), *radio]
         result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
@@ -223,9 +232,8 @@ def test_take_off_exchange_landing(tmp_path: Path) -> None:
             next(e["t"] for e in events if e["cf"] == k and e["event"] == "streaming") for k in range(1, COUNT + 1)
         )
         end = min(e["t"] for e in events if e["event"] == "land")
-        during = track[(times >= begin) & (times <= end)]
-        gap = np.linalg.norm(during[:, :, :, None] - during[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
-        assert summary["min_distance_m"] == pytest.approx(gap.min(), abs=0.05)
+        truly = nearest_m(track[(times >= begin) & (times <= end)])
+        assert summary["min_distance_m"] == pytest.approx(truly, abs=0.05)
 
 
 @pytest.mark.realtime
@@ -239,7 +247,7 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
         robots = list(data["robots"].values())  # cf1 is the agent of the third place's vehicle, and the other way round
         robots[0]["uri"], robots[2]["uri"] = robots[2]["uri"], robots[0]["uri"]
         config.write_text(yaml.safe_dump(data))
-        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        environment = node_environment(domain, tmp_path)
         log = (tmp_path / "bridge.log").open("w+")
         command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config)]
         bridge = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
@@ -264,26 +272,17 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
         _, track, events = read_truth(fleet.truth)
         assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
         assert [e["event"] for e in events].count("takeoff") == 2 * COUNT
-        flown = track[track[:, 2].min(axis=1) > 0.5]
-        gap = np.linalg.norm(flown[:, :, :, None] - flown[:, :, None, :], axis=1) + 10 * np.eye(COUNT)
-        assert gap.min() > 0.25
+        assert nearest_m(track[track[:, 2].min(axis=1) > 0.5]) > 0.25
 
 
 @pytest.mark.realtime
 def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
-        command = [*FLY, "--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out"), "--tail-s", "60"]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        try:
-            end = time.monotonic() + 60
-            while len(fleet.events(name="streaming")) < COUNT and time.monotonic() < end:
-                time.sleep(0.1)
+        with mission("--config", str(swarm_yaml(fleet, tmp_path)), "--out", str(tmp_path / "out")) as process:
+            wait_for(lambda: streaming(fleet), 60)
             time.sleep(1.0)
             fleet.fault("freeze", 2)
             _, errors = process.communicate(timeout=60)
-        finally:
-            process.kill()
-            process.wait()
         assert process.returncode == 1
         assert "cut short: cf2 is lost" in errors
         for k in (1, 3, 4):
@@ -293,13 +292,7 @@ def test_one_that_is_lost_ends_the_mission_and_the_others_land(tmp_path: Path) -
         # They come to rest before they land, out of each other's way.
         _, track, _ = read_truth(fleet.truth)
         others = track[:, :, [0, 2, 3]]
-        others = others[others[:, 2].min(axis=1) > 0.5]
-        gap = np.linalg.norm(others[:, :, :, None] - others[:, :, None, :], axis=1) + 10 * np.eye(3)
-        assert gap.min() > 0.25
-
-
-def fly(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*FLY, *arguments], capture_output=True, text=True, timeout=60, check=False)
+        assert nearest_m(others[others[:, 2].min(axis=1) > 0.5]) > 0.25
 
 
 def test_bad_input_starts_nothing(tmp_path: Path) -> None:
@@ -312,7 +305,7 @@ def test_bad_input_starts_nothing(tmp_path: Path) -> None:
         (["--out", out, "--config", str(config)], "within 0.25 m of (1."),
         (["--out", out, "--config", str(config), "--agents", "3", "--moving", "2"], "the ids 1 to 3"),
     ):
-        result = fly(*arguments)
+        result = subprocess.run([*FLY, *arguments], capture_output=True, text=True, timeout=60, check=False)
         assert result.returncode == 2
         assert words in result.stderr
         assert len(result.stderr.strip().splitlines()) == 1
@@ -328,23 +321,14 @@ def test_without_cflib_the_bridge_says_how_to_get_it(monkeypatch: pytest.MonkeyP
 @pytest.mark.realtime
 def test_ctrl_c_lands_and_a_second_one_stops(tmp_path: Path) -> None:
     with fake_fleet(tmp_path, 2, *MIXED) as fleet:
-        data: dict[str, Any] = settings(fleet, {"safety": {"link_age_s": 3.0, "command_age_s": 0.45}})
-        data["robots"]["cf1"]["initial_position"] = [1.2, 0.0, 0.0]
-        data["robots"]["cf2"]["initial_position"] = [-1.2, 0.0, 0.0]
-        config = tmp_path / "swarm.yaml"
-        config.write_text(yaml.safe_dump(data))
-        command = [*FLY, "--config", str(config), "--out", str(tmp_path / "out"), "--tail-s", "60"]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        try:
-            wait_for(lambda: len(fleet.events(name="streaming")) == 2, 60)
+        config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
+        with mission("--config", str(config), "--out", str(tmp_path / "out")) as process:
+            wait_for(lambda: streaming(fleet), 60)
             process.send_signal(signal.SIGINT)
             wait_for(lambda: len(fleet.events(name="land")) == 2, 20)
             assert not any(e["state"] == "locked" for e in fleet.events(name="state"))
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=60)
-        finally:
-            process.kill()
-            process.wait()
         assert process.returncode == 130
         for k in (1, 2):
             assert fleet.state_event(k, "locked")["reason"] == "emergency stop"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -14,7 +13,6 @@ from pathlib import Path
 import pytest
 from live_helpers import LiveLaboratory, live_laboratory
 
-from dtsa_agent.core import SwarmConfig
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
 from dtsa_bench.crazyflies.peer_lab import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
@@ -124,21 +122,6 @@ def test_ground_sets_parameters_and_reads_logs_of_an_app_and_talks_to_it(live: L
     assert crtp.pack(crtp.PLATFORM, 2, b"echo") in said
     assert any(packet.endswith(b"own\0go\0") for packet in said)
     assert any(packet[:1] == crtp.pack(crtp.LOG, 2, b"") and len(packet) == 1 + 4 + 2 for packet in said)
-
-
-def test_sniff_judges_the_protocol_on_board_by_a_dongle(tmp_path: Path) -> None:
-    pytest.importorskip("usb")
-    swarm = tmp_path / "swarm.json"
-    swarm.write_text(json.dumps(SwarmConfig(agents=2, slot_ms=20.0, policy="lease").to_dict()))
-    radio = ["--air", "crazyradio", "--uri", "radio://0/80/2M", "--simulated-radio", str(tmp_path / "radio")]
-    options = ["--agents", "2", "--slot-ms", "20", "--policy", "lease", "--no-seal", "--duration-s", "10", "--json"]
-    with live_laboratory(tmp_path, str(swarm), "ground"):
-        command = [sys.executable, "-m", "dtsa_bench", "sniff", *radio, *options]
-        said = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert said.returncode == 0, said.stderr
-    summary = json.loads(said.stdout)
-    assert all(summary["heard"][f"cf{agent}"] > 0 for agent in (1, 2))
-    assert summary["rules_broken"] == 0
 
 
 CFLIB = """

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,9 @@ pytest.importorskip("cflib")
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from builtin_interfaces.msg import Duration
-from dtsa_msgs.msg import Status
-from dtsa_msgs.srv import Arm, Takeoff
+from ground_helpers import Operator
 from live_helpers import live_laboratory
-from node_helpers import Graph, ros_graph
+from node_helpers import ros_graph
 from std_srvs.srv import Empty, SetBool
 from waiting import wait_for
 
@@ -55,70 +53,26 @@ DTSA = [sys.executable, "-m", "dtsa_bench"]
 def swarm_yaml(folder: Path) -> Path:
     start = make_scenario(CONFIG).start
     robots = {
-        name: {
-            "uri": f"{URI.format(0)}/E7E7E7E70{k + 1}",
-            "initial_position": [float(start[0, k]), float(start[1, k]), 0.0],
-        }
+        name: {"uri": f"{URI.format(0)}/E7E7E7E70{k + 1}", "initial_position": [*start[:2, k].tolist(), 0.0]}
         for k, name in enumerate(NAMES)
     }
+    patient = {"link_age_s": 3.0, "emergency_watchdog": False, "min_distance_m": 0}  # on a busy machine
     station = {
-        "on_board": {"swarm": SEALED, "polls_hz": 10},
-        "room_origin_in_world": [0.0, 0.0, FLOOR_M],
-        "toc_cache": str(folder / "cache"),
-        "land_speed_mps": 1.0,
-        "safety": {
-            "link_age_s": 3.0,
-            "emergency_watchdog": False,
-            "min_distance_m": 0,
-        },  # on a machine that is busy with other tests
-    }
+        "on_board": {"swarm": SEALED, "polls_hz": 10}, "room_origin_in_world": [0.0, 0.0, FLOOR_M],
+        "toc_cache": str(folder / "cache"), "land_speed_mps": 1.0, "safety": patient,
+    }  # fmt: skip
     path = folder / "swarm.yaml"
     path.write_text(yaml.safe_dump({"robots": robots, "all": {"log_rate_hz": 4}, "station": station}))
     return path
 
 
-def laboratory(folder: Path) -> AbstractContextManager[subprocess.Popen[str]]:
-    """Three vehicles on the floor, each with the app, and dongles; nobody plays the ground."""
-    swarm = folder / "swarm.json"
-    swarm.write_text(json.dumps(CONFIG.to_dict()))
-    return live_laboratory(folder, str(swarm), **KEY)
-
-
-class Operator:
-    """Calls services, and knows the states."""
-
-    def __init__(self, graph: Graph) -> None:
-        self.graph = graph
-        self.states: dict[str, str] = {}
-        for name in NAMES:
-            graph.node.create_subscription(Status, f"/{name}/status", lambda m, name=name: self._keep(name, m), 10)  # type: ignore[misc]
-
-    def _keep(self, name: str, message: Status) -> None:
-        self.states[name] = message.state_name
-
-    def until(self, *states: str) -> None:
-        self.graph.until(lambda: tuple(map(self.states.get, NAMES)) == states)
-
-    def call(self, kind: Any, name: str, **fields: Any) -> None:
-        client = self.graph.node.create_client(kind, name)
-        self.graph.until(client.service_is_ready)
-        answer = self.graph.ask(client, kind.Request(**fields))
-        assert getattr(answer, "success", True), answer
-
-    def take_off(self) -> None:
-        """All, until their agents steer."""
-        self.call(Arm, "/all/arm", arm=True)
-        self.until("armed", "armed", "armed")
-        self.call(Takeoff, "/all/takeoff", height=FLOOR_M, duration=Duration(sec=1, nanosec=200_000_000))
-        self.until("flying", "flying", "flying")
-        self.enable()
-
-    def enable(self) -> None:
-        """As soon as the take-off is over; before that the bridge refuses."""
-        client = self.graph.node.create_client(SetBool, "/all/enable")
-        self.graph.until(client.service_is_ready)
-        assert "still flies its take-off" in self.graph.ask(client, SetBool.Request(data=True)).message
-        self.graph.until(lambda: self.graph.ask(client, SetBool.Request(data=True)).success)
+def steer(operator: Operator) -> None:
+    """All take off, and their agents steer as soon as the take-off is over; before that the bridge refuses."""
+    operator.take_off(FLOOR_M, 1.2)
+    client = operator.graph.node.create_client(SetBool, "/all/enable")
+    operator.graph.until(client.service_is_ready)
+    assert "still flies its take-off" in operator.graph.ask(client, SetBool.Request(data=True)).message
+    operator.graph.until(lambda: operator.graph.ask(client, SetBool.Request(data=True)).success)
 
 
 def events(folder: Path) -> list[dict[str, Any]]:
@@ -138,13 +92,14 @@ def arrived(folder: Path) -> bool:
 @contextmanager
 def bridged(folder: Path) -> Iterator[tuple[Operator, subprocess.Popen[str], subprocess.Popen[str], dict[str, str]]]:
     """An operator, the bridge, the laboratory, and the environment of other programs on its air."""
-    config = swarm_yaml(folder)
-    with laboratory(folder) as lab, ros_graph(folder) as graph:
+    config, swarm = swarm_yaml(folder), folder / "swarm.json"
+    swarm.write_text(json.dumps(CONFIG.to_dict()))
+    with live_laboratory(folder, str(swarm), **KEY) as lab, ros_graph(folder) as graph:
         environment = {**graph.environment, SIMULATED_RADIO: str(folder / "radio"), **KEY}
         bridge = subprocess.Popen([*DTSA, "bridge", "--config", str(config)], env=environment, text=True)
         graph.processes.append(bridge)
         try:
-            yield Operator(graph), bridge, lab, environment
+            yield Operator(graph, NAMES), bridge, lab, environment
         finally:
             bridge.kill()
             bridge.wait()
@@ -164,10 +119,10 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
     with bridged(tmp_path) as (operator, bridge, lab, environment):
         listener = subprocess.Popen(sniff, stdout=subprocess.PIPE, text=True, env=os.environ | environment)
         try:
-            operator.until("ready", "ready", "ready")
+            operator.until("ready")
             topics = operator.graph.node.get_topic_names_and_types()
             assert not [name for name, _ in topics if "/cmd_" in name]
-            operator.take_off()
+            steer(operator)
             wait_for(lambda: arrived(tmp_path))
             operator.call(Empty, "/cf3/emergency")
             operator.until("flying", "flying", "emergency")
@@ -182,7 +137,9 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
     assert summary["crashed"] == [3]
     assert [e["cf"] for e in events(tmp_path) if e.get("state") == "landed"] in ([1, 2], [2, 1])
     assert summary["min_distance_m"] > 0.2
+    assert listener.returncode == 0
     assert all(heard["heard"][name] > 50 for name in NAMES)
+    assert heard["rules_broken"] == 0
     found = Merge([read(tmp_path / f"{name}.mcap") for name in NAMES]).judge()
     assert verified(found)
     assert found["decisions_again"]["differences"] == []
@@ -190,10 +147,9 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
 
 def test_a_second_ctrl_c_stops_the_motors_of_agents_that_steer_on_board(tmp_path: Path) -> None:
     with bridged(tmp_path) as (operator, bridge, lab, _):
-        operator.until("ready", "ready", "ready")
-        operator.take_off()
+        steer(operator)
         bridge.send_signal(signal.SIGINT)
-        operator.until("landing", "landing", "landing")
+        operator.until("landing")
         bridge.send_signal(signal.SIGINT)
         assert bridge.wait(60) != 0
         wait_for(lambda: sum(e["event"] == "hard landing" for e in events(tmp_path)) == len(NAMES))

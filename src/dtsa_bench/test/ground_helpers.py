@@ -1,0 +1,56 @@
+"""The ground in tests: an operator who calls a bridge's services and knows its vehicles' states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from builtin_interfaces.msg import Duration
+from dtsa_msgs.msg import Status
+from dtsa_msgs.srv import Arm, Takeoff
+from node_helpers import Graph
+
+
+def children_of(process: int) -> list[int]:
+    """Processes that one has started itself."""
+    tasks = Path(f"/proc/{process}/task").iterdir()
+    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+
+
+class Operator:
+    """Calls services of a bridge on a graph, and knows the states of some vehicles."""
+
+    def __init__(self, graph: Graph, names: Sequence[str]) -> None:
+        self.graph, self.names = graph, names
+        self.states: dict[str, str] = {}
+        for name in names:
+            graph.node.create_subscription(Status, f"/{name}/status", lambda m, name=name: self._keep(name, m), 10)  # type: ignore[misc]
+
+    def _keep(self, name: str, message: Status) -> None:
+        self.states[name] = message.state_name
+
+    def until(self, *states: str) -> None:
+        """Wait for the vehicles' states; one: that of all."""
+        wanted = states * len(self.names) if len(states) == 1 else states
+        self.graph.until(lambda: tuple(map(self.states.get, self.names)) == wanted)
+
+    def call(self, kind: Any, name: str, **fields: Any) -> None:
+        """Call a service, which succeeds."""
+        client = self.graph.node.create_client(kind, name)
+        self.graph.until(client.service_is_ready)
+        answer = self.graph.ask(client, kind.Request(**fields))
+        assert getattr(answer, "success", True), answer
+
+    def arm(self) -> None:
+        """Arm all that are ready."""
+        self.until("ready")
+        self.call(Arm, "/all/arm", arm=True)
+        self.until("armed")
+
+    def take_off(self, height: float = 0.5, seconds: float = 2.0) -> None:
+        """Arm all, and let them take off."""
+        self.arm()
+        duration = Duration(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
+        self.call(Takeoff, "/all/takeoff", height=height, duration=duration)
+        self.until("flying")
