@@ -16,13 +16,13 @@ from dtsa_bench.crazyflies.simulated.peer import Peer
 class Craft:
     """Firmware of one Crazyflie on a test stand that follows every command at once."""
 
-    def __init__(self, protocol: int = 12, *, auto_arming: bool = False) -> None:
+    def __init__(self, *, auto_arming: bool = False) -> None:
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.firmware = Firmware(
             lambda name, **details: self.events.append((name, details)), tau=0.0, auto_arming=auto_arming
         )
         self.estimate = Estimate()
-        self.peer = Peer(self.firmware, self.estimate, protocol)
+        self.peer = Peer(self.firmware, self.estimate, 12)
         self.t = 0.0
         self.mode = OFF
         self.command = (0.0, 0.0, 0.0)

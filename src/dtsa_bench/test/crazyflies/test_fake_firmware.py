@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import struct
 
 import pytest
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 from dtsa_agent.crazyflie.state.conversions import decompress_quaternion, yaw_of
 from dtsa_bench.crazyflies.simulated import crtp, planner
 from dtsa_bench.crazyflies.simulated.estimate import attitude, compress, quaternion
-from dtsa_bench.crazyflies.simulated.firmware import FLY, LEVEL, OFF, Battery
+from dtsa_bench.crazyflies.simulated.firmware import FLY, OFF, Battery
 
 finite = st.floats(-5, 5, width=32)  # as the firmware counts; the half of the smallest double is not exact
 
@@ -26,23 +25,6 @@ def test_paths_begin_and_end_as_they_should(p0: float, v0: float, a0: float, p1:
     assert planner.evaluate(path, 0.0) == (p0, v0, a0)
     p, v, a = planner.evaluate(path, duration)
     assert (p, v, a) == pytest.approx((p1, 0.0, 0.0), abs=1e-6 / duration**2)
-
-
-def test_a_flight_by_high_level_commands() -> None:
-    craft = Craft()
-    assert craft.mode == OFF
-    craft.take_off()
-    craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<B3B5f", 12, 0, 0, 0, 0.5, -0.5, 0.8, math.pi / 2, 1.0))
-    craft.fly(1.5)
-    assert craft.estimate.position == pytest.approx((0.5, -0.5, 0.8), abs=0.02)
-    assert craft.firmware.yaw == pytest.approx(math.pi / 2)
-    craft.ask(crtp.HIGH_LEVEL, 0, struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 1.0))
-    craft.fly(1.2)
-    assert (craft.mode, craft.state) == (OFF, "flying")  # the firmware waits for two seconds
-    craft.fly(2.0)
-    assert craft.state == "landed"
-    craft.fly(3.1)
-    assert not craft.firmware.supervisor.armed
 
 
 def test_orders_to_groups_that_it_is_not_in_are_nothing_to_it() -> None:
@@ -69,24 +51,6 @@ def test_high_level_commands_have_no_effect_while_setpoints_are_streamed() -> No
     craft.ask(crtp.GENERIC_COMMANDER, 1, struct.pack("<BI", 0, 0))
     craft.fly(1.2)
     assert craft.estimate.position[2] < 0.05
-
-
-def test_old_setpoints_level_out_then_fall() -> None:
-    craft = Craft()
-    craft.take_off()
-    craft.velocity(0.3, 0.0, 0.0)
-    craft.fly(0.49)
-    assert (craft.mode, craft.command) == (FLY, pytest.approx((0.3, 0.0, 0.0)))
-    craft.fly(0.05)
-    assert (craft.mode, craft.state) == (LEVEL, "level out")
-    craft.velocity(0.3, 0.0, 0.0)
-    craft.fly(0.02)
-    assert (craft.mode, craft.state) == (FLY, "flying")
-    craft.fly(2.1)
-    assert (craft.mode, craft.state) == (OFF, "locked")
-    craft.velocity(0.3, 0.0, 0.0)
-    craft.fly(0.1)
-    assert craft.mode == OFF
 
 
 def test_a_stream_that_ends_with_nothing_else_to_fly_stops_the_motors() -> None:
@@ -156,19 +120,6 @@ def test_the_emergency_watchdog_begins_with_its_first_packet_and_latches() -> No
     assert craft.ask(9, 1, b"\x01\x01") == b"\x81\x00\x00"
     craft.firmware.reset()
     craft.take_off()
-
-
-@pytest.mark.parametrize(("port", "channel", "protocol"), [(9, 1, 12), (6, 1, 10)])
-def test_emergency_stop(port: int, channel: int, protocol: int) -> None:
-    craft = Craft(protocol)
-    craft.firmware.supervisor.request_arming(True)
-    craft.fly(0.02)
-    craft.velocity(0.0, 0.0, 0.5)
-    craft.fly(0.3)
-    assert craft.mode == FLY
-    craft.ask(port, channel, b"\x03")
-    craft.fly(0.02)
-    assert (craft.mode, craft.state) == (OFF, "locked")
 
 
 def test_arming_needs_a_crazyflie_that_may_fly() -> None:

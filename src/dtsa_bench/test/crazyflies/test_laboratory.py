@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -18,49 +19,125 @@ from dtsa_channel_sim.model.airtime import RADIOS
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 
-HEAD = """
-#include "app.h"
-#include "app_channel.h"
-#include "cfassert.h"
-#include "commander.h"
-#include "configblock.h"
-#include "crtp_commander_high_level.h"
-#include "debug.h"
-#include "log.h"
-#include "param.h"
-#include "peer_lab.h"
-#include "pm.h"
-#include "radiolink.h"
-#include "semphr.h"
-#include "static_mem.h"
-#include "supervisor.h"
-#include "timers.h"
-#include "usec_time.h"
-#include <string.h>
-"""
+ALONE = LabSettings(agents=1, boot_s=0.0)
+HEADERS = (
+    "app app_channel cfassert commander configblock crtp_commander_high_level debug log param peer_lab pm radiolink "
+    "semphr static_mem supervisor timers usec_time"
+)
+HEAD = "".join(f'#include "{name}.h"\n' for name in HEADERS.split()) + "#include <string.h>\n"
 
 
 @pytest.fixture
 def write(tmp_path: Path):
     """Makes the directory of an app from its C code."""
 
-    def make(code: str, name: str = "trial", settings: str = "") -> str:
-        directory = tmp_path / name
-        directory.mkdir()
+    def make(code: str, settings: str = "{}") -> str:
+        directory = Path(tempfile.mkdtemp(dir=tmp_path))
         (directory / "app.c").write_text(HEAD + code)
-        if settings:
-            (directory / "app.yaml").write_text(settings)
+        (directory / "app.yaml").write_text(settings)
         return str(directory)
 
     return make
 
 
-def lines(code_place: str, seconds: float = 1.0, **settings: object) -> list[str]:
-    """What the first vehicle's app prints in a flight."""
-    app = read_app(code_place)
-    with Laboratory(app, LabSettings(**{"agents": 1, "boot_s": 0.0, **settings})) as lab:
+# Code of an app by what it shows, how long it flies (s), and what it prints.
+APPS = {
+    "time goes on by ticks and by calls": ("""
+void appMain(void) {
+    TickType_t ticks = xTaskGetTickCount();
+    vTaskDelay(M2T(5));
+    DEBUG_PRINT("%d\\n", (int)(xTaskGetTickCount() - ticks));
+    uint64_t end = usecTimestamp() + 300;
+    int calls = 0;
+    while (usecTimestamp() < end) calls++;
+    DEBUG_PRINT("%d\\n", calls > 250 && calls <= 300);
+    uint64_t before = usecTimestamp();
+    peerLabSpend(2500);
+    DEBUG_PRINT("%d\\n", usecTimestamp() - before >= 2500);
+    TickType_t due = xTaskGetTickCount();
+    for (int i = 0; i < 3; i++) vTaskDelayUntil(&due, 7);
+    DEBUG_PRINT("%lu\\n", (unsigned long)(xTaskGetTickCount() - due));
+}""", 1.0, ["5", "1", "1", "0"]),
+    "queues wait for items and for room": ("""
+STATIC_MEM_QUEUE_ALLOC(numbers, 2, sizeof(int));
+static QueueHandle_t numbers;
+static void other(void *argument) {
+    (void)argument;
+    for (int i = 0; i < 4; i++) { xQueueSend(numbers, &i, portMAX_DELAY); vTaskDelay(3); }
+    vTaskDelete(NULL);
+}
+void appMain(void) {
+    numbers = STATIC_MEM_QUEUE_CREATE(numbers);
+    int got = -1;
+    DEBUG_PRINT("%d\\n", (int)xQueueReceive(numbers, &got, 4));
+    xTaskCreate(other, "other", 200, NULL, 1, NULL);
+    for (int i = 0; i < 4; i++) { xQueueReceive(numbers, &got, M2T(100)); DEBUG_PRINT("%d\\n", got); }
+    for (int i = 0; i < 3; i++) DEBUG_PRINT("%d\\n", (int)xQueueSend(numbers, &i, 2));
+    SemaphoreHandle_t mutex = xSemaphoreCreateMutex();
+    for (int i = 0; i < 2; i++) DEBUG_PRINT("%d\\n", (int)xSemaphoreTake(mutex, 3));
+    xSemaphoreGive(mutex);
+    DEBUG_PRINT("%d\\n", (int)xSemaphoreTake(mutex, 0));
+}""", 1.0, ["0", "0", "1", "2", "3", "1", "1", "0", "1", "0", "1"]),
+    "a timer runs until it is stopped": ("""
+static int runs;
+static void tick(TimerHandle_t timer) { if (++runs == 3) xTimerStop(timer, 0); }
+void appMain(void) {
+    TimerHandle_t timer = xTimerCreate("t", 5, pdTRUE, NULL, tick);
+    xTimerStart(timer, 0);
+    vTaskDelay(12); DEBUG_PRINT("%d\\n", runs);
+    vTaskDelay(50); DEBUG_PRINT("%d\\n", runs);
+}""", 1.0, ["2", "3"]),
+    "parameters of the firmware": ("""
+void appMain(void) {
+    paramVarId_t deck = paramGetVarId("deck", "bcLighthouse4"), effect = paramGetVarId("ring", "effect");
+    paramSetInt(effect, 9);
+    vTaskDelay(M2T(20));
+    paramVarId_t none = paramGetVarId("no", "one");
+    DEBUG_PRINT("%u %d %d\\n", paramGetUint(deck), paramGetInt(effect), PARAM_VARID_IS_VALID(none));
+    paramSetInt(paramGetVarId("stabilizer", "stop"), 1);
+    vTaskDelay(M2T(20));
+    DEBUG_PRINT("%d\\n", supervisorIsLocked());
+}""", 1.0, ["1 9 0", "1"]),
+    "flies its vehicle": ("""
+static logVarId_t z, x;
+void appMain(void) {
+    z = logGetVarId("stateEstimate", "z"); x = logGetVarId("stateEstimate", "x");
+    while (!supervisorCanFly()) vTaskDelay(10);
+    DEBUG_PRINT("takeoff %d\\n", crtpCommanderHighLevelTakeoff(1.0f, 2.0f));
+    vTaskDelay(M2T(2500));
+    float start = logGetFloat(x);
+    DEBUG_PRINT("%d %d\\n", logGetFloat(z) > 0.9f, supervisorIsFlying());
+    DEBUG_PRINT("%d\\n", crtpCommanderHighLevelIsTrajectoryFinished());
+    static setpoint_t s;
+    s.mode.x = s.mode.y = s.mode.z = modeVelocity; s.velocity.x = 0.5f;
+    for (int i = 0; i < 200; i++) { commanderSetSetpoint(&s, COMMANDER_PRIORITY_EXTRX); vTaskDelay(M2T(10)); }
+    float way = logGetFloat(x) - start;
+    DEBUG_PRINT("%d %d\\n", way > 0.7f && way < 1.1f, commanderGetActivePriority());
+    commanderRelaxPriority();
+    DEBUG_PRINT("land %d\\n", crtpCommanderHighLevelLand(0.0f, 2.0f));
+    vTaskDelay(M2T(6000));
+    DEBUG_PRINT("%d %d\\n", supervisorIsFlying(), logGetFloat(z) < 0.1f);
+}""", 12.0, ["takeoff 0", "1 1", "1", "1 3", "land 0", "0 1"]),
+    "falls when its setpoints cease": ("""
+void appMain(void) {
+    while (!supervisorCanFly()) vTaskDelay(10);
+    crtpCommanderHighLevelTakeoff(1.0f, 2.0f);
+    vTaskDelay(M2T(2500));
+    static setpoint_t s;
+    s.mode.x = s.mode.y = s.mode.z = modeVelocity;
+    commanderSetSetpoint(&s, COMMANDER_PRIORITY_EXTRX);
+    vTaskDelay(M2T(3000));
+    DEBUG_PRINT("%d\\n", supervisorIsLocked());
+}""", 7.0, ["1"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", APPS)
+def test_what_an_app_may_do(what: str, write) -> None:
+    code, seconds, printed = APPS[what]
+    with Laboratory(read_app(write(code)), ALONE) as lab:
         lab.run(seconds)
-        return [line for _, agent, line in lab.record.console if agent == 1]
+        assert [line for _, _, line in lab.record.console] == printed
 
 
 @pytest.mark.parametrize("app", ["beacons", "dtr"])
@@ -75,14 +152,6 @@ def test_every_header_stands_alone(tmp_path: Path) -> None:
         (tmp_path / f"{header.stem}.c").write_text(f'#include "{header.name}"\n')
     command = [*compiler(), "-std=gnu11", "-Wall", "-Wextra", "-Werror", f"-I{FIRMWARE}", "-fsyntax-only"]
     subprocess.run([*command, *map(str, tmp_path.glob("*.c"))], check=True)
-
-
-def test_a_seed_gives_its_bits_again_and_another_one_does_not() -> None:
-    def digest(seed: int) -> str:
-        settings = LabSettings(agents=5, seed=seed, loss=0.1, drift_ppm=50.0, polls=20.0)
-        return str(fly("beacons", 3.0, settings)["digest"])
-
-    assert digest(1) == digest(1) != digest(2)
 
 
 def test_each_vehicle_has_variables_of_its_own(write) -> None:
@@ -102,26 +171,6 @@ void appMain(void) {
         assert [line for _, agent, line in lab.record.console if agent == 2] == ["2", "2"]
 
 
-def test_time_goes_on_by_ticks_and_by_calls(write) -> None:
-    place = write("""
-void appMain(void) {
-    TickType_t ticks = xTaskGetTickCount();
-    vTaskDelay(M2T(5));
-    DEBUG_PRINT("%d\\n", (int)(xTaskGetTickCount() - ticks));
-    uint64_t end = usecTimestamp() + 300;
-    int calls = 0;
-    while (usecTimestamp() < end) calls++;
-    DEBUG_PRINT("%d\\n", calls > 250 && calls <= 300);
-    uint64_t before = usecTimestamp();
-    peerLabSpend(2500);
-    DEBUG_PRINT("%d\\n", usecTimestamp() - before >= 2500);
-    TickType_t due = xTaskGetTickCount();
-    for (int i = 0; i < 3; i++) vTaskDelayUntil(&due, 7);
-    DEBUG_PRINT("%lu\\n", (unsigned long)(xTaskGetTickCount() - due));
-}""")
-    assert lines(place) == ["5", "1", "1", "0"]
-
-
 def test_a_clock_drifts(write) -> None:
     place = write("""
 void appMain(void) { vTaskDelay(M2T(20000)); DEBUG_PRINT("%u\\n", (unsigned)usecTimestamp()); }""")
@@ -131,43 +180,6 @@ void appMain(void) { vTaskDelay(M2T(20000)); DEBUG_PRINT("%u\\n", (unsigned)usec
     assert len(times) == 2
     assert all(abs(time - 20.0) < 0.021 for time in times)
     assert abs(times[0] - times[1]) > 1e-4
-
-
-def test_queues_wait_for_items_and_for_room(write) -> None:
-    place = write("""
-STATIC_MEM_QUEUE_ALLOC(numbers, 2, sizeof(int));
-static QueueHandle_t numbers;
-static void other(void *argument) {
-    (void)argument;
-    for (int i = 0; i < 4; i++) { xQueueSend(numbers, &i, portMAX_DELAY); vTaskDelay(3); }
-    vTaskDelete(NULL);
-}
-void appMain(void) {
-    numbers = STATIC_MEM_QUEUE_CREATE(numbers);
-    int got = -1;
-    DEBUG_PRINT("%d\\n", (int)xQueueReceive(numbers, &got, 4));
-    xTaskCreate(other, "other", 200, NULL, 1, NULL);
-    for (int i = 0; i < 4; i++) { xQueueReceive(numbers, &got, M2T(100)); DEBUG_PRINT("%d\\n", got); }
-    for (int i = 0; i < 3; i++) DEBUG_PRINT("%d\\n", (int)xQueueSend(numbers, &i, 2));
-    SemaphoreHandle_t mutex = xSemaphoreCreateMutex();
-    for (int i = 0; i < 2; i++) DEBUG_PRINT("%d\\n", (int)xSemaphoreTake(mutex, 3));
-    xSemaphoreGive(mutex);
-    DEBUG_PRINT("%d\\n", (int)xSemaphoreTake(mutex, 0));
-}""")
-    assert lines(place) == ["0", "0", "1", "2", "3", "1", "1", "0", "1", "0", "1"]
-
-
-def test_a_timer_runs_until_it_is_stopped(write) -> None:
-    place = write("""
-static int runs;
-static void tick(TimerHandle_t timer) { if (++runs == 3) xTimerStop(timer, 0); }
-void appMain(void) {
-    TimerHandle_t timer = xTimerCreate("t", 5, pdTRUE, NULL, tick);
-    xTimerStart(timer, 0);
-    vTaskDelay(12); DEBUG_PRINT("%d\\n", runs);
-    vTaskDelay(50); DEBUG_PRINT("%d\\n", runs);
-}""")
-    assert lines(place) == ["2", "3"]
 
 
 def test_parameters_and_log_variables_have_names(write) -> None:
@@ -188,7 +200,7 @@ LOG_ADD(LOG_INT32, seen, &seen)
 LOG_ADD_BY_FUNCTION(LOG_FLOAT, doubled, &doubled)
 LOG_GROUP_STOP(own)
 """)
-    with Laboratory(read_app(place), LabSettings(agents=1, boot_s=0.0)) as lab:
+    with Laboratory(read_app(place), ALONE) as lab:
         lab.run(0.01)
         assert lab.logs(1) == {"own.seen": 0.0, "own.doubled": 1.0}
         lab.set_parameter(1, "own.mode", 3)
@@ -198,21 +210,6 @@ LOG_GROUP_STOP(own)
         assert lab.parameter(1, "own.mode") == 3
         with pytest.raises(ConfigError, match=r"own\.mode"):
             lab.set_parameter(1, "own.other", 1)
-
-
-def test_an_app_sets_parameters_of_the_firmware(write) -> None:
-    place = write("""
-void appMain(void) {
-    paramVarId_t deck = paramGetVarId("deck", "bcLighthouse4"), effect = paramGetVarId("ring", "effect");
-    paramSetInt(effect, 9);
-    vTaskDelay(M2T(20));
-    paramVarId_t none = paramGetVarId("no", "one");
-    DEBUG_PRINT("%u %d %d\\n", paramGetUint(deck), paramGetInt(effect), PARAM_VARID_IS_VALID(none));
-    paramSetInt(paramGetVarId("stabilizer", "stop"), 1);
-    vTaskDelay(M2T(20));
-    DEBUG_PRINT("%d\\n", supervisorIsLocked());
-}""")
-    assert lines(place) == ["1 9 0", "1"]
 
 
 def test_app_channel_carries_both_ways_and_says_when_it_overflowed(write) -> None:
@@ -228,7 +225,7 @@ void appMain(void) {
     }
     appchannelSendDataPacket("over", 4);
 }""")
-    with Laboratory(read_app(place), LabSettings(agents=1, boot_s=0.0)) as lab:
+    with Laboratory(read_app(place), ALONE) as lab:
         lab.run(0.005)
         taken = [lab.send(1, bytes(k + 1)) for k in range(12)]
         lab.run(0.2)
@@ -296,45 +293,6 @@ def test_receptions_that_find_the_queue_full_are_lost(write) -> None:
         assert lab.record.heard[2] > 60
 
 
-def test_an_app_flies_its_vehicle(write) -> None:
-    place = write("""
-static logVarId_t z, x;
-void appMain(void) {
-    z = logGetVarId("stateEstimate", "z"); x = logGetVarId("stateEstimate", "x");
-    while (!supervisorCanFly()) vTaskDelay(10);
-    DEBUG_PRINT("takeoff %d\\n", crtpCommanderHighLevelTakeoff(1.0f, 2.0f));
-    vTaskDelay(M2T(2500));
-    float start = logGetFloat(x);
-    DEBUG_PRINT("%d %d\\n", logGetFloat(z) > 0.9f, supervisorIsFlying());
-    DEBUG_PRINT("%d\\n", crtpCommanderHighLevelIsTrajectoryFinished());
-    static setpoint_t s;
-    s.mode.x = s.mode.y = s.mode.z = modeVelocity; s.velocity.x = 0.5f;
-    for (int i = 0; i < 200; i++) { commanderSetSetpoint(&s, COMMANDER_PRIORITY_EXTRX); vTaskDelay(M2T(10)); }
-    float way = logGetFloat(x) - start;
-    DEBUG_PRINT("%d %d\\n", way > 0.7f && way < 1.1f, commanderGetActivePriority());
-    commanderRelaxPriority();
-    DEBUG_PRINT("land %d\\n", crtpCommanderHighLevelLand(0.0f, 2.0f));
-    vTaskDelay(M2T(6000));
-    DEBUG_PRINT("%d %d\\n", supervisorIsFlying(), logGetFloat(z) < 0.1f);
-}""")
-    assert lines(place, 12.0) == ["takeoff 0", "1 1", "1", "1 3", "land 0", "0 1"]
-
-
-def test_an_app_whose_setpoints_cease_falls(write) -> None:
-    place = write("""
-void appMain(void) {
-    while (!supervisorCanFly()) vTaskDelay(10);
-    crtpCommanderHighLevelTakeoff(1.0f, 2.0f);
-    vTaskDelay(M2T(2500));
-    static setpoint_t s;
-    s.mode.x = s.mode.y = s.mode.z = modeVelocity;
-    commanderSetSetpoint(&s, COMMANDER_PRIORITY_EXTRX);
-    vTaskDelay(M2T(3000));
-    DEBUG_PRINT("%d\\n", supervisorIsLocked());
-}""")
-    assert lines(place, 7.0) == ["1"]
-
-
 def test_the_ground_gives_orders_at_instants(write) -> None:
     place = write(
         "static uint8_t go; void appMain(void) { for (;;) vTaskDelay(100); }\n"
@@ -367,23 +325,25 @@ def test_the_ground_gives_orders_at_instants(write) -> None:
 )  # fmt: skip
 def test_an_app_that_fails_is_named(write, code: str, said: str) -> None:
     with pytest.raises(AppError, match=said) as error:
-        fly(write(code), 2.0, LabSettings(agents=1, boot_s=0.0))
+        fly(write(code), 2.0, ALONE)
     assert "agent 1" in str(error.value)
 
 
-def test_bad_input_is_said_in_a_line(write, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("code", "settings", "error", "said"),
+    [
+        ("void appMain(void) { nonsense(); } syntax", "{}", CompileError, "error"),
+        ("void eventQueueSend(void); void appMain(void) { eventQueueSend(); }", "{}", CompileError, "eventQueueSend"),
+        ("int other;", "{}", AppError, "appMain"),
+        ("", "parameters: {own.go: fast}", ConfigError, "parameters"),
+        ("", "sorces: [x.c]", ConfigError, "sorces"),
+    ],
+)
+def test_bad_input_is_said_in_a_line(write, code: str, settings: str, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        fly(write(code, settings), 1.5)
     with pytest.raises(ConfigError, match="beacons, dtr"):
-        read_app(tmp_path / "nowhere")
-    with pytest.raises(CompileError, match="error"):
-        fly(write("void appMain(void) { nonsense(); } syntax", "a"), 1.0)
-    with pytest.raises(CompileError, match="eventQueueSend"):
-        fly(write("void eventQueueSend(void); void appMain(void) { eventQueueSend(); }", "e"), 1.0)
-    with pytest.raises(AppError, match="appMain"):
-        fly(write("int other;", "b"), 1.5)
-    with pytest.raises(ConfigError, match="parameters"):
-        read_app(write("", "c", "parameters: {own.go: fast}"))
-    with pytest.raises(ConfigError, match="sorces"):
-        read_app(write("", "d", "sorces: [x.c]"))
+        read_app("nowhere")
 
 
 def test_a_ground_station_that_polls_takes_air_and_frames_survive_between_its_packets() -> None:
@@ -425,11 +385,10 @@ def test_sanitizers_find_what_an_app_does(write) -> None:
     place = write("""
 static volatile char room[8]; volatile int place = 9; int top = 2147483647;
 void appMain(void) { vTaskDelay(7); top += place; room[place] = (char)top; }""")
-    settings = LabSettings(agents=1, boot_s=0.0)
     for name in ("libubsan.so", "libasan.so"):
         asked = subprocess.run([*compiler(), f"-print-file-name={name}"], capture_output=True, text=True, check=True)
         if asked.stdout.strip() == name:
             pytest.skip(f"no {name}")
-    assert "signed integer overflow" in fly(place, 0.1, settings, flags=("-fsanitize=undefined",))["warnings"]
+    assert "signed integer overflow" in fly(place, 0.1, ALONE, flags=("-fsanitize=undefined",))["warnings"]
     with pytest.raises(AppError, match="global-buffer-overflow"):
-        fly(place, 0.1, settings, flags=("-fsanitize=address",))
+        fly(place, 0.1, ALONE, flags=("-fsanitize=address",))

@@ -78,7 +78,8 @@ def test_a_policy_that_nobody_can_join_begins_with_all_together(loss: float, tmp
 def test_the_same_seed_gives_the_same_bits() -> None:
     digests = []
     for seed in (1, 1, 2):
-        with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings(seed=seed, loss=0.2)) as flight:
+        lab = LabSettings(seed=seed, loss=0.2, drift_ppm=50.0, polls=20.0)
+        with OnBoard(SwarmConfig(agents=3, policy="lease"), lab) as flight:
             flight.lab.run(9.0)
             digests.append(flight.finish()["digest"])
     assert digests[0] == digests[1] != digests[2]
