@@ -15,59 +15,29 @@ class Without:
         if name.split(".")[0] == {package!r}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Without())
-from {module} import {function}
-sys.exit({function}({arguments}))
+from dtsa_bench import entry
+from dtsa_bench.commands import cli
+words = {words!r}.split()
+sys.exit(entry.recorded_channel() if words == ["recorded_channel"] else cli.main(words))
 """
 
 
 @pytest.mark.parametrize(
-    ("package", "module", "function", "arguments", "said"),
+    ("package", "words", "said"),
     [
-        (
-            "mcap",
-            "dtsa_bench.commands.cli",
-            "main",
-            "['verify', 'x']",
-            "dtsa: error: the Python package mcap is missing: pip",
-        ),
-        (
-            "yaml",
-            "dtsa_bench.commands.cli",
-            "main",
-            "['verify', 'x']",
-            "yaml is missing: apt install python3-yaml",
-        ),
-        (
-            "pyarrow",
-            "dtsa_bench.commands.cli",
-            "main",
-            "['export', 'x']",
-            "pyarrow is missing: pip install pyarrow",
-        ),
-        (
-            "aiohttp",
-            "dtsa_bench.commands.cli",
-            "main",
-            "['view', 'x']",
-            "aiohttp is missing: pip install aiohttp",
-        ),
-        *(
-            (
-                package,
-                "dtsa_bench.commands.cli",
-                "main",
-                "['sniff', '--air', 'serial', '--device', 'x', '--no-seal']",
-                f"{package} is missing: pip install pyserial cobs",
-            )
-            for package in ("serial", "cobs")
-        ),
-        ("rclpy", "dtsa_bench.commands.cli", "main", "['demo']", "rclpy is missing: source an installation of ROS 2"),
-        ("mcap", "dtsa_bench.entry", "recorded_channel", "", "recorded_channel: error: the Python package mcap"),
-        ("dtsa_msgs", "dtsa_bench.entry", "recorded_channel", "", "dtsa_msgs is missing: build the workspace"),
+        ("mcap", "verify x", "dtsa: error: the Python package mcap is missing: pip"),
+        ("yaml", "verify x", "yaml is missing: apt install python3-yaml"),
+        ("pyarrow", "export x", "pyarrow is missing: pip install pyarrow"),
+        ("aiohttp", "view x", "aiohttp is missing: pip install aiohttp"),
+        ("serial", "sniff --air serial --device x --no-seal", "serial is missing: pip install pyserial cobs"),
+        ("cobs", "sniff --air serial --device x --no-seal", "cobs is missing: pip install pyserial cobs"),
+        ("rclpy", "demo", "rclpy is missing: source an installation of ROS 2"),
+        ("mcap", "recorded_channel", "recorded_channel: error: the Python package mcap"),
+        ("dtsa_msgs", "recorded_channel", "dtsa_msgs is missing: build the workspace"),
     ],
 )
-def test_a_missing_package_is_named(package: str, module: str, function: str, arguments: str, said: str) -> None:
-    program = WITHOUT.format(package=package, module=module, function=function, arguments=arguments)
+def test_a_missing_package_is_named(package: str, words: str, said: str) -> None:
+    program = WITHOUT.format(package=package, words=words)
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert result.returncode == 2, result.stderr
     assert said in result.stderr

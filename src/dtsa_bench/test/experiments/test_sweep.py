@@ -8,14 +8,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from cli_helpers import refused
+from fly_helpers import children
+from waiting import wait_for
 
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_bench.commands.cli import main
@@ -26,6 +28,7 @@ from dtsa_bench.experiments.batch import Journal
 from dtsa_bench.experiments.provenance import PROJECT
 from dtsa_bench.experiments.tables import SweepTable
 
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 CONTENT: dict[str, Any] = {
     "title": "small",
     "seeds": 6,
@@ -113,16 +116,6 @@ def test_cores_change_nothing(tmp_path: Path) -> None:
     assert len(here) == 24
     assert stable(here) == stable(cores)
     assert [row["seed"] for row in here[:6]] == list(plan.seeds)
-
-
-def test_chunks_hold_every_run_once_and_keep_all_workers_busy() -> None:
-    tasks = sweep(axes={"agents": [4, 8, 60]}, seeds=30).tasks
-    chunks = batch.chunks_of(tasks, 3)
-    assert [task for chunk in chunks for task in chunk] == tasks
-    assert len(chunks) >= 12
-    single = max(task.cost for task in tasks)
-    assert all(sum(task.cost for task in chunk) <= max(batch.CHUNK_COST, single) for chunk in chunks)
-    assert batch.chunks_of([], 2) == []
 
 
 def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,63 +269,32 @@ def test_wrong_words_end_with_one_line_and_code_2(
     monkeypatch.setattr(batch, "PATIENCE_S", 1.0)
     if field == "cluster":
         pytest.importorskip("distributed")
-    try:
-        code = main(["sweep", *words, "--out", str(tmp_path)])
-    except SystemExit as ended:
-        code = int(str(ended.code))
-    error = capsys.readouterr().err
-    assert code == 2
-    assert error.count("\n") == 1
-    assert f"error: {field}" in error
+    assert f"error: {field}" in refused(["sweep", *words, "--out", str(tmp_path)], capsys)
 
 
-def start(out: Path, *words: str) -> subprocess.Popen[bytes]:
-    """A sweep that takes long, in a process group of its own."""
-    command = [sys.executable, "-m", "dtsa_bench", "sweep", "--preset", "limits", "--out", str(out)]
-    return subprocess.Popen(
-        [*command, *words],
-        start_new_session=True,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "DTSA_TRIAL": str(out)},
-    )
-
-
-def wait_for_rows(path: Path, count: int, process: subprocess.Popen[bytes]) -> None:
-    end = time.monotonic() + 60
-    while time.monotonic() < end and process.poll() is None:
-        if path.exists() and path.read_bytes().count(b"\n") >= count:
-            return
-        time.sleep(0.05)
-    raise AssertionError(f"no {count} rows in {path}")
-
-
-def processes_of(directory: Path) -> list[int]:
-    """Processes whose environment names a directory: those of a sweep, its workers too."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            with suppress(OSError):
-                if f"DTSA_TRIAL={directory}".encode() in entry.joinpath("environ").read_bytes().split(b"\0"):
-                    found.append(int(entry.name))
-    return found
+def run_python(code: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Code, then the command with words, in a process of its own."""
+    code = f"{code}\nimport sys\nfrom dtsa_bench.commands.cli import main\nsys.exit(main({list(words)!r}))"
+    return subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
 
 
 @pytest.mark.parametrize("how", ["ctrl-c", "terminated", "killed"])
 def test_however_a_sweep_ends_nothing_runs_on_and_its_rows_stay(how: str, tmp_path: Path) -> None:
-    process = start(tmp_path, "--jobs", "2")
+    command = [sys.executable, "-m", "dtsa_bench", "sweep", "--preset", "limits", "--jobs", "2", "--out", str(tmp_path)]
+    marked = {**ENVIRONMENT, "DTSA_SUPERVISOR": str(os.getpid())}
+    process = subprocess.Popen(
+        command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=marked
+    )
     try:
-        wait_for_rows(tmp_path / "runs.jsonl", 5, process)
+        rows = tmp_path / "runs.jsonl"
+        wait_for(lambda: rows.exists() and rows.read_bytes().count(b"\n") >= 5)
         if how == "ctrl-c":
             os.killpg(process.pid, signal.SIGINT)
         else:
             process.send_signal(signal.SIGTERM if how == "terminated" else signal.SIGKILL)
         error = process.communicate(timeout=60)[1].decode()
         assert process.returncode == (-signal.SIGKILL if how == "killed" else 130)
-        end = time.monotonic() + 20
-        while (left := processes_of(tmp_path)) and time.monotonic() < end:
-            time.sleep(0.1)
-        assert not left
+        wait_for(lambda: not children(os.getpid()), 20.0)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -362,18 +324,15 @@ def test_a_worker_process_that_dies_costs_no_result(tmp_path: Path, monkeypatch:
 
 def test_a_sweep_needs_no_shared_memory(tmp_path: Path) -> None:
     """As on a machine whose /dev/shm is missing, full or read-only, where no semaphore can be made."""
-    words = ["sweep", "--preset", "trajectories", "--seeds", "2", "--jobs", "2", "--no-report", "--out", str(tmp_path)]
-    code = f"""
-import _multiprocessing, sys
+    code = """
+import _multiprocessing
 class Semaphore(_multiprocessing.SemLock):
     def __new__(cls, *args, **more):
         raise OSError(28, "No space left on device")
 _multiprocessing.SemLock = Semaphore
-from dtsa_bench.commands.cli import main
-sys.exit(main({words!r}))
 """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    words = ("sweep", "--preset", "trajectories", "--seeds", "2", "--jobs", "2", "--no-report", "--out", str(tmp_path))
+    ended = run_python(code, *words)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert len(lines_of(tmp_path)) == 6
 
@@ -382,47 +341,22 @@ sys.exit(main({words!r}))
 def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """A real Dask scheduler with two worker processes."""
     pytest.importorskip("distributed")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     file = tmp_path / "scheduler.json"
-    dask = [
-        sys.executable,
-        "-m",
-        "distributed.cli.dask_scheduler",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        "0",
-        "--no-dashboard",
-        "--scheduler-file",
-        str(file),
-    ]
-    worker = [
-        sys.executable,
-        "-m",
-        "distributed.cli.dask_worker",
-        "--scheduler-file",
-        str(file),
-        "--nworkers",
-        "1",
-        "--nthreads",
-        "1",
-        "--no-dashboard",
-        "--no-nanny",
-        "--local-directory",
-        str(tmp_path),
-    ]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
-    processes = [subprocess.Popen(dask, **quiet)]  # type: ignore[call-overload]
+
+    def start(what: str, *words: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.{what}", "--scheduler-file", str(file), "--no-dashboard"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return subprocess.Popen([*command, *words], env=ENVIRONMENT, **quiet)  # type: ignore[call-overload, no-any-return]
+
+    processes = [start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")]
+    alone = ("--nworkers", "1", "--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path))
     try:
-        processes += [subprocess.Popen(worker, **quiet) for _ in range(2)]  # type: ignore[call-overload]
-        end = time.monotonic() + 60
-        while not (file.exists() and file.read_text().rstrip().endswith("}")) and time.monotonic() < end:
-            time.sleep(0.05)
+        processes += [start("dask_worker", *alone) for _ in range(2)]
+        wait_for(lambda: file.exists() and file.read_text().rstrip().endswith("}"))
         yield json.loads(file.read_text())["address"], processes[1:]
     finally:
         for process in processes:
             process.kill()
-        for process in processes:
             process.wait()
 
 
@@ -453,11 +387,9 @@ def test_a_worker_of_a_cluster_that_dies_costs_no_result(
 
 
 def test_rows_that_cannot_be_written_end_in_one_line(tmp_path: Path) -> None:
-    limit = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000));"
-    words = ["sweep", "--preset", "trajectories", "--seeds", "9", "--jobs", "1", "--out", str(tmp_path)]
-    code = f"{limit} from dtsa_bench.commands.cli import main; sys.exit(main({words!r}))"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    limit = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))"
+    words = ("sweep", "--preset", "trajectories", "--seeds", "9", "--jobs", "1", "--out", str(tmp_path))
+    ended = run_python(limit, *words)
     assert ended.returncode == 1
     assert ended.stderr.count("\n") == 1
     assert "runs.jsonl cannot be written (File too large)" in ended.stderr
