@@ -9,7 +9,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from dtsa_bench.pages.view.server import ViewServer
 
@@ -25,10 +28,7 @@ _OPTIONS = ("--enable-unsafe-swiftshader", "--disable-gpu", "--disable-dev-shm-u
 
 
 class Browser:
-    """One page of a browser.
-
-    :param page: the page.
-    """
+    """One page of a browser."""
 
     def __init__(self, page: Page) -> None:
         self._page = page
@@ -64,11 +64,9 @@ class Browser:
         """A picture of the window as PNG."""
         return self._page.screenshot()
 
-    def heap(self) -> int:
-        """Bytes that the page's script uses, arrays among them, after a collection of garbage."""
-        self._tools.send("HeapProfiler.collectGarbage")
-        used = self._tools.send("Runtime.getHeapUsage")
-        return int(used["usedSize"] + used.get("backingStorageSize", 0))
+    def paper(self) -> bytes:
+        """The page printed as PDF."""
+        return self._page.pdf()
 
     def complaints(self) -> list[str]:
         """Errors that the page or its script have given."""
@@ -76,14 +74,18 @@ class Browser:
         return list(self._said)
 
 
-@contextmanager
-def browsing(width: int = 1400, height: int = 1000, dark: bool = False) -> Iterator[Browser]:
-    """A browser with one page, for as long as the context lasts.
+def colours(picture: bytes, directory: Path) -> int:
+    """How many different colours a picture has."""
+    from matplotlib.image import imread
 
-    :param width: pixels.
-    :param height: pixels.
-    :param dark: whether it prefers dark pages.
-    """
+    path = directory / "picture.png"
+    path.write_bytes(picture)
+    return len(np.unique((imread(path)[:, :, :3] * 31).astype(np.uint8).reshape(-1, 3), axis=0))
+
+
+@contextmanager
+def browsing() -> Iterator[Browser]:
+    """A browser with one page, for as long as the context lasts."""
     from playwright.sync_api import sync_playwright  # not needed to know that there is no browser
 
     with sync_playwright() as playwright:
@@ -91,19 +93,14 @@ def browsing(width: int = 1400, height: int = 1000, dark: bool = False) -> Itera
             executable_path=CHROMIUM, args=_OPTIONS, chromium_sandbox=False, timeout=1000.0 * PATIENCE_S
         )
         with browser:
-            page = browser.new_page(
-                viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light"
-            )
+            page = browser.new_page(viewport={"width": 1400, "height": 1000})
             page.set_default_timeout(1000.0 * PATIENCE_S)
             yield Browser(page)
 
 
 @contextmanager
 def serving(server: ViewServer) -> Iterator[str]:
-    """A server in a thread of its own; gives the address of its page.
-
-    :param server: the server.
-    """
+    """A server in a thread of its own; gives the address of its page."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()

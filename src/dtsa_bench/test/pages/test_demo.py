@@ -9,8 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +18,7 @@ from PIL import Image
 from dtsa_agent.core import make_scenario
 from dtsa_bench.commands import demo as command
 from dtsa_bench.drawing.palette import AGENT_COLOURS
-from dtsa_bench.pages.demo import flights as demo
-from dtsa_bench.pages.demo.flights import HEAD, KILLED, FinishedFlight, KillAgent, StopOr, demo_steps, table_rows
+from dtsa_bench.pages.demo.flights import HEAD, KILLED, FinishedFlight, demo_steps, table_rows
 from dtsa_bench.pages.demo.picture import draw_animation, draw_demo, killed_cells, killed_parts, step_text
 from dtsa_bench.simulation.simulate import simulate
 
@@ -112,37 +109,6 @@ def test_animation_is_small_and_moves(flights: dict[str, FinishedFlight], tmp_pa
     assert (first[0, 0] == 255).all()
     assert (last[0, 0] == 255).all()
     assert (first != last).any(axis=2).mean() > 0.02
-
-
-def test_table_has_a_row_a_flight(flights: dict[str, FinishedFlight]) -> None:
-    assert len(command.aligned([HEAD, *table_rows(STEPS, flights)]).splitlines()) == 2 + 8
-
-
-def test_the_agent_is_killed_once_and_the_flight_ends_when_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    shot: list[tuple[int, int]] = []
-    monkeypatch.setattr(demo.os, "kill", lambda pid, number: shot.append((pid, number)))
-    now = [100.0]
-    monkeypatch.setattr(demo, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    killing = KillAgent(3)
-    over = StopOr(SimpleNamespace(signal=0), lambda: killing.is_over)  # type: ignore[arg-type]
-    over._stop = False  # type: ignore[assignment]
-    processes = [SimpleNamespace(agents=[id_], process=SimpleNamespace(pid=10 + id_)) for id_ in (2, 3)]
-    killing.started(SimpleNamespace(all=processes))  # type: ignore[arg-type]
-    status: Any = None
-    killing.idle(status)
-    killing.begun(100.0)
-    killing.idle(status)
-    assert not shot
-    now[0] = 101.5
-    killing.idle(status)
-    killing.idle(status)
-    assert shot == [(13, signal.SIGKILL)]
-    killing.agents_back([2])
-    now[0] = 108.0
-    killing.agents_back([3])
-    assert not over
-    now[0] = 110.0
-    assert over
 
 
 @pytest.mark.parametrize(

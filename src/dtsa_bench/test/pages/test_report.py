@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import shutil
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser_helpers import CHROMIUM, MISSING, Browser, browsing, colours
 from flight_helpers import flight_bag
+from view_helpers import numbers
 
 from dtsa_agent.core import REASONS
 from dtsa_agent.core.errors import ConfigError
@@ -32,10 +31,6 @@ from dtsa_bench.recordings.verify import verify_bag
 from dtsa_bench.runs.config import RunConfig
 from dtsa_bench.simulation.simulate import simulate
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-
 SLOTS = 429  # until a second after all have arrived, as in a simulated flight
 
 
@@ -52,11 +47,6 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def data(flights: dict[str, Path]) -> dict[str, Any]:
     """What the report shows of both."""
     return {name: run_data(path) for name, path in flights.items()}
-
-
-def numbers(text: str, kind: str) -> np.ndarray:
-    """A packed array."""
-    return np.frombuffer(base64.b64decode(text), kind)
 
 
 def test_everything_that_reads_a_run_takes_its_directory_its_bag_and_its_file(
@@ -83,9 +73,12 @@ def test_results_of_a_run_directory_stay_in_it(
     run = tmp_path / "a"
     shutil.copytree(flights["clean"], run / "bag")
     assert main(["report", str(run)]) == main(["export", str(run)]) == main(["recover", str(run)]) == 0
-    capsys.readouterr()
+    assert "report.html" in capsys.readouterr().out
     assert {path.name for path in run.iterdir()} == {"bag", "report.html", "bag_tables", "bag_recovered"}
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    shutil.copytree(flights["clean"], tmp_path / "alone")
+    assert main(["report", str(tmp_path / "alone")]) == 0
+    assert (tmp_path / "report.html").is_file()
 
 
 def test_results_are_those_of_the_simulator(data: dict[str, Any], flights: dict[str, Path]) -> None:
@@ -181,8 +174,8 @@ def crash(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Pat
     return run_data(directory), directory
 
 
-def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], Path]) -> None:
-    data, directory = crash
+def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], Path], data: dict[str, Any]) -> None:
+    clean, (data, directory) = data["clean"], crash
     found = data["crashes"]
     assert found[0]["ids"] == data["summary"]["collided_pair"]
     assert [one["time_s"] for one in found] == sorted(one["time_s"] for one in found)
@@ -193,10 +186,7 @@ def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], P
         assert (motion.time_ns[near[0]] - 1_000_000_000) / 1e9 == pytest.approx(one["time_s"], abs=1e-3)
         assert one["place"] == pytest.approx(((a + b) / 2)[near[0]], abs=1e-3)
     assert len({tuple(one["ids"]) for one in found}) == len(found) > 1
-
-
-def test_flights_without_a_crash_have_none(data: dict[str, Any]) -> None:
-    assert data["clean"]["crashes"] == []
+    assert clean["crashes"] == []
 
 
 class Outside(HTMLParser):
@@ -213,16 +203,26 @@ class Outside(HTMLParser):
             self.found.append(tag)
 
 
-def test_the_page_fetches_nothing(data: dict[str, Any]) -> None:
-    page = render([data["clean"], data["lossy"]])
-    finder = Outside()
-    finder.feed(page)
-    assert finder.found == []
-    addresses = set(re.findall(r"https?://[^\s\"'<>)]+", page)) - {"http://www.w3.org/2000/svg"}
-    assert addresses == set()
-    assert "@import" not in page
-    assert not re.search(r"url\((?!#|data:)", page)
-    assert "default-src 'none'" in page
+@pytest.fixture(scope="module")
+def hostile(data: dict[str, Any]) -> dict[str, Any]:
+    """A run whose name and settings try to be HTML."""
+    evil = "</script><img src=x onerror=\"document.title='broken'\"><!-- {{ script }}"
+    return {**data["clean"], "name": evil, "config": [["swarm", evil, evil]], "notes": [evil]}
+
+
+def test_the_page_fetches_nothing_and_names_and_settings_cannot_break_out(
+    data: dict[str, Any], hostile: dict[str, Any]
+) -> None:
+    for page in (render([data["clean"], data["lossy"]]), render([hostile])):
+        finder = Outside()
+        finder.feed(page)
+        assert finder.found == []
+        assert page.count("</script>") == 2
+        addresses = set(re.findall(r"https?://[^\s\"'<>)]+", page)) - {"http://www.w3.org/2000/svg"}
+        assert addresses == set()
+        assert "@import" not in page
+        assert not re.search(r"url\((?!#|data:)", page)
+        assert "default-src 'none'" in page
 
 
 def test_data_in_the_page_is_the_data(data: dict[str, Any]) -> None:
@@ -232,20 +232,6 @@ def test_data_in_the_page_is_the_data(data: dict[str, Any]) -> None:
     content = json.loads(match[1])
     assert content["runs"] == [json.loads(json.dumps(data["clean"]))]
     assert content["reasons"].keys() == set(REASONS)
-
-
-def hostile(data: dict[str, Any]) -> dict[str, Any]:
-    """A run whose name and settings try to be HTML."""
-    evil = "</script><img src=x onerror=\"document.title='broken'\"><!-- {{ script }}"
-    return {**data["clean"], "name": evil, "config": [["swarm", evil, evil]], "notes": [evil]}
-
-
-def test_names_and_settings_cannot_break_out(data: dict[str, Any]) -> None:
-    page = render([hostile(data)])
-    assert page.count("</script>") == 2
-    finder = Outside()
-    finder.feed(page)
-    assert finder.found == []
 
 
 def test_a_bag_without_a_usable_configuration_still_gives_a_page(tmp_path: Path, flights: dict[str, Path]) -> None:
@@ -282,60 +268,38 @@ def test_equal_names_are_told_apart_and_bad_input_is_refused(flights: dict[str, 
     assert not (tmp_path / "none.html").exists()
 
 
-def test_the_command_writes_beside_the_bag(flights: dict[str, Path]) -> None:
-    command = [sys.executable, "-m", "dtsa_bench", "report", str(flights["clean"])]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert (flights["clean"].parent / "report.html").is_file()
-    assert "report.html" in result.stdout
-
-
 # ---- in a browser ----
 
 
-def drawn(page: Path, profile: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    """The page after its script has run, as text."""
-    options = [
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-quic",
-        "--no-first-run",
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-sync",
-        "--enable-logging=stderr",
-        "--virtual-time-budget=4000",
-    ]
-    return subprocess.run(
-        [str(CHROMIUM), *options, f"--user-data-dir={profile}", *more, page.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-
-
-def complaints(log: str) -> list[str]:
-    """What the page's script complained about."""
-    return [line for line in log.splitlines() if "CONSOLE" in line]
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-@pytest.mark.parametrize("names", [["clean"], ["clean", "lossy"]])
-def test_chromium_draws_every_part(data: dict[str, Any], tmp_path: Path, names: list[str]) -> None:
-    page = tmp_path / "report.html"
-    page.write_text(render([data[name] for name in names]), encoding="utf-8")
-    result = drawn(page, tmp_path / "profile", "--dump-dom", "--window-size=1400,2400")
-    assert "data-ready" in result.stdout, result.stderr
-    assert complaints(result.stderr) == []
-    headings = re.findall(r"<h2>([^<]+)</h2>", result.stdout)
+def drawn(browser: Browser, runs: list[dict[str, Any]], directory: Path, script: str = "") -> str:
+    """The page after its script has run, as text, without a complaint."""
+    page = directory / "report.html"
+    page.write_text(render(runs).replace("</body>", f"<script>{script}</script></body>"), encoding="utf-8")
+    browser.open(page.as_uri())
+    browser.wait_for("document.documentElement.dataset.ready === ''")
+    assert browser.complaints() == []
+    shown = str(browser.run("document.documentElement.outerHTML"))
+    headings = re.findall(r"<h2>([^<]+)</h2>", shown)
     expected = ["Flight", "Distances", "Slots", "Channel use", "Decisions", "Age", "Estimate error", "Agents"]
     assert [heading for heading in headings if heading in expected] == expected
     assert headings[-1] == "Configuration"
     # distances, channel, decisions, twice age, twice error; scene and two canvases for the slots
-    assert result.stdout.count('<svg class="plot"') == 7 * len(names)
-    assert result.stdout.count("<canvas") == 3 * len(names)
-    assert "NaN" not in re.sub(r"<script.*?</script>", "", result.stdout, flags=re.S)
+    assert shown.count('<svg class="plot"') == 7 * len(runs)
+    assert shown.count("<canvas") == 3 * len(runs)
+    shown = re.sub(r"<script.*?</script>", "", shown, flags=re.S)
+    assert "NaN" not in shown
+    return shown
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_chromium_draws_every_part_and_shows_hostile_names_as_text(
+    data: dict[str, Any], hostile: dict[str, Any], tmp_path: Path
+) -> None:
+    with browsing() as browser:
+        shown = drawn(browser, [hostile, data["lossy"]], tmp_path)
+        assert "<title>broken" not in shown
+        assert "<img" not in shown
+        assert colours(browser.picture(), tmp_path) > 150  # text and lines alone have far fewer
 
 
 PLAY = """
@@ -348,48 +312,24 @@ const waits = setInterval(() => {  // a busy machine may draw nothing for a whil
   told.push(stood > 0.5, clock.time === stood);
   clock.set(DURATION); told.push(document.querySelector(".play").textContent);
   clock.toggle(); told.push(clock.time); clock.toggle();
-  document.body.append(el("div", {}, "told " + JSON.stringify(told)));
+  document.body.dataset.told = JSON.stringify(told);
 }, 100);
 """
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_chromium_plays_on_from_where_it_stood_and_marks_crashes(
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_chromium_plays_on_from_where_it_stood_marks_crashes_and_prints(
     crash: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
     data, _ = crash
-    page = tmp_path / "report.html"
-    page.write_text(render([data]).replace("</body>", f"<script>{PLAY}</script></body>"), encoding="utf-8")
-    result = drawn(page, tmp_path / "profile", "--dump-dom")
-    assert complaints(result.stderr) == []
-    assert 'told [0.5,true,true,"↻",0]' in result.stdout
-    assert "A cross in a ring is a crash" in result.stdout
-    assert result.stdout.count('class="mark"') == len(data["crashes"])
-    for name in data["sent_for"]:
-        assert REASON_TEXTS[name] in result.stdout  # explained where they appear
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_chromium_shows_hostile_names_as_text(data: dict[str, Any], tmp_path: Path) -> None:
-    page = tmp_path / "report.html"
-    page.write_text(render([hostile(data)]), encoding="utf-8")
-    result = drawn(page, tmp_path / "profile", "--dump-dom")
-    assert "<title>broken" not in result.stdout
-    assert "<img" not in re.sub(r"<script.*?</script>", "", result.stdout, flags=re.S)
-    assert "data-ready" in result.stdout
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_chromium_paints_the_canvases_and_prints(data: dict[str, Any], tmp_path: Path) -> None:
-    from matplotlib.image import imread
-
-    page = tmp_path / "report.html"
-    page.write_text(render([data["clean"]]), encoding="utf-8")
-    picture, paper = tmp_path / "page.png", tmp_path / "page.pdf"
-    drawn(page, tmp_path / "profile", f"--screenshot={picture}", "--window-size=1200,1500", "--hide-scrollbars")
-    pixels = imread(picture)[:, :, :3]
-    colours = len(np.unique((pixels * 31).astype(np.uint8).reshape(-1, 3), axis=0))
-    assert colours > 150  # text and lines alone have far fewer
-    drawn(page, tmp_path / "profile", f"--print-to-pdf={paper}", "--no-pdf-header-footer")
-    assert paper.read_bytes().startswith(b"%PDF")
-    assert 2 <= len(re.findall(rb"/Type\s*/Page\b", paper.read_bytes())) <= 12
+    with browsing() as browser:
+        shown = drawn(browser, [data], tmp_path, PLAY)
+        browser.wait_for("document.body.dataset.told")
+        assert browser.run("document.body.dataset.told") == '[0.5,true,true,"↻",0]'
+        assert "A cross in a ring is a crash" in shown
+        assert shown.count('class="mark"') == len(data["crashes"])
+        for name in data["sent_for"]:
+            assert REASON_TEXTS[name] in shown  # explained where they appear
+        paper = browser.paper()
+    assert paper.startswith(b"%PDF")
+    assert 2 <= len(re.findall(rb"/Type\s*/Page\b", paper)) <= 12

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("aiohttp")
 
 import aiohttp
-from browser_helpers import CHROMIUM, MISSING, browsing, serving
+from browser_helpers import CHROMIUM, MISSING, browsing, colours, serving
 from view_helpers import AGENTS, PATIENCE_S, lossy_bag, numbers, track_of, viewed_flight
 from waiting import wait_for
 
@@ -86,16 +86,6 @@ def test_chromium_shows_crazyflies_and_an_emergency_stop_takes_two_clicks(tmp_pa
         wait_for(lambda: len(ordered) > 1)
         assert ordered == [Order("land"), Order("emergency", value="stop all motors")]
         assert browser.complaints() == []
-
-
-def colours(picture: bytes, directory: Path) -> int:
-    """How many different colours a picture has."""
-    from matplotlib.image import imread
-
-    path = directory / "picture.png"
-    path.write_bytes(picture)
-    pixels = (imread(path)[:, :, :3] * 31).astype(np.uint8).reshape(-1, 3)
-    return len(np.unique(pixels, axis=0))
 
 
 def slots_of(track: Track) -> int:
