@@ -66,25 +66,6 @@ def test_a_socket_comes_back_to_an_interface_that_has_changed(change: object) ->
     assert said[0].startswith(f"interface {CABLE} is another one now")
 
 
-def test_an_interface_that_has_gone_is_said_once_and_found_when_it_is_back() -> None:
-    said: list[str] = []
-    with hosts(1) as (host,), inside(host), UdpPort(UdpSettings(interface=CABLE)) as port:
-        port.say = said.append
-        host.unplug()
-        assert port.send(b"x")
-        assert port.send(b"x")
-        assert len(said) == 1
-        host.plug(host.address)
-        assert port.send(b"x") == ""
-        assert [line.split()[2] for line in said] == ["has", "is"]
-        host.switch(up=False)
-        assert port.send(b"x") == "Network is unreachable"
-        host.switch(up=True)
-        assert port.send(b"back") == ""
-        assert heard(port, b"back") == [True]
-        assert port.counts()["interface_changes"] == 1
-
-
 SWARM = SwarmConfig(agents=4, policy="lease", slot_ms=20.0, auth=True, auth_session=5, scenario="waypoints")
 
 
@@ -110,6 +91,6 @@ def test_agents_fly_on_when_their_interfaces_change(tmp_path: Path) -> None:
     assert summaries[3]["unsent_because"]["Network is unreachable"] > 0
     errors = {agent: (tmp_path / f"cf{agent}-1.err").read_text() for agent in (1, 2, 3, 4)}
     assert "is another one now" in errors[2]
-    assert "has gone" in errors[3]
+    assert errors[3].count("has gone") == 1
     assert "frames leave again" in errors[3]
     assert "frames leave again" in errors[4]

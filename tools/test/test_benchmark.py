@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from dtsa_dev import benchmark
 from dtsa_dev.benchmark import core
 from dtsa_dev.registry import main
 
@@ -39,10 +38,3 @@ def test_nodes_and_the_bare_round_beside_them(monkeypatch: pytest.MonkeyPatch) -
     assert first.ratio > 0
     assert first.target == "<= 2.5, >= 1 slots/s"
     assert (second.ratio, second.target) == (None, "")
-
-
-def test_unknown_parts_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["benchmark", "--parts", "kernels,moon"]) == 2
-    assert "moon" in capsys.readouterr().err
-    assert benchmark.Row("a", "b", ratio=0.5, target="<= 0.4", met=False).cells() == ("a", "b", "", "0.5",
-                                                                                     "<= 0.4, NOT MET")  # fmt: skip

@@ -129,12 +129,6 @@ def test_groups_that_meet_again(agents: int, movers: int, loss: float) -> None:
     assert done.outcome.ledger.broken == []
 
 
-def test_a_run_is_repeatable() -> None:
-    first, second = (random_misfortune(9, 1500).experiment() for _ in range(2))
-    assert first.run(1500) == second.run(1500)
-    assert (first.swarm.digest == second.swarm.digest).all()
-
-
 def test_the_ledger_sees_broken_rules() -> None:
     """The referee itself: each rule broken once."""
     zero = (0.0, 0.0, 0.0)
