@@ -35,12 +35,7 @@ def test_flights_are_equal_in_which_few_of_many_move(moving: int) -> None:
 
 @pytest.mark.parametrize(
     ("module", "name", "value"),
-    [
-        (issue, "MISSED", 1),
-        (issue, "RELAY_IDS", 1),
-        (listen, "DEAF", 0),
-        (issue, "OFTEN", 50.0),
-    ],
+    [(issue, "MISSED", 1), (issue, "RELAY_IDS", 1), (listen, "DEAF", 0), (issue, "OFTEN", 50.0)],
 )
 def test_a_rule_that_differs_is_found(monkeypatch: pytest.MonkeyPatch, module: object, name: str, value: float) -> None:
     """The oracle itself: one constant of the specification changed."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -13,12 +15,19 @@ from dtsa_dev.prove import MUTANTS, World, explore
 from dtsa_dev.prove import build as build_prover
 
 
-@pytest.mark.parametrize(("target", "inputs"), [("frames", 200_000), ("agents", 10_000), ("hearing", 20_000)])
-def test_fuzzing_finds_nothing(target: str, inputs: int, tmp_path: Path) -> None:
+@contextmanager
+def skipped_if_not_here() -> Iterator[None]:
+    """Skip the test where a compiler or an emulator is missing."""
     try:
-        program = build(target, tmp_path)
+        yield
     except NotHere as error:
         pytest.skip(str(error))
+
+
+@pytest.mark.parametrize(("target", "inputs"), [("frames", 200_000), ("agents", 10_000), ("hearing", 20_000)])
+def test_fuzzing_finds_nothing(target: str, inputs: int, tmp_path: Path) -> None:
+    with skipped_if_not_here():
+        program = build(target, tmp_path)
     done = fuzz(program, 120, tmp_path / "corpus", seed=1, most=inputs)
     assert done.runs >= inputs
     assert done.covered > 50  # it got past the first checks
@@ -33,19 +42,15 @@ def test_fuzzing_finds_a_missing_check(tmp_path: Path) -> None:
         .replace(check, "")
         .replace("i < RELAY_IDS; i++) {\n        e->relay", "i < count; i++) {\n        e->relay")
     )
-    try:
+    with skipped_if_not_here():
         program = build("frames", tmp_path, broken)
-    except NotHere as error:
-        pytest.skip(str(error))
     with pytest.raises(Found, match=r"overflow|out of bounds|ABRT|deadly"):
         fuzz(program, 20, tmp_path / "corpus", seed=1)
 
 
 def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
-    try:
+    with skipped_if_not_here():
         cortex = fly_on_cortex(tmp_path, slots=30, metered=False)
-    except NotHere as error:
-        pytest.skip(str(error))
     here = fly_here(tmp_path, slots=30)
     assert [(flight.policy, flight.agents) for flight in here] == [
         (policy, agents) for policy in ("tdma", "dtsa", "lease") for agents in (12, 18)
@@ -56,10 +61,8 @@ def test_a_microcontroller_flies_the_same_bits(tmp_path: Path) -> None:
 
 
 def test_a_slot_of_the_app_on_board_fits_its_stack_and_its_time(tmp_path: Path) -> None:
-    try:
+    with skipped_if_not_here():
         (cost,) = fly_app_on_cortex(tmp_path, slots=5, sample=True)
-    except NotHere as error:
-        pytest.skip(str(error))
     assert (cost.policy, cost.agents, cost.slots) == ("lease", 20, 5)  # it steers
     assert 1000 < cost.stack < STACK_BYTES
     assert all(mean <= most for mean, most in cost.instructions.values())
@@ -71,12 +74,10 @@ def test_a_firmware_that_fuses_operations_flies_the_same_bits(tmp_path: Path) ->
     copy = tmp_path / "libdtsa"
     shutil.copytree(LIBRARY, copy)
     (copy / "rounding.h").write_text("")
-    try:
+    with skipped_if_not_here():
         assert fused(tmp_path) == {}
         assert set(fused(tmp_path, copy)) == {"orca_scalar.c", "urgent.c"}
         cortex = fly_on_cortex(tmp_path, slots=30, metered=False, more=FUSING)
-    except NotHere as error:
-        pytest.skip(str(error))
     assert [flight.digest for flight in cortex] == [flight.digest for flight in fly_here(tmp_path, slots=30)]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from contextlib import nullcontext
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,23 +22,6 @@ NEVER = 2**62  # slot
 KINDS = ("go", "stop", "go", "stop", "die", "join", "join", "restart", "leave")
 
 
-@dataclass(frozen=True, slots=True)
-class Misfortune:
-    """What befalls one swarm."""
-
-    config: SwarmConfig
-    channel: ChannelConfig
-    movers: tuple[int, ...]
-    events: tuple[Event, ...]
-    final: bool
-
-    def experiment(self) -> Experiment:
-        """The run to make with it; ages are not measured."""
-        return Experiment(
-            self.config, self.channel, movers=self.movers, events=self.events, final=self.final, warmup=NEVER
-        )
-
-
 def _events(random: np.random.Generator, agents: int, slots: int) -> list[Event]:
     events = []
     for agent in range(1, agents + 1):
@@ -50,10 +32,10 @@ def _events(random: np.random.Generator, agents: int, slots: int) -> list[Event]
     return events
 
 
-def random_misfortune(seed: int, slots: int, most_agents: int = 16, **settings: Any) -> Misfortune:
+def random_misfortune(seed: int, slots: int, **settings: Any) -> Experiment:
     """Everything that can go wrong, at random, in a run that lasts so many slots; settings: of the swarm."""
     random = np.random.default_rng(seed)
-    agents = int(random.integers(2, most_agents + 1))
+    agents = int(random.integers(2, 17))
     config = SwarmConfig(
         agents=agents, policy="lease", avoider="none", seed=seed, anchor_every=int(random.integers(1, 8)),
         depth_rate=float(random.choice([0.1, 1.0, 5.0])), lease_share=float(random.choice([0.75, 1.0])), **settings,
@@ -70,14 +52,16 @@ def random_misfortune(seed: int, slots: int, most_agents: int = 16, **settings: 
         range_m=float(random.choice([0.0, 0.0, 8.0])), schedule=tuple(random_schedule(random, agents, slots)),
     )  # fmt: skip
     movers = tuple(k for k in range(1, agents + 1) if random.random() < 0.5)
-    return Misfortune(config, channel, movers, tuple(_events(random, agents, slots)), bool(random.random() < 0.5))
+    events = _events(random, agents, slots)
+    # Ages are not measured.
+    return Experiment(config, channel, movers=movers, events=events, final=bool(random.random() < 0.5), warmup=NEVER)
 
 
 @pytest.mark.parametrize("chunk", range(CHUNKS))
 def test_without_open_turns_and_adoption_never_two_senders(chunk: int) -> None:
     leased = 0
     for seed in range(chunk * RUNS, (chunk + 1) * RUNS):
-        out = random_misfortune(seed, SLOTS, open_every=0, adoption=False).experiment().run(SLOTS)
+        out = random_misfortune(seed, SLOTS, open_every=0, adoption=False).run(SLOTS)
         assert out.ledger is not None
         assert (out.collisions, out.ledger.broken) == (0, []), seed
         leased += out.ledger.leased_slots
@@ -87,7 +71,7 @@ def test_without_open_turns_and_adoption_never_two_senders(chunk: int) -> None:
 @pytest.mark.parametrize("chunk", range(3))
 def test_by_default_two_senders_only_in_turns_that_are_counted(chunk: int) -> None:
     for seed in range(chunk * RUNS, (chunk + 1) * RUNS):
-        out = random_misfortune(seed + 5000, SLOTS).experiment().run(SLOTS)
+        out = random_misfortune(seed + 5000, SLOTS).run(SLOTS)
         assert out.ledger is not None
         assert out.ledger.broken == [], seed
         book = out.ledger

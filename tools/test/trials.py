@@ -13,11 +13,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
 from dtsa_dev.network.fake_modems import FakeModems, FakeModemSettings
 from dtsa_dev.network.hosts import CABLE, Host, hosts
 from dtsa_dev.network.switch import Links, Switch
@@ -27,9 +28,10 @@ from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
 from dtsa_agent.keys import VARIABLE
 from dtsa_bench.recordings.merge.agent_bag import AgentBag, read
-from dtsa_bench.recordings.merge.merge import Merge
+from dtsa_bench.recordings.merge.merge import Merge, verified
 from dtsa_bench.recordings.merge.merged_run import lay
 from dtsa_bench.recordings.merge.merged_writer import write
+from dtsa_bench.recordings.verify import verify_bag
 from dtsa_bench.runs.config import RunConfig, RunLimits, from_swarm
 from dtsa_bench.simulation.simulate import simulate
 from dtsa_channel_sim import ChannelConfig
@@ -50,43 +52,29 @@ class TrialError(DtsaError):
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What is flown.
-
-    :param channel: settings of the medium, without what follows from the swarm.
-    :param links: over UDP: what links do beside the medium.
-    :param modems: None: over UDP.
-    :param seconds: s from when all have begun.
-    :param drift_ppm: largest drift of a clock, either way.
-    :param spread_s: s within which processes start, in any order.
-    :param seed: of order, drifts and offsets.
-    """
-
     swarm: SwarmConfig
-    channel: dict[str, Any] = field(default_factory=dict)
-    links: Links = field(default_factory=Links)
-    modems: FakeModemSettings | None = None
-    seconds: float = 8.0
-    drift_ppm: float = 50.0
-    spread_s: float = 0.5
-    seed: int = 1
+    channel: dict[str, Any] = field(default_factory=dict)  # settings of the medium that do not follow from the swarm
+    links: Links = field(default_factory=Links)  # over UDP: what links do beside the medium
+    modems: FakeModemSettings | None = None  # None: over UDP
+    seconds: float = 8.0  # from when all have begun
+    drift_ppm: float = 50.0  # largest drift of a clock, either way
+    spread_s: float = 0.5  # within which processes start, in any order
+    seed: int = 1  # of order, drifts and offsets
 
 
 class AgentFlight:
-    """A trial under way. A medium says how a process starts, how time goes on, and how often an agent has sent.
-
-    :param directory: for bags; each process has one of its own below.
-    """
+    """A trial under way. A medium says how a process starts, how time goes on, and how often an agent has sent."""
 
     def __init__(self, trial: Trial, directory: Path) -> None:
         self.trial, self.directory = trial, directory
         self.agents = list(range(1, trial.swarm.agents + 1))
+        (directory / "swarm.yaml").write_text(yaml.safe_dump(trial.swarm.to_dict()), encoding="utf-8")
         self.key = secrets.token_hex(32)
         self.random = random.Random(trial.seed)
         self._processes: dict[int, subprocess.Popen[str]] = {}
         self._lives: dict[int, int] = {}
 
     def popen(self, agent: int, command: list[str], **more: Any) -> subprocess.Popen[str]:
-        """Start a process of an agent."""
         return subprocess.Popen(command, text=True, **more)
 
     def options(self, agent: int) -> dict[str, object]:
@@ -101,7 +89,6 @@ class AgentFlight:
         return done
 
     def sent_count(self, agent: int) -> int:
-        """Frames that an agent has sent so far."""
         raise NotImplementedError
 
     def start(self, agent: int) -> None:
@@ -110,17 +97,23 @@ class AgentFlight:
         options = {
             "id": agent, "clock-offset-ns": self.random.randrange(10**12),
             "clock-drift-ppb": round(self.random.uniform(-1.0, 1.0) * self.trial.drift_ppm * 1000),
-            "out": self.directory / f"cf{agent}-{life}", **self.options(agent),
+            "out": self.directory / f"cf{agent}-{life}", "swarm": self.directory / "swarm.yaml", **self.options(agent),
         }  # fmt: skip
         command = [sys.executable, "-m", "dtsa_bench", "agent", *(f"--{key}={value}" for key, value in options.items())]
         with (self.directory / f"cf{agent}-{life}.err").open("w") as errors:
             self._processes[agent] = self.popen(
-                agent, command + swarm_options(self.trial.swarm), stdout=subprocess.DEVNULL, stderr=errors,
+                agent, command, stdout=subprocess.DEVNULL, stderr=errors,
                 env={**os.environ, VARIABLE: self.key},
             )  # fmt: skip
 
+    def kill_and_restart(self, agent: int, seconds: float) -> None:
+        """An agent's process is killed, and started again after so long; it sends again."""
+        self.signal(agent, signal.SIGKILL)
+        self.carry(seconds)
+        self.start(agent)
+        self.wait_for_frames([agent])
+
     def signal(self, agent: int, number: int) -> None:
-        """Send a signal to an agent's process."""
         self._processes[agent].send_signal(number)
         if number == signal.SIGKILL:
             self._processes[agent].wait()
@@ -153,20 +146,17 @@ class AgentFlight:
         self._check(None, -signal.SIGKILL)
 
     def end(self) -> None:
-        """End all in order."""
         for process in self._living():
             process.send_signal(signal.SIGTERM)
         self.run(lambda: not self._living(), _END_S)
         self._check(0, -signal.SIGKILL)
 
     def close(self) -> None:
-        """Kill whatever still runs."""
         for process in self._living():
             process.kill()
             process.wait()
 
     def bags(self) -> list[AgentBag]:
-        """All bags."""
         return [read(path) for path in sorted(self.directory.glob("cf*-*")) if path.is_dir()]
 
     def stderr(self, agent: int) -> str:
@@ -175,11 +165,9 @@ class AgentFlight:
         return " ".join(path.read_text(encoding="utf-8").split())
 
     def findings(self, from_ns: int, to_ns: int) -> dict[str, Any]:
-        """What the medium has seen between two times."""
         return {}
 
     def now_ns(self) -> int:
-        """Time of the medium."""
         return time.monotonic_ns()
 
     def _check(self, *codes: int | None) -> None:
@@ -211,8 +199,7 @@ class UdpFlight(AgentFlight):
 
     def options(self, agent: int) -> dict[str, object]:
         fixed, byte = flight_time(self.config.airtime)
-        group = f"{GROUP[0]}:{GROUP[1]}"
-        return {"interface": CABLE, "group": group, "flight-time-ns": fixed, "byte-time-ns": byte}
+        return {"interface": CABLE, "group": "{}:{}".format(*GROUP), "flight-time-ns": fixed, "byte-time-ns": byte}
 
     def run(self, until: Callable[[], bool], seconds: float) -> bool:
         return self.switch.run(until, seconds)
@@ -261,21 +248,17 @@ def under_way(trial: Trial, directory: Path) -> Iterator[Any]:
 
     :raises Unavailable: if hosts cannot be made here.
     """
-    if trial.modems is None:
-        with hosts(trial.swarm.agents) as joined, _as_medium():
-            yield from _begun(UdpFlight(trial, joined, directory))
-    else:
-        channel = FakeModems.channel(trial.modems.count, seed=trial.seed, **trial.channel)
-        with FakeModems(trial.modems, channel, directory) as modems:
-            yield from _begun(SerialFlight(trial, modems, directory))
-
-
-def _begun(flight: AgentFlight) -> Iterator[AgentFlight]:
-    try:
+    with ExitStack() as stack:
+        flight: AgentFlight
+        if trial.modems is None:
+            flight = UdpFlight(trial, stack.enter_context(hosts(trial.swarm.agents)), directory)
+            stack.enter_context(_as_medium())
+        else:
+            channel = FakeModems.channel(trial.modems.count, seed=trial.seed, **trial.channel)
+            flight = SerialFlight(trial, stack.enter_context(FakeModems(trial.modems, channel, directory)), directory)
+        stack.callback(flight.close)
         flight.begin()
         yield flight
-    finally:
-        flight.close()
 
 
 @contextmanager
@@ -291,17 +274,16 @@ def _as_medium() -> Iterator[None]:
             os.sched_setscheduler(0, before, os.sched_param(0))
 
 
-def fly(trial: Trial, directory: Path, disturb: Callable[[Any], None] | None = None) -> dict[str, Any]:
-    """Fly a trial and judge it; a flight in which all came to count alike is kept as a bag (``WHOLE``).
+def fly(trial: Trial, directory: Path, disturb: Callable[[Any], None], **simulators: Any) -> dict[str, Any]:
+    """Fly a trial, whose bags verify and become a bag that verifies (``WHOLE``).
 
     :param disturb: called when all have begun and a third of the time is over; carries the flight on as it likes.
-    :returns: the merged flight, and what the medium has seen.
+    :returns: the merged flight, what the medium has seen, and the simulator's summary of such a flight.
     """
     with under_way(trial, directory) as flight:
         begun = flight.now_ns()
         flight.carry(trial.seconds / 3)
-        if disturb is not None:
-            disturb(flight)
+        disturb(flight)
         flight.carry(trial.seconds * 2 / 3)
         flown = flight.now_ns()
         flight.end()
@@ -309,9 +291,18 @@ def fly(trial: Trial, directory: Path, disturb: Callable[[Any], None] | None = N
         airtime = flight.config.airtime if trial.modems is None else None
     merged = Merge(flight.bags())
     found = merged.judge(*([] if airtime is None else [airtime.on_air_ns(HEADER + trial.swarm.frame_length)]))
-    if found["common_slot"] is not None:
-        write(directory / WHOLE, lay(merged, found), found)
-    return {**found, "medium": medium}
+    assert verified(found), (found["decisions_again"], found["turns"]["which"], found["frames_heard_not_as_sent"])
+    assert found["flight"] is not None, "they never counted alike"
+    write(directory / WHOLE, lay(merged, found), found)
+    checked = verify_bag(directory / WHOLE)
+    assert checked.ok, checked.difference
+    channel = {"loss": trial.channel["loss"], **simulators}
+    return {**found, "medium": medium, "simulated": simulated(trial.swarm, found["flight"]["flight_time_s"], **channel)}
+
+
+def apart(agents: int) -> list[list[int]]:
+    """Two groups of agents that do not hear each other."""
+    return [list(range(1, agents // 2 + 1)), list(range(agents // 2 + 1, agents + 1))]
 
 
 def simulated(swarm: SwarmConfig, seconds: float, **channel: Any) -> dict[str, Any]:
@@ -325,16 +316,3 @@ def simulated(swarm: SwarmConfig, seconds: float, **channel: Any) -> dict[str, A
 def flight_time(airtime: Airtime) -> tuple[int, int]:
     """How long a datagram is under way on an air, as `agent` asks for it: ns for any, ns more for each byte."""
     return airtime.on_air_ns(0) + airtime.ramp_up_ns, 8 * 1_000_000_000 // airtime.bitrate
-
-
-def swarm_options(swarm: SwarmConfig) -> list[str]:
-    """Options of `agent` for a swarm's settings, as far as they differ from their defaults."""
-    plain, words = SwarmConfig(agents=swarm.agents).to_dict(), [f"--agents={swarm.agents}", f"--policy={swarm.policy}"]
-    for name, value in swarm.to_dict().items():
-        option = name.replace("_", "-")
-        if name in ("agents", "policy", "auth") or value == plain[name]:
-            continue
-        if isinstance(value, dict):
-            value = ",".join(f"{key}={number}" for key, number in value.items())
-        words.append(f"--{option}={value}" if not isinstance(value, bool) else f"--{'' if value else 'no-'}{option}")
-    return [*words, "--seal" if swarm.auth else "--no-seal"]

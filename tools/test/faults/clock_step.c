@@ -21,56 +21,41 @@ static long step(void)
     return seconds;
 }
 
+static void *next(const char *name)
+{
+    void *versioned = dlvsym(RTLD_NEXT, name, "GLIBC_2.3.2");  // of a condition there are two
+    return versioned ? versioned : dlsym(RTLD_NEXT, name);
+}
+
 int clock_gettime(clockid_t clock, struct timespec *now)
 {
     static int (*real)(clockid_t, struct timespec *);
-    if (!real) *(void **)&real = dlsym(RTLD_NEXT, "clock_gettime");
+    if (!real) *(void **)&real = next("clock_gettime");
     int result = real(clock, now);
     if (!result && clock == CLOCK_REALTIME) now->tv_sec += step();
     return result;
 }
 
-static struct timespec by_the_kernel(const struct timespec *until)
-{
-    struct timespec right = *until;
-    if (right.tv_sec > 500000000) right.tv_sec -= step();
-    return right;
-}
-
-typedef int (*cond_wait)(pthread_cond_t *, pthread_mutex_t *, const struct timespec *);
-
-int pthread_cond_timedwait(pthread_cond_t *cond, pthread_mutex_t *mutex,
-                           const struct timespec *until)
-{
-    static cond_wait real;
-    if (!real) *(void **)&real = dlvsym(RTLD_NEXT, "pthread_cond_timedwait", "GLIBC_2.3.2");
-    if (!real) *(void **)&real = dlsym(RTLD_NEXT, "pthread_cond_timedwait");
-    struct timespec right = by_the_kernel(until);
-    return real(cond, mutex, &right);
-}
-
-int pthread_mutex_timedlock(pthread_mutex_t *mutex, const struct timespec *until)
-{
-    static int (*real)(pthread_mutex_t *, const struct timespec *);
-    if (!real) *(void **)&real = dlsym(RTLD_NEXT, "pthread_mutex_timedlock");
-    struct timespec right = by_the_kernel(until);
-    return real(mutex, &right);
-}
-
-int sem_timedwait(sem_t *sem, const struct timespec *until)
-{
-    static int (*real)(sem_t *, const struct timespec *);
-    if (!real) *(void **)&real = dlsym(RTLD_NEXT, "sem_timedwait");
-    struct timespec right = by_the_kernel(until);
-    return real(sem, &right);
-}
+// A function that waits until a time by the clock, which the kernel is told by its own.
+#define WAITS(name, parameters, ...)                                \
+    int name(parameters, const struct timespec *until)              \
+    {                                                               \
+        static int (*real)(parameters, const struct timespec *);    \
+        struct timespec right = *until;                             \
+        if (!real) *(void **)&real = next(#name);                   \
+        if (right.tv_sec > 500000000) right.tv_sec -= step();       \
+        return real(__VA_ARGS__, &right);                           \
+    }
+#define BOTH(a, b) a, b
+WAITS(pthread_cond_timedwait, BOTH(pthread_cond_t *c, pthread_mutex_t *m), c, m)
+WAITS(pthread_mutex_timedlock, pthread_mutex_t *m, m)
+WAITS(sem_timedwait, sem_t *s, s)
 
 int gettimeofday(struct timeval *now, void *zone)
 {
     struct timespec fine;
     (void)zone;
     if (clock_gettime(CLOCK_REALTIME, &fine)) return -1;
-    now->tv_sec = fine.tv_sec;
-    now->tv_usec = fine.tv_nsec / 1000;
+    *now = (struct timeval){fine.tv_sec, fine.tv_nsec / 1000};
     return 0;
 }

@@ -36,7 +36,6 @@ _NOT_BELIEVED = "nobody in the flight believes it; the flight goes on; the bag v
 
 
 def _environment(flight: FlightProcess) -> dict[str, str]:
-    """Environment of a process in the flight's domain."""
     known = flight.environment(flight.nodes[0])
     names = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION")
     return {**os.environ, **{name: known[name] for name in names if name in known}}
@@ -106,10 +105,7 @@ def bag_replayed(directory: Path) -> None:
 
 
 def random_message(kind: Any, pick: random.Random) -> Any:
-    """A well-formed message with fields of random length and value.
-
-    :param kind: its class.
-    """
+    """A well-formed message of a class with fields of random length and value."""
     message = kind()
     for name, spec in kind.get_fields_and_field_types().items():
         setattr(message, name, _random_value(spec, getattr(message, name), pick))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from fly_helpers import ENDLESS, PATIENCE_S, FlightProcess, children, start_flight
@@ -24,12 +24,21 @@ _RECOVERS = "the agents end, too; `recover` saves the bag, which verifies up to 
 _WAIT = "all wait, then fly on; the bag verifies"
 
 
-def _end(flight: FlightProcess, pids: Iterable[int], number: int, *messages: str) -> None:
-    """Signals to processes of a flight end it."""
-    for pid in pids:
-        os.kill(pid, number)
-    flight.assert_ends(1, *messages)
-    flight.assert_verifies()
+def _ends(
+    name: str, what: str, words: tuple[str, ...], number: int, pids: Callable[[FlightProcess], Sequence[int]],
+    *messages: str, reaction: str = _ENDS, sample: bool = False,
+) -> None:  # fmt: skip
+    """Declare a row: a signal to processes of a flight with these options ends it, with messages."""
+
+    def act(flight: FlightProcess) -> None:
+        killed = pids(flight)
+        for pid in killed:
+            os.kill(pid, number)
+        flight.assert_ends(1, *(message.format(pid=killed[0]) for message in messages))
+        flight.assert_verifies()
+
+    act.__name__ = name
+    in_flight(what, reaction, *words, sample=sample)(act)
 
 
 def _pause(flight: FlightProcess, *pids: int, seconds: float = 1.0) -> None:
@@ -42,33 +51,17 @@ def _pause(flight: FlightProcess, *pids: int, seconds: float = 1.0) -> None:
     flight.assert_flies_on()
 
 
-@in_flight("SIGKILL to an agent's process, lockstep", _ENDS, *LOCKSTEP, sample=True)
-def agent_killed(flight: FlightProcess) -> None:
-    pid = flight.pid_of(2)
-    _end(flight, [pid], signal.SIGKILL, f"cf2 (process {pid}) was killed by SIGKILL")
-
-
-@in_flight("SIGTERM to an agent's process, lockstep", _ENDS, *LOCKSTEP)
-def agent_terminated(flight: FlightProcess) -> None:
-    pid = flight.pid_of(2)
-    _end(flight, [pid], signal.SIGTERM, f"cf2 (process {pid}) ended")
-
-
-@in_flight("SIGKILL to all agents' processes, lockstep", _ENDS, *LOCKSTEP)
-def all_agents_killed(flight: FlightProcess) -> None:
-    _end(flight, flight.nodes, signal.SIGKILL, "was killed by SIGKILL")
-
-
-@in_flight("SIGKILL to a process with several agents, lockstep", _ENDS, *LOCKSTEP, "--processes", "2")
-def host_killed(flight: FlightProcess) -> None:
-    _end(flight, flight.nodes[-1:], signal.SIGKILL, "swarm_host_", "was killed by SIGKILL")
-
-
-@in_flight(
-    "SIGSTOP to an agent's process, lockstep", f"after `--answer-s` {_ENDS}", *LOCKSTEP, "--answer-s", "1", sample=True
-)
-def agent_hangs(flight: FlightProcess) -> None:
-    _end(flight, [flight.pid_of(3)], signal.SIGSTOP, "cf3 did not answer slot", "within 1 s: dead or hung?")
+_ends("agent_killed", "SIGKILL to an agent's process, lockstep", LOCKSTEP, signal.SIGKILL,
+      lambda flight: [flight.pid_of(2)], "cf2 (process {pid}) was killed by SIGKILL", sample=True)  # fmt: skip
+_ends("agent_terminated", "SIGTERM to an agent's process, lockstep", LOCKSTEP, signal.SIGTERM,
+      lambda flight: [flight.pid_of(2)], "cf2 (process {pid}) ended")  # fmt: skip
+_ends("all_agents_killed", "SIGKILL to all agents' processes, lockstep", LOCKSTEP, signal.SIGKILL,
+      lambda flight: flight.nodes, "was killed by SIGKILL")  # fmt: skip
+_ends("host_killed", "SIGKILL to a process with several agents, lockstep", (*LOCKSTEP, "--processes", "2"),
+      signal.SIGKILL, lambda flight: flight.nodes[-1:], "swarm_host_", "was killed by SIGKILL")  # fmt: skip
+_ends("agent_hangs", "SIGSTOP to an agent's process, lockstep", (*LOCKSTEP, "--answer-s", "1"), signal.SIGSTOP,
+      lambda flight: [flight.pid_of(3)], "cf3 did not answer slot", "within 1 s: dead or hung?",
+      reaction=f"after `--answer-s` {_ENDS}", sample=True)  # fmt: skip
 
 
 @in_flight("SIGSTOP and, 1 s later, SIGCONT to an agent, lockstep", _WAIT, *LOCKSTEP, sample=True)
@@ -137,12 +130,9 @@ def agent_killed_and_started_again(flight: FlightProcess) -> None:
     assert flight.interrupt()["returned_agents"] == [2]
 
 
-@in_flight(
-    "SIGKILL to all agents' processes, real time",
-    "the flight says that nobody is left and ends with code 1; the bag verifies", *REALTIME,
-)  # fmt: skip
-def all_agents_killed_in_real_time(flight: FlightProcess) -> None:
-    _end(flight, flight.nodes, signal.SIGKILL, "nobody is left")
+_ends("all_agents_killed_in_real_time", "SIGKILL to all agents' processes, real time", REALTIME, signal.SIGKILL,
+      lambda flight: flight.nodes, "nobody is left",
+      reaction="the flight says that nobody is left and ends with code 1; the bag verifies")  # fmt: skip
 
 
 @in_flight(
@@ -160,7 +150,6 @@ def agent_stopped_in_real_time(flight: FlightProcess) -> None:
 
 
 def _signal(directory: Path, number: int, words: tuple[str, ...]) -> None:
-    """A signal stops a flight."""
     before = signal.signal(number, signal.SIG_DFL)  # under nohup the flight would inherit that it is ignored
     try:
         with start_flight(directory, *words, *ENDLESS) as flight:

@@ -17,8 +17,6 @@ Act = Callable[[FlightProcess], None]  # the same to a flight that does not end 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault and the reaction, both in words."""
-
     what: str
     reaction: str
     run: Run

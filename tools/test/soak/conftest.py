@@ -20,7 +20,7 @@ def record(request: pytest.FixtureRequest) -> Iterator[list[Any]]:
     if os.environ.get("DTSA_EVIDENCE"):
         name = request.path.stem.removeprefix("test_")
         items = sum(item.path == request.path for item in request.session.items)
-        heads, rows = request.module.summarise(found)
+        heads, rows = getattr(request.module, "summarise", lambda found: ([], []))(found)
         figures = {
             "promise": " ".join(request.module.__doc__.removeprefix("Integration: ").split()),
             "passed": f"{len(found)} of {items}",

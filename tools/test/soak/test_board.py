@@ -75,10 +75,7 @@ def _schedule_fault(flight: OnBoard, fault: str, seconds: float, seed: int) -> N
 
 
 def fly(fault: str, seconds: float, seed: int, directory: Path, flags: Sequence[str] = ()) -> dict[str, Any]:
-    """One flight of virtual time with a fault; what the laboratory says of it.
-
-    :param flags: more of the compiler's.
-    """
+    """One flight of virtual time with a fault; what the laboratory says of it."""
     settings = LabSettings(seed=seed, drift_ppm=50.0, **FAULTS[fault])  # type: ignore[arg-type]
     swarm = SwarmConfig(agents=AGENTS, policy="lease", seed=seed, targets_known=False)
     with OnBoard(swarm, settings, directory, enable_s=ENABLED_S, flags=flags) as flight:
@@ -126,7 +123,6 @@ def test_fault(fault: str, seed: int, seconds: float, tmp_path: Path, record: li
 
 
 def summarise(found: list[dict[str, Any]]) -> tuple[list[str], list[list[object]]]:
-    """The rows of the record."""
     rows: list[list[object]] = []
     for fault in FAULTS:
         mine = [row for row in found if row["fault"] == fault]

@@ -41,25 +41,17 @@ LOOP = "import ctypes; ctypes.CDLL(None).prctl(1, 9)\nwhile True: pass"  # kille
 
 @dataclass(frozen=True, slots=True)
 class RunningFleet:
-    """Simulated Crazyflies that run."""
-
     words: tuple[str, ...]  # options of `fly` that reach them
     truth: Path
     control: int  # UDP port
 
     def fault(self, name: str, cf: int, **numbers: Any) -> float:
-        """Let one fail; the fleet's time, s."""
         return float(send_fault(("127.0.0.1", self.control), fault=name, cf=cf, **numbers)["t"])
 
 
 @contextmanager
 def fleet_of_twelve(directory: Path, loss: float | None, *options: str, **station: Any) -> Iterator[RunningFleet]:
-    """Simulated Crazyflies on the ellipse of the paper's room, over three dongles or UDP, that end with this.
-
-    :param loss: share of packets lost on the air; None: over UDP.
-    :param options: of `fake-crazyflie`.
-    :param station: settings of the station.
-    """
+    """Simulated Crazyflies on the ellipse of the paper's room, over three dongles or UDP (loss: None)."""
     base = free_base_port(COUNT)
     robots = {}
     for k in range(COUNT):
@@ -196,7 +188,6 @@ def closest_m(truth: Path, stopped: dict[int, float]) -> float:
 
 
 def summarise(found: list[dict[str, Any]]) -> tuple[list[str], list[list[object]]]:
-    """The rows of the record."""
     rows: list[list[object]] = []
     for what in dict.fromkeys(row["what"] for row in found):
         mine = [row for row in found if row["what"] == what]

@@ -16,8 +16,3 @@ def test_reaction(fault: Fault, tmp_path: Path, record: list[tuple[object, ...]]
     pytest.importorskip("dtsa_msgs.msg")
     fault.run(tmp_path)
     record.append((fault.name,))
-
-
-def summarise(found: list[tuple[object, ...]]) -> tuple[list[str], list[list[object]]]:
-    """The rows of the record: none, the page has those of the table."""
-    return [], []

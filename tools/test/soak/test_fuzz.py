@@ -26,7 +26,6 @@ def test_nothing_is_found(target: str, share: int, tmp_path: Path, record: list[
 
 
 def summarise(found: list[dict[str, Any]]) -> tuple[list[str], list[list[object]]]:
-    """The rows of the record."""
     rows: list[list[object]] = []
     for target in TARGETS:
         mine = [row for row in found if row["target"] == target]

@@ -67,7 +67,6 @@ def _saved_s(growth: list[tuple[float, int]], result: Recovery, size: int) -> fl
 
 
 def summarise(found: list[dict[str, Any]]) -> tuple[list[str], list[list[object]]]:
-    """The rows of the record."""
     lost = {mode: [row["lost_s"] for row in found if row["mode"] == mode] for mode in MODES}
     rows: list[list[object]] = [[mode, len(times), f"{max(times):.2f} s"] for mode, times in lost.items()]
     return ["mode", "kills", "lost at most"], rows

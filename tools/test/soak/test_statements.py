@@ -21,7 +21,6 @@ def test_flight_is_equal(seed: int, record: list[dict[str, Any]]) -> None:
 
 
 def summarise(found: list[dict[str, Any]]) -> tuple[list[str], list[list[object]]]:
-    """The rows of the record."""
     heads = ("slots", "decisions", "frames", "heard", "collisions", "faults")
     flights = Counter(row["policy"] for row in found)
     rows: list[list[object]] = [
