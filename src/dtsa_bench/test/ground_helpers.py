@@ -1,8 +1,11 @@
-"""The ground in tests: an operator who calls a bridge's services and knows its vehicles' states."""
+"""The ground in tests: a bridge's process, and an operator who calls its services and knows the vehicles' states."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -54,3 +57,50 @@ class Operator:
         duration = Duration(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
         self.call(Takeoff, "/all/takeoff", height=height, duration=duration)
         self.until("flying")
+
+
+class Bridge:
+    """A bridge's process, or another one, in a graph; what it prints; and an operator."""
+
+    def __init__(self, graph: Graph, command: Sequence[str], names: Sequence[str], more: dict[str, str]) -> None:
+        self.process = subprocess.Popen(
+            command, env=graph.environment | more, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self.operator = Operator(graph, names)
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as stream:
+            self.lines.extend(iter(stream.readline, ""))
+
+    def text(self) -> str:
+        return "".join(self.lines)
+
+    def end(self, number: int | None = None) -> int:
+        """Wait for its end, after a signal; the exit code."""
+        if number is not None:
+            self.process.send_signal(number)
+        code = self.process.wait(60.0)
+        self._reader.join(10)
+        return code
+
+    def child(self) -> int:
+        """Id of the process that it has started."""
+        return children_of(self.process.pid)[0]
+
+
+@contextmanager
+def running(graph: Graph, command: Sequence[str], names: Sequence[str] = (), **more: str) -> Iterator[Bridge]:
+    """A process in a graph with more in its environment; it is killed in the end.
+
+    :param names: vehicles of the operator.
+    """
+    started = Bridge(graph, command, names, more)
+    try:
+        yield started
+    finally:
+        started.process.kill()
+        started.end()

@@ -6,6 +6,7 @@ import base64
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -98,3 +99,18 @@ def viewed_flight(out: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str
         except subprocess.TimeoutExpired:
             process.kill()
             raise
+
+
+@contextmanager
+def on_graph(track: Track, domain: int) -> Iterator[Any]:
+    """A track that follows a ROS graph, in a thread; its source."""
+    from dtsa_bench.pages.view.graph import GraphSource  # needs ROS
+
+    source = GraphSource(track, domain, control=True)
+    listening = threading.Thread(target=source.run, daemon=True)
+    listening.start()
+    try:
+        yield source
+    finally:
+        source.stopped = True
+        listening.join(PATIENCE_S)

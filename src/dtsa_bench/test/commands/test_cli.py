@@ -17,7 +17,6 @@ from dtsa_bench.commands import cli, registry
 
 
 def fake_command(monkeypatch: pytest.MonkeyPatch, action: object) -> None:
-    """Register one command `probe` that does what the action says."""
     module = ModuleType("dtsa_bench.commands.probe")
 
     def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,8 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,8 +26,8 @@ from bridge_helpers import fake_fleet
 from bridge_helpers import settings as fleet_settings
 from builtin_interfaces.msg import Duration
 from dtsa_msgs.srv import Land
-from ground_helpers import Operator, children_of
-from node_helpers import Graph, ros_graph
+from ground_helpers import Bridge, running
+from node_helpers import ros_graph
 from waiting import wait_for
 
 from dtsa_agent.crazyflie.settings.config import load_swarm
@@ -41,59 +40,15 @@ NAMES = ("cf1", "cf2")
 PATIENT = {"link_age_s": 3.0, "command_age_s": 0.45}  # not what is tested here
 
 
-class Bridge:
-    """A bridge's process, or another one, in a graph; what it prints; and an operator."""
-
-    def __init__(self, graph: Graph, command: Sequence[str]) -> None:
-        self.process = subprocess.Popen(
-            command, env=graph.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        self.operator = Operator(graph, NAMES)
-        self.lines: list[str] = []
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        with self.process.stdout as stream:
-            self.lines.extend(iter(stream.readline, ""))
-
-    def text(self) -> str:
-        return "".join(self.lines)
-
-    def end(self, number: int | None = None) -> int:
-        """Wait for its end, after a signal; the exit code."""
-        if number is not None:
-            self.process.send_signal(number)
-        code = self.process.wait(60.0)
-        self._reader.join(10)
-        return code
-
-    def child(self) -> int:
-        """Id of the process that it has started."""
-        return children_of(self.process.pid)[0]
-
-
-@contextmanager
-def running(graph: Graph, command: Sequence[str]) -> Iterator[Bridge]:
-    started = Bridge(graph, command)
-    try:
-        yield started
-    finally:
-        started.process.kill()
-        started.end()
-
-
 @contextmanager
 def bridge(folder: Path, config: Path, *options: str) -> Iterator[Bridge]:
     """That of `dtsa bridge`, in a graph of its own."""
     command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), *options]
-    with ros_graph(folder) as graph, running(graph, command) as started:
+    with ros_graph(folder) as graph, running(graph, command, NAMES) as started:
         yield started
 
 
 def swarm_yaml(folder: Path, uri: str = "usb://{}", first: int = 0, **common: object) -> Path:
-    """A swarm whose URIs have numbers from the first on."""
     robots = {
         name: {"uri": uri.format(first + k), "initial_position": [0.5 * k, 0.3, 0.0]} for k, name in enumerate(NAMES)
     }
@@ -170,7 +125,7 @@ def test_ctrl_c_in_a_launch_lands_simulated_ones_before_they_end(
     with (
         ros_graph(tmp_path) as graph,
         running(graph, simulated.cmd) as fleet,
-        running(graph, node.cmd) as started,
+        running(graph, node.cmd, NAMES) as started,
     ):
         started.operator.take_off()
         fleet.process.send_signal(signal.SIGINT)  # a terminal's Ctrl-C is for all

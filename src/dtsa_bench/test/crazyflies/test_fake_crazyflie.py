@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import json
-import signal
 import socket
 import struct
-import subprocess
-import sys
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -26,7 +22,6 @@ from dtsa_bench.crazyflies.simulated.process import free_base_port
 from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 
-# -- packets and tables -----------------------------------------------------------------------------------------------
 @settings(deadline=None)
 @given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
 def test_packets_round_trip(port: int, channel: int, data: bytes) -> None:
@@ -61,9 +56,7 @@ def test_log_blocks() -> None:
     assert not craft.peer.blocks
 
 
-# -- fleet ------------------------------------------------------------------------------------------------------------
 def hop(seed: int, truth: Path) -> None:
-    """Two Crazyflies take off and land again, driven tick by tick."""
     fleet = Fleet(FleetConfig(count=2, base_port=free_base_port(2), seed=seed, truth=truth))
     for firmware in fleet.firmware:
         firmware.supervisor.request_arming(True)
@@ -158,34 +151,21 @@ def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "control port of a running fleet" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("ignores", [False, True])
-def test_a_running_fleet_answers_and_ends_with_ctrl_c_unless_others_still_have_to_land_it(
-    ignores: bool, tmp_path: Path
-) -> None:
-    port, truth = free_base_port(2), tmp_path / "truth.jsonl"
-    command = [sys.executable, "-m", "dtsa_bench.crazyflies.simulated.cli", "--count", "2", "--base-port", str(port)]
-    command += ["--ignore-interrupt"] if ignores else []
-    with subprocess.Popen([*command, "--truth", str(truth)], stdout=subprocess.PIPE, text=True) as process:
-        try:
-            lines = [process.stdout.readline() for _ in range(3)]  # type: ignore[union-attr]
-            assert lines[:2] == [f"udp://127.0.0.1:{port}\n", f"udp://127.0.0.1:{port + 1}\n"]
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as host:
-                host.settimeout(5)
-                host.connect(("127.0.0.1", port))
-                host.send(b"\xff")
-                assert host.recv(64)
-                host.connect(("127.0.0.1", port - 1))
-                host.send(b"nonsense")
-                assert json.loads(host.recv(512))["ok"] is False
-            if ignores:
-                process.send_signal(signal.SIGINT)
-                time.sleep(0.1)
-            assert cli.main(["--fault", "freeze", "--cf", "2", "--seconds", "0.2", "--base-port", str(port)]) == 0
-            process.send_signal(signal.SIGTERM if ignores else signal.SIGINT)
-            assert process.wait(10) == 0
-        finally:
-            process.kill()
-    (fault,) = (event for event in read_truth(truth)[2] if event["event"] == "fault: freeze")
+def test_a_running_fleet_answers_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+    pytest.importorskip("cflib")
+    from bridge_helpers import fake_fleet
+
+    with fake_fleet(tmp_path, 2) as fleet, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as host:
+        port = fleet.base_port
+        host.settimeout(5)
+        host.connect(("127.0.0.1", port))
+        host.send(b"\xff")
+        assert host.recv(64)
+        host.connect(("127.0.0.1", port - 1))
+        host.send(b"nonsense")
+        assert json.loads(host.recv(512))["ok"] is False
+        assert cli.main(["--fault", "freeze", "--cf", "2", "--seconds", "0.2", "--base-port", str(port)]) == 0
+    (fault,) = fleet.events(name="fault: freeze")
     assert set(fault) == {"t", "cf", "event", "seconds"}
 
 

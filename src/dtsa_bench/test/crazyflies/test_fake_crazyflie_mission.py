@@ -28,7 +28,7 @@ pytest.importorskip("dtsa_msgs.srv")
 
 import aiohttp
 from bridge_helpers import FakeFleet, fake_fleet, settings
-from ground_helpers import children_of
+from ground_helpers import children_of, running
 from node_helpers import node_environment
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -57,12 +57,10 @@ MIXED = ("--arming", "mixed")  # stock ones, which arm themselves, beside those 
 
 
 def swarm_yaml(fleet: FakeFleet, folder: Path, **safety: float) -> Path:
-    """The swarm's YAML, everybody on its place of the ellipse."""
     return written(settings(fleet, {"safety": safety}), folder)
 
 
 def written(data: dict[str, Any], folder: Path) -> Path:
-    """The YAML's file."""
     for k, robot in enumerate(data["robots"].values()):
         angle = 2 * math.pi * k / len(data["robots"])
         robot["initial_position"] = [round(1.2 * math.cos(angle), 3), round(2.0 * math.sin(angle), 3), 0.0]
@@ -84,7 +82,6 @@ def mission(*words: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def streaming(fleet: FakeFleet) -> bool:
-    """Whether all follow their agents."""
     return len(fleet.events(name="streaming")) == fleet.count
 
 
@@ -241,17 +238,14 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
     """The first one finds two at each other's places, and all exchange roles; the second one may not: nobody flies."""
     with ros_domain() as domain:
         pass  # free: the bridge's now
+    graph: Any = SimpleNamespace(environment=node_environment(domain, tmp_path))
     with fake_fleet(tmp_path, COUNT, *MIXED) as fleet:
         config = swarm_yaml(fleet, tmp_path, link_age_s=3.0, command_age_s=0.45)
         data = yaml.safe_load(config.read_text())
         robots = list(data["robots"].values())  # cf1 is the agent of the third place's vehicle, and the other way round
         robots[0]["uri"], robots[2]["uri"] = robots[2]["uri"], robots[0]["uri"]
         config.write_text(yaml.safe_dump(data))
-        environment = node_environment(domain, tmp_path)
-        log = (tmp_path / "bridge.log").open("w+")
-        command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config)]
-        bridge = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
-        try:
+        with running(graph, [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config)]) as bridge:
             for number, (options, code, words) in enumerate((
                 ([], 0, "exchange of roles, places 3 2 1 4"),
                 ([], 0, "exchange of roles, places 1 4 3 2"),
@@ -259,16 +253,11 @@ def test_missions_in_a_row_by_one_bridge_with_its_watchdog(tmp_path: Path) -> No
             )):  # fmt: skip
                 command = [*FLY, "--config", str(config), "--attach", "--out", str(tmp_path / str(number)), *options]
                 result = subprocess.run(
-                    command, env=environment, capture_output=True, text=True, timeout=150, check=False
+                    command, env=graph.environment, capture_output=True, text=True, timeout=150, check=False
                 )
-                assert result.returncode == code, result.stderr + (tmp_path / "bridge.log").read_text()
+                assert result.returncode == code, result.stderr + bridge.text()
                 assert words in result.stderr
-            bridge.send_signal(signal.SIGINT)
-            assert bridge.wait(60) == 0
-        finally:
-            bridge.kill()
-            bridge.wait()
-            log.close()
+            assert bridge.end(signal.SIGINT) == 0
         _, track, events = read_truth(fleet.truth)
         assert not [e for e in events if e["event"] in ("collision", "crash", "hard landing")]
         assert [e["event"] for e in events].count("takeoff") == 2 * COUNT

@@ -29,7 +29,6 @@ HEAD = "".join(f'#include "{name}.h"\n' for name in HEADERS.split()) + "#include
 
 @pytest.fixture
 def write(tmp_path: Path):
-    """Makes the directory of an app from its C code."""
 
     def make(code: str, settings: str = "{}") -> str:
         directory = Path(tempfile.mkdtemp(dir=tmp_path))
@@ -152,23 +151,6 @@ def test_every_header_stands_alone(tmp_path: Path) -> None:
         (tmp_path / f"{header.stem}.c").write_text(f'#include "{header.name}"\n')
     command = [*compiler(), "-std=gnu11", "-Wall", "-Wextra", "-Werror", f"-I{FIRMWARE}", "-fsyntax-only"]
     subprocess.run([*command, *map(str, tmp_path.glob("*.c"))], check=True)
-
-
-def test_each_vehicle_has_variables_of_its_own(write) -> None:
-    place = write("""
-static int count;
-void appMain(void) {
-    count += (int)(configblockGetRadioAddress() & 255);
-    vTaskDelay(M2T(10));
-    DEBUG_PRINT("%d\\n", count);
-}""")
-    with Laboratory(read_app(place), LabSettings(agents=3, boot_s=0.0)) as lab:
-        lab.run(0.1)
-        assert sorted((agent, line) for _, agent, line in lab.record.console) == [(1, "1"), (2, "2"), (3, "3")]
-        lab.switch_off(2)
-        lab.at(0.2, lambda: lab.switch_on(2))
-        lab.run(0.3)
-        assert [line for _, agent, line in lab.record.console if agent == 2] == ["2", "2"]
 
 
 def test_a_clock_drifts(write) -> None:

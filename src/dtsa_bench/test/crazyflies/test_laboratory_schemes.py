@@ -23,14 +23,12 @@ HALF_SLOT_MS = 5.0
 
 
 def scheme_ms(policy: str, **options: float) -> float:
-    """Mean age of a flight of twelve."""
     channel = ChannelConfig(agents=12, radio="crazyflie")
     swarm = SwarmConfig(agents=12, policy=policy, options=options, seed=1)
     return float(simulate(RunConfig(swarm=swarm, channel=channel)).summary()["age_mean_ms"]) + HALF_SLOT_MS
 
 
 def lab_ms(app: str) -> float:
-    """Mean age of the same in the laboratory."""
     return float(fly(app, 12.0, LabSettings(agents=12, seed=1))["mean_age_ms"])
 
 

@@ -16,38 +16,25 @@ from live_helpers import LiveLaboratory, live_laboratory
 from dtsa_agent.crazyflie.links.link import SIMULATED_RADIO
 from dtsa_bench.crazyflies.peer_lab import LabSettings, read_app
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
-from dtsa_bench.crazyflies.simulated import crtp
 from dtsa_bench.crazyflies.simulated.radio import dongle as requests
 from dtsa_bench.crazyflies.simulated.radio import esb
-from dtsa_bench.crazyflies.simulated.radio.dongle import Dongle
 
 pytestmark = pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler")
 
 APP = """
 #include "app.h"
-#include "app_channel.h"
 #include "configblock.h"
-#include "debug.h"
 #include "log.h"
-#include "param.h"
 #include "radiolink.h"
 #include "task.h"
-static uint8_t go = 1; static uint16_t heard;
+static uint16_t heard;
 static void hear(P2PPacket *p) { if (p->port == 3) heard += p->size; }
 void appMain(void) {
     static P2PPacket packet;
-    char text[30];
     p2pRegisterCB(hear);
     packet.port = 5; packet.size = 4; packet.data[0] = configblockGetRadioAddress() & 255;
-    for (;;) {
-        radiolinkSendP2PPacketBroadcast(&packet);
-        size_t length = appchannelReceiveDataPacket(text, sizeof text, 20);
-        if (length) appchannelSendDataPacket(text, length);
-    }
+    for (;;) { radiolinkSendP2PPacketBroadcast(&packet); vTaskDelay(20); }
 }
-PARAM_GROUP_START(own)
-PARAM_ADD(PARAM_UINT8, go, &go)
-PARAM_GROUP_STOP(own)
 LOG_GROUP_START(own)
 LOG_ADD(LOG_UINT16, heard, &heard)
 LOG_GROUP_STOP(own)
@@ -81,17 +68,6 @@ def sniff(live: LiveLaboratory) -> list[bytes]:
     return heard
 
 
-def exchange(live: LiveLaboratory, dongle: Dongle, packet: bytes) -> bytes:
-    """A packet to the vehicle; what came with its acknowledgement."""
-    answers: list[bytes] = []
-    while not answers or not answers[-1][0] & 1:  # what collides is sent again
-        start = len(answers)
-        dongle.transfer(packet, live.now_ns, answers.append)
-        while len(answers) == start:
-            live.run(live.time + 0.001)
-    return answers[-1][1:]
-
-
 def test_a_dongle_in_sniffer_mode_hears_apps_and_they_hear_it(live: LiveLaboratory) -> None:
     heard = sniff(live)
     live.run(0.5)
@@ -100,28 +76,6 @@ def test_a_dongle_in_sniffer_mode_hears_apps_and_they_hear_it(live: LiveLaborato
     live.side.dongles[0].transfer(esb.BROADCAST + b"\xff\x83hello", live.now_ns, lambda data: None)
     live.run(0.6)
     assert {live.log(agent, "own.heard") for agent in (1, 2)} == {5.0}
-
-
-def test_ground_sets_parameters_and_reads_logs_of_an_app_and_talks_to_it(live: LiveLaboratory) -> None:
-    dongle = live.side.dongles[1]
-    dongle.request(requests.SET_CHANNEL, 80, 0, b"", 0)
-    dongle.request(requests.SET_RATE, 2, 0, b"", 0)
-    dongle.request(requests.SET_ADDRESS, 0, 0, b"\xe7\xe7\xe7\xe7\x02", 0)
-    live.run(0.1)
-    index = len(crtp.PARAM_ENTRIES)
-    number, log = index.to_bytes(2, "little"), len(crtp.LOG_ENTRIES).to_bytes(2, "little")
-    packets = [
-        crtp.pack(crtp.PARAM, 0, b"\x02" + number),
-        crtp.pack(crtp.PARAM, 2, number + b"\x07"),
-        crtp.pack(crtp.PLATFORM, 2, b"echo"),
-        crtp.pack(crtp.LOG, 1, b"\x06\x01\x02" + log),  # a block of one 16-bit variable
-        crtp.pack(crtp.LOG, 1, b"\x03\x01\x05"),  # every 50 ms
-    ]
-    said = [exchange(live, dongle, packet) for packet in packets + 60 * [b"\xff"]]
-    assert [live.parameter(agent, "own.go") for agent in (1, 2)] == [1.0, 7.0]
-    assert crtp.pack(crtp.PLATFORM, 2, b"echo") in said
-    assert any(packet.endswith(b"own\0go\0") for packet in said)
-    assert any(packet[:1] == crtp.pack(crtp.LOG, 2, b"") and len(packet) == 1 + 4 + 2 for packet in said)
 
 
 CFLIB = """

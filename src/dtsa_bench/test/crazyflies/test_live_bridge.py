@@ -21,7 +21,7 @@ pytest.importorskip("cflib")
 pytest.importorskip("rclpy")
 pytest.importorskip("dtsa_msgs.srv")
 
-from ground_helpers import Operator
+from ground_helpers import Bridge, Operator, running
 from live_helpers import live_laboratory
 from node_helpers import ros_graph
 from std_srvs.srv import Empty, SetBool
@@ -76,13 +76,11 @@ def steer(operator: Operator) -> None:
 
 
 def events(folder: Path) -> list[dict[str, Any]]:
-    """What happened to vehicles, in truth."""
     lines = map(json.loads, (folder / "truth.jsonl").read_text().splitlines())
     return [line for line in lines if "event" in line]
 
 
 def arrived(folder: Path) -> bool:
-    """Whether all are where they wanted to be."""
     lines = (folder / "truth.jsonl").read_text().splitlines()[:-1]
     places = next((json.loads(line)["p"] for line in reversed(lines) if '"p"' in line), None)
     goal = np.array(make_scenario(CONFIG).target) + np.array([[0.0], [0.0], [FLOOR_M]])
@@ -90,23 +88,17 @@ def arrived(folder: Path) -> bool:
 
 
 @contextmanager
-def bridged(folder: Path) -> Iterator[tuple[Operator, subprocess.Popen[str], subprocess.Popen[str], dict[str, str]]]:
+def bridged(folder: Path) -> Iterator[tuple[Operator, Bridge, subprocess.Popen[str], dict[str, str]]]:
     """An operator, the bridge, the laboratory, and the environment of other programs on its air."""
     config, swarm = swarm_yaml(folder), folder / "swarm.json"
     swarm.write_text(json.dumps(CONFIG.to_dict()))
     with live_laboratory(folder, str(swarm), **KEY) as lab, ros_graph(folder) as graph:
         environment = {**graph.environment, SIMULATED_RADIO: str(folder / "radio"), **KEY}
-        bridge = subprocess.Popen([*DTSA, "bridge", "--config", str(config)], env=environment, text=True)
-        graph.processes.append(bridge)
-        try:
-            yield Operator(graph, NAMES), bridge, lab, environment
-        finally:
-            bridge.kill()
-            bridge.wait()
+        with running(graph, [*DTSA, "bridge", "--config", str(config)], NAMES, **environment) as bridge:
+            yield bridge.operator, bridge, lab, environment
 
 
 def told(lab: subprocess.Popen[str]) -> dict[str, Any]:
-    """What the laboratory says when it is ended."""
     lab.send_signal(signal.SIGINT)
     return json.loads(lab.communicate(timeout=60)[0])  # type: ignore[no-any-return]
 
@@ -126,8 +118,7 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
             wait_for(lambda: arrived(tmp_path))
             operator.call(Empty, "/cf3/emergency")
             operator.until("flying", "flying", "emergency")
-            bridge.send_signal(signal.SIGINT)
-            assert bridge.wait(60) == 0
+            assert bridge.end(signal.SIGINT) == 0, bridge.text()
             listener.send_signal(signal.SIGINT)
             heard = json.loads(listener.communicate(timeout=60)[0])
             summary = told(lab)
@@ -143,15 +134,3 @@ def test_agents_on_board_fly_while_the_bridge_is_the_ground_and_sniff_listens_to
     found = Merge([read(tmp_path / f"{name}.mcap") for name in NAMES]).judge()
     assert verified(found)
     assert found["decisions_again"]["differences"] == []
-
-
-def test_a_second_ctrl_c_stops_the_motors_of_agents_that_steer_on_board(tmp_path: Path) -> None:
-    with bridged(tmp_path) as (operator, bridge, lab, _):
-        steer(operator)
-        bridge.send_signal(signal.SIGINT)
-        operator.until("landing")
-        bridge.send_signal(signal.SIGINT)
-        assert bridge.wait(60) != 0
-        wait_for(lambda: sum(e["event"] == "hard landing" for e in events(tmp_path)) == len(NAMES))
-        summary = told(lab)
-    assert summary["crashed"] == [1, 2, 3]

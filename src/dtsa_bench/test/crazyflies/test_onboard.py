@@ -28,7 +28,6 @@ LEASE = SwarmConfig(agents=5, policy="lease")
 
 
 def merged(folder: Path) -> dict[str, Any]:
-    """What came of the bags of all agents, made one flight."""
     return Merge([read(path) for path in sorted(folder.glob("cf*.mcap"))]).judge()
 
 
@@ -117,37 +116,30 @@ def test_an_agent_with_a_new_goal_is_soon_heard(known: bool, tmp_path: Path) -> 
 
 
 def in_flight(flight: OnBoard) -> None:
-    """Until all steer."""
     flight.lab.run(9.5)
-    assert [flight.lab.log(k, "dtsa.mode") for k in range(1, 4)] == [FLY] * 3
+    agents = flight.swarm.agents
+    assert [flight.lab.log(k, "dtsa.mode") for k in range(1, agents + 1)] == [FLY] * agents
 
 
-def test_the_ground_takes_a_vehicle_back_in_three_ways() -> None:
-    with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
+def test_the_ground_takes_a_vehicle_back_in_four_ways() -> None:
+    with OnBoard(SwarmConfig(agents=4, policy="lease"), LabSettings()) as flight:
         in_flight(flight)
         lab = flight.lab
         lab.set_parameter(1, "dtsa.enable", 0)
         lab.go_to(2, 0.0, 0.0, 2.5, 2.0)  # a command of the ground's, without a word to the app
         lab.send(3, b"L")
+        lab.land(4, 0.0, 2.0)
+        lab.set_parameter(4, "dtsa.enable", 0)  # before the app looks again: it lands all the same
         lab.run(10.0)
         assert [lab.log(k, "dtsa.mode") for k in range(1, 4)] == [OFF, OFF, LAND]
         assert [lab.log(k, "dtsa.why") for k in range(1, 4)] == [DISABLED, GROUND, ORDERED]
-        lab.run(16.0)
+        lab.run(12.5)
         height = lab.world.vehicles.position[2]
+        assert height[3] < 0.05
+        lab.run(16.0)
         assert height[0] == pytest.approx(1.2, abs=0.15)  # it holds its place
         assert height[1] == pytest.approx(2.5, abs=0.15)
         assert height[2] < 0.05
-        assert lab.record.crashed == {}
-
-
-def test_a_landing_that_the_ground_orders_is_not_undone_by_the_end_of_enable() -> None:
-    with OnBoard(SwarmConfig(agents=3, policy="lease"), LabSettings()) as flight:
-        in_flight(flight)
-        lab = flight.lab
-        lab.land(1, 0.0, 2.0)
-        lab.set_parameter(1, "dtsa.enable", 0)  # before the app looks again
-        lab.run(12.5)
-        assert lab.world.vehicles.position[2, 0] < 0.05
         assert lab.record.crashed == {}
 
 

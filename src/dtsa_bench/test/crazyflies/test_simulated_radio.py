@@ -7,17 +7,10 @@ from dataclasses import dataclass, field
 import pytest
 
 from dtsa_agent.crazyflie.settings import radio_budget as budget
+from dtsa_bench.crazyflies.simulated.radio import dongle as requests
 from dtsa_bench.crazyflies.simulated.radio import esb
 from dtsa_bench.crazyflies.simulated.radio.air import Agenda, RadioAir
-from dtsa_bench.crazyflies.simulated.radio.dongle import (
-    ACK_ENABLE,
-    SET_ADDRESS,
-    SET_CHANNEL,
-    SET_RADIO_MODE,
-    SET_RATE,
-    SET_SNIFFER_ADDRESS,
-    Dongle,
-)
+from dtsa_bench.crazyflies.simulated.radio.dongle import Dongle
 from dtsa_bench.crazyflies.simulated.radio.receiver import QUEUE, Receiver
 from dtsa_bench.crazyflies.simulated.radio.settings import RadioSettings, Station
 from dtsa_bench.crazyflies.simulated.radio.sniffer_mode import SnifferMode
@@ -51,23 +44,17 @@ class Room:
         air = RadioAir(first - 1 + len(by_id), self.settings.loss, self.settings.seed)
         sniffers: dict[int, SnifferMode] = {}
         self.dongles = [
-            Dongle(
-                k,
-                self.settings,
-                air,
-                self.agenda,
-                by_id,
-                lambda radio, up: (radio - first, up) not in self.deaf,
-                sniffers,
-            )
-            for k in range(1, first)
+            Dongle(k, self.settings, air, self.agenda, by_id, self._hears, sniffers) for k in range(1, first)
         ]
+
+    def _hears(self, radio: int, up: bool) -> bool:
+        return (radio - self.settings.dongles - 1, up) not in self.deaf
 
     def tune(self, dongle: int, to: Station) -> None:
         d = self.dongles[dongle]
-        d.request(SET_CHANNEL, to.channel, 0, b"", 0)
-        d.request(SET_ADDRESS, 0, 0, to.address, 0)
-        d.request(SET_RATE, esb.RATE_NAMES.index(to.rate), 0, b"", 0)
+        d.request(requests.SET_CHANNEL, to.channel, 0, b"", 0)
+        d.request(requests.SET_ADDRESS, 0, 0, to.address, 0)
+        d.request(requests.SET_RATE, esb.RATE_NAMES.index(to.rate), 0, b"", 0)
 
     def exchange(self, packet: bytes, at_ns: int = 0, dongle: int = 0) -> list[tuple[int, bytes]]:
         """When the answer to a packet came (ns), and the answer."""
@@ -143,7 +130,7 @@ def test_two_dongles_on_one_channel_collide_and_on_two_channels_do_not() -> None
 def test_a_broadcast_reaches_all_on_its_channel_and_is_not_answered() -> None:
     room = Room(stations=(station(1), station(2), station(3, 60), station(4, 80, "1M")))
     room.tune(0, Station("", 80, "2M", esb.BROADCAST))
-    room.dongles[0].request(ACK_ENABLE, 0, 0, b"", 0)
+    room.dongles[0].request(requests.ACK_ENABLE, 0, 0, b"", 0)
     assert room.exchange(PACKET) == []
     assert room.exchange(PACKET[:16] * 2 + bytes(10)) == [], "more than 32 bytes: two packets"
     assert [k for k, _ in room.heard] == [0, 1, 0, 1, 0, 1]
@@ -173,7 +160,7 @@ def test_the_bridges_budget_is_what_a_dongle_carries(rate: str, count: int) -> N
     while now < 503_000 * US:
         to = exchanges % count
         if count > 1:
-            room.dongles[0].request(SET_ADDRESS, 0, 0, stations[to].address, now)
+            room.dongles[0].request(requests.SET_ADDRESS, 0, 0, stations[to].address, now)
         room.receivers[to].push(bytes((0x5C,)) + bytes(budget.DOWN_BYTES - 1))
         ((now, answer),) = room.exchange(bytes((0x7C,)) + bytes(budget.UP_BYTES - 1), now)
         assert answer[0] & 1
@@ -187,8 +174,6 @@ def test_what_the_devices_cannot_do() -> None:
         room.tune(0, room.stations[0])
         assert (room.exchange(PACKET)[0][1] != b"\0") is there, (device, rate, channel)
 
-
-# -- sniffer mode ----------------------------------------------------------------------------------------------------
 
 SHARED = Station("", 80, "2M", esb.BROADCAST)
 SPOKEN = bytes((0xFF, 0x87)) + bytes(range(60))
@@ -206,7 +191,7 @@ class Ears:
 
     def __post_init__(self) -> None:
         self.room.now = 0
-        self.dongle.request(SET_RADIO_MODE, 1, 0, b"", 0)
+        self.dongle.request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
         self.dongle.sniffer.give = self._take
         if self.reads:
             self.dongle.sniffer.read()
@@ -275,8 +260,8 @@ def test_packets_that_are_not_fetched_wait_and_more_than_eight_are_dropped_and_c
     ears.reads = True
     room.dongles[1].sniffer.read()
     assert [p[2] for p in ears.payloads] == list(range(8))
-    ears.dongle.request(SET_RADIO_MODE, 0, 0, b"", 0)
-    ears.dongle.request(SET_RADIO_MODE, 1, 0, b"", 0)
+    for mode in (0, 1):
+        ears.dongle.request(requests.SET_RADIO_MODE, mode, 0, b"", 0)
     assert ears.dongle.sniffer.dropped == 0
 
 
@@ -284,7 +269,7 @@ def test_a_sniffer_hears_polls_and_acknowledgements_to_its_two_addresses() -> No
     room = Room(THREE, (station(1), station(2)))
     room.tune(0, room.stations[0])
     room.tune(1, room.stations[0])
-    room.dongles[1].request(SET_SNIFFER_ADDRESS, 1, 0, room.stations[1].address, 0)
+    room.dongles[1].request(requests.SET_SNIFFER_ADDRESS, 1, 0, room.stations[1].address, 0)
     ears = Ears(room.dongles[1], room)
     room.exchange(PACKET)
     room.tune(0, room.stations[1])
@@ -306,5 +291,5 @@ def test_broadcasts_between_crazyflies_are_not_for_the_ground_link() -> None:
 
 def test_a_crazyradio_pa_has_no_sniffer_mode() -> None:
     room = Room(RadioSettings(dongles=2, device="pa"), ())
-    room.dongles[0].request(SET_RADIO_MODE, 1, 0, b"", 0)
+    room.dongles[0].request(requests.SET_RADIO_MODE, 1, 0, b"", 0)
     assert room.dongles[0].sniffer.tuned is None

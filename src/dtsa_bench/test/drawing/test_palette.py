@@ -54,24 +54,18 @@ LAYOUTS = Path(__file__).resolve().parents[4] / "layouts"
 
 
 @pytest.mark.parametrize("sight", SIGHT)
-def test_any_two_agents_are_told_apart(sight: str) -> None:
-    for first, second in combinations(AGENT_COLOURS, 2):
-        apart = np.linalg.norm(lab(first, sight) - lab(second, sight))
-        assert apart > 18.0, f"{first} and {second}: {apart:.1f}"
+def test_any_two_agents_and_any_two_series_are_told_apart(sight: str) -> None:
+    for colours, least in ((AGENT_COLOURS, 18.0), ((*SERIES, COLLIDED), 16.0)):
+        for first, second in combinations(colours, 2):
+            apart = np.linalg.norm(lab(first, sight) - lab(second, sight))
+            assert apart > least, f"{first} and {second}: {apart:.1f}"
 
 
-@pytest.mark.parametrize("sight", SIGHT)
-def test_any_two_series_are_told_apart(sight: str) -> None:
-    for first, second in combinations((*SERIES, COLLIDED), 2):
-        apart = np.linalg.norm(lab(first, sight) - lab(second, sight))
-        assert apart > 16.0, f"{first} and {second}: {apart:.1f}"
-
-
-@pytest.mark.parametrize("paper", ["#ffffff", "#181f27"])
-def test_every_colour_stands_out_from_light_and_dark_paper(paper: str) -> None:
+def test_every_colour_stands_out_from_light_and_dark_paper_and_ids_can_be_read_on_it() -> None:
     for colour in AGENT_COLOURS:
-        light, dark = sorted((luminance(colour), luminance(paper)), reverse=True)
-        assert (light + 0.05) / (dark + 0.05) > 1.5, colour
+        for other, least in (("#ffffff", 1.5), ("#181f27", 1.5), (ink_on(colour), 4.0)):
+            light, dark = sorted((luminance(colour), luminance(other)), reverse=True)
+            assert (light + 0.05) / (dark + 0.05) > least, (colour, other)
 
 
 def test_an_agent_has_one_colour_in_page_picture_layouts_and_markers() -> None:
@@ -111,9 +105,3 @@ def test_colours_that_come_again_have_another_dash_and_shape() -> None:
     turns = [agent_turn(agent) for agent in range(1, 4 * len(AGENT_COLOURS) + 1)]
     looks = {(agent_colour(k), DASHES[turn], SHAPES[turn]) for k, turn in enumerate(turns, 1)}
     assert len(looks) == len(turns)
-
-
-def test_ids_can_be_read_on_every_colour() -> None:
-    for colour in AGENT_COLOURS:
-        light, dark = sorted((luminance(colour), luminance(ink_on(colour))), reverse=True)
-        assert (light + 0.05) / (dark + 0.05) > 4.0, colour

@@ -38,16 +38,10 @@ SMALL = ("--cells", "crazyflie,few", "--sample", "2", "--jobs", "1")
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Directories of two entries of a few flights."""
     directory = tmp_path_factory.mktemp("league")
     for name in ("lease", "tdma"):
         assert cli.main(["league", "enter", name, *SMALL, "--out", str(directory / name)]) == 0
     return directory
-
-
-@pytest.fixture
-def entry(flown: Path) -> Entry:
-    return read_entries(flown / "lease")[0]
 
 
 def test_what_is_frozen_stays_and_seeds_follow_from_word_cell_and_number() -> None:
@@ -74,7 +68,7 @@ def test_all_built_in_schemes_are_entrants_and_fly_every_cell() -> None:
             run_config(LEAGUE.settings(cell, scheme, 1))
 
 
-def test_any_changed_value_is_found_and_named(flown: Path, entry: Entry, capsys: pytest.CaptureFixture[str]) -> None:
+def test_any_changed_value_is_found_and_named(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = flown / "forged.json"
     content = json.loads((flown / "lease" / "entry.json").read_text())
     for place, field in enumerate(FIELDS):

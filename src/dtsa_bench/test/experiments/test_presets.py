@@ -20,16 +20,10 @@ NAMED = (
     *("estimate", "trajectories", "scenarios", "access", "bounds"),
 )
 
-VOCABULARIES = {
-    "http://www.w3.org",
-    "http://creativecommons.org",
-    "http://purl.org",
-    "https://matplotlib.org",
-}
+VOCABULARIES = {"http://www.w3.org", "http://creativecommons.org", "http://purl.org", "https://matplotlib.org"}
 
 
 def invented(sweep: spec.Sweep) -> SweepTable:
-    """A table of results that are made up."""
     finished = {}
     for task in sweep.tasks:
         collided, slots = task.seed % 2 == 0, {"total": 100, "success": 90, "collision": 0, "idle": 10}
@@ -114,7 +108,6 @@ def test_gossip_and_genies_fly_in_the_settings_of_the_preset_beside_which_they_s
     plain, bounds = spec.load_preset(name), spec.load_preset(f"{name}-bounds")
 
     def flown(sweep: spec.Sweep) -> set[str]:
-        """What is flown with TDMA."""
         runs = [cell.run(1001).swarm for cell in sweep.cells]
         tdma = [repr(replace(run, frame="auto")) for run in runs if run.policy == "tdma"]
         return {text for text in tdma if name in ("grid", "idle") or "estimator='linear'" in text}

@@ -20,20 +20,13 @@ FIRST = 300
 
 
 class Heard:
-    """A listener, to which frames come."""
-
     def __init__(self) -> None:
         self._track = Track("listener")
         self._run = HeardRun(self._track, CONFIG, "udp", FIRST, 0)
         self._wrapping = Wrapping(CONFIG, None)
 
     def slots(self, first: int, end: int, senders: tuple[int, ...]) -> None:
-        """Slots go by; in its turn each sender says that it flies along x at 1 m/s.
-
-        :param first: the first slot.
-        :param end: the slot after the last one.
-        :param senders: those that are heard.
-        """
+        """Slots go by; in its turn each of the senders says that it flies along x at 1 m/s."""
         for slot in range(first, end):
             sender = slot % CONFIG.agents + 1
             now = slot * CONFIG.slot_ns
@@ -45,12 +38,10 @@ class Heard:
             self._run.tell(Counter(), now)
 
     def moments(self) -> list[dict[str, Any]]:
-        """What a page is told."""
         return [json.loads(moment.text) for moment in self._track.since(0, MOST_MOMENTS)[1]]
 
 
 def places(moment: dict[str, Any]) -> NDArray[np.float32]:
-    """(3, N) m, where the page has the agents."""
     return np.frombuffer(base64.b64decode(moment["place"]), "<f4").reshape(-1, 3, CONFIG.agents)[-1]
 
 

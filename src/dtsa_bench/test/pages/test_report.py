@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,6 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def data(flights: dict[str, Path]) -> dict[str, Any]:
-    """What the report shows of both."""
     return {name: run_data(path) for name, path in flights.items()}
 
 
@@ -189,20 +187,6 @@ def test_crashes_have_their_agents_time_and_place(crash: tuple[dict[str, Any], P
     assert clean["crashes"] == []
 
 
-class Outside(HTMLParser):
-    """Finds everything that a browser would fetch."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = dict(attrs)
-        self.found += [f"{tag} {values[name]}" for name in ("src", "href", "srcset", "data") if values.get(name)]
-        if tag in ("link", "iframe", "object", "embed", "base"):
-            self.found.append(tag)
-
-
 @pytest.fixture(scope="module")
 def hostile(data: dict[str, Any]) -> dict[str, Any]:
     """A run whose name and settings try to be HTML."""
@@ -214,9 +198,8 @@ def test_the_page_fetches_nothing_and_names_and_settings_cannot_break_out(
     data: dict[str, Any], hostile: dict[str, Any]
 ) -> None:
     for page in (render([data["clean"], data["lossy"]]), render([hostile])):
-        finder = Outside()
-        finder.feed(page)
-        assert finder.found == []
+        shown = re.sub(r"<script.*?</script>", "", page, flags=re.S)
+        assert not re.search(r"<(link|img|iframe|object|embed|base)\b|<[^>]* (src|href|srcset|data)=", shown)
         assert page.count("</script>") == 2
         addresses = set(re.findall(r"https?://[^\s\"'<>)]+", page)) - {"http://www.w3.org/2000/svg"}
         assert addresses == set()
@@ -266,9 +249,6 @@ def test_equal_names_are_told_apart_and_bad_input_is_refused(flights: dict[str, 
     with pytest.raises(UnusableBag):
         write_report([tmp_path / "nothing"], tmp_path / "none.html")
     assert not (tmp_path / "none.html").exists()
-
-
-# ---- in a browser ----
 
 
 def drawn(browser: Browser, runs: list[dict[str, Any]], directory: Path, script: str = "") -> str:
