@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import atexit
 import os
+import struct
+import time
 from contextlib import ExitStack
-from functools import cache, lru_cache
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.recordings.bag import schema
 from dtsa_bench.recordings.bag.cdr import MarkerPacker, OdometryPacker
 from dtsa_bench.recordings.bag.errors import BagError
+from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.writer import BagWriter
 
 MESSAGES = Path(__file__).parents[2] / "dtsa_msgs" / "msg"
@@ -24,7 +28,7 @@ RUN = 0x1234  # id of all synthetic runs
 SECOND = 1_000_000_000
 
 
-@lru_cache(maxsize=1)
+@cache
 def typestore() -> Typestore:
     """Jazzy's messages and those of this project, from their sources."""
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -165,16 +169,40 @@ atexit.register(_HELD.close)
 
 
 @cache
-def _own_domain() -> int:
-    """A ROS domain that is this process's as long as it runs."""
-    return _HELD.enter_context(ros_domain())
-
-
 def ros_environment() -> dict[str, str]:
-    """Environment for nodes that hear nobody else."""
-    return {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(_own_domain()),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "PYTHONUNBUFFERED": "1",
-    }
+    """Environment for nodes in a domain that is this process's as long as it runs."""
+    domain = str(_HELD.enter_context(ros_domain()))
+    here = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1"}
+    return {**os.environ, **here, "ROS_DOMAIN_ID": domain}
+
+
+def listen(graph: Any, bag: Path) -> dict[str, list[tuple[int, str]]]:
+    """What will arrive in a test's graph on each topic of a bag and on `/clock`: ns, monotonic, and hexadecimal."""
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+    arrived: dict[str, list[tuple[int, str]]] = {}
+
+    def subscribe(name: str, kind: str, reliability: str) -> None:
+        package, _, short = kind.split("/")
+        rows = arrived[name] = []
+        qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy[reliability.upper()])
+        message = getattr(import_module(f"{package}.msg"), short)
+        receive = lambda data: rows.append((time.monotonic_ns(), data.hex()))  # noqa: E731
+        graph.node.create_subscription(message, name, receive, qos, raw=True)
+
+    with Bag(bag) as opened:
+        for topic in opened.topics.values():
+            subscribe(topic.name, topic.type, topic.profiles[0]["reliability"])
+    subscribe("/clock", "rosgraph_msgs/msg/Clock", "best_effort")
+    return arrived
+
+
+def clock_ns(data: str) -> int:
+    """The time of a message on `/clock`."""
+    seconds, nanoseconds = struct.unpack_from("<iI", bytes.fromhex(data), 4)
+    return seconds * SECOND + nanoseconds
+
+
+def as_it_arrives(data: bytes) -> str:
+    """A recorded message, hexadecimal: the middleware fills the last word up with zeros."""
+    return (data + bytes(-len(data) % 4)).hex()

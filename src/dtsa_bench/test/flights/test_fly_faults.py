@@ -53,10 +53,7 @@ rclpy.spin(node)
     ("kind", "said"),
     [
         ("bytes", "channel: error: cf2 sent garbage in slot 5: a message of 44 bytes that is no Transmission"),
-        (
-            "nan",
-            "channel: error: cf2 sent garbage in slot 5: cf2 sent an unusable answer: positions, velocities or",
-        ),
+        ("nan", "channel: error: cf2 sent garbage in slot 5: cf2 sent an unusable answer: positions, velocities or"),
         (
             "shape",
             "channel: error: cf2 sent garbage in slot 5: cf2 sent an unusable answer: 4 numbers in track for 1 agents",

@@ -35,11 +35,7 @@ from dtsa_bench.recordings.verify import verify_bag
 
 pytestmark = pytest.mark.ros
 
-CHANNEL, AGENT, HOST = (
-    "dtsa_channel_sim.ros.channel_node",
-    "dtsa_agent.ros.agent_node",
-    "dtsa_agent.ros.swarm_host",
-)
+CHANNEL, AGENT, HOST = ("dtsa_channel_sim.ros.channel_node", "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host")
 TOPICS = {
     names.SLOT: Slot,
     names.TRANSMISSION: Transmission,

@@ -173,13 +173,3 @@ def test_a_directory_in_use_is_refused_and_left_alone(run: SyntheticRun, tmp_pat
     with pytest.raises(ConfigError, match="empty or does not exist"):
         recover(run.writer.directory, run.writer.directory)
     assert [path.name for path in tmp_path.iterdir()] == ["note"]
-
-
-def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "text.mcap").write_text("nothing of the kind")
-    (tmp_path / "nothing.mcap").touch()
-    for name in ("text.mcap", "nothing.mcap"):
-        with pytest.raises(UnusableBag, match="not an MCAP file"):
-            recover(tmp_path / name)
-    with pytest.raises(UnusableBag, match="no such file"):
-        recover(tmp_path / "missing")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pty
 import signal
@@ -11,15 +10,27 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
-from bag_helpers import SECOND, SyntheticRun, ros_environment, synthetic_bag
+from bag_helpers import (
+    SECOND,
+    SyntheticRun,
+    as_it_arrives,
+    clock_ns,
+    definition,
+    listen,
+    ros_environment,
+    synthetic_bag,
+)
 
 from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.recordings.bag import schema
 from dtsa_bench.recordings.bag.errors import BagError, UnusableBag
+from dtsa_bench.recordings.bag.metadata import PROFILES
 from dtsa_bench.recordings.bag.reader import Bag, Message
 from dtsa_bench.recordings.bag.replay import Player, ros_profile
+from dtsa_bench.recordings.bag.writer import BagWriter
 
 
 @pytest.fixture(scope="module")
@@ -67,17 +78,6 @@ def test_the_clock_reaches_each_moment_before_its_messages_and_never_runs_back(r
     assert listener.clocks == sorted(listener.clocks)
     assert listener.clocks[0] == listener.messages[0].log_time_ns
     assert {message.log_time_ns for message in listener.messages} <= set(listener.clocks)
-
-
-def test_the_clock_goes_on_while_nothing_is_published(tmp_path: Path) -> None:
-    run = SyntheticRun(tmp_path / "bag", agents=2)
-    with run.writer:
-        run.slot(0)
-        run.slot(30)
-    listener, _ = play(run, rate=1.0)
-    gaps = [b - a for a, b in zip(listener.clocks, listener.clocks[1:], strict=False)]
-    assert len(gaps) >= 10
-    assert listener.clocks == sorted(listener.clocks)
 
 
 @pytest.mark.parametrize(("rate", "gap_slots"), [(0.5, 30), (8.0, 800)])
@@ -181,73 +181,34 @@ def need_ros() -> None:
         pytest.skip(str(error))
 
 
-REPLAY = [sys.executable, "-m", "dtsa_bench", "replay"]
-SUBSCRIBER = """
-import json, sys, time
-import rclpy
-from nav_msgs.msg import Odometry
-from dtsa_msgs.msg import Slot
-from rosgraph_msgs.msg import Clock
-from rclpy.qos import qos_profile_sensor_data
-rclpy.init()
-node = rclpy.create_node("listener")
-found = {"slot": [], "odom": [], "clock": []}
-def slot(data):
-    found["slot"].append((time.monotonic_ns(), data.hex()))
-def odom(data):
-    found["odom"].append(data.hex())
-node.create_subscription(Slot, "/swarm/slot", slot, 100, raw=True)
-node.create_subscription(Odometry, "/cf2/odom", odom, qos_profile_sensor_data, raw=True)
-node.create_subscription(Clock, "/clock", lambda m: found["clock"].append(m.clock.sec * 10**9 + m.clock.nanosec),
-                         qos_profile_sensor_data)
-print("ready", flush=True)
-end = time.monotonic() + 40
-while time.monotonic() < end and len(found["slot"]) < int(sys.argv[1]):
-    rclpy.spin_once(node, timeout_sec=0.05)
-for _ in range(20):
-    rclpy.spin_once(node, timeout_sec=0.02)
-print(json.dumps(found), flush=True)
-rclpy.try_shutdown()
-"""
-
-
-def filled(data: bytes) -> str:
-    """A message as it arrives, hexadecimal."""
-    return (data + bytes(-len(data) % 4)).hex()
+def start_replay(*words: str | Path, **options: Any) -> subprocess.Popen[str]:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": ros_environment(), **options}
+    return subprocess.Popen([sys.executable, "-m", "dtsa_bench", "replay", *map(str, words)], text=True, **pipes)
 
 
 @pytest.mark.ros
 @pytest.mark.alone
 @pytest.mark.realtime
-def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun) -> None:
+def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun, tmp_path: Path) -> None:
     need_ros()
-    environment = ros_environment()
-    listener = subprocess.Popen(
-        [sys.executable, "-c", SUBSCRIBER, "100"], stdout=subprocess.PIPE, text=True, env=environment
-    )
-    try:
-        assert listener.stdout is not None
-        assert listener.stdout.readline() == "ready\n"
-        player = subprocess.run(
-            [*REPLAY, str(run.writer.directory), "--wait-for-subscriber", "--delay", "1.5"],
-            capture_output=True,
-            text=True,
-            env=environment,
-            timeout=60,
-        )
-        assert player.returncode == 0, player.stderr
-        assert f"played {run.writer.message_count} messages" in player.stdout
-        found = json.loads(listener.communicate(timeout=60)[0])
-    finally:
-        listener.kill()
-        listener.wait()
-    # The middleware fills the last word of a message up with zeros.
-    assert [data for _, data in found["slot"]] == [filled(row[2]) for row in run.written["/swarm/slot"]]
-    assert set(found["odom"]) <= {filled(row[2]) for row in run.written["/cf2/odom"]}
-    assert len(found["odom"]) >= 90  # best effort, as recorded
-    assert found["clock"] == sorted(found["clock"])
-    assert found["clock"][0] >= SECOND
-    offsets = [wall - 10_000_000 * k for k, (wall, _) in enumerate(found["slot"])]
+    from node_helpers import ros_graph
+
+    with ros_graph(tmp_path) as graph:
+        arrived = listen(graph, run.writer.directory)
+        words = ("--wait-for-subscriber", "--delay", "1.5")
+        player = start_replay(run.writer.directory, *words, env=graph.environment)
+        graph.until(lambda: player.poll() is not None and len(arrived["/swarm/slot"]) >= 100)
+        out, error = player.communicate()
+    assert player.returncode == 0, error
+    assert f"played {run.writer.message_count} messages" in out
+    assert [data for _, data in arrived["/swarm/slot"]] == [as_it_arrives(row[2]) for row in run.written["/swarm/slot"]]
+    odometry = {data for _, data in arrived["/cf2/odom"]}
+    assert odometry <= {as_it_arrives(row[2]) for row in run.written["/cf2/odom"]}
+    assert len(odometry) >= 90  # best effort, as recorded
+    clock = [clock_ns(data) for _, data in arrived["/clock"]]
+    assert clock == sorted(clock)
+    assert clock[0] >= SECOND
+    offsets = [wall - 10_000_000 * k for k, (wall, _) in enumerate(arrived["/swarm/slot"])]
     middle = statistics.median(offsets)
     assert statistics.median(abs(offset - middle) for offset in offsets) < 1_000_000
 
@@ -256,14 +217,7 @@ def test_another_process_hears_the_recorded_bytes_in_time(run: SyntheticRun) -> 
 def test_space_pauses_and_q_ends_in_a_terminal(run: SyntheticRun) -> None:
     need_ros()
     control, terminal = pty.openpty()
-    player = subprocess.Popen(
-        [*REPLAY, str(run.writer.directory), "--loop", "--delay", "0"],
-        stdin=terminal,
-        stdout=subprocess.PIPE,
-        stderr=terminal,
-        text=True,
-        env=ros_environment(),
-    )
+    player = start_replay(run.writer.directory, "--loop", "--delay", "0", stdin=terminal, stderr=terminal)
     seen = ""
 
     def read_until(text: str) -> None:
@@ -276,34 +230,22 @@ def test_space_pauses_and_q_ends_in_a_terminal(run: SyntheticRun) -> None:
 
     try:
         os.close(terminal)
-        read_until(" messages ")
-        os.write(control, b" ")
-        read_until("paused")
-        os.write(control, b" ")
-        read_until("messages         ")
-        os.write(control, b"q")
-        assert player.wait(timeout=30) == 0
-        assert player.stdout is not None
-        assert "played" in player.stdout.read()
+        for text, key in ((" messages ", b" "), ("paused", b" "), ("messages         ", b"q")):
+            read_until(text)
+            os.write(control, key)
+        assert "played" in player.communicate(timeout=30)[0]
+        assert player.returncode == 0
     finally:
         player.kill()
-        player.wait()
+        player.communicate()
         os.close(control)
-        if player.stdout:
-            player.stdout.close()
 
 
 @pytest.mark.ros
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_a_player_cleanly(run: SyntheticRun, number: signal.Signals) -> None:
     need_ros()
-    player = subprocess.Popen(
-        [*REPLAY, str(run.writer.directory), "--loop"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=ros_environment(),
-    )
+    player = start_replay(run.writer.directory, "--loop")
     assert player.stdout is not None
     assert player.stdout.readline().startswith("playing ")
     player.send_signal(number)
@@ -316,8 +258,6 @@ def test_signals_end_a_player_cleanly(run: SyntheticRun, number: signal.Signals)
 def test_recorded_qos_becomes_that_of_the_publisher() -> None:
     pytest.importorskip("rclpy", reason="rclpy is not installed")
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-
-    from dtsa_bench.recordings.bag.metadata import PROFILES
 
     latched = ros_profile([PROFILES["latched"]])
     assert (latched.reliability, latched.durability) == (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
@@ -335,20 +275,12 @@ def test_recorded_qos_becomes_that_of_the_publisher() -> None:
 @pytest.mark.ros
 def test_a_type_that_has_changed_since_is_refused(tmp_path: Path) -> None:
     need_ros()
-    from bag_helpers import definition
-
-    from dtsa_bench.recordings.bag.writer import BagWriter
-
     kind = "nav_msgs/msg/Odometry"
     other = schema.Definition(kind, definition(kind).text, "RIHS01_" + 64 * "0")
     with BagWriter(tmp_path / "bag", {}) as writer:
         writer.add_topic("/odom", kind, "reliable", other)
-    result = subprocess.run(
-        [*REPLAY, str(tmp_path / "bag")],
-        capture_output=True,
-        text=True,
-        env=ros_environment(),
-    )
-    assert result.returncode == 1
-    assert "differs from the installed one" in result.stderr
-    assert "Traceback" not in result.stderr
+    player = start_replay(tmp_path / "bag")
+    error = player.communicate()[1]
+    assert player.returncode == 1
+    assert "differs from the installed one" in error
+    assert "Traceback" not in error

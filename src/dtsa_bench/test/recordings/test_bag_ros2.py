@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
-import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from bag_helpers import SECOND, SyntheticRun, ros_environment, synthetic_bag
+from bag_helpers import SECOND, as_it_arrives, clock_ns, listen, ros_environment, synthetic_bag
 
 from dtsa_bench.recordings.bag.errors import UnusableBag
 from dtsa_bench.recordings.bag.metadata import ROOT
@@ -35,13 +34,8 @@ def ros2(*words: str, timeout: float = 60) -> str:
     """Output of `ros2 bag ...`."""
     result = subprocess.run(
         ["ros2", "bag", *words],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        env=ros_environment(),
-        check=False,
-    )
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout, env=ros_environment(), check=False,
+    )  # fmt: skip
     text = result.stdout + result.stderr
     assert result.returncode == 0, text
     assert "[ERROR]" not in text
@@ -71,10 +65,6 @@ def test_info_shows_topics_and_counts(tmp_path: Path) -> None:
     for topic, count in run.writer.counts.items():
         line = next(line for line in text.splitlines() if f"Topic: {topic} " in line)
         assert f"Count: {count} " in line
-
-
-def test_info_reads_the_file_alone(tmp_path: Path) -> None:
-    run = synthetic_bag(tmp_path / "flight", slots=50)
     assert "/swarm/slot" in ros2("info", "--storage", "mcap", str(run.writer.path))
 
 
@@ -85,64 +75,26 @@ def test_play_ends_well(tmp_path: Path, compression: str) -> None:
     assert "[WARN]" not in text
 
 
-# Waits until it knows the player's topics, then has it begin: all messages must come.
-LISTENER = """
-import importlib, json, sys, time
-import rclpy
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
-from rosbag2_interfaces.srv import Resume
-from rosgraph_msgs.msg import Clock
-topics = json.loads(sys.argv[1])
-rclpy.init()
-node = rclpy.create_node("listener")
-found, clocks, last = {name: [] for name, _, _ in topics}, [], [time.monotonic()]
-def hear(name):
-    def heard(data):
-        found[name].append(data.hex())
-        last[0] = time.monotonic()
-    return heard
-for name, kind, reliability in topics:
-    package, _, short = kind.split("/")
-    message = getattr(importlib.import_module(package + ".msg"), short)
-    profile = QoSProfile(depth=1000, reliability=ReliabilityPolicy[reliability.upper()])
-    node.create_subscription(message, name, hear(name), profile, raw=True)
-def clock(message):
-    clocks.append(message.clock.sec * 10**9 + message.clock.nanosec)
-node.create_subscription(Clock, "/clock", clock, qos_profile_sensor_data)
-client = node.create_client(Resume, "/rosbag2_player/resume")
-def spin(seconds, until=lambda: False):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and not until():
-        rclpy.spin_once(node, timeout_sec=0.05)
-spin(40, lambda: client.service_is_ready() and all(node.count_publishers(name) for name, _, _ in topics))
-spin(1.5)
-client.call_async(Resume.Request())
-last[0] = time.monotonic() + 5
-spin(40, lambda: time.monotonic() > last[0] + 2)
-print(json.dumps([found, clocks]), flush=True)
-rclpy.try_shutdown()
-"""
+def play_into(graph: Any, bag: Path, *options: str) -> dict[str, list[tuple[int, str]]]:
+    """What arrives in a test's graph while `ros2 bag play` plays a bag, which begins when the test knows its topics."""
+    from rosbag2_interfaces.srv import Resume
 
-
-def heard(run: SyntheticRun, *options: str) -> tuple[dict[str, list[str]], list[int]]:
-    """What another process hears while `ros2 bag play` plays a bag: messages by topic, and times on /clock."""
-    with Bag(run.writer.directory) as bag:
-        topics = [(topic.name, topic.type, topic.profiles[0]["reliability"]) for topic in bag.topics.values()]
-    listener = subprocess.Popen(
-        [sys.executable, "-c", LISTENER, json.dumps(topics)], stdout=subprocess.PIPE, text=True, env=ros_environment()
-    )
-    try:
-        ros2("play", str(run.writer.directory), "--start-paused", "--clock", "100", *options)
-        found, clocks = json.loads(listener.communicate(timeout=60)[0])
-    finally:
-        listener.kill()
-        listener.wait()
-    return found, clocks
-
-
-def expected(run: SyntheticRun, topic: str, start_ns: int = 0) -> list[str]:
-    """A topic's messages as they arrive: the middleware fills the last word up with zeros."""
-    return [(data + bytes(-len(data) % 4)).hex() for log_ns, _, data in run.written[topic] if log_ns >= start_ns]
+    arrived = listen(graph, bag)
+    client = graph.node.create_client(Resume, "/rosbag2_player/resume")
+    words = ["ros2", "bag", "play", str(bag), "--start-paused", "--clock", "100", *options]
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(words, text=True, env=graph.environment, **pipes) as player:
+        graph.until(lambda: client.service_is_ready() and all(map(graph.node.count_publishers, arrived)))
+        known_s = time.monotonic()
+        graph.until(lambda: time.monotonic() > known_s + 1.5)
+        client.call_async(Resume.Request())
+        graph.until(lambda: player.poll() is not None)
+        text = player.communicate()[0]
+        assert player.returncode == 0, text
+        assert "[ERROR]" not in text
+    ended_s = time.monotonic()
+    graph.until(lambda: time.monotonic() > ended_s + 2.0)
+    return arrived
 
 
 @pytest.mark.ros
@@ -154,14 +106,19 @@ def expected(run: SyntheticRun, topic: str, start_ns: int = 0) -> list[str]:
 def test_a_subscriber_hears_what_is_played(tmp_path: Path, options: tuple[str, ...], start_ns: int) -> None:
     pytest.importorskip("dtsa_msgs", reason="the workspace is not built")
     run = synthetic_bag(tmp_path / "flight", slots=100)
-    found, clocks = heard(run, *options)
-    for topic in run.written:
-        wanted = expected(run, topic, start_ns)
+    from node_helpers import ros_graph
+
+    with ros_graph(tmp_path) as graph:
+        arrived = play_into(graph, run.writer.directory, *options)
+    for topic, written in run.written.items():
+        found = [data for _, data in arrived[topic]]
+        wanted = [as_it_arrives(data) for log_ns, _, data in written if log_ns >= start_ns]
         if topic.endswith("/odom"):  # best effort, as recorded
-            assert set(found[topic]) <= set(wanted)
-            assert len(found[topic]) >= 0.9 * len(wanted)
+            assert set(found) <= set(wanted)
+            assert len(found) >= 0.9 * len(wanted)
         else:
-            assert found[topic] == wanted
+            assert found == wanted
+    clocks = [clock_ns(data) for _, data in arrived["/clock"]]
     assert clocks == sorted(clocks)
     assert clocks[0] >= max(start_ns, SECOND)
 
@@ -204,20 +161,16 @@ def test_info_and_reindex_take_a_recovered_bag(tmp_path: Path) -> None:
             r"holds 2 .mcap files: .* join them with `ros2 bag convert`",
         ),
         ({"compression_mode": "file", "compression_format": "zstd"}, "compressed as a whole; `ros2 bag convert`"),
+        ({"compression_mode": "message", "compression_format": "zstd"}, "compressed one by one; `ros2 bag convert`"),
     ],
-    ids=["split", "packed"],
+    ids=["split", "packed", "packed messages"],
 )
 def test_bags_are_made_plain_as_the_reader_says(tmp_path: Path, options: dict[str, object], said: str) -> None:
     run = synthetic_bag(tmp_path / "flight", slots=150)
     convert(run.writer.directory, tmp_path / "other", **options)
     with pytest.raises(UnusableBag, match=said):
         Bag(tmp_path / "other")
+    if options.get("compression_mode") == "message":
+        return
     convert(tmp_path / "other", tmp_path / "plain")
     assert rows(tmp_path / "plain") == rows(run.writer.directory)
-
-
-def test_packed_messages_are_refused(tmp_path: Path) -> None:
-    run = synthetic_bag(tmp_path / "flight", slots=50)
-    convert(run.writer.directory, tmp_path / "packed", compression_mode="message", compression_format="zstd")
-    with pytest.raises(UnusableBag, match="compressed one by one; `ros2 bag convert`"):
-        Bag(tmp_path / "packed")

@@ -147,10 +147,7 @@ def test_tables_larger_than_a_batch_are_whole(flight: Path, tmp_path: Path, monk
 
 
 def test_motion_falls_back_to_odometry(flight: Path, tmp_path: Path) -> None:
-    with (
-        Bag(flight) as bag,
-        BagWriter(tmp_path / "bag", bag.config) as writer,
-    ):
+    with Bag(flight) as bag, BagWriter(tmp_path / "bag", bag.config) as writer:
         names = [name for name in bag.topics if name != "/swarm/transmission"]
         channels = {}
         for name in names:

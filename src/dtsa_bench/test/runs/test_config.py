@@ -20,8 +20,7 @@ def run(radio: str, loss: float = 0.0, **swarm: Any) -> RunConfig:
 
 
 @pytest.mark.parametrize(
-    ("policy", "shortest_ms"),
-    [("tdma", 0.5205), ("lease", 1.0385), ("dtsa", 0.7805), ("age", 0.7805)],
+    ("policy", "shortest_ms"), [("tdma", 0.5205), ("lease", 1.0385), ("dtsa", 0.7805), ("age", 0.7805)]
 )
 def test_slots_that_no_clock_and_no_processor_could_keep_are_refused(policy: str, shortest_ms: float) -> None:
     """Turn-round, frame, and the line: to the receiver, and back for those that need the frame."""
