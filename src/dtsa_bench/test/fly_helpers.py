@@ -19,7 +19,7 @@ from waiting import wait_for
 from dtsa_agent.ros.common.wire.packing import split_frames
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.recover import recover
-from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.recordings.verify import Result, verify_bag
 
 PATIENCE_S = 180.0
 ENDLESS = ("--tail-s", "3600", "--no-picture")  # of simulated time, long enough to be disturbed
@@ -37,7 +37,7 @@ def fly(out: Path, *words: str) -> dict[str, Any]:
         command("--out", str(out), *words), capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert done.returncode == 0, done.stderr
-    return json.loads((out / "summary.json").read_text())
+    return summary_of(out)
 
 
 def frames(out: Path) -> list[tuple[int, int, bytes]]:
@@ -50,31 +50,21 @@ def frames(out: Path) -> list[tuple[int, int, bytes]]:
     return sorted(sent)
 
 
-@contextmanager
-def flying(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """A flight that has begun, in the state in which the test leaves it."""
-    process = subprocess.Popen(
-        command("--out", str(out), *words), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-    )
-    bag = out / "bag" / "bag_0.mcap"
-    try:
-        wait_for(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 20_000))
-        yield process
-    finally:
-        end_all(process)
-
-
-def pid_of(supervisor: int, agent: int) -> int:
-    """Process of one agent."""
-    return process_with(supervisor, f"__ns:=/cf{agent}")
-
-
 def readable(out: Path) -> int:
     """Slots in a bag that is finished and says nothing but what the protocol gives."""
     assert (out / "bag" / "metadata.yaml").is_file()
-    result = verify_bag(out / "bag")
+    return int(verified(out / "bag").slots)
+
+
+def verified(bag: Path) -> Result:
+    """The verification of a bag that is what the protocol gives."""
+    result = verify_bag(bag)
     assert result.ok, result.difference
-    return result.slots
+    return result
+
+
+def summary_of(out: Path) -> dict[str, Any]:
+    return dict(json.loads((out / "summary.json").read_text()))
 
 
 def run_dtsa(*words: str) -> subprocess.CompletedProcess[str]:
@@ -124,6 +114,11 @@ def end_all(process: subprocess.Popen[Any]) -> None:
         process.communicate()  # the pipes end with the last of them
 
 
+def pid_of(supervisor: int, agent: int) -> int:
+    """Process of one agent, in flights with a process each."""
+    return process_with(supervisor, f"__ns:=/cf{agent}")
+
+
 @dataclass(slots=True)
 class FlightProcess:
     """A flight under way, to be killed, stopped or disturbed, and what is asserted of it."""
@@ -131,6 +126,7 @@ class FlightProcess:
     out: Path
     process: subprocess.Popen[bytes]
     nodes: list[int] = field(default_factory=list)  # its node processes when it had begun
+    safety: dict[str, Any] = field(default_factory=dict)  # what `verify` counts in its bag
 
     def bag_bytes(self) -> int:
         """Size of the file that is being recorded; 0: not there yet."""
@@ -144,7 +140,12 @@ class FlightProcess:
 
     def pid_of(self, agent: int) -> int:
         """Process of one agent, in flights with a process each."""
-        return process_with(self.process.pid, f"__ns:=/cf{agent}")
+        return pid_of(self.process.pid, agent)
+
+    def until_says(self, *texts: str) -> None:
+        """Wait until a text is on standard error; the flight goes on until then."""
+        wait_for(lambda: self.process.poll() is not None or any(text in self.stderr() for text in texts), PATIENCE_S)
+        assert any(text in self.stderr() for text in texts), self.stderr()[-1500:]
 
     def environment(self, pid: int) -> dict[str, str]:
         """Environment variables of a process of the flight."""
@@ -184,19 +185,18 @@ class FlightProcess:
         self.process.send_signal(number)
         self.assert_ends(130, "interrupted")
         self.assert_verifies()
-        summary: dict[str, Any] = json.loads((self.out / "summary.json").read_text())
-        return summary
+        return summary_of(self.out)
 
     def assert_verifies(self) -> None:
         """The bag is closed, has slots, and is what the protocol gives."""
-        result = verify_bag(self.out / "bag")
-        assert result.ok, result.difference
+        assert (self.out / "bag" / "metadata.yaml").is_file()
+        result = verified(self.out / "bag")
         assert result.slots
+        self.safety = result.safety
 
     def assert_recovered_verifies(self) -> None:
         """The bag was not closed; what `recover` makes of it verifies up to where it breaks off."""
-        result = verify_bag(recover(self.out / "bag").directory)
-        assert result.ok, result.difference
+        result = verified(recover(self.out / "bag").directory)
         assert result.broken_off
         assert result.slots
 

@@ -18,68 +18,41 @@ FRAME = st.tuples(st.integers(1, 5), st.integers(0, 12 * MS), st.integers(1, 60)
 FRAMES = st.lists(FRAME, min_size=2, max_size=12, unique_by=lambda frame: frame[:2])
 
 
-def on_air(
-    config: ChannelConfig, frames: list[tuple[int, int, int]], flip: tuple[int, int] | None = None
-) -> SentFrames:
-    """Frames with the channel's verdicts on them, one receiver's bit turned round in deliveries and verdicts alike."""
-    line, sent = Air(Channel(config)), SentFrames(config, own_clocks=True)
-    ordered = sorted(frames, key=lambda f: f[1])
-    for number, (sender, start, length) in enumerate(ordered):
-        line.begin(number, sender, start, length)
-        sent.send(number, sender, start, bytes(length))
-    verdicts = sorted(line.settle(100 * MS), key=lambda v: v.frame_id)
-    for v in verdicts:
-        received = v.received.copy()
-        if flip and v.frame_id == flip[0] % len(ordered):
-            received[flip[1]] ^= True
-        if received.any():
-            sent.deliver(v.frame_id, v.sender, bytes(ordered[v.frame_id][2]), received)
-        sent.judged(v.slot, v.sender, received, v.lost, v.collided)
-    return sent
-
-
-@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
-@settings(max_examples=60, deadline=None)
-def test_the_channels_own_verdicts_always_pass(frames: list[tuple[int, int, int]], loss: float, seed: int) -> None:
-    sent = on_air(ChannelConfig(agents=5, loss=loss, seed=seed), frames)
-    sent.check_overlaps()
-    assert sent.check_verdicts([]) == len(frames)
-
-
-@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9))
-@settings(max_examples=60, deadline=None)
-def test_when_frames_began_and_arrived_behind_a_line_follows_from_who_received_them(
-    frames: list[tuple[int, int, int]], loss: float, seed: int
-) -> None:
-    """Starts that waited and arrivals that queued are found again from the recording, without the channel's seed."""
-    config = ChannelConfig(agents=5, loss=loss, seed=seed, radio="crazyflie")
+def check_on_air(config: ChannelConfig, frames: list[tuple[int, int, int]], flip: tuple[int, int] | None = None) -> int:
+    """Check frames with the channel's verdicts, one receiver's bit turned round in deliveries and verdicts alike."""
     line, sent = Air(Channel(config)), SentFrames(config, own_clocks=True)
     for number, (sender, start, length) in enumerate(sorted(frames, key=lambda f: f[1])):
         line.begin((number, sender), sender, start, length)
         sent.send(number, sender, start, bytes(length))
-    verdicts = {v.frame_id: v for v in line.settle(100 * MS)}
-    sent.lay({key: v.received for key, v in verdicts.items()})
-    for key, verdict in verdicts.items():
-        found = sent.get(*key)
+    verdicts = sorted(line.settle(100 * MS), key=lambda v: v.frame_id)
+    sent.lay({v.frame_id: v.received for v in verdicts})
+    for number, v in enumerate(verdicts):
+        found = sent.get(*v.frame_id)
         assert found is not None
-        assert (found.on_air.start_ns, found.arrival_ns) == (verdict.start_ns, verdict.arrival_ns)
-        if verdict.received.any():
-            sent.deliver(*key, found.data, verdict.received)
-        sent.judged(key[0], key[1], verdict.received, verdict.lost, verdict.collided)
+        assert (found.on_air.start_ns, found.arrival_ns) == (v.start_ns, v.arrival_ns)
+        received = v.received.copy()
+        if flip and number == flip[0] % len(frames):
+            received[flip[1]] ^= True
+        if received.any():
+            sent.deliver(*v.frame_id, found.data, received)
+        sent.judged(*v.frame_id, received, v.lost, v.collided)
     sent.check_overlaps()
-    assert sent.check_verdicts([]) == len(frames)
+    return sent.check_verdicts([])
+
+
+@given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9), st.sampled_from(("plain", "crazyflie")))
+@settings(max_examples=120, deadline=None)
+def test_the_channels_own_verdicts_always_pass(
+    frames: list[tuple[int, int, int]], loss: float, seed: int, radio: str
+) -> None:
+    assert check_on_air(ChannelConfig(agents=5, loss=loss, seed=seed, radio=radio), frames) == len(frames)
 
 
 @given(FRAMES, st.integers(0, 99), st.integers(0, 4))
 @settings(max_examples=60, deadline=None)
 def test_one_wrong_receiver_never_passes(frames: list[tuple[int, int, int]], frame: int, receiver: int) -> None:
-    def check() -> None:
-        sent = on_air(ChannelConfig(agents=5), frames, flip=(frame, receiver))
-        sent.check_overlaps()
-        sent.check_verdicts([])
-
     with pytest.raises(Mismatch):
-        check()
+        check_on_air(ChannelConfig(agents=5), frames, flip=(frame, receiver))
 
 
 def test_a_dropped_frame_has_disturbed_nobody() -> None:
@@ -150,3 +123,28 @@ def test_late_frames_do_not_move_the_common_time(seed: int) -> None:
             for by in random.permutation(late).tolist():
                 shift += aligner.hear(by - shift)
         assert (shift == 0) == (most == 4)
+
+
+@pytest.mark.parametrize("earlier", [True, False])
+def test_no_sender_hears_what_is_on_the_air_meanwhile(earlier: bool) -> None:
+    """Neither the one that began first nor the other."""
+    sent = SentFrames(ChannelConfig(agents=3), own_clocks=True)
+    for sender, start_ns in ((1, 0), (2, 100_000)):
+        sent.send(0, sender, start_ns, bytes(24))
+    sent.deliver(0, 2 if earlier else 1, bytes(24), np.array([earlier, not earlier, False]))
+    with pytest.raises(Mismatch, match="who sends does not hear"):
+        sent.check_overlaps()
+
+
+@pytest.mark.parametrize(("verdicts", "not_judged", "collided"), [((), 3, 0), (((0, 2), (1, 0)), 1, 1)])
+def test_frames_without_a_verdict_are_counted(
+    verdicts: tuple[tuple[int, int], ...], not_judged: int, collided: int
+) -> None:
+    frames = SentFrames(ChannelConfig(agents=3), own_clocks=True)
+    for slot in range(3):
+        frames.send(slot, slot + 1, slot * 10_000_000, bytes(24))
+    for slot, met in verdicts:
+        frames.judged(slot, slot + 1, np.zeros(3, dtype=np.bool_), 0, met)
+    assert frames.safety() == {
+        "frames": 3, "frames_not_judged": not_judged, "overlapping_pairs": 0, "frames_collided": collided,
+    }  # fmt: skip

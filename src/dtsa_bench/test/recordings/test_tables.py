@@ -20,6 +20,7 @@ from dtsa_bench.commands.export import TABLES
 from dtsa_bench.recordings.bag.errors import BagError, UnusableBag
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.run import load_run
+from dtsa_bench.recordings.bag.schema import Definition
 from dtsa_bench.recordings.bag.writer import BagWriter
 from dtsa_bench.recordings.tables import export as module
 from dtsa_bench.recordings.tables.columns import COLUMNS
@@ -44,6 +45,7 @@ def read(directory: Path, kind: str) -> dict[str, pd.DataFrame]:
 
 @pytest.mark.parametrize("kind", ["parquet", "csv"])
 def test_tables_have_the_documented_columns_and_the_bag_s_values(flight: Path, tmp_path: Path, kind: str) -> None:
+    assert tuple(COLUMNS) == TABLES
     written = export(flight, tmp_path / "tables", kind)
     tables = read(tmp_path / "tables", kind)
     assert {one.path.stem: one.rows for one in written} == {name: len(table) for name, table in tables.items()}
@@ -127,10 +129,6 @@ def test_pairs_of_a_flight_without_losses_have_all_observers(tmp_path: Path) -> 
     assert sorted(ages["observers"]) == [0, 0, 3, 3]
 
 
-def test_every_table_has_columns() -> None:
-    assert tuple(COLUMNS) == TABLES
-
-
 def test_units_are_in_the_parquet_files(flight: Path, tmp_path: Path) -> None:
     export(flight, tmp_path / "tables", tables=["states"])
     assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["columns.md", "states.parquet"]
@@ -148,43 +146,33 @@ def test_tables_larger_than_a_batch_are_whole(flight: Path, tmp_path: Path, monk
 
 def test_motion_falls_back_to_odometry(flight: Path, tmp_path: Path) -> None:
     with Bag(flight) as bag, BagWriter(tmp_path / "bag", bag.config) as writer:
+        with_tracks = load_run(bag).motion
         names = [name for name in bag.topics if name != "/swarm/transmission"]
         channels = {}
         for name in names:
             topic = bag.topics[name]
-            definition = module_definition(topic)
+            definition = Definition(topic.type, topic.definition, topic.type_hash)
             channels[name] = writer.add_topic(name, topic.type, list(topic.profiles), definition)
         for message in bag.messages(names):
             writer.write(channels[message.topic], message.data, message.log_time_ns, message.publish_time_ns)
-    with Bag(flight) as bag:
-        with_tracks = load_run(bag).motion
-    with Bag(tmp_path / "bag") as bag:
-        run = load_run(bag)
+    run = load_run(tmp_path / "bag")
     assert not any(run.frames.data)
     common, a, b = np.intersect1d(run.motion.time_ns, with_tracks.time_ns, return_indices=True)
     assert len(common) > SLOTS - 3
     assert np.array_equal(run.motion.position[a], with_tracks.position[b])
 
 
-def module_definition(topic: object) -> object:
-    """A topic's definition, to write it again."""
-    from dtsa_bench.recordings.bag.schema import Definition
-
-    return Definition(topic.type, topic.definition, topic.type_hash)  # type: ignore[attr-defined]
-
-
 def test_bad_input_is_refused(flight: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="parquet or csv"):
-        export(flight, tmp_path / "a", "xlsx")
-    with pytest.raises(ConfigError, match="slots, frames, receptions, decisions, states, ages, ages_by_observer"):
-        export(flight, tmp_path / "a", tables=["slot"])
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="empty or does not exist"):
-        export(flight, tmp_path)
-    with pytest.raises(UnusableBag):
-        export(tmp_path / "nothing", tmp_path / "a")
-    with pytest.raises((BagError, ConfigError)):
-        export(flight, tmp_path / "file" / "below")
+    for error, match, bag, out, words in (
+        (ConfigError, "parquet or csv", flight, "a", {"kind": "xlsx"}),
+        (ConfigError, ", ".join(TABLES), flight, "a", {"tables": ["slot"]}),
+        (ConfigError, "empty or does not exist", flight, "", {}),
+        (UnusableBag, None, tmp_path / "nothing", "a", {}),
+        ((BagError, ConfigError), None, flight, "file/below", {}),
+    ):
+        with pytest.raises(error, match=match):
+            export(bag, tmp_path / out, **words)
     assert not (tmp_path / "a").exists()
 
 

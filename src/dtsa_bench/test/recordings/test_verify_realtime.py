@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import PATIENCE_S, fly, flying, pid_of
+from fly_helpers import fly, start_flight
 from waiting import wait_for
 
 pytest.importorskip("dtsa_msgs.msg")
@@ -19,9 +19,6 @@ from dtsa_agent.core.frame import decode_extended
 from dtsa_bench.recordings.bag.reader import Bag, Message
 from dtsa_bench.recordings.bag.writer import BagWriter
 from dtsa_bench.recordings.verify import Result, verify_bag
-from dtsa_bench.recordings.verify.frames import SentFrames
-from dtsa_bench.recordings.verify.result import Mismatch
-from dtsa_channel_sim import ChannelConfig
 
 pytestmark = pytest.mark.ros
 BEGUN = 50  # a slot in which all are under way
@@ -68,6 +65,10 @@ def rewritten(original: Path, copy: Path, edit: Edit, **config: Any) -> Result:
     return verify_bag(copy)
 
 
+def untouched(message: Message, value: Any, pack: Callable[[Any], bytes]) -> bytes:
+    return message.data
+
+
 def once(topic: str, change: Callable[[Any], bool]) -> Callable[..., bytes | None]:
     """An edit of one message of a topic: the first from slot `BEGUN` on that ``change`` says it has changed."""
     done: list[bool] = []
@@ -103,12 +104,6 @@ def frame_time(message: Any) -> bool:
     return True
 
 
-def heard_early(message: Any) -> bool:
-    if len(message.heard_ns):
-        message.heard_ns[0] = 0
-    return len(message.heard_ns) > 0
-
-
 def not_heard(message: Any) -> bool:
     """A frame less was taken in than what was decided follows from."""
     there = len(message.heard_sender) > 0
@@ -117,37 +112,25 @@ def not_heard(message: Any) -> bool:
     return there
 
 
-def heard_by_all(message: Any) -> bool:
-    there = len(message.heard_by) > 0 and bool(message.heard_by[0] != 0b11)
-    if there:
-        message.heard_by[0] = 0b11
-    return there
+def first_of(field: str, value: Callable[[Any, int], int]) -> Callable[[Any], bool]:
+    """A change of the first entry of a field, from the message and what the entry was, if that makes a difference."""
+
+    def change(message: Any) -> bool:
+        entries = getattr(message, field)
+        if not len(entries) or value(message, int(entries[0])) == entries[0]:
+            return False
+        entries[0] = value(message, int(entries[0]))
+        return True
+
+    return change
 
 
-def own_bit(message: Any) -> bool:
-    if len(message.sender):
-        message.received[0] |= 1 << (int(message.sender[0]) - 1)
-    return bool(len(message.sender))
-
-
-def no_receiver(message: Any) -> bool:
-    there = len(message.sender) > 0 and message.received[0] != 0
-    if there:
-        message.received[:] = 0
-    return there
-
-
-def other_sender(message: Any) -> bool:
-    """Of a frame that was delivered: an agent that has not sent."""
-    there = len(message.sender) == 1
-    if there:
-        message.sender[0] = int(message.sender[0]) % 4 + 1
-    return there
-
-
-def other_choice(message: Any) -> bool:
-    message.chosen[0] += 1
-    return True
+heard_early, heard_by_all = first_of("heard_ns", lambda _, was: 0), first_of("heard_by", lambda _, was: 0b11)
+no_receiver = first_of("received", lambda _, was: 0)
+own_bit = first_of("received", lambda message, was: was | 1 << (int(message.sender[0]) - 1))
+# Of a frame that was delivered: an agent that has not sent.
+other_sender = first_of("sender", lambda message, was: was % 4 + 1 if len(message.sender) == 1 else was)
+other_choice = first_of("chosen", lambda _, was: was + 1)
 
 
 @pytest.mark.parametrize(
@@ -181,18 +164,16 @@ def test_a_missing_message_is_found_without_the_digest(flown: Path, tmp_path: Pa
     dropped = []
 
     def edit(message: Message, value: Any, pack: Callable[[Any], bytes]) -> bytes | None:
-        wanted = message.topic == f"/swarm/{topic}" and int(value.slot) >= BEGUN and len(value.data)
-        if wanted and not dropped:
-            dropped.append(message)
-            return None
-        return message.data
+        if dropped or message.topic != f"/swarm/{topic}" or value.slot < BEGUN or not len(value.data):
+            return message.data
+        return dropped.append(message)
 
     assert not rewritten(flown, tmp_path / "less", edit).ok
     assert dropped
 
 
 def test_untouched_bags_pass_and_what_is_not_checked_is_said(flown: Path, tmp_path: Path) -> None:
-    result = rewritten(flown, tmp_path / "same", lambda message, value, pack: message.data)
+    result = rewritten(flown, tmp_path / "same", untouched)
     assert result.ok, result.difference
     for what in ("frames equal to their sender's state", "frames heard as they were sent", "verdicts made again",
                  "frames taken in as they were delivered", "decisions made again", "reception",
@@ -207,18 +188,18 @@ def test_untouched_bags_pass_and_what_is_not_checked_is_said(flown: Path, tmp_pa
 def test_bags_from_before_radios_had_names_are_checked_as_they_were(flown: Path, tmp_path: Path) -> None:
     with Bag(flown / "bag") as bag:
         channel = {name: value for name, value in bag.config["channel"].items() if name != "radio"}
-    result = rewritten(flown, tmp_path / "old", lambda message, value, pack: message.data, channel=channel)
+    result = rewritten(flown, tmp_path / "old", untouched, channel=channel)
     assert result.ok, result.difference
 
 
 def test_radios_behind_lines_are_checked_by_their_times(waiting: Path, tmp_path: Path) -> None:
     """Frames that waited began later than they were handed over, and receptions that queued arrived later."""
-    result = rewritten(waiting, tmp_path / "same", lambda message, value, pack: message.data)
+    result = rewritten(waiting, tmp_path / "same", untouched)
     assert result.ok, result.difference
     assert result.checked["frames taken in as they were delivered"] > 100
     with Bag(waiting / "bag") as bag:
         channel = bag.config["channel"]
-    plain = rewritten(waiting, tmp_path / "plain", lambda m, v, pack: m.data, channel={**channel, "radio": "plain"})
+    plain = rewritten(waiting, tmp_path / "plain", untouched, channel={**channel, "radio": "plain"})
     assert "slot.stamp" in str(plain.difference)
 
 
@@ -226,7 +207,7 @@ def test_a_mission_whose_slots_follow_the_station_is_checked_too(tmp_path: Path)
     """Vehicles that are not simulated: nothing can be flown again, but frames and verdicts must still be right."""
     words = ("--agents", "5", "--policy", "dtsa", "--loss", "0.2", "--processes", "1", "--timeout-s", "1.5")
     fly(tmp_path / "flight", *words, "--no-picture")
-    result = rewritten(tmp_path / "flight", tmp_path / "copy", lambda message, value, pack: message.data, mode="cflib")
+    result = rewritten(tmp_path / "flight", tmp_path / "copy", untouched, mode="cflib")
     assert result.mode == "cflib"
     assert result.ok, result.difference
     assert result.checked["verdicts made again"] > 100
@@ -237,42 +218,13 @@ def test_a_mission_whose_slots_follow_the_station_is_checked_too(tmp_path: Path)
 def test_a_flight_that_an_agent_has_left_is_checked_too(tmp_path: Path) -> None:
     """What made it leave came from outside; what it decided in the slot in which it said so follows from its frame."""
     words = ("--agents", "4", "--moving", "2", "--policy", "lease", "--mode", "realtime", "--slot-ms", "20")
-    out = tmp_path / "flight"
-    words += ("--clock-offset-ns", "200000")
-    with flying(out, *words, "--timeout-s", "3600", "--respawn", "0", "--no-picture") as flight:
-        leaving = pid_of(flight.pid, 3)
+    words += ("--clock-offset-ns", "200000", "--timeout-s", "3600", "--respawn", "0", "--no-picture")
+    with start_flight(tmp_path, *words) as flight:
+        leaving = flight.pid_of(3)
         os.kill(leaving, signal.SIGTERM)
         wait_for(lambda: not Path(f"/proc/{leaving}").exists())
-        flight.send_signal(signal.SIGINT)
-        assert flight.wait(PATIENCE_S) == 130
-    result = verify_bag(out)
-    assert result.ok, result.difference
-    assert 0.0 < result.safety["clock_spread_mean_ms"] <= result.safety["clock_spread_max_ms"] < 10.0
-    with Bag(out / "bag") as bag:
+        flight.interrupt()
+    assert 0.0 < flight.safety["clock_spread_mean_ms"] <= flight.safety["clock_spread_max_ms"] < 10.0
+    with Bag(flight.out / "bag") as bag:
         last = [bytes(message.data) for _, message in bag.typed(["/swarm/frame"]) if message.agent == 3][-1]
     assert decode_extended(last).leaving
-
-
-@pytest.mark.parametrize("earlier", [True, False])
-def test_no_sender_hears_what_is_on_the_air_meanwhile(earlier: bool) -> None:
-    """Neither the one that began first nor the other."""
-    frames = SentFrames(ChannelConfig(agents=3), own_clocks=True)
-    for sender, start_ns in ((1, 0), (2, 100_000)):
-        frames.send(0, sender, start_ns, bytes(24))
-    frames.deliver(0, 2 if earlier else 1, bytes(24), np.array([earlier, not earlier, False]))
-    with pytest.raises(Mismatch, match="who sends does not hear"):
-        frames.check_overlaps()
-
-
-@pytest.mark.parametrize(("verdicts", "not_judged", "collided"), [((), 3, 0), (((0, 2), (1, 0)), 1, 1)])
-def test_frames_without_a_verdict_are_counted(
-    verdicts: tuple[tuple[int, int], ...], not_judged: int, collided: int
-) -> None:
-    frames = SentFrames(ChannelConfig(agents=3), own_clocks=True)
-    for slot in range(3):
-        frames.send(slot, slot + 1, slot * 10_000_000, bytes(24))
-    for slot, met in verdicts:
-        frames.judged(slot, slot + 1, np.zeros(3, dtype=np.bool_), 0, met)
-    assert frames.safety() == {
-        "frames": 3, "frames_not_judged": not_judged, "overlapping_pairs": 0, "frames_collided": collided,
-    }  # fmt: skip
