@@ -16,16 +16,19 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from dtsa_agent.core import REASONS, Swarm, SwarmConfig
 from dtsa_bench.flights.domain import ros_domain
 from dtsa_bench.recordings.bag import schema
 from dtsa_bench.recordings.bag.cdr import MarkerPacker, OdometryPacker
 from dtsa_bench.recordings.bag.errors import BagError
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.writer import BagWriter
+from dtsa_bench.runs.config import RunConfig
 
 MESSAGES = Path(__file__).parents[2] / "dtsa_msgs" / "msg"
 RUN = 0x1234  # id of all synthetic runs
 SECOND = 1_000_000_000
+_FLIGHT = ("Transmission", "Reception", "Decision")
 
 
 @cache
@@ -52,112 +55,113 @@ def cdr(kind: str, **fields: Any) -> bytes:
 
 
 def stamp(time_ns: int) -> Any:
-    """`builtin_interfaces/Time` for rosbags' serialiser."""
     return typestore().types["builtin_interfaces/msg/Time"](time_ns // SECOND, time_ns % SECOND)
 
 
 def header(time_ns: int) -> Any:
-    """`std_msgs/Header` in frame `map` for rosbags' serialiser."""
     return typestore().types["std_msgs/msg/Header"](stamp(time_ns), "map")
 
 
-def positions(agents: int, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """(3, n) m and (3, n) m/s of agents that circle the origin."""
-    angle = 2 * np.pi * np.arange(agents) / agents + 0.3 * time_s
-    place = np.stack([2 * np.cos(angle), 2 * np.sin(angle), 0.1 * np.sin(3 * angle)])
-    speed = 0.3 * np.stack([-2 * np.sin(angle), 2 * np.cos(angle), 0.3 * np.cos(3 * angle)])
-    return place, speed
-
-
 class SyntheticRun:
-    """Writes a plausible run slot by slot: TDMA, every agent sends in its turn, all hear.
+    """A flight of the real core on a seeded channel that loses frames, recorded slot by slot.
 
-    :param directory: where the bag is made.
-    :param agents: number of agents.
-    :param slot_ms: ms, length of a slot.
+    :param whole: record slot messages and markers, too.
+    :param options: of `BagWriter`.
     """
 
-    def __init__(self, directory: Path, agents: int = 4, slot_ms: int = 10, **options: Any) -> None:
-        self.agents, self.slot_ns = agents, slot_ms * 1_000_000
-        config = {"agents": agents, "moving": agents, "policy": "tdma", "slot_ms": slot_ms, "seed": 7}
-        self.writer = BagWriter(directory, config, **options)
+    def __init__(
+        self, directory: Path, config: SwarmConfig, loss: float = 0.0, whole: bool = True, **options: Any
+    ) -> None:
+        self.config, self.loss, self._swarm = config, loss, Swarm(config)
+        self._ids = np.arange(1, config.agents + 1, dtype=np.uint16)
+        self._random, self._start = np.random.default_rng(config.seed), self._swarm.position.copy()
+        self._next = 0
+        self._delivery: dict[str, Any] = dict.fromkeys(("sender", "length", "data", "received"), np.zeros(0, np.uint8))
+        self.writer = BagWriter(directory, RunConfig(config).to_dict(), **options)
         self.written: dict[str, list[tuple[int, int, bytes]]] = {}
         self._channels: dict[str, int] = {}
-        for topic, kind, qos in [
-            ("/swarm/slot", "dtsa_msgs/msg/Slot", "reliable"),
-            ("/swarm/transmission", "dtsa_msgs/msg/Transmission", "reliable"),
-            ("/swarm/reception", "dtsa_msgs/msg/Reception", "reliable"),
-            ("/swarm/decision", "dtsa_msgs/msg/Decision", "reliable"),
-            ("/swarm/markers", "visualization_msgs/msg/MarkerArray", "reliable"),
-            *((f"/cf{i}/odom", "nav_msgs/msg/Odometry", "sensor_data") for i in range(1, agents + 1)),
-        ]:
+        swarm_topics = ("Slot", "Transmission", "Reception", "Decision") if whole else _FLIGHT
+        topics = [(f"/swarm/{name.lower()}", f"dtsa_msgs/msg/{name}", "reliable") for name in swarm_topics]
+        topics += [("/swarm/markers", "visualization_msgs/msg/MarkerArray", "reliable")] * whole
+        topics += [(f"/cf{i}/odom", "nav_msgs/msg/Odometry", "sensor_data") for i in self._ids]
+        for topic, kind, qos in topics:
             self._channels[topic] = self.writer.add_topic(topic, kind, qos, definition(kind))
             self.written[topic] = []
-        self._odometry = OdometryPacker([f"cf{i}/base_link" for i in range(1, agents + 1)])
-        self._markers = MarkerPacker([str(i) for i in range(1, agents + 1)])
+        self._odometry = OdometryPacker([f"cf{i}/base_link" for i in self._ids])
+        self._markers = MarkerPacker([str(i) for i in self._ids])
 
-    def _write(self, topic: str, data: bytes, log_ns: int, publish_ns: int) -> None:
-        self.writer.write(self._channels[topic], data, log_ns, publish_ns)
-        self.written[topic].append((log_ns, publish_ns, data))
+    def _write(self, topic: str, log_ns: int, publish_ns: int, packed: bytes = b"", **fields: Any) -> None:
+        if topic not in self._channels:
+            return
+        kind = f"dtsa_msgs/msg/{topic.rpartition('/')[2].capitalize()}"
+        message = packed or cdr(kind, header=header(publish_ns), run=RUN, **fields)
+        self.writer.write(self._channels[topic], message, log_ns, publish_ns)
+        self.written[topic].append((log_ns, publish_ns, message))
+
+    def answer(self, slot: int, data: np.ndarray) -> None:
+        """Record what the agents say at the start of a slot."""
+        swarm, start = self._swarm, SECOND + slot * self.config.slot_ns
+        lengths = [len(swarm.frame(k)) if len(data) else 0 for k in range(self.config.agents)]
+        track = swarm.track if slot else np.repeat(self._start[None], self.config.steps, 0)
+        self._write(
+            "/swarm/transmission", start, start, slot=slot, agent=self._ids, length=np.array(lengths, np.uint8),
+            data=data, offset_ns=np.zeros(0, np.int64), chosen=swarm.chosen, reason=swarm.reason, digest=swarm.digest,
+            score=swarm.score, steps=self.config.steps, track=track.ravel(), velocity=swarm.velocity.ravel(),
+            command=swarm.command.ravel(), goal=swarm.goal.ravel() if slot == 0 else np.zeros(0),
+        )  # fmt: skip
 
     def slot(self, slot: int) -> None:
-        """Record everything of one slot."""
-        n, start = self.agents, SECOND + slot * self.slot_ns
-        end = start + self.slot_ns
-        ids = np.arange(1, n + 1, dtype=np.uint16)
-        sender = slot % n + 1
-        frame = np.frombuffer(bytes([1, sender, slot & 255, slot >> 8]) + bytes(19), np.uint8)
-        heard = np.packbits(np.ones(n, np.uint8), bitorder="little")
-        place, speed = positions(n, (end - SECOND) / SECOND)
-        u8, u16 = (lambda *v: np.array(v, np.uint8)), (lambda *v: np.array(v, np.uint16))
+        """Fly the next slot, and record it as that of a number."""
+        swarm, n, start = self._swarm, self.config.agents, SECOND + slot * self.config.slot_ns
+        end, flown = start + self.config.slot_ns, self._next
+        self._next += 1
+        self._write("/swarm/slot", start, start, slot=slot, phase=0, heard_slot=max(0, slot - 1), **self._delivery)
+        swarm.scenario.advance(flown, swarm)
+        senders = swarm.begin(flown)
+        frames = [swarm.frame(k) for k in senders]
+        data = np.frombuffer(b"".join(frames), np.uint8)
+        self.answer(slot, data)
+        names = [REASONS[code] for code in sorted(set(swarm.reason.tolist()))]
+        decision = {
+            "slot": slot, "agent": self._ids, "chosen": swarm.chosen.copy(), "reason_name": names,
+            "reason_index": np.array([names.index(REASONS[c]) for c in swarm.reason], np.uint8),
+            "reason": swarm.reason.copy(), "digest": swarm.digest.copy(), "score": swarm.score.copy(),
+        }  # fmt: skip
+        swarm.fly(flown)
+        alone, heard = len(senders) == 1, np.zeros((len(senders), n), np.uint8)
+        if alone:
+            heard[0] = self._random.random(n) >= self.loss
+            heard[0, senders[0]] = 0
+            swarm.hear(flown, frames[0], heard[0])
+        swarm.end(flown)
+        sender = np.array([k + 1 for k in senders], np.uint16)
+        received = np.packbits(heard, axis=1, bitorder="little").ravel()
+        self._delivery = {
+            "sender": sender, "length": np.array([len(frame) for frame in frames], np.uint8), "data": data,
+            "received": received,
+        }  # fmt: skip
+        lost = np.array([n - 1 - heard[0].sum()] if alone else [0] * len(senders), np.uint16)
+        collided = np.array([0] if alone else [n - 1] * len(senders), np.uint16)
         self._write(
-            "/swarm/slot",
-            cdr(
-                "dtsa_msgs/msg/Slot", header=header(start), run=RUN, slot=slot, phase=0, heard_slot=max(0, slot - 1),
-                sender=u16((slot - 1) % n + 1) if slot else u16(), length=u8(23) if slot else u8(),
-                data=frame if slot else u8(), received=heard if slot else u8(),
-            ),
-            start, start,
+            "/swarm/reception", end, end, slot=slot, outcome=min(2, len(senders)), sender=sender, received=received,
+            lost=lost, collided=collided,
         )  # fmt: skip
-        self._write(
-            "/swarm/transmission",
-            cdr(
-                "dtsa_msgs/msg/Transmission", header=header(start), run=RUN, slot=slot, agent=ids,
-                length=np.where(ids == sender, 23, 0).astype(np.uint8), data=frame,
-                offset_ns=np.zeros(0, np.int64), chosen=np.full(n, sender, np.uint16), reason=np.zeros(n, np.uint8),
-                digest=np.full(n, slot, np.uint32), score=np.zeros(n), steps=1,
-                track=place.ravel(), velocity=speed.ravel(), command=speed.ravel(),
-                goal=-place.ravel() if slot == 0 else np.zeros(0),
-            ),
-            start + 1000, start,
-        )  # fmt: skip
-        self._write(
-            "/swarm/reception",
-            cdr(
-                "dtsa_msgs/msg/Reception", header=header(end), run=RUN, slot=slot, outcome=1, sender=u16(sender),
-                received=heard, lost=u16(0), collided=u16(0),
-            ),
-            end, end,
-        )  # fmt: skip
-        self._write(
-            "/swarm/decision",
-            cdr(
-                "dtsa_msgs/msg/Decision", header=header(start), run=RUN, slot=slot, agent=ids,
-                chosen=np.full(n, sender, np.uint16), reason_name=["tdma"], reason_index=np.zeros(n, np.uint8),
-                reason=np.zeros(n, np.uint8), digest=np.full(n, slot, np.uint32), score=np.zeros(n),
-            ),
-            end, start,
-        )  # fmt: skip
-        for number, data in enumerate(self._odometry.pack(end, place, speed), 1):
-            self._write(f"/cf{number}/odom", data, end, end)
+        self._write("/swarm/decision", end, start, **decision)
+        for number, packed in enumerate(self._odometry.pack(end, swarm.position, swarm.velocity), 1):
+            self._write(f"/cf{number}/odom", end, end, packed)
         if slot % 10 == 0:
-            state = (ids == sender).astype(np.uint8) + 1
-            self._write("/swarm/markers", self._markers.pack(end, place, state, -place), end, end)
+            state = np.isin(self._ids, sender).astype(np.uint8) + 1
+            self._write("/swarm/markers", end, end, self._markers.pack(end, swarm.position, state, swarm.goal))
+
+
+def synthetic_run(directory: Path, agents: int = 4, **options: Any) -> SyntheticRun:
+    """TDMA without losses."""
+    return SyntheticRun(directory, SwarmConfig(agents=agents, policy="tdma", seed=7), **options)
 
 
 def synthetic_bag(directory: Path, slots: int = 100, **options: Any) -> SyntheticRun:
     """A closed bag of a synthetic run."""
-    run = SyntheticRun(directory, **options)
+    run = synthetic_run(directory, **options)
     with run.writer:
         for slot in range(slots):
             run.slot(slot)

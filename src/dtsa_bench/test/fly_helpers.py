@@ -32,7 +32,6 @@ def command(*words: str) -> list[str]:
 
 
 def fly(out: Path, *words: str) -> dict[str, Any]:
-    """A whole flight; its summary."""
     done = subprocess.run(
         command("--out", str(out), *words), capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
@@ -129,13 +128,11 @@ class FlightProcess:
     safety: dict[str, Any] = field(default_factory=dict)  # what `verify` counts in its bag
 
     def bag_bytes(self) -> int:
-        """Size of the file that is being recorded; 0: not there yet."""
         with contextlib.suppress(OSError):
             return (self.out / "bag" / "bag_0.mcap").stat().st_size
         return 0
 
     def stderr(self) -> str:
-        """Everything on standard error until now."""
         return (self.out.parent / "stderr.txt").read_text(errors="replace")
 
     def pid_of(self, agent: int) -> int:
@@ -148,7 +145,6 @@ class FlightProcess:
         assert any(text in self.stderr() for text in texts), self.stderr()[-1500:]
 
     def environment(self, pid: int) -> dict[str, str]:
-        """Environment variables of a process of the flight."""
         words = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
         return dict(word.split("=", 1) for word in words if "=" in word)
 
@@ -203,11 +199,7 @@ class FlightProcess:
 
 @contextmanager
 def start_flight(directory: Path, *words: str, begun: bool = True, files_bytes: int = 0) -> Iterator[FlightProcess]:
-    """A flight in a directory; whatever happens to it, no process of it is left afterwards.
-
-    :param begun: wait until some slots are in its bag.
-    :param files_bytes: largest size of a file that it can write; 0: any.
-    """
+    """A flight whose bag has slots, and which can write so many bytes a file; nothing of it is left afterwards."""
     directory.mkdir(parents=True, exist_ok=True)
 
     def limit() -> None:

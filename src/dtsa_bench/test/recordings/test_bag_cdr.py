@@ -32,19 +32,16 @@ FRAMES = st.text(st.characters(codec="ascii", exclude_characters="\0"), max_size
 
 
 def odometry(time_ns: int, child: str, position: Any, velocity: Any, frame: str) -> bytes:
-    """The same message by rosbags."""
     types = typestore().types
     g = "geometry_msgs/msg/"
     zero = types[g + "Vector3"](0.0, 0.0, 0.0)
     pose = types[g + "Pose"](types[g + "Point"](*position), types[g + "Quaternion"](0.0, 0.0, 0.0, 1.0))
     twist = types[g + "Twist"](types[g + "Vector3"](*velocity), zero)
     return cdr(
-        "nav_msgs/msg/Odometry",
-        header=types["std_msgs/msg/Header"](stamp(time_ns), frame),
-        child_frame_id=child,
+        "nav_msgs/msg/Odometry", header=types["std_msgs/msg/Header"](stamp(time_ns), frame), child_frame_id=child,
         pose=types[g + "PoseWithCovariance"](pose, COVARIANCE),
         twist=types[g + "TwistWithCovariance"](twist, COVARIANCE),
-    )
+    )  # fmt: skip
 
 
 @settings(max_examples=60, deadline=None)

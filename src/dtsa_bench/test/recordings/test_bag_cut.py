@@ -39,9 +39,7 @@ def flown(directory: Path, mode: str, patch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_cut_anywhere_it_verifies_up_to_its_end(
-    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_cut_anywhere_it_verifies_up_to_its_end(mode, tmp_path, monkeypatch, capsys):
     whole = flown(tmp_path / "whole", mode, monkeypatch)
     complete = verify_bag(whole)
     assert complete.ok, complete.difference

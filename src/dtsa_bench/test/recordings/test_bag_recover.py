@@ -21,17 +21,14 @@ COMPRESSIONS = ("zstd", "lz4", "none")
 
 
 def rows_of(path: Path) -> list[Row]:
-    """All messages in the order of the file."""
     with path.open("rb") as stream:
         messages = make_reader(stream).iter_messages(log_time_order=False)
         return [(c.topic, m.log_time, m.publish_time, m.sequence, bytes(m.data)) for _, c, m in messages]
 
 
 def chunks_of(path: Path) -> list[tuple[int, int, int]]:
-    """(start, end, messages) of each chunk in the file."""
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    assert summary is not None
     found = []
     with path.open("rb") as stream:
         for index in sorted(summary.chunk_indexes, key=lambda one: one.chunk_start_offset):
@@ -45,7 +42,6 @@ def chunks_of(path: Path) -> list[tuple[int, int, int]]:
 
 @pytest.fixture(scope="module", params=COMPRESSIONS)
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
-    """A bag in many small chunks."""
     directory = tmp_path_factory.mktemp(f"bags_{request.param}") / "flight"
     return synthetic_bag(directory, slots=30, agents=3, chunk_size=9000, compression=request.param)
 
@@ -105,9 +101,7 @@ def test_flipped_bits_lose_only_what_stands_behind_them(run: SyntheticRun, tmp_p
     check_flipped(run, tmp_path, [(pick.randrange(size), pick.randrange(8)) for _ in range(34)])
 
 
-def test_a_flipped_bit_in_what_a_record_is_brings_nothing_wrong(
-    run: SyntheticRun, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_a_flipped_bit_in_what_a_record_is_brings_nothing_wrong(run, tmp_path, request):
     whole = run.writer.path.read_bytes()
     places, position = [], len(MAGIC)
     while position < len(whole) - len(MAGIC):

@@ -22,6 +22,7 @@ from bag_helpers import (
     listen,
     ros_environment,
     synthetic_bag,
+    synthetic_run,
 )
 
 from dtsa_agent.core.errors import ConfigError
@@ -35,13 +36,10 @@ from dtsa_bench.recordings.bag.writer import BagWriter
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
-    """A bag of 1 s and 3 agents."""
     return synthetic_bag(tmp_path_factory.mktemp("bags") / "flight", slots=100, agents=3, chunk_size=40_000)
 
 
 class Listener:
-    """Keeps what a player gives out."""
-
     def __init__(self) -> None:
         self.messages: list[Message] = []
         self.walls: list[int] = []
@@ -58,7 +56,6 @@ class Listener:
 
 
 def play(run: SyntheticRun, **options: object) -> tuple[Listener, Player]:
-    """Play a bag as fast as may be."""
     listener = Listener()
     with Bag(run.writer.directory) as bag:
         player = Player(bag, listener, **{"rate": 50.0, **options})  # type: ignore[arg-type]
@@ -82,7 +79,7 @@ def test_the_clock_reaches_each_moment_before_its_messages_and_never_runs_back(r
 
 @pytest.mark.parametrize(("rate", "gap_slots"), [(0.5, 30), (8.0, 800)])
 def test_between_messages_the_clock_goes_on_at_the_rate(tmp_path: Path, rate: float, gap_slots: int) -> None:
-    run = SyntheticRun(tmp_path / "bag", agents=2)
+    run = synthetic_run(tmp_path / "bag", agents=2)
     with run.writer:
         run.slot(0)
         run.slot(gap_slots)
@@ -172,7 +169,6 @@ def test_a_damaged_chunk_ends_the_playing_with_an_error(run: SyntheticRun, tmp_p
 
 
 def need_ros() -> None:
-    """Skip where nodes cannot run."""
     pytest.importorskip("rclpy", reason="rclpy is not installed")
     pytest.importorskip("dtsa_msgs", reason="the workspace is not built")
     try:
@@ -246,7 +242,6 @@ def test_space_pauses_and_q_ends_in_a_terminal(run: SyntheticRun) -> None:
 def test_signals_end_a_player_cleanly(run: SyntheticRun, number: signal.Signals) -> None:
     need_ros()
     player = start_replay(run.writer.directory, "--loop")
-    assert player.stdout is not None
     assert player.stdout.readline().startswith("playing ")
     player.send_signal(number)
     out, error = player.communicate(timeout=30)

@@ -20,7 +20,6 @@ from dtsa_bench.recordings.bag.recover import recover
 
 
 def has_ros2_bag() -> bool:
-    """Whether `ros2 bag` is there: the command, and its package in one of the sourced prefixes."""
     prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
     return shutil.which("ros2") is not None and any(Path(prefix, "share/ros2bag").is_dir() for prefix in prefixes)
 
@@ -31,7 +30,6 @@ pytestmark = pytest.mark.skipif(
 
 
 def ros2(*words: str, timeout: float = 60) -> str:
-    """Output of `ros2 bag ...`."""
     result = subprocess.run(
         ["ros2", "bag", *words],
         stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout, env=ros_environment(), check=False,
@@ -43,7 +41,6 @@ def ros2(*words: str, timeout: float = 60) -> str:
 
 
 def convert(source: Path, target: Path, **options: object) -> None:
-    """Let `ros2 bag convert` write a bag anew."""
     bag = {"uri": str(target), "storage_id": "mcap", "all_topics": True, **options}
     settings = target.with_suffix(".yaml")
     settings.write_text(yaml.safe_dump({"output_bags": [bag]}), encoding="utf-8")
@@ -51,7 +48,6 @@ def convert(source: Path, target: Path, **options: object) -> None:
 
 
 def rows(path: Path) -> list[tuple[int, str, bytes]]:
-    """Messages of a bag, those of equal time by topic."""
     with Bag(path) as bag:
         return sorted((message.log_time_ns, message.topic, message.data) for message in bag.messages())
 
@@ -128,7 +124,6 @@ def test_reindex_finds_the_same(tmp_path: Path) -> None:
     path = run.writer.directory / "metadata.yaml"
 
     def content() -> dict[str, Any]:
-        """All values as texts, topics by name."""
         loaded = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.BaseLoader)[ROOT]
         topics = {entry["topic_metadata"]["name"]: entry for entry in loaded["topics_with_message_count"]}
         return {**loaded, "topics_with_message_count": topics}

@@ -26,12 +26,10 @@ HERE = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> SyntheticRun:
-    """A bag of 40 slots and 4 agents, in several chunks."""
     return synthetic_bag(tmp_path_factory.mktemp("bags") / "flight", slots=40, chunk_size=20_000)
 
 
 def content(run: SyntheticRun) -> dict:
-    """The map below the root of metadata.yaml."""
     text = (run.writer.directory / "metadata.yaml").read_text(encoding="utf-8")
     assert "&id" not in text  # anchors, which rosbag2 does not read
     loaded = yaml.safe_load(text)
@@ -54,7 +52,7 @@ def test_metadata_has_every_mandatory_field(run: SyntheticRun) -> None:
     assert {key: found[key] for key in wanted} == wanted
     assert all(isinstance(value, str) for value in found["custom_data"].values())
     assert found["custom_data"]["seed"] == "7"
-    assert json.loads(found["custom_data"]["configuration"])["agents"] == 4
+    assert json.loads(found["custom_data"]["configuration"])["swarm"]["agents"] == 4
     assert found["custom_data"]["version"]
 
 
@@ -70,16 +68,11 @@ def test_metadata_describes_each_topic(run: SyntheticRun) -> None:
         assert topic["type_description_hash"] == definition(topic["type"]).type_hash
         (profile,) = topic["offered_qos_profiles"]
         assert profile == {
-            "history": "keep_last",
-            "depth": 5 if name.endswith("odom") else 10,
-            "reliability": "best_effort" if name.endswith("odom") else "reliable",
-            "durability": "volatile",
-            "deadline": INFINITE,
-            "lifespan": INFINITE,
-            "liveliness": "automatic",
-            "liveliness_lease_duration": INFINITE,
-            "avoid_ros_namespace_conventions": False,
-        }
+            "history": "keep_last", "depth": 5 if name.endswith("odom") else 10,
+            "reliability": "best_effort" if name.endswith("odom") else "reliable", "durability": "volatile",
+            "deadline": INFINITE, "lifespan": INFINITE, "liveliness": "automatic",
+            "liveliness_lease_duration": INFINITE, "avoid_ros_namespace_conventions": False,
+        }  # fmt: skip
 
 
 def test_mcap_reads_header_schemas_channels_and_indexes(run: SyntheticRun) -> None:
@@ -87,8 +80,6 @@ def test_mcap_reads_header_schemas_channels_and_indexes(run: SyntheticRun) -> No
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
         assert reader.get_header().profile == "ros2"
-        assert summary is not None
-        assert summary.statistics is not None
         assert summary.statistics.message_count == sum(map(len, run.written.values()))
         assert len(summary.chunk_indexes) > 1
         assert all(index.compression == "zstd" for index in summary.chunk_indexes)
@@ -191,10 +182,10 @@ FULL_DISK = """
 import resource, sys
 sys.path.insert(0, sys.argv[2])
 from pathlib import Path
-from bag_helpers import SyntheticRun
+from bag_helpers import synthetic_run
 from dtsa_bench.recordings.bag.errors import BagError
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # what a full disk does, without one
-run = SyntheticRun(Path(sys.argv[1]), compression="none", chunk_size=20_000)
+run = synthetic_run(Path(sys.argv[1]), compression="none", chunk_size=20_000)
 try:
     with run.writer:
         for slot in range(10_000):

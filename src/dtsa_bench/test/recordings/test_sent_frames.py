@@ -8,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.core.reference.timebase import ClockAligner
+from dtsa_agent.ros.common.graph import names
 from dtsa_bench.flights.statistics import ClockStatistics
 from dtsa_bench.recordings.verify.frames import SentFrames
+from dtsa_bench.recordings.verify.odometry import odometry_fault
 from dtsa_bench.recordings.verify.result import Mismatch
 from dtsa_channel_sim import Air, Channel, ChannelConfig
 
@@ -28,7 +30,6 @@ def check_on_air(config: ChannelConfig, frames: list[tuple[int, int, int]], flip
     sent.lay({v.frame_id: v.received for v in verdicts})
     for number, v in enumerate(verdicts):
         found = sent.get(*v.frame_id)
-        assert found is not None
         assert (found.on_air.start_ns, found.arrival_ns) == (v.start_ns, v.arrival_ns)
         received = v.received.copy()
         if flip and number == flip[0] % len(frames):
@@ -42,9 +43,7 @@ def check_on_air(config: ChannelConfig, frames: list[tuple[int, int, int]], flip
 
 @given(FRAMES, st.floats(0.0, 0.5), st.integers(0, 9), st.sampled_from(("plain", "crazyflie")))
 @settings(max_examples=120, deadline=None)
-def test_the_channels_own_verdicts_always_pass(
-    frames: list[tuple[int, int, int]], loss: float, seed: int, radio: str
-) -> None:
+def test_the_channels_own_verdicts_always_pass(frames, loss, seed, radio):
     assert check_on_air(ChannelConfig(agents=5, loss=loss, seed=seed, radio=radio), frames) == len(frames)
 
 
@@ -137,9 +136,7 @@ def test_no_sender_hears_what_is_on_the_air_meanwhile(earlier: bool) -> None:
 
 
 @pytest.mark.parametrize(("verdicts", "not_judged", "collided"), [((), 3, 0), (((0, 2), (1, 0)), 1, 1)])
-def test_frames_without_a_verdict_are_counted(
-    verdicts: tuple[tuple[int, int], ...], not_judged: int, collided: int
-) -> None:
+def test_frames_without_a_verdict_are_counted(verdicts, not_judged, collided):
     frames = SentFrames(ChannelConfig(agents=3), own_clocks=True)
     for slot in range(3):
         frames.send(slot, slot + 1, slot * 10_000_000, bytes(24))
@@ -148,3 +145,43 @@ def test_frames_without_a_verdict_are_counted(
     assert frames.safety() == {
         "frames": 3, "frames_not_judged": not_judged, "overlapping_pairs": 0, "frames_collided": collided,
     }  # fmt: skip
+
+
+SLOT_NS = 20_000_000
+SLOTS = 10
+FIRST = 6  # slot of the first report
+SPEED = 1.0  # m/s
+
+
+def rows() -> tuple[np.ndarray, np.ndarray, list]:
+    """Ten slots of an agent that flies along x, whose first reports have missed their slots' accounts."""
+    times = names.TIME_ZERO_NS + np.arange(SLOTS) * SLOT_NS
+    found = np.zeros((SLOTS, 3))
+    found[FIRST:, 0] = 0.9 + np.arange(SLOTS - FIRST) * SPEED * SLOT_NS / 1e9
+    reports = [(slot, found[slot].copy(), SPEED) for slot in range(FIRST, SLOTS)]
+    return times, found, reports
+
+
+def fault(found: np.ndarray, carried: np.ndarray | None = None) -> tuple[int, float, float] | None:
+    times, _, reports = rows()
+    return odometry_fault(times, found, np.zeros(SLOTS, bool) if carried is None else carried, reports, SLOT_NS)
+
+
+def test_an_agent_stays_where_it_was_called_until_its_first_report() -> None:
+    _, found, _ = rows()
+    assert fault(found) is None
+
+
+@pytest.mark.parametrize("slot", [2, FIRST - 1, FIRST, FIRST + 2])
+def test_a_place_that_was_not_reported_is_found(slot: int) -> None:
+    _, found, _ = rows()
+    found[slot, 1] += 0.01
+    assert fault(found) == (slot, pytest.approx(0.01, abs=0.02), pytest.approx(1e-6, abs=1e-9))
+
+
+def test_a_slot_whose_report_came_too_late_keeps_the_place_before() -> None:
+    _, found, _ = rows()
+    late = np.arange(SLOTS) == FIRST + 1
+    found[late] = found[FIRST]
+    assert fault(found) is not None
+    assert fault(found, late) is None

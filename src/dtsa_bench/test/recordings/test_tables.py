@@ -31,14 +31,12 @@ SLOTS, AGENTS = 120, 6
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A lossy flight whose frames collide: ALOHA."""
     directory = tmp_path_factory.mktemp("bags") / "flight"
     flight_bag(directory, slots=SLOTS, loss=0.2, agents=AGENTS, policy="aloha", seed=3)
     return directory
 
 
 def read(directory: Path, kind: str) -> dict[str, pd.DataFrame]:
-    """All tables of an export."""
     how = {"parquet": pd.read_parquet, "csv": pd.read_csv}[kind]
     return {path.stem: how(path) for path in directory.glob(f"*.{kind}")}
 

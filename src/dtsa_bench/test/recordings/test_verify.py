@@ -51,7 +51,6 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four agents whose frames carry tags of `KEY`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DTSA_AUTH_KEY", KEY)
         return fly(tmp_path_factory.mktemp("sealed") / "flight", *LEASE, "--auth")
@@ -73,7 +72,6 @@ def rewrite(original: Path, copy: Path, edit: Edit, keep_digest: bool = True) ->
                 values["serialized_metadata"] = "\n".join(line for line in lines if "digest:" not in line)
             writer.add_metadata(record.name, values)
         summary = reader.get_summary()
-        assert summary is not None
         channels = {}
         for channel in summary.channels.values():
             schema = summary.schemas[channel.schema_id]
@@ -125,14 +123,12 @@ def test_a_sealed_flight_verifies_with_its_key_only(sealed: Path, monkeypatch: p
     assert verify_bag(sealed).ok
     monkeypatch.setenv("DTSA_AUTH_KEY", "ff" + KEY[2:])
     difference = verify_bag(sealed).difference
-    assert difference is not None
     assert difference.what == "transmission.data"
     for path in sealed.rglob("*"):
         assert not path.is_file() or KEY[-6:].encode() not in path.read_bytes()  # the key is nowhere
 
 
 def frame_places(messages: list[Message], bag: Bag) -> list[tuple[int, int]]:
-    """Message and offset of every byte of every radio frame on the wire."""
     places = []
     for index, message in enumerate(messages):
         if message.topic.endswith(("/slot", "/transmission")):
@@ -190,9 +186,7 @@ def test_a_hundred_tamperings_are_found(flight: Path, tmp_path: Path, kind: str)
 
 
 @pytest.mark.parametrize("tagged", [False, True])
-def test_a_changed_frame_is_named_and_shown_in_words_without_any_digest(
-    flight: Path, sealed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tagged: bool
-) -> None:
+def test_a_changed_frame_is_named_and_shown_in_words_without_any_digest(flight, sealed, tmp_path, monkeypatch, tagged):
     """One bit of the position in one frame: slot, agent, both values and the reason are shown."""
     monkeypatch.setenv("DTSA_AUTH_KEY", KEY)
     original = sealed if tagged else flight
@@ -208,7 +202,6 @@ def test_a_changed_frame_is_named_and_shown_in_words_without_any_digest(
 
     result = result_of(original, tmp_path, edit)
     found = result.difference
-    assert found is not None
     assert result.slots == found.slot > 0  # those before it are right
     assert found.what == "transmission.data"
     assert found.slot == int(sent.slot)
@@ -229,9 +222,7 @@ def result_of(flight: Path, tmp_path: Path, edit: Edit) -> Result:
 @pytest.mark.parametrize(
     "topic", ["/swarm/slot", "/swarm/transmission", "/swarm/decision", "/swarm/reception", "/cf3/odom"]
 )
-def test_a_missing_message_and_a_wrong_sequence_number_are_found_without_any_digest(
-    flight: Path, tmp_path: Path, topic: str
-) -> None:
+def test_a_missing_message_and_a_wrong_sequence_number_are_found_without_any_digest(flight, tmp_path, topic):
     def middle(messages: list[Message]) -> int:
         of_topic = [i for i, m in enumerate(messages) if m.topic == topic]
         return of_topic[len(of_topic) // 2]
@@ -246,10 +237,8 @@ def test_a_missing_message_and_a_wrong_sequence_number_are_found_without_any_dig
         return messages
 
     difference = result_of(flight, tmp_path, drop).difference
-    assert difference is not None
     assert difference.slot is not None
     difference = result_of(flight, tmp_path, renumber).difference
-    assert difference is not None
     assert difference.what == f"{topic}, sequence number"
     assert int(difference.recorded) == int(difference.expected) + 1
 
@@ -268,7 +257,6 @@ def test_an_answer_that_names_nobody_is_nobodys(flight: Path, tmp_path: Path) ->
         return messages
 
     difference = result_of(flight, tmp_path, without_ids).difference
-    assert difference is not None
     assert (difference.what, difference.recorded) == ("transmission.agent", "[]")
 
 
@@ -290,13 +278,10 @@ def test_a_tampered_decision_and_a_tampered_loss_are_named(flight: Path, tmp_pat
 
     for topic, field, part in (("/swarm/decision", "score", "score"), ("/swarm/reception", "received", "received")):
         difference = result_of(flight, tmp_path, change(topic, field)).difference
-        assert difference is not None
         assert part in difference.what
 
 
-def test_of_a_bag_with_a_hole_it_is_said_what_is_missing(
-    holed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_a_bag_with_a_hole_it_is_said_what_is_missing(holed, tmp_path, capsys):
     begin, end = 1_505_000_000, 1_595_000_000  # ns, where slots have 10 ms from 1 s on
     saved = rewrite(
         holed, tmp_path / "saved.mcap", lambda messages: [m for m in messages if not begin < m.log_time_ns < end]
@@ -319,7 +304,6 @@ def test_of_a_bag_with_a_hole_it_is_said_what_is_missing(
 
 @pytest.fixture(params=["lockstep", "realtime"])
 def holed(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A flight of some chunks."""
     shape = ("--agents", "4", "--policy", "lease", "--processes", "1", "--timeout-s", "3")
     fly(tmp_path / "flown", *shape, "--mode", request.param, "--slot-ms", "10")
     return tmp_path / "flown"
