@@ -102,6 +102,7 @@ def an_agent_is_never_started(nodes: Nodes) -> None:
 @_by_hand(
     "SIGKILL to a channel whose agents were started by hand, lockstep",
     "the agents say that it has gone and end with code 1",
+    sample=True,
 )
 def channel_killed(nodes: Nodes) -> None:
     _kill_channel(nodes)
@@ -120,6 +121,7 @@ def _kill_channel(nodes: Nodes, *words: str) -> subprocess.Popen[str] | None:
 @_by_hand(
     "the same, and a new channel is started at once",
     "the agents say that theirs has gone and end; the new one waits for others, or refuses the old ones by name",
+    sample=True,
 )
 def channel_restarted(nodes: Nodes) -> None:
     second = _kill_channel(nodes, *_SLOTS)
@@ -134,6 +136,7 @@ def channel_restarted(nodes: Nodes) -> None:
 @_by_hand(
     "a second channel is started beside a run under way",
     "it names the first, or its agents, and ends with code 2; the run goes on",
+    sample=True,
 )
 def second_channel(nodes: Nodes) -> None:
     channel, agents = nodes.begin()
@@ -156,7 +159,9 @@ def other_seed(nodes: Nodes) -> None:
 
 
 @_by_hand(
-    "two processes have the same agent", "the channel refuses the run before slot 0, names both, and ends with code 2"
+    "two processes have the same agent",
+    "the channel refuses the run before slot 0, names both, and ends with code 2",
+    sample=True,
 )
 def the_same_id_twice(nodes: Nodes) -> None:
     nodes.agent(1)

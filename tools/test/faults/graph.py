@@ -90,7 +90,7 @@ _row("frames, reports and slot messages with the id of another run, real time", 
      "/swarm/frame /swarm/report /swarm/slot", ("foreign",), "another_run")  # fmt: skip
 
 
-@fault("`replay` of a bag into the domain of a live flight", _DROPPED)
+@fault("`replay` of a bag into the domain of a live flight", _DROPPED, sample=True)
 def bag_replayed(directory: Path) -> None:
     done = run_dtsa("fly", "--out", str(directory / "old"), *LOCKSTEP, "--timeout-s", "1", "--no-picture")
     assert done.returncode == 0, done.stderr[-300:]

@@ -109,7 +109,7 @@ def bag_changed(directory: Path) -> None:
     assert "Traceback" not in done.stderr, done.stderr[-300:]
 
 
-@fault("`--auth` without a key in the environment", _REFUSED)
+@fault("`--auth` without a key in the environment", _REFUSED, sample=True)
 def key_missing(directory: Path) -> None:
     with patch.dict(os.environ):
         os.environ.pop("DTSA_AUTH_KEY", None)

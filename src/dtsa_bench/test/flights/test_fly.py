@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fly_helpers import fly, frames, readable
+from fly_helpers import fly, readable
 from node_helpers import end_of, ros_graph
 
 pytest.importorskip("dtsa_msgs.msg")
@@ -16,46 +16,16 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.workarounds.dds import RANGE
+from dtsa_bench.commands.cli import main
 from dtsa_bench.flights.children import Children
 from dtsa_bench.flights.domain import clear_hindrances, ros_domain
 from dtsa_bench.flights.flight import fly as fly_here
 from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.runs.config import RunConfig, RunLimits
-from dtsa_bench.simulation.simulate import simulate
+from dtsa_bench.runs.config import RunConfig
 from dtsa_channel_sim import ChannelConfig, ClockConfig, make_clocks
 
 pytestmark = pytest.mark.ros
-
-
-@pytest.mark.parametrize(("loss", "splits"), [("0", ["per-agent", "1"]), ("0.25", ["per-agent", "2"])])
-def test_same_seed_same_flight_whatever_the_processes(tmp_path: Path, loss: str, splits: list[str]) -> None:
-    words = ("--agents", "4", "--loss", loss, "--seed", "7", "--tail-s", "0.2", "--no-picture")
-    summaries = [fly(tmp_path / split, *words, "--processes", split) for split in splits]
-    first, second = (frames(tmp_path / split) for split in splits)
-    assert first == second
-    assert len(first) > 100
-    for summary in summaries:
-        del summary["wall_time_s"], summary["realtime_factor"]
-    assert summaries[0] == summaries[1]
-    swarm = SwarmConfig(agents=4, seed=7)
-    air = ChannelConfig(agents=4, slot_ns=swarm.slot_ns, seed=7, loss=float(loss))
-    simulated = simulate(RunConfig(swarm, air, RunLimits(tail_s=0.2))).summary()
-    for key in ("slots", "min_distance_m", "completion_time_s", "efficiency_mean", "age_max_slots"):
-        assert simulated[key] == summaries[0][key], key
-
-
-def test_nodes_agree_on_the_sender_and_never_send_together(tmp_path: Path) -> None:
-    words = ("--agents", "12", "--policy", "dtsa", "--processes", "3", "--timeout-s", "3", "--no-picture")
-    summary = fly(tmp_path / "out", *words)
-    assert summary["slots"]["collision"] == 0
-    with Bag(tmp_path / "out" / "bag") as bag:
-        decisions = [message for _, message in bag.typed(["/swarm/decision"])]
-        receptions = [message for _, message in bag.typed(["/swarm/reception"])]
-    assert len(decisions) == len(receptions) == summary["slots"]["total"]
-    assert all(len(np.unique(message.chosen)) == 1 for message in decisions)
-    assert all(len(message.sender) <= 1 for message in receptions)
-    assert sum(len(message.sender) for message in receptions) == summary["slots"]["success"]
-    readable(tmp_path / "out")
+LIVE = ("--mode", "realtime", "--policy")
 
 
 def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_path: Path) -> None:
@@ -63,35 +33,17 @@ def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_pa
 
     out = tmp_path / "out"
     summary = fly(out, "--agents", "5", "--moving", "4", "--tail-s", "0.1")
-    wanted = {
-        "agents",
-        "moving",
-        "policy",
-        "estimator",
-        "avoider",
-        "slot_ms",
-        "loss",
-        "seed",
-        "slots",
-        "collided",
-        "min_distance_m",
-        "efficiency_mean",
-        "completion_time_s",
-        "age_mean_slots",
-        "age_max_slots",
-        "estimate_error_mean_m",
-        "wall_time_s",
-        "realtime_factor",
-    }
+    wanted = {"agents", "moving", "policy", "estimator", "avoider", "slot_ms", "loss", "seed", "slots", "collided",
+              "min_distance_m", "efficiency_mean", "completion_time_s", "age_mean_slots", "age_max_slots",
+              "estimate_error_mean_m", "wall_time_s", "realtime_factor"}  # fmt: skip
     assert wanted <= summary.keys()
     assert summary["end"] == "completed"
     total = summary["slots"]["total"]
     with AnyReader([out / "bag"]) as reader:
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
         stamps = [time_ns for _, time_ns, _ in reader.messages()]
-        last = [
-            reader.deserialize(data, c.msgtype) for c, _, data in reader.messages() if c.topic == "/swarm/transmission"
-        ][-5:]
+        answers = [(data, c.msgtype) for c, _, data in reader.messages() if c.topic == "/swarm/transmission"]
+        last = [reader.deserialize(*answer).agent[0] for answer in answers[-5:]]
     assert counts == {
         "/swarm/slot": total + 1,
         "/swarm/transmission": 5 * (total + 1),
@@ -104,8 +56,7 @@ def test_a_flight_leaves_a_bag_that_rosbags_reads_a_summary_and_a_picture(tmp_pa
     }
     assert stamps[0] == 1_000_000_000
     assert stamps[-1] == 1_000_000_000 + total * 10_000_000
-    target = {int(message.agent[0]): message for message in last}
-    assert sorted(target) == [1, 2, 3, 4, 5]
+    assert sorted(last) == [1, 2, 3, 4, 5]
     assert (out / "trajectories.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert (out / "trajectories.png").stat().st_size > 20_000
 
@@ -172,13 +123,16 @@ def test_the_channel_changes_in_flight_and_the_bag_still_verifies(tmp_path: Path
         (["--domain", "233"], "domain: got '233'; allowed: a whole number, 0 to 232"),
         (["--mode", "turbo"], "mode: got 'turbo'; allowed: lockstep, realtime"),
         (["--estimator", "oracle"], "estimator: got 'oracle'; allowed: hold, linear or intent"),
+        (["--respawn", "1"], "respawn: got 1.0; allowed: only with --mode realtime"),
+        ([*LIVE, "tdma", "--respawn", "-1"], "respawn: got -1.0; allowed: 0 to 3600 s"),
+        ([*LIVE, "dtsa", "--respawn", "1"], "policy: got 'dtsa'; allowed: tdma, aloha, lease"),
+        (["--late", "cf2"], "late: got 'cf2'; allowed: cfK=S,..."),
+        (["--late", "cf2=1"], "late: got {2: 1.0}; allowed: only with --mode realtime"),
+        ([*LIVE, "tdma", "--late", "cf13=1"], "late: got {13: 1.0}; allowed: some, not all"),
+        ([*LIVE, "lease", "--late", "cf2=1", "--processes", "2"], "late: got {2: 1.0}; allowed: only with --processes"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
-) -> None:
-    from dtsa_bench.commands.cli import main
-
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, words, said):
     assert main(["fly", "--out", str(tmp_path / "out"), *words]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"dtsa: error: {said}")
@@ -186,11 +140,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_directory_or_a_domain_in_use_is_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from dtsa_bench.commands.cli import main
-
+def test_a_directory_or_a_domain_in_use_is_one_line_and_exit_code_2(tmp_path, capsys):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     assert main(["fly", "--out", str(tmp_path / "full")]) == 2
@@ -221,12 +171,8 @@ def test_variables_of_a_shell_that_would_keep_processes_apart_do_not_count(capsy
     shell = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "ROS_DISCOVERY_SERVER": "a:1", RANGE: "OFF", "HOME": "/"}
     clear_hindrances(shell)
     assert shell == {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", RANGE: "LOCALHOST", "HOME": "/"}
-    said = capsys.readouterr().err.splitlines()
-    assert [line.split("=")[0] for line in said] == [
-        "dtsa: RMW_IMPLEMENTATION",
-        "dtsa: ROS_DISCOVERY_SERVER",
-        f"dtsa: {RANGE}",
-    ]
+    said = [line.split("=")[0] for line in capsys.readouterr().err.splitlines()]
+    assert said == ["dtsa: RMW_IMPLEMENTATION", "dtsa: ROS_DISCOVERY_SERVER", f"dtsa: {RANGE}"]
     clear_hindrances(shell)
     assert not capsys.readouterr().err
 

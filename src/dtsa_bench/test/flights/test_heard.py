@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import os
 import re
@@ -23,7 +22,8 @@ pytest.importorskip("dtsa_msgs.msg")
 
 import air_helpers as helpers
 from bridge_helpers import fake_fleet, settings
-from fly_helpers import PATIENCE_S, command
+from fly_helpers import PATIENCE_S, fly, summary_of, verified
+from fly_helpers import run_dtsa as bench
 from node_helpers import end_of, ros_graph
 from waiting import wait_for
 
@@ -35,7 +35,6 @@ from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_bench.recordings.bag.run import load_run
 from dtsa_bench.recordings.tables.export import export
-from dtsa_bench.recordings.verify import verify_bag
 
 pytestmark = pytest.mark.ros
 
@@ -85,11 +84,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def flown(out: Path, *words: str) -> dict[str, Any]:
-    """A flight that has been cut off by time; its summary."""
-    shape = ("--agents", str(AGENTS), "--timeout-s", "2", "--no-picture", "--out", str(out))
-    done = subprocess.run(command(*shape, *words), capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads((out / "summary.json").read_text())
+    return fly(out, "--agents", str(AGENTS), "--timeout-s", "2", "--no-picture", *words)
 
 
 def check_heard(out: Path, summary: dict[str, Any], own_bytes: int, sealed: bool) -> None:
@@ -101,9 +96,7 @@ def check_heard(out: Path, summary: dict[str, Any], own_bytes: int, sealed: bool
     if summary.get("mode") != "realtime":
         assert receptions["taken_in"] == receptions["delivered"]
     assert summary["age_mean_slots"] is not None
-    result = verify_bag(out)
-    assert result.ok, result.difference
-    assert not result.unheard
+    assert not verified(out).unheard
     with Bag(out) as bag:
         run = load_run(bag)
     heard = np.zeros((AGENTS, AGENTS), dtype=bool)
@@ -152,8 +145,7 @@ def test_agents_on_a_network_hear_each_other(tmp_path: Path, kind: str) -> None:
             assert not {"rejected", "malformed", "foreign", "length"} & set(summary["not_taken_in"]), summary
     merged = bench("merge", *bags(tmp_path), "--out", str(tmp_path / "whole"), "--json")
     assert merged.returncode == 0, merged.stderr
-    result = verify_bag(tmp_path / "whole")
-    assert result.ok, result.difference
+    verified(tmp_path / "whole")
     with Bag(tmp_path / "whole") as bag:
         lengths = {len(data) for data in load_run(bag).frames.data if data}
     tag = TAG_LENGTH if "--auth" in words else 0
@@ -195,12 +187,7 @@ def test_agents_that_steer_crazyflies_hear_each_other(tmp_path: Path, kind: str)
         shape = ("--backend", "cflib", "--config", str(robots), "--slot-ms", "20", "--no-picture", "--out", str(out))
         done = bench("fly", *shape, *words)
         assert done.returncode == 0, done.stderr
-    check_heard(out, json.loads((out / "summary.json").read_text()), own_bytes, "--auth" in words)
-
-
-def bench(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "dtsa_bench", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    check_heard(out, summary_of(out), own_bytes, "--auth" in words)
 
 
 def bags(folder: Path) -> list[str]:
@@ -217,20 +204,12 @@ def on_a_network(folder: Path, words: tuple[str, ...], keys: list[str]) -> Itera
     start = [sys.executable, "-m", "dtsa_bench", "agent", *shape]
     files = [folder / f"cf{agent}" / f"cf{agent}.mcap" for agent in range(1, len(keys) + 1)]
     with ExitStack() as stack:
-        processes = [
-            stack.enter_context(
-                subprocess.Popen(
-                    [*start, "--id", str(agent), "--out", str(folder / f"cf{agent}")],
-                    env={**os.environ, VARIABLE: key},
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.PIPE,
-                    text=True,
-                )
-            )
-            for agent, key in enumerate(keys, 1)
-        ]
-        for process in processes:
-            stack.callback(process.kill)
+        processes = []
+        for agent, key in enumerate(keys, 1):
+            words = [*start, "--id", str(agent), "--out", str(folder / f"cf{agent}")]
+            pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "env": {**os.environ, VARIABLE: key}}
+            processes.append(stack.enter_context(subprocess.Popen(words, text=True, **pipes)))
+            stack.callback(processes[-1].kill)
 
         def ended() -> list[Any]:
             wait_for(lambda: all(file.exists() and file.stat().st_size > 20_000 for file in files))
@@ -239,8 +218,7 @@ def on_a_network(folder: Path, words: tuple[str, ...], keys: list[str]) -> Itera
             found = []
             for file, process in zip(files, processes, strict=True):
                 _, said = process.communicate(timeout=PATIENCE_S)
-                summary = json.loads((file.parent / "summary.json").read_text())
-                found.append((process.returncode, said, summary))
+                found.append((process.returncode, said, summary_of(file.parent)))
             return found
 
         yield ended
@@ -251,23 +229,13 @@ def on_a_network(folder: Path, words: tuple[str, ...], keys: list[str]) -> Itera
     ("keys", "says"),
     [([KEY, KEY, OTHER_KEY], "most frames were of no use"), ([KEY, OTHER_KEY, THIRD_KEY], "nobody heard anybody")],
 )
-def test_agents_of_other_keys_are_refused_and_the_flight_says_so(
-    tmp_path: Path, mode: str, keys: list[str], says: str
-) -> None:
+def test_agents_of_other_keys_are_refused_and_the_flight_says_so(tmp_path, mode, keys, says):
     out = tmp_path / "out"
-    parameters = [
-        f"agents:={AGENTS}",
-        f"mode:={mode}",
-        "slot_ms:=20.0",
-        "policy:=lease",
-        "auth:=true",
-        "auth_session:=3",
-    ]
-    given = [word for value in parameters for word in ("-p", value)]
+    values = {"agents": AGENTS, "mode": mode, "slot_ms": 20.0, "policy": "lease", "auth": "true", "auth_session": 3}
+    given = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
     with ros_graph(tmp_path) as graph:
-        channel = graph.start(
-            "dtsa_bench.flights.recorded_channel", *given, "-p", f"out:={out}", "-p", "timeout_s:=2.0"
-        )
+        limits = ("-p", f"out:={out}", "-p", "timeout_s:=2.0")
+        channel = graph.start("dtsa_bench.flights.recorded_channel", *given, *limits)
         for agent, key in enumerate(keys, 1):
             graph.environment[VARIABLE] = key
             graph.start("dtsa_agent.ros.agent_node", *given, "-p", f"id:={agent}")
@@ -275,7 +243,7 @@ def test_agents_of_other_keys_are_refused_and_the_flight_says_so(
     assert code == 1
     pattern = rf"recorded_channel: error: {says}: of \d+ frames that arrived \d+ were not taken in; .* \d+ rejected \("
     assert re.match(pattern, said.strip().splitlines()[-1]), said
-    summary = json.loads((out / "summary.json").read_text())
+    summary = summary_of(out)
     assert said.strip().endswith(summary["unheard"])
     receptions = summary["receptions"]
     assert (receptions["taken_in"] == 0) is (len(set(keys)) == AGENTS)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import time
+import tracemalloc
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import pytest
 from fly_helpers import readable
 from node_helpers import end_of, ros_graph
@@ -16,7 +18,7 @@ pytest.importorskip("dtsa_msgs.msg")
 from dtsa_msgs.msg import Frame, Process, Report, Slot
 from rclpy.node import Node
 
-from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core import SwarmConfig, make_scenario
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError
 from dtsa_agent.core.frame import Frame as RadioFrame
 from dtsa_agent.core.frame import encode_frame
@@ -24,7 +26,10 @@ from dtsa_agent.core.settings.config import settings_hash
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Feed
 from dtsa_agent.ros.common.wire.stamps import header_of
+from dtsa_bench.flights import measurement
+from dtsa_bench.flights.measurement import PositionLog
 from dtsa_bench.flights.recorded_channel import RecordedFlight
+from dtsa_bench.flights.slot_messages import SlotMessages
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_channel_sim import Channel, ChannelConfig
 from dtsa_channel_sim.model.verdict import Verdict
@@ -38,8 +43,6 @@ Sender = TypeVar("Sender", bound="LateSender")
 
 
 class Diary(ChannelObserver):
-    """Writes down what it is told."""
-
     def __init__(self, pages: list[str], name: str = "") -> None:
         self.pages, self.name = pages, name
 
@@ -61,8 +64,6 @@ class Diary(ChannelObserver):
 
 
 class Failing(ChannelObserver):
-    """Raises an error of Python's in one slot, or when it is closed."""
-
     def __init__(self, slot: int | None) -> None:
         self.slot = slot
 
@@ -198,8 +199,6 @@ class LateSender(ChannelObserver):
 
     def judged(self, slot: int, answers: Answers, frames: dict[int, bytes], verdict: Verdict) -> None:
         for row, sender in enumerate(verdict.senders):
-            assert verdict.received is not None
-            assert verdict.collided is not None
             self.frames.append((sender, verdict.received[row].tolist(), verdict.collided[row]))
 
 
@@ -278,3 +277,61 @@ def test_in_real_time_a_frame_that_comes_too_late_is_dropped_and_counted(tmp_pat
     assert channel.air.late == channel.late_frames == 1
     # That of agent 1 disturbed nobody; agent 2 was heard by the one other agent.
     assert sender.frames == [(2, [True, False], 0)]
+
+
+AGENTS, RUN, SLOT_NS = 9, 77, 10_000_000
+PACKED = SlotMessages(make_scenario(SwarmConfig(agents=AGENTS)), SLOT_NS, RUN)
+
+
+def test_combinations_of_reasons_are_not_kept_for_ever() -> None:
+    packed, answers = SlotMessages(make_scenario(SwarmConfig(agents=AGENTS)), SLOT_NS, RUN), Answers(AGENTS, 1)
+
+    def pack(first: int) -> int:
+        for slot in range(first, first + 700):
+            answers.reason[:] = [(slot >> bit) & 1 for bit in range(AGENTS)][::-1]
+            answers.reason[0] = slot % 7
+            packed.decision(slot, answers)
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    try:
+        before = pack(0)
+        assert pack(700) < before + 50_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("in_memory", [1 << 20, 0, 1000])
+def test_what_was_put_in_comes_out(in_memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurement, "_IN_MEMORY", in_memory)
+    random = np.random.default_rng(1)
+    positions = random.normal(size=(50, 3, 7))
+    log = PositionLog(7)
+    for position in positions:
+        log.append(position)
+    assert len(log) == 50
+    assert np.array_equal(log.array(), positions)
+
+
+def test_an_empty_one_is_empty() -> None:
+    assert not PositionLog(3)
+    assert PositionLog(3).array().shape == (0, 3, 3)
+
+
+def test_a_full_disk_keeps_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurement, "_IN_MEMORY", 1000)
+    log, random = PositionLog(4), np.random.default_rng(2)
+    positions = random.normal(size=(60, 3, 4))
+    for position in positions[:30]:
+        log.append(position)
+
+    def full(data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    assert log._file is not None
+    monkeypatch.setattr(log._file, "write", full, raising=False)
+    for position in positions[30:]:
+        log.append(position)
+    kept = log.array()
+    assert 20 <= len(kept) == len(log) < 60
+    assert np.array_equal(kept, positions[: len(kept)])

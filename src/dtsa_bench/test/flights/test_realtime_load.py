@@ -2,49 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import children, command, end_all
+from fly_helpers import FlightProcess, children, start_flight, summary_of, verified
 from node_helpers import ros_graph
 from process_helpers import addresses, may_be_real_time, real_time, segments_of
-from waiting import wait_for
 
 from dtsa_agent.core.agents.delays import Delays
 from dtsa_agent.stop import Stop, StopToken
 from dtsa_bench.commands.fly import describe
 from dtsa_bench.flights.options import FlightOptions
-from dtsa_bench.recordings.verify import verify_bag
 from dtsa_channel_sim.ros.pace import Pace
 
 MS = 1_000_000
-PATIENCE_S = 60.0  # far more than any flight here takes
 
 
-@contextmanager
-def flight(out: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """A flight whose slots have begun."""
-    whole = command("--out", str(out), "--no-picture", "--mode", "realtime", *words)
-    process = subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    bag = out / "bag" / "bag_0.mcap"
-    try:
-        wait_for(lambda: process.poll() is not None or (bag.exists() and bag.stat().st_size > 10_000))
-        yield process
-    finally:
-        end_all(process)
-
-
-def summary_of(out: Path) -> dict[str, Any]:
-    return dict(json.loads((out / "summary.json").read_text()))
+def started(directory: Path, *words: str, begun: bool = True) -> AbstractContextManager[FlightProcess]:
+    return start_flight(directory, "--no-picture", "--mode", "realtime", *words, begun=begun)
 
 
 # Slots of 1 ms are far too short for twelve Python processes' worth of agents.
@@ -53,53 +34,47 @@ TOO_FAST = ("--policy", "tdma", "--agents", "12", "--processes", "2", "--slot-ms
 
 @pytest.mark.ros
 def test_a_flight_that_no_machine_keeps_up_with_ends_by_itself_and_says_why(tmp_path: Path) -> None:
-    with flight(tmp_path / "flight", *TOO_FAST) as process:
-        said = process.communicate(timeout=PATIENCE_S)[1]
-    summary = summary_of(tmp_path / "flight")
+    with started(tmp_path, *TOO_FAST, begun=False) as flight:
+        code, said = flight.end(), flight.stderr()
+    summary = summary_of(flight.out)
     assert summary["slots"]["total"] > 0
     assert summary["warning"] in said
-    if process.returncode:
+    if code:
         assert summary["cut_short"] in said
         assert "longer slots or fewer processes would help" in summary["cut_short"]
     else:
         assert summary["end"] in ("timed out", "completed", "crashed")
-    result = verify_bag(tmp_path / "flight")
-    assert result.ok, result.difference
+    verified(flight.out)
 
 
 @pytest.mark.ros
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_obeyed_at_any_load(tmp_path: Path, number: int) -> None:
-    with flight(tmp_path / "flight", *TOO_FAST) as process:
-        started = children(process.pid)
+    with started(tmp_path, *TOO_FAST) as flight:
         begin = time.monotonic()
-        process.send_signal(number)
-        process.communicate(timeout=PATIENCE_S)
+        flight.process.send_signal(number)
         # The machine that tests run on may be busy; it took minutes where the signal was not looked at.
+        assert flight.process.wait(10.0) == 130
         assert time.monotonic() - begin < 10.0
-        assert process.returncode == 130
-        assert started
-        assert not children(process.pid)
-    assert summary_of(tmp_path / "flight")["end"] == "stopped"
+        assert flight.nodes
+        assert not children(flight.process.pid)
+    assert summary_of(flight.out)["end"] == "stopped"
 
 
 @pytest.mark.ros
 @pytest.mark.alone
 @pytest.mark.realtime
 def test_a_channel_that_stood_still_shows_in_what_the_agents_knew_and_makes_nobody_lost(tmp_path: Path) -> None:
-    out = tmp_path / "flight"
     words = ("--policy", "tdma", "--agents", "12", "--processes", "4", "--slot-ms", "20", "--scenario", "waypoints")
-    with flight(out, *words, "--stops", "50", "--axis-x-m", "8", "--timeout-s", "600", "--no-stop-on-crash") as process:
+    more = ("--stops", "50", "--axis-x-m", "8", "--timeout-s", "600", "--no-stop-on-crash")
+    with started(tmp_path, *words, *more) as flight:
         time.sleep(1.5)
         for pause_s, then_s in ((1.5, 1.5), (3.0, 5.0)):  # what the middleware lost meanwhile, it repeats after 3 s
-            os.kill(process.pid, signal.SIGSTOP)
+            os.kill(flight.process.pid, signal.SIGSTOP)
             time.sleep(pause_s)
-            os.kill(process.pid, signal.SIGCONT)
+            os.kill(flight.process.pid, signal.SIGCONT)
             time.sleep(then_s)
-            assert process.poll() is None
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=PATIENCE_S)
-    summary = summary_of(out)
+        summary = flight.interrupt()
     assert summary["lost_agents"] == summary["returned_agents"] == []
     # Nobody heard anything for three seconds: 150 slots.
     assert summary["age_max_slots"] >= 145
@@ -107,10 +82,8 @@ def test_a_channel_that_stood_still_shows_in_what_the_agents_knew_and_makes_nobo
     assert pauses == pytest.approx([1.5, 3.0], abs=0.4)
     assert "the channel stood still" in summary["warning"]
     assert summary["late_frames"] > 50
-    result = verify_bag(out)
-    assert result.ok, result.difference
-    assert result.checked["frames taken in as they were delivered"] > 100
-    assert result.safety["stalls"] == summary["stalls"]
+    assert verified(flight.out).checked["frames taken in as they were delivered"] > 100
+    assert flight.safety["stalls"] == summary["stalls"]
 
 
 @pytest.mark.ros
@@ -118,32 +91,16 @@ def test_a_channel_that_stood_still_shows_in_what_the_agents_knew_and_makes_nobo
 def test_the_clock_on_the_wall_ends_a_flight(tmp_path: Path, mode: str) -> None:
     words = ("--agents", "3", "--moving", "2", "--policy", "tdma", "--tail-s", "3600", "--timeout-s", "3600")
     limit = ("--processes", "1", "--wall-timeout-s", "3", "--mode", mode, "--no-picture")
-    with flight(tmp_path / "out", *words, *limit) as process:
-        nodes = [process.pid, *children(process.pid)]
+    with started(tmp_path, *words, *limit) as flight:
+        nodes = [flight.process.pid, *flight.nodes]
         assert len(nodes) == 2
         # What is limited to this machine cannot be reached from outside, and real time has no port in shared memory.
         assert [addresses(pid) for pid in nodes] == [{"127.0.0.1"}] * 2
         assert all(bool(segments_of(pid)) == (mode == "lockstep") for pid in nodes)
         assert all(real_time(pid) == (mode == "realtime" and may_be_real_time()) for pid in nodes)
-        said = process.communicate(timeout=PATIENCE_S)[1]
-    assert process.returncode == 1
-    assert "the flight took longer than 3 s by the clock on the wall" in said
-    assert "longer than 3 s" in summary_of(tmp_path / "out")["cut_short"]
-    assert verify_bag(tmp_path / "out").ok
-
-
-@pytest.mark.ros
-def test_a_flight_whose_agents_all_died_has_results(tmp_path: Path) -> None:
-    words = ("--agents", "2", "--moving", "2", "--policy", "lease", "--processes", "1", "--tail-s", "3600")
-    with flight(tmp_path / "out", *words) as process:
-        (agents,) = children(process.pid)
-        os.kill(agents, signal.SIGKILL)
-        said = process.communicate(timeout=PATIENCE_S)[1]
-        assert process.returncode == 1
-    summary = summary_of(tmp_path / "out")
-    assert "nobody is left" in summary["cut_short"]
-    assert "nobody is left" in said
-    assert summary["lost_agents"] == [1, 2]
+        flight.assert_ends(1, "the flight took longer than 3 s by the clock on the wall")
+        flight.assert_verifies()
+    assert "longer than 3 s" in summary_of(flight.out)["cut_short"]
 
 
 # Without nodes.

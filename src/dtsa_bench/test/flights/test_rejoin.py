@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from fly_helpers import children, end_all, process_with
+from fly_helpers import PATIENCE_S, FlightProcess, process_with, start_flight, summary_of
 
 from dtsa_agent.core import REASONS, SwarmConfig, make_scenario
 from dtsa_agent.core.frame import decode_extended
 from dtsa_agent.core.reference.lease.memory import Memory
 from dtsa_agent.core.reference.rules import Rules
 from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.verify import verify_bag
 from dtsa_bench.runs.config import RunConfig, RunLimits
 from dtsa_bench.runs.metrics import COMPLETED, CRASHED, FlightMetrics
 from dtsa_channel_sim.model.verdict import SUCCESS
 
-PATIENCE_S = 100.0
 # Room enough that nobody is where another one appears again; without OPEN turns and adoption no frames may ever meet.
 ROOMY = (
     "--agents", "4", "--moving", "4", "--scenario", "waypoints", "--axis-x-m", "6", "--stops", "50",
@@ -37,67 +31,22 @@ ROOMY = (
 LEASE = ("--policy", "lease", "--open-every", "0", "--no-adoption")
 
 
-class Flight:
-    """A flight under way that the test ends."""
-
-    def __init__(self, out: Path, words: tuple[str, ...]) -> None:
-        self.out, self._log = out, out.with_suffix(".log")
-        command = [sys.executable, "-m", "dtsa_bench", "fly", "--out", str(out), *words]
-        with self._log.open("wb") as log:
-            self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
-
-    @property
-    def said(self) -> str:
-        return self._log.read_text()
-
-    @property
-    def under_way(self) -> bool:
-        """Whether slots are being flown."""
-        bag = self.out / "bag" / "bag_0.mcap"
-        return bag.exists() and bag.stat().st_size > 20_000
-
-    def until(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert self.process.poll() is None, self.said
-            assert time.monotonic() < deadline, f"nothing happened: {self.said}"
-            time.sleep(0.05)
-
-    def fly_on(self, slots: int) -> None:
-        """Waits for so many slots, each of 10 ms by the clock."""
-        time.sleep(slots * 0.01)
-        assert self.process.poll() is None, self.said
-
-    def pid(self, argument: str) -> int:
-        """The process that was started with an argument."""
-        return process_with(self.process.pid, argument)
-
-    def land(self) -> dict[str, object]:
-        """Ends the flight; its summary."""
-        self.process.send_signal(signal.SIGINT)
-        self.process.wait(PATIENCE_S)
-        assert self.process.returncode == 130, self.said
-        assert children(self.process.pid) == []
-        result = verify_bag(self.out)
-        assert result.ok, result.difference
-        self.safety = result.safety
-        return dict(json.loads((self.out / "summary.json").read_text()))
+def fly_on(flight: FlightProcess, slots: int) -> None:
+    """Waits for so many slots, each of 10 ms by the clock."""
+    time.sleep(slots * 0.01)
+    assert flight.process.poll() is None, flight.stderr()
 
 
-@contextmanager
-def flying(out: Path, *words: str) -> Iterator[Flight]:
-    flight = Flight(out, words)
-    try:
-        flight.until(lambda: flight.under_way)
-        yield flight
-    finally:
-        end_all(flight.process)
+def land(flight: FlightProcess, slots: int) -> dict[str, Any]:
+    """Ends a flight after so many slots; its summary. No frames have met."""
+    fly_on(flight, slots)
+    summary = flight.interrupt()
+    assert flight.safety["frames_collided"] == 0
+    return summary
 
 
 @dataclass
 class Report:
-    """What an agent said in one slot."""
-
     slot: int
     speaker: int  # whom it took for the slot's sender
     reason: str
@@ -158,20 +107,14 @@ def begins_at_an_anchor(found: list[Report], agent: int) -> bool:
 )
 @pytest.mark.alone
 @pytest.mark.realtime
-def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
-    tmp_path: Path, argument: str, agents: list[int], words: tuple[str, ...]
-) -> None:
-    with flying(tmp_path / "flight", *ROOMY, *words, "--respawn", "0") as flight:
-        os.kill(flight.pid(argument), signal.SIGKILL)
-        flight.until(lambda: "again" in flight.said.replace("started again", ""))
-        flight.fly_on(300)
-        summary = flight.land()
-    assert "was killed by SIGKILL; the others fly on" in flight.said
-    assert "has not been heard of" not in flight.said
-    assert summary["lost_agents"] == []
-    assert summary["returned_agents"] == agents
-    assert summary["collided"] is False
-    assert flight.safety["frames_collided"] == 0
+def test_a_killed_process_comes_back_and_its_agents_are_heard_again(tmp_path, argument, agents, words):
+    with start_flight(tmp_path, *ROOMY, *words, "--respawn", "0") as flight:
+        os.kill(process_with(flight.process.pid, argument), signal.SIGKILL)
+        flight.until_says("takes part again", "take part again")
+        summary = land(flight, 300)
+    assert "was killed by SIGKILL; the others fly on" in flight.stderr()
+    assert "has not been heard of" not in flight.stderr()
+    assert (summary["lost_agents"], summary["returned_agents"], summary["collided"]) == ([], agents, False)
     for agent in agents:
         before, after = before_and_after(flight.out, agent)
         # Its program started again, its vehicle went on hovering where it was.
@@ -188,18 +131,15 @@ def test_a_killed_process_comes_back_and_its_agents_are_heard_again(
 @pytest.mark.alone
 @pytest.mark.realtime
 def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None:
-    with flying(tmp_path / "flight", *ROOMY, *LEASE) as flight:
-        asleep = flight.pid("__ns:=/cf2")
+    with start_flight(tmp_path, *ROOMY, *LEASE) as flight:
+        asleep = flight.pid_of(2)
         os.kill(asleep, signal.SIGSTOP)
-        flight.fly_on(700)
+        fly_on(flight, 700)
         os.kill(asleep, signal.SIGCONT)
-        flight.until(lambda: "cf2 takes part again" in flight.said)
-        flight.fly_on(300)
-        summary = flight.land()
-    assert "cf2 has not been heard of for 2 s; the others fly on" in flight.said
-    assert summary["lost_agents"] == []
-    assert summary["returned_agents"] == [2]
-    assert flight.safety["frames_collided"] == 0
+        flight.until_says("cf2 takes part again")
+        summary = land(flight, 300)
+    assert "cf2 has not been heard of for 2 s; the others fly on" in flight.stderr()
+    assert (summary["lost_agents"], summary["returned_agents"]) == ([], [2])
     _, after = before_and_after(flight.out, 2)
     assert begins_at_an_anchor(after, 2)
     assert sum(report.heard > 0 for report in after) > 5
@@ -209,16 +149,16 @@ def test_a_process_that_stood_still_for_long_begins_anew(tmp_path: Path) -> None
 @pytest.mark.alone
 @pytest.mark.realtime
 def test_sigterm_lets_an_agent_say_farewell_and_a_second_one_does_not_wait(tmp_path: Path) -> None:
-    with flying(tmp_path / "flight", *ROOMY, "--policy", "lease", "--respawn", "0") as flight:
-        os.kill(flight.pid("__ns:=/cf2"), signal.SIGTERM)
-        flight.until(lambda: "cf2 has left; the others fly on" in flight.said)
-        impatient = flight.pid("__ns:=/cf3")
+    with start_flight(tmp_path, *ROOMY, "--policy", "lease", "--respawn", "0") as flight:
+        os.kill(flight.pid_of(2), signal.SIGTERM)
+        flight.until_says("cf2 has left; the others fly on")
+        impatient = flight.pid_of(3)
         os.kill(impatient, signal.SIGTERM)
         os.kill(impatient, signal.SIGINT)
-        flight.until(lambda: "cf3 has left; the others fly on" in flight.said)
-        flight.fly_on(50)
-        summary = flight.land()
-    assert "started again" not in flight.said
+        flight.until_says("cf3 has left; the others fly on")
+        fly_on(flight, 50)
+        summary = flight.interrupt()
+    assert "started again" not in flight.stderr()
     assert summary["lost_agents"] == [2, 3]
     sent = [report for report in reports(flight.out, 2) if report.frame]
     last = sent[-1]
@@ -256,13 +196,11 @@ def test_who_comes_late_with_a_policy_of_equal_tables_is_told_so(tmp_path: Path)
 @pytest.mark.alone
 @pytest.mark.realtime
 def test_an_agent_may_come_late(tmp_path: Path) -> None:
-    with flying(tmp_path / "flight", *ROOMY, *LEASE, "--late", "cf3=0.5") as flight:
-        flight.until(lambda: "cf3 takes part\n" in flight.said)
-        flight.fly_on(300)
-        summary = flight.land()
-    assert "has not been heard of" not in flight.said
+    with start_flight(tmp_path, *ROOMY, *LEASE, "--late", "cf3=0.5") as flight:
+        flight.until_says("cf3 takes part\n")
+        summary = land(flight, 300)
+    assert "has not been heard of" not in flight.stderr()
     assert (summary["lost_agents"], summary["returned_agents"]) == ([], [3])
-    assert flight.safety["frames_collided"] == 0
     found = reports(flight.out, 3)
     assert found[0].slot > 50
     scenario = make_scenario(SwarmConfig(agents=4, moving=4, scenario="waypoints", axis_x_m=6.0, stops=50))
@@ -275,64 +213,23 @@ def test_an_agent_may_come_late(tmp_path: Path) -> None:
 @pytest.mark.alone
 @pytest.mark.realtime
 def test_a_flight_without_anybody_is_over_unless_they_come_back(tmp_path: Path) -> None:
-    few = (
-        "--agents",
-        "2",
-        "--moving",
-        "2",
-        "--mode",
-        "realtime",
-        "--policy",
-        "lease",
-        "--processes",
-        "1",
-        "--no-picture",
-    )
-    with flying(tmp_path / "over", *few) as flight:
-        os.kill(flight.pid("__node:=swarm_host_1"), signal.SIGKILL)
-        assert flight.process.wait(PATIENCE_S) == 1
-        assert "nobody is left: swarm_host_1 with cf1 .. cf2" in flight.said
-    with flying(tmp_path / "again", *few, "--respawn", "0") as flight:
-        os.kill(flight.pid("__node:=swarm_host_1"), signal.SIGKILL)
-        assert flight.process.wait(PATIENCE_S) == 0, flight.said
-    assert "cf1 .. cf2 take part again" in flight.said
-    summary = json.loads((flight.out / "summary.json").read_text())
+    few = ("--agents", "2", "--moving", "2", "--processes", "1", "--mode", "realtime", "--policy", "lease")
+    with start_flight(tmp_path / "over", *few, "--no-picture") as flight:
+        os.kill(flight.nodes[0], signal.SIGKILL)
+        flight.assert_ends(1, "nobody is left: swarm_host_1 with cf1 .. cf2")
+        flight.assert_verifies()
+    summary = summary_of(flight.out)
+    assert "nobody is left" in summary["cut_short"]
+    assert summary["lost_agents"] == [1, 2]
+    with start_flight(tmp_path / "again", *few, "--no-picture", "--respawn", "0") as flight:
+        os.kill(flight.nodes[0], signal.SIGKILL)
+        flight.assert_ends(0, "cf1 .. cf2 take part again")
+        flight.assert_verifies()
+    summary = summary_of(flight.out)
     assert (summary["end"], summary["returned_agents"]) == ("completed", [1, 2])
-    result = verify_bag(flight.out)
-    assert result.ok, result.difference
 
 
 # Without nodes.
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--respawn", "1"], "respawn: got 1.0; allowed: only with --mode realtime"),
-        (["--respawn", "-1", "--mode", "realtime", "--policy", "tdma"], "respawn: got -1.0; allowed: 0 to 3600 s"),
-        (
-            ["--respawn", "1", "--mode", "realtime", "--policy", "dtsa"],
-            "policy: got 'dtsa'; allowed: tdma, aloha, lease",
-        ),
-        (["--late", "cf2"], "late: got 'cf2'; allowed: cfK=S,..."),
-        (["--late", "cf2=1"], "late: got {2: 1.0}; allowed: only with --mode realtime"),
-        (["--late", "cf13=1", "--mode", "realtime", "--policy", "tdma"], "late: got {13: 1.0}; allowed: some, not all"),
-        (
-            ["--late", "cf2=1", "--mode", "realtime", "--policy", "lease", "--processes", "2"],
-            "late: got {2: 1.0}; allowed: only with --processes per-agent",
-        ),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
-) -> None:
-    from dtsa_bench.commands.cli import main
-
-    assert main(["fly", "--out", str(tmp_path / "out"), *words]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"dtsa: error: {said}")
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
 
 
 def test_who_is_back_counts_again() -> None:
