@@ -71,7 +71,6 @@ def flown(env: SwarmEnv, rule: Rule, seed: int | None = None, slots: int = 10**6
 
 
 def assert_same(summary: dict[str, Any], wanted: dict[str, Any], left_out: set[str] = OPEN) -> None:
-    """Compares results, but for what is left open."""
     assert {k: v for k, v in summary.items() if k not in left_out} == {
         k: v for k, v in wanted.items() if k not in left_out
     }
@@ -89,8 +88,6 @@ def assert_same(summary: dict[str, Any], wanted: dict[str, Any], left_out: set[s
 )
 def test_a_scripted_policy_flies_what_simulate_flies(policy: str, rule: Rule, settings: dict[str, Any]) -> None:
     class Ahead:
-        """The last state heard, a tenth of a second later."""
-
         def __init__(self, config: dtsa.SwarmConfig, agent: int) -> None:
             pass
 
@@ -103,7 +100,6 @@ def test_a_scripted_policy_flies_what_simulate_flies(policy: str, rule: Rule, se
     expected = simulate(dtsa.run_config(policy=policy, **settings), trace=True, shared_table=False)
     steps = flown(parallel_env(**settings), rule)
     trace = expected.trace
-    assert trace is not None
     assert [step[1] for step in steps] == trace.senders
     assert [step[2] for step in steps] == trace.outcomes
     np.testing.assert_array_equal(np.stack([step[3] for step in steps]), np.stack(trace.tracks))
@@ -252,6 +248,5 @@ def test_the_learned_example_trains_and_flies_as_it_was_trained() -> None:
     dtsa.register("policy", "learned", lambda config, agent: learned["Learned"](config, agent, first))
     run = dtsa.run_config(policy="learned", seed=7, **learned["COMMON"], **swarm)
     trace = simulate(run, trace=True).trace
-    assert trace is not None
     assert len(record) > 100
     assert record == trace.senders[: len(record)]

@@ -29,7 +29,6 @@ EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "dtsa_plugins"
 
 @pytest.fixture(scope="module", autouse=True)
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The example package, installed by pip into a directory of its own."""
     source, target = tmp_path_factory.mktemp("source") / "example", tmp_path_factory.mktemp("target")
     shutil.copytree(EXAMPLE, source)
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-build-isolation"]
@@ -97,21 +96,16 @@ def test_all_three_together_are_the_same_flight_every_time_and_with_single_agent
 
 
 @pytest.mark.ros
-def test_nodes_find_plugins_too_and_agree_with_the_simulator(
-    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nodes_find_plugins_too_and_agree_with_the_simulator(installed, tmp_path, monkeypatch):
     pytest.importorskip("rclpy")
     from dtsa_bench.flights.flight import fly
     from dtsa_bench.flights.options import FlightOptions
 
-    # Its processes inherit the way to the package.
-    before = os.environ.get("PYTHONPATH", "")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(installed), before])))
+    monkeypatch.setenv("PYTHONPATH", str(installed), prepend=os.pathsep)
     settings = {"agents": 4, "policy": "least-known", "estimator": "damped", "avoider": "give-way", "loss": 0.1}
     run = spec.run_config({**settings, "seed": 5, "timeout_s": 0.8})
     real = fly(run, tmp_path / "flight", FlightOptions(processes=2, pictures=False))
     ours = simulate(run, trace=True)
-    assert ours.trace is not None
     ends = np.stack([track[-1] for track in ours.trace.tracks])
     assert len(real.positions) >= 80
     assert np.array_equal(real.positions[1:80], ends[:79])
@@ -137,69 +131,15 @@ def test_sweeps_take_plugins_by_name_and_their_failures_are_rows(monkeypatch: py
         simulate(spec.run_config({**tasks[0].settings, "agents": 6, "moving": 6}))
 
 
-_WRONG = """
-class {name}:
-    def __init__(self, config, agent):
-        if {where!r} == "factory":
-            raise KeyError("no such option")
-
-    def choose(self, table, slot):
-        {choose}
-
-    def estimate(self, table, slot, step, position, velocity):
-        position[0, 0] = float("nan")
-
-    def command(self, table, slot, step):
-        return {command}
-"""
-
-
-def _wrong(where: str, choose: str = "return 1", command: str = "(0.0, 0.0, 0.0)") -> Any:
-    scope: dict[str, Any] = {}
-    exec(compile(_WRONG.format(name="Wrong", where=where, choose=choose, command=command), "wrong.py", "exec"), scope)
-    return scope["Wrong"]
-
-
-@pytest.mark.parametrize(
-    ("kind", "wrong", "said"),
-    [
-        ("policy", _wrong("factory"), r"policy wrong: KeyError: 'no such option' \(wrong.py:5\)"),
-        ("policy", _wrong("", "raise RuntimeError('lost')"), r"policy wrong, choose: RuntimeError: lost \(wrong"),
-        ("policy", _wrong("", "return None"), r"chose agent None in slot 0; allowed: an integer, 0 \(nobody\) to 4"),
-        ("policy", _wrong("", "return 3.0"), "wrong, choose: chose agent 3.0 in slot 0; allowed: an integer, 0"),
-        ("policy", _wrong("", "return -1"), "policy wrong, choose: chose agent -1 in slot 0"),
-        ("estimator", _wrong(""), "estimator wrong, estimate: wrote a number that is not finite in slot 0"),
-        ("avoider", _wrong("", command="(1.0, 2.0)"), r"wrong, command: gave \(1.0, 2.0\) in slot 0; allowed: three"),
-        ("avoider", _wrong("", command="(1.0, 2.0, float('inf'))"), "avoider wrong, command: gave"),
-        ("avoider", _wrong("", command="'fast'"), "avoider wrong, command: gave 'fast'"),
-    ],
-)  # fmt: skip
-def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(kind: str, wrong: Any, said: str) -> None:
-    dtsa.register(kind, "wrong", wrong)
-    settings = {"policy": "tdma", "estimator": "linear", kind: "wrong"}
-    run = spec.run_config({"agents": 4, "timeout_s": 0.2, **settings})
-    with pytest.raises(PluginError, match=said):
-        simulate(run)
-    row = attempt(Task("key", 0, 1, {"agents": 4, "timeout_s": 0.2, **settings}, 1.0), spec.fly)
-    assert row["status"] == "failed"
-    assert row["reason"].startswith(f"PluginError: {kind} wrong")
-
-
 @pytest.mark.ros
 def test_a_plugin_that_raises_is_named_where_nodes_fly_it(installed: Path, tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     broken = tmp_path / "path"
     shutil.copytree(installed, broken)
     source = broken / "dtsa_plugins" / "__init__.py"
-    source.write_text(
-        source.read_text().replace(
-            "        speed = np.sqrt(", "        raise RuntimeError('lost')\n        speed = np.sqrt("
-        )
-    )
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(broken), os.environ.get("PYTHONPATH", "")])),
-    }
+    line = "        speed = np.sqrt("
+    source.write_text(source.read_text().replace(line, f"        raise RuntimeError('lost')\n{line}"))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(broken), os.environ.get("PYTHONPATH", "")])}
     for words in (["simulate"], ["fly", "--out", str(tmp_path / "flight"), "--no-picture", "--processes", "2"]):
         command = [sys.executable, "-m", "dtsa_bench", *words, "--agents", "4", "--policy", "least-known"]
         ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
@@ -220,11 +160,6 @@ class Mute(Empty):
         return 1
 
 
-class Nobody(Empty):
-    def senders(self, swarm: object, slot: int) -> Any:
-        return None
-
-
 class Odd:
     """Whatever is asked of it raises an error."""
 
@@ -234,44 +169,68 @@ class Odd:
     __repr__ = __index__ = __len__ = __iter__ = __float__ = __bool__ = _raise
 
 
-class Leaves(Empty):
-    def choose(self, table: object, slot: int) -> int:
-        raise SystemExit(0)
+class Endless(Empty):
+    def estimate(self, table: object, slot: int, step: int, position: Any, velocity: Any) -> None:
+        position[0, 0] = float("nan")
 
 
-def _odd(*methods: str) -> type:
-    return type("OddAnswers", (Empty,), {method: lambda self, *_: Odd() for method in methods})
+def gives(method: str, answer: Any) -> type:
+    """A plug-in with a method that gives an answer, or raises it."""
+
+    def call(self: object, *_: object) -> Any:
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    return type("Wrong", (Empty,), {method: call})
 
 
 @pytest.mark.parametrize(
     ("kind", "wrong", "said"),
     [
-        ("policy", Empty, r"^policy wrong: Empty has no method choose\(table, slot\)$"),
-        ("policy", lambda config, agent: None, r"^policy wrong: NoneType has no method choose"),
         (
             "policy",
-            Mute,
-            r"^policy wrong: Mute has no method say\(table, slot\) and heard\(table, slot, sender, data\)$",
+            lambda *_: {}["no such option"],
+            r"^policy wrong: KeyError: 'no such option' \(.*plugins.py:\d",
         ),
-        ("policy", Nobody, r"^policy wrong, senders: gave None in slot 0; allowed: a list of the ids that send$"),
-        ("policy", Leaves, r"^policy wrong, choose: SystemExit: 0 \(.*test_plugins.py"),
-        ("policy", _odd("choose"), r"^policy wrong, choose: chose agent <Odd> in slot 0; allowed: an integer, 0"),
-        ("policy", _odd("senders"), r"^policy wrong, senders: gave <Odd> in slot 0; allowed: a list"),
-        ("policy", _odd("wake"), r"^policy wrong, wake: gave <Odd> ns; allowed: whole numbers above 0"),
-        ("avoider", _odd("command"), r"^avoider wrong, command: gave <Odd> in slot 0; allowed: three finite numbers"),
-        ("policy", type("Args", (), {}), r"^policy wrong: TypeError: Args\(\) takes no arguments"),
         (
-            "estimator",
-            Empty,
-            r"^estimator wrong: Empty has no method estimate\(table, slot, step, position, velocity\)$",
+            "policy",
+            gives("choose", RuntimeError("lost")),
+            r"^policy wrong, choose: RuntimeError: lost \(.*plugins.py",
         ),
+        ("policy", gives("choose", SystemExit(0)), r"^policy wrong, choose: SystemExit: 0 \(.*test_plugins.py"),
+        ("policy", gives("choose", None), r"chose agent None in slot 0; allowed: an integer, 0 \(nobody\) to 4"),
+        ("policy", gives("choose", 3.0), "wrong, choose: chose agent 3.0 in slot 0; allowed: an integer, 0"),
+        ("policy", gives("choose", -1), "policy wrong, choose: chose agent -1 in slot 0"),
+        (
+            "policy",
+            gives("choose", Odd()),
+            r"^policy wrong, choose: chose agent <Odd> in slot 0; allowed: an int",
+        ),
+        ("policy", gives("senders", None), r"^policy wrong, senders: gave None in slot 0; allowed: a list of the ids"),
+        ("policy", gives("senders", Odd()), r"^policy wrong, senders: gave <Odd> in slot 0; allowed: a list"),
+        ("policy", gives("wake", Odd()), r"^policy wrong, wake: gave <Odd> ns; allowed: whole numbers above 0"),
+        ("policy", Empty, r"^policy wrong: Empty has no method choose\(table, slot\)$"),
+        ("policy", lambda config, agent: None, r"^policy wrong: NoneType has no method choose"),
+        ("policy", Mute, r"Mute has no method say\(table, slot\) and heard\(table, slot, sender, data\)$"),
+        ("policy", type("Args", (), {}), r"^policy wrong: TypeError: Args\(\) takes no arguments"),
+        ("estimator", Endless, "estimator wrong, estimate: wrote a number that is not finite in slot 0"),
+        ("estimator", Empty, r": Empty has no method estimate\(table, slot, step, position, velocity\)$"),
+        ("avoider", gives("command", (1.0, 2.0)), r"wrong, command: gave \(1.0, 2.0\) in slot 0; allowed: three"),
+        ("avoider", gives("command", (1.0, 2.0, float("inf"))), "avoider wrong, command: gave"),
+        ("avoider", gives("command", "fast"), "avoider wrong, command: gave 'fast'"),
+        ("avoider", gives("command", Odd()), r"^avoider wrong, command: gave <Odd> in slot 0; allowed: three finite"),
         ("avoider", Empty, r"^avoider wrong: Empty has no method command\(table, slot, step\)$"),
     ],
 )
-def test_a_method_that_is_missing_is_named(kind: str, wrong: Any, said: str) -> None:
+def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(kind: str, wrong: Any, said: str) -> None:
     dtsa.register(kind, "wrong", wrong)
+    settings = {"agents": 4, "timeout_s": 0.2, kind: "wrong"}
     with pytest.raises(PluginError, match=said):
-        simulate(spec.run_config({"agents": 4, "timeout_s": 0.2, kind: "wrong"}))
+        simulate(spec.run_config(settings))
+    row = attempt(Task("key", 0, 1, settings, 1.0), spec.fly)
+    assert row["status"] == "failed"
+    assert row["reason"].startswith(f"PluginError: {kind} wrong")
 
 
 @pytest.mark.parametrize(
@@ -311,9 +270,7 @@ def test_attributes_that_mean_nothing_are_named(kind: str, attribute: str, value
         ("lease.probation", ""),
     ],
 )
-def test_an_option_that_no_plug_in_has_is_refused_with_the_nearest(
-    option: str, near: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_option_that_no_plug_in_has_is_refused_with_the_nearest(option, near, tmp_path, capsys):
     for policy in ("event-tdma", "tdma"):
         file = tmp_path / "sweep.yaml"
         file.write_text(f"base: {{agents: 4, options: {{{option}: 9}}}}\naxes: {{policy: [{policy}]}}\n")
@@ -377,11 +334,10 @@ def test_lots_and_estimates_are_the_same_in_nodes_processes_and_simulator_and_ve
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: lots\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[dtsa.policies]\nlots = lots_of_test:Lots\nnear = lots_of_test:Near\n")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH", "")])))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.syspath_prepend(str(tmp_path))
     run = spec.run_config({"agents": 4, "policy": policy, "loss": 0.1, "seed": 5, "timeout_s": 0.8})
     ours = simulate(run, trace=True)
-    assert ours.trace is not None
     assert {len(ids) for ids in ours.trace.senders} >= {0, 1}
     ends = np.stack([track[-1] for track in ours.trace.tracks])
     for processes in counts:
@@ -406,8 +362,3 @@ def test_what_a_plugin_sees_it_cannot_change() -> None:
     for name in ("sent_position", "in_ap", "last_turn", "own_position", "goal"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(table, name)[...] = 0
-
-
-def test_built_in_names_never_make_a_plugin_swarm() -> None:
-    assert type(plugins.make_swarm(SwarmConfig())).__name__ == "Swarm"
-    assert type(plugins.make_swarm(SwarmConfig(policy="least-known"))).__name__ == "PluginSwarm"

@@ -33,19 +33,12 @@ from dtsa_channel_sim.model.airtime import Airtime
 from dtsa_channel_sim.model.verdict import COLLISION
 
 
-def steady(
-    policy: str,
-    agents: int,
-    movers: int,
-    loss: float = 0.0,
-    slots: int = 3000,
-    warmup: int | None = None,
-    **settings: object,
-) -> Experiment:
+def steady(policy: str, agents: int, movers: int, loss: float = 0.0, slots: int = 3000, **settings: Any) -> Experiment:
     """Some circle, the rest hover."""
+    warmup = settings.pop("warmup", 20 * agents)
     config = SwarmConfig(agents=agents, moving=0, avoider="none", seed=3, policy=policy, **settings)
     channel = ChannelConfig(agents=agents, slot_ns=config.slot_ns, seed=3, loss=loss)
-    experiment = Experiment(config, channel, movers=range(1, movers + 1), warmup=warmup or 20 * agents)
+    experiment = Experiment(config, channel, movers=range(1, movers + 1), warmup=warmup)
     experiment.run(slots)
     return experiment
 
@@ -125,7 +118,6 @@ def delivered(share: float, loss: float, agents: int = 12) -> float:
         "stop_on_crash": False, "options": {"mixer.slots_per_agent": share},
     })  # fmt: skip
     trace = simulate(run, trace=True).trace
-    assert trace is not None
     period = round(share * agents)
     ends = np.array(trace.heard_slot)[2 * period - 2 :: period, 1:]
     return float((ends == period * np.arange(1, len(ends) + 1)[:, None]).mean())
@@ -174,7 +166,6 @@ def test_first_reports_of_sotdma_that_enter_by_random_access_collide_as_often_as
     for seed in range(15):
         settings = {"policy": "sotdma", "agents": 20, "seed": seed, "timeout_s": 2, "options": {"sotdma.entry": 1}}
         trace = simulate(run_config(settings), trace=True).trace
-        assert trace is not None
         seen: set[int] = set()
         for senders in trace.senders:
             new = set(senders) - seen
@@ -201,9 +192,7 @@ def test_a_first_report_of_sotdma_keeps_out_of_slots_that_others_have_announced_
 
 
 @pytest.mark.parametrize(("free", "taken"), [(None, 22), (23, 23)])
-def test_an_agent_of_sotdma_that_finds_no_free_slot_may_take_that_of_the_agent_farthest_away(
-    free: int | None, taken: int
-) -> None:
+def test_an_agent_of_sotdma_that_finds_no_free_slot_may_take_that_of_the_agent_farthest_away(free, taken):
     """Frames have 12 slots: the first report of agent 5 comes in slot 21, 22 or 23."""
     config = SwarmConfig(agents=6, policy="sotdma", options={"sotdma.reuse": 1})
     swarm = make_swarm(config)
@@ -218,7 +207,6 @@ def test_an_agent_of_sotdma_that_finds_no_free_slot_may_take_that_of_the_agent_f
 
 
 def traffic(policy: str, slots: int, **settings: object) -> tuple[UnslottedTraffic, list[object], SwarmConfig]:
-    """The air alone: nobody flies."""
     config = SwarmConfig(agents=20, policy=policy, seed=5, slot_ms=2, **settings)
     swarm = make_swarm(config)
     air = UnslottedTraffic(swarm, Channel(ChannelConfig(agents=20, slot_ns=config.slot_ns, seed=5)))
@@ -254,7 +242,6 @@ def test_carrier_sense_helps_where_frames_are_longer_than_the_turn_round_of_radi
 def test_the_radio_of_an_agent_that_is_switched_off_sends_nothing() -> None:
     options = {"csma.period_ms": 15.0, "csma.window_ms": 60.0}
     air, _, _ = traffic("csma", 0, frame="extended", options=options)
-    assert air._radios is not None
     slots = iter(range(2000))
     while not air._radios.holds(4):
         air.slot(next(slots))
@@ -402,26 +389,13 @@ def test_nodes_refuse_what_nodes_cannot_do() -> None:
 
 
 def test_wrong_answers_of_such_plug_ins_are_named() -> None:
-    class Wrong:
-        def __init__(self, config: SwarmConfig, agent: int) -> None:
-            pass
-
-        def senders(self, swarm: object, slot: int) -> list[int]:
-            return [5]
-
-    class Stuck:
-        def __init__(self, config: SwarmConfig, agent: int) -> None:
-            pass
-
-        def wake(self, table: object, now_ns: int, radio: object) -> int:
-            return now_ns
-
-    class Chatty:
+    class Base:
         options = ("to",)
 
         def __init__(self, config: SwarmConfig, agent: int) -> None:
             self.to = int(config.options.get("chatty.to", 0.0))
 
+    class Chatty(Base):
         def wake(self, table: object, now_ns: int, radio: Any) -> int:
             radio.send(bytes(250), self.to)
             return now_ns + 1
@@ -430,15 +404,13 @@ def test_wrong_answers_of_such_plug_ins_are_named() -> None:
             return 0
 
     dtsa.register("policy", "chatty", Chatty)
-    for to, said in (
-        (0.0, "sent 269 bytes; allowed: 1 to 255"),
-        (5.0, r"sent .*, 5\); allowed: bytes, to 0 \(all\) to 4"),
+    dtsa.register("policy", "wrong-genie", type("Wrong", (Base,), {"senders": lambda self, swarm, slot: [5]}))
+    dtsa.register("policy", "stuck", type("Stuck", (Base,), {"wake": lambda self, table, now_ns, radio: now_ns}))
+    for policy, options, said in (
+        ("chatty", {}, "wake: sent 269 bytes; allowed: 1 to 255"),
+        ("chatty", {"chatty.to": 5.0}, r"wake: sent .*, 5\); allowed: bytes, to 0 \(all\) to 4"),
+        ("wrong-genie", {}, "senders: chose agent 5 in slot 0; allowed: 1 to 4"),
+        ("stuck", {}, "wake: gave 0 ns"),
     ):
-        with pytest.raises(PluginError, match=f"policy chatty, wake: {said}"):
-            simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="chatty", options={"chatty.to": to})))
-    dtsa.register("policy", "wrong-genie", Wrong)
-    dtsa.register("policy", "stuck", Stuck)
-    with pytest.raises(PluginError, match="policy wrong-genie, senders: chose agent 5 in slot 0; allowed: 1 to 4"):
-        simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="wrong-genie")))
-    with pytest.raises(PluginError, match="policy stuck, wake: gave 0 ns"):
-        simulate(RunConfig(swarm=SwarmConfig(agents=4, policy="stuck")))
+        with pytest.raises(PluginError, match=f"policy {policy}, {said}"):
+            simulate(RunConfig(swarm=SwarmConfig(agents=4, policy=policy, options=options)))
