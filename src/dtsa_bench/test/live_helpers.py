@@ -43,17 +43,13 @@ APP_CHANNEL = 2  # of CRTP's platform port
 
 
 def station(settings: LabSettings, agent: int) -> Station:
-    """Where a vehicle listens."""
     address = (ADDRESS + agent).to_bytes(5, "big")
     uri = f"radio://0/{settings.channel}/{settings.rate}/{address.hex().upper()}"
     return Station(uri, settings.channel, settings.rate, address)
 
 
 class LiveLaboratory(Laboratory):
-    """A laboratory with dongles on its air.
-
-    :param path: of the dongles' socket. :param dongles: their number.
-    """
+    """A laboratory with dongles on its air."""
 
     def __init__(
         self, path: Path, dongles: int, app: App, settings: LabSettings, out: Path | None = None, *observers: Observer
@@ -78,7 +74,6 @@ class LiveLaboratory(Laboratory):
         self._stopped = True
 
     def fly(self, seconds: float) -> None:
-        """Fly in real time."""
         self.side.listen()  # not before: the app has been compiled
         selector = selectors.SelectSelector()  # waits to the microsecond; epoll to the millisecond
         selector.register(self.side.listener, selectors.EVENT_READ, None)
@@ -151,7 +146,6 @@ class LiveOnBoard(OnBoard):
 
 
 def main() -> int:
-    """Fly until SIGINT."""
     place, out, what, *more = sys.argv[1:]
     lab: Any
     if what.endswith(".json"):

@@ -54,7 +54,6 @@ def track_of(bag: Path) -> Track:
 
 
 def markers_of(answer: Any) -> SimpleNamespace:
-    """Where all agents are, of a transmission."""
     place = answer.track.reshape(answer.steps, 3, -1)[-1].T
     spheres = [
         SimpleNamespace(
@@ -86,7 +85,6 @@ def viewed_flight(out: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL, text=True
     )
-    assert process.stderr is not None
     try:
         line = process.stderr.readline()
         assert line.startswith("view: http://127.0.0.1:"), line + process.stderr.read()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -35,13 +35,9 @@ pytestmark = pytest.mark.skipif(not LAYOUTS.is_dir(), reason="the layouts are pa
 
 @pytest.fixture(scope="module")
 def make() -> ModuleType:
-    """The script that fits the layouts to a number of agents."""
-    spec = importlib.util.spec_from_file_location("make_layouts", LAYOUTS / "make.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(LAYOUTS))
+        return import_module("make")
 
 
 def has_field(topic: str, path: str) -> bool:
@@ -61,7 +57,6 @@ def has_field(topic: str, path: str) -> bool:
 
 
 def numbers(kind: str) -> set[str]:
-    """Types of all numbers and texts in a message type."""
     found: set[str] = set()
     fields: Any = typestore().fielddefs[kind][1]
     for _, (node, detail) in fields:
@@ -72,7 +67,6 @@ def numbers(kind: str) -> set[str]:
 
 
 def panels(node: Any) -> list[str]:
-    """All panels in a layout's tree."""
     return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
 
 
@@ -81,9 +75,7 @@ def test_files_are_what_the_script_writes(make: ModuleType) -> None:
     assert make.PLOTJUGGLER.read_text(encoding="utf-8") == make.plotjuggler()
 
 
-def test_layouts_that_were_made_for_fewer_agents_grow_again(
-    make: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_layouts_that_were_made_for_fewer_agents_grow_again(make, tmp_path, monkeypatch):
     wanted = make.foxglove(), make.plotjuggler()
     monkeypatch.setattr(make, "FOXGLOVE", tmp_path / "layout.json")
     monkeypatch.setattr(make, "PLOTJUGGLER", tmp_path / "layout.xml")
@@ -104,8 +96,6 @@ def test_every_foxglove_panel_is_shown_and_every_path_exists(make: ModuleType) -
         source = script["sourceCode"]
         produced = re.search(r'^export const output = "([^"]+)"', source, re.M)
         inputs = re.search(r"^export const inputs = (\[[^\]]+\])", source, re.M)
-        assert produced is not None
-        assert inputs is not None
         assert set(json.loads(inputs[1])) <= TYPES.keys()
         assert "return undefined" not in source
         assert produced[1] not in fields
@@ -113,6 +103,8 @@ def test_every_foxglove_panel_is_shown_and_every_path_exists(make: ModuleType) -
     shown = set()
     checked = 0
     for config in layout["configById"].values():
+        for limit in ("minXValue", "maxXValue", "minYValue", "maxYValue"):
+            assert isinstance(config.get(limit, 0), (int, float)), limit  # Lichtblick takes "" for 0
         for topic in config.get("topics", {}):
             assert topic in TYPES or topic in fields
             shown.add(topic)
@@ -128,19 +120,6 @@ def test_every_foxglove_panel_is_shown_and_every_path_exists(make: ModuleType) -
             checked += 1
     assert checked > 12
     assert fields.keys() <= shown
-
-
-def test_no_limit_of_an_axis_is_text(make: ModuleType) -> None:
-    for config in json.loads(make.foxglove())["configById"].values():
-        for limit in ("minXValue", "maxXValue", "minYValue", "maxYValue"):
-            assert isinstance(config.get(limit, 0), (int, float)), limit  # Lichtblick takes "" for 0
-
-
-def test_arrows_of_all_agents(make: ModuleType) -> None:
-    for agents in (1, 3, 12):
-        assert [f'"/cf{k}/odom"' in make.user_script("swarm_odometry", agents) for k in range(1, 14)] == [
-            k <= agents for k in range(1, 14)
-        ]
 
 
 def test_the_check_of_fields_can_fail() -> None:
@@ -161,30 +140,22 @@ def test_every_plotjuggler_curve_exists(make: ModuleType) -> None:
     for name in [curve for curve in curves if curve not in made] + sources:
         assert name is not None
         match = re.match(r"(/swarm/\w+|/cf\d+/odom)/(.+)", name)
-        assert match is not None
         assert has_field(match[1], match[2].replace("/", ".")), name
     for splitter in root.iter("DockSplitter"):
         sizes = [float(size) for size in splitter.get("sizes", "").split(";")]
         assert len(splitter) == int(splitter.get("count", 0)) == len(sizes)
         assert sum(sizes) == pytest.approx(1)
-    for line in root.iter("curve"):
-        for change in line.iter("transform"):
-            assert change.get("alias")  # the legend shows an empty text otherwise
-            assert change.find("options") is not None
-
-
-def test_plotjuggler_equations_name_all_their_sources(make: ModuleType) -> None:
-    for snippet in ElementTree.fromstring(make.plotjuggler()).iter("snippet"):
+    for change in (change for line in root.iter("curve") for change in line.iter("transform")):
+        assert change.get("alias")  # the legend shows an empty text otherwise
+        assert change.find("options") is not None
+    for snippet in root.iter("snippet"):
         used = set(re.findall(r"\bv\d+\b", snippet.findtext("function", "")))
         sources = snippet.find("additional_sources")
-        assert sources is not None
         assert {source.tag for source in sources} == used
         assert len(used) <= 8  # more are too many for PlotJuggler 3.9
         if "age of" in snippet.get("name", ""):
-            assert (snippet.findtext("linked_source"), sources[0].text) == (
-                "/swarm/reception/outcome",
-                "/swarm/reception/sender[0]",
-            )
+            assert snippet.findtext("linked_source") == "/swarm/reception/outcome"
+            assert sources[0].text == "/swarm/reception/sender[0]"
 
 
 def test_no_topic_has_numbers_that_plotjuggler_refuses() -> None:
@@ -196,6 +167,9 @@ def test_no_topic_has_numbers_that_plotjuggler_refuses() -> None:
 def test_other_numbers_of_agents(make: ModuleType) -> None:
     assert "/cf70/odom" in make.foxglove(70)
     assert "/cf3/odom" not in make.foxglove(2)
+    for agents in (1, 3, 12):
+        arrows = [f'"/cf{k}/odom"' in make.user_script("swarm_odometry", agents) for k in range(1, 14)]
+        assert arrows == [k <= agents for k in range(1, 14)]
     for agents, pairs in ((1, 1), (3, 2), (70, 5)):  # with one agent a pair stays, from which others are made again
         curves = [curve.get("name", "") for curve in ElementTree.fromstring(make.plotjuggler(agents)).iter("curve")]
         assert sum(name.startswith("age of") for name in curves) == agents

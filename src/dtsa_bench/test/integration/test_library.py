@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,7 +27,6 @@ HEAVY = ("numpy", "matplotlib", "pandas", "rclpy", "pyarrow", "yaml")
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Directory of a recorded run with losses."""
     directory = tmp_path_factory.mktemp("runs") / "a"
     flight_bag(directory / "bag", slots=200, loss=0.1, agents=6, policy="lease", seed=3)
     return directory
@@ -71,12 +71,9 @@ def test_simulate_is_the_flight_of_the_command(flight: dtsa.Flight) -> None:
     assert isinstance(config, RunConfig)
     assert (config.swarm.policy, config.air.loss, config.air.seed) == ("lease", 0.1, 3)
     same = simulate(config, trace=True)
-    assert same.trace is not None
     assert np.array_equal(flight.path, same.trace.positions())
-    timeless = {"wall_time_s", "realtime_factor"}
-    assert {k: v for k, v in flight.summary.items() if k not in timeless} == {
-        k: v for k, v in same.summary().items() if k not in timeless
-    }
+    timeless = dict.fromkeys(("wall_time_s", "realtime_factor"))
+    assert flight.summary | timeless == same.summary() | timeless
     bare = dtsa.simulate(config, trace=False)
     assert bare.summary["min_distance_m"] == flight.summary["min_distance_m"]
     with pytest.raises(dtsa.ConfigError, match="trace: got False"):
@@ -93,16 +90,6 @@ def test_tables_of_a_flight_have_a_row_a_slot_and_a_row_an_agent_and_instant(fli
     last = positions[positions["agent"] == 4].iloc[-1]
     assert last["time_s"] == pytest.approx(flight.summary["flight_time_s"])
     assert last["position_y_m"] == flight.path[-1, 1, 3]
-
-
-@pytest.mark.parametrize(
-    ("settings", "field"),
-    [({"agents": -1}, "agents"), ({"color": "red"}, "color"), ({"loss": 2.0}, "loss"), ({"observer": 99}, "observer")],
-)
-def test_wrong_settings_of_a_flight_are_named(settings: dict[str, object], field: str) -> None:
-    with pytest.raises(dtsa.ConfigError) as caught:
-        dtsa.simulate(**settings)  # type: ignore[arg-type]
-    assert caught.value.field == field
 
 
 def test_a_recording_has_its_configuration_and_tables(run: Path) -> None:
@@ -156,8 +143,6 @@ def test_ages_of_a_simulated_flight_sum_up_to_its_results() -> None:
 
 
 class Backwards:
-    """Policy: slot modulo N, from the last agent to the first."""
-
     def __init__(self, config: dtsa.SwarmConfig, agent: int) -> None:
         self.agents = config.agents
 
@@ -167,13 +152,8 @@ class Backwards:
 
 def test_a_registered_policy_flies_in_this_process_and_is_refused_elsewhere(tmp_path: Path) -> None:
     dtsa.register("policy", "backwards", Backwards)
-    assert dtsa.simulate(agents=4, policy="backwards", timeout_s=0.2).slots["sender"].head(5).tolist() == [
-        4,
-        3,
-        2,
-        1,
-        4,
-    ]
+    flight = dtsa.simulate(agents=4, policy="backwards", timeout_s=0.2)
+    assert flight.slots["sender"].head(5).tolist() == [4, 3, 2, 1, 4]
     axes, base = {"policy": ["backwards"]}, {"agents": 4, "timeout_s": 0.2}
     assert len(dtsa.sweep(axes=axes, base=base, seeds=2).runs()) == 2
     for more, field in (({"jobs": 2}, "jobs"), ({"out": tmp_path / "s"}, "out")):
@@ -205,20 +185,24 @@ def test_a_sweep_has_a_row_a_combination_and_a_row_a_flight(swept: dtsa.SweepRes
 
 
 @pytest.mark.parametrize(
-    ("arguments", "field"),
+    ("use", "arguments", "field"),
     [
-        ({}, "sweep"),
-        ({"preset": "loss", "axes": {"loss": [0]}}, "sweep"),
-        ({"preset": "nothing"}, "preset"),
-        ({"axes": {"cell": [0]}}, "axes.cell"),
-        ({"axes": {"loss": [0]}, "seeds": 0}, "seeds"),
-        ({"axes": {"loss": [0]}, "seeds": []}, "seeds"),
-        ({"axes": {"loss": [0]}, "jobs": 0}, "jobs"),
+        (dtsa.simulate, {"agents": -1}, "agents"),
+        (dtsa.simulate, {"color": "red"}, "color"),
+        (dtsa.simulate, {"loss": 2.0}, "loss"),
+        (dtsa.simulate, {"observer": 99}, "observer"),
+        (dtsa.sweep, {}, "sweep"),
+        (dtsa.sweep, {"preset": "loss", "axes": {"loss": [0]}}, "sweep"),
+        (dtsa.sweep, {"preset": "nothing"}, "preset"),
+        (dtsa.sweep, {"axes": {"cell": [0]}}, "axes.cell"),
+        (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": 0}, "seeds"),
+        (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": []}, "seeds"),
+        (dtsa.sweep, {"axes": {"loss": [0]}, "jobs": 0}, "jobs"),
     ],
 )
-def test_wrong_sweeps_are_named_before_anything_flies(arguments: dict[str, object], field: str) -> None:
+def test_wrong_settings_are_named_before_anything_flies(use: Any, arguments: dict[str, object], field: str) -> None:
     with pytest.raises(dtsa.ConfigError) as caught:
-        dtsa.sweep(**arguments)  # type: ignore[arg-type]
+        use(**arguments)
     assert caught.value.field == field
 
 

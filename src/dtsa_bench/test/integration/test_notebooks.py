@@ -23,10 +23,7 @@ pytestmark = pytest.mark.skipif(not EXAMPLES.is_dir(), reason="the examples are 
 
 
 def run_cells(path: Path) -> tuple[dict[str, Any], list[Any]]:
-    """All cells one after the other, as Jupyter runs them.
-
-    :returns: the notebook's names, and what the last lines of its cells showed.
-    """
+    """All cells one after the other, as Jupyter runs them."""
     names: dict[str, Any] = {"__name__": "__main__"}
     shown: list[Any] = []
     for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
@@ -62,9 +59,7 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
         assert cell.get("execution_count") is None
 
 
-def test_the_notebook_of_the_library_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_notebook_of_the_library_runs(tmp_path, monkeypatch, capsys):
     flight_bag(tmp_path / "runs" / "b" / "bag", slots=60, loss=0.1, agents=6, policy="lease", seed=3)
     damaged = tmp_path / "runs" / "a" / "bag"
     shutil.copytree(tmp_path / "runs" / "b" / "bag", damaged)

@@ -18,7 +18,6 @@ from dtsa_bench.drawing.flight_paths import svg_from_above
 
 
 def lines_of(shown: object) -> list[str]:
-    """What a terminal shows; checks that it is short."""
     lines = repr(shown).splitlines()
     assert len(lines) <= 12
     assert max(map(len, lines)) <= 120

@@ -51,7 +51,6 @@ def some_of(cls: type[Settings], *left_out: str) -> st.SearchStrategy[dict[str, 
 
 
 def allowed(cls: type[Settings], values: dict[str, Any]) -> Any:
-    """The settings, if the values may stand together."""
     try:
         return cls(**values)
     except ConfigError:
@@ -193,7 +192,6 @@ def words() -> tuple[str, ...]:
 
 
 def make(name: str, **fields: tuple[str, Any]) -> type[Settings]:
-    """A settings class."""
     spec = {key: kind for key, (kind, _) in fields.items()}
     body = {key: default for key, (_, default) in fields.items()} | {"__annotations__": spec}
     return dataclasses.dataclass(frozen=True)(type(name, (Settings,), body))

@@ -23,7 +23,6 @@ NONE = np.zeros(3)
 
 
 def record(slot: int, chosen: int, heard: list[Heard], anew: bool = False) -> SlotRecord:
-    """A slot of cf1."""
     start, track = slot * SLOT, np.zeros((1, 3))
     return SlotRecord(slot, start, start, anew, 1, chosen, 0, 0, 0.0, track, NONE, NONE, NONE, heard=heard)
 
@@ -36,12 +35,7 @@ def said(sender: int, slot: int, delay_ns: int, hears: Sequence[int]) -> Heard:
 
 
 def checked(delay_ns: dict[int, int], hears: dict[int, Sequence[int]], silent: Sequence[int] = ()) -> Check:
-    """What cf1 has found after 200 slots.
-
-    :param delay_ns: when frames arrive, by sender; senders that are left out are not heard.
-    :param hears: whom they hear.
-    :param silent: slots whose frames are lost.
-    """
+    """What cf1 has found after 200 slots: delays by sender, whom they hear, and slots whose frames are lost."""
     check = Check(1, CONFIG, NETWORK)
     for slot in range(100, 300):
         sender = slot % 4 + 1
@@ -79,9 +73,7 @@ def test_all_hear_all_in_time() -> None:
         (QUICK, ALL, range(106, 254, 8), ["61% of 49 frames of cf3 heard in time, 80% needed"]),
     ],
 )
-def test_what_is_missing_is_said(
-    delays: dict[int, int], hears: dict[int, Sequence[int]], silent: Sequence[int], missing: list[str]
-) -> None:
+def test_what_is_missing_is_said(delays, hears, silent, missing):
     assert checked(delays, hears, silent).result()["missing"] == missing
 
 

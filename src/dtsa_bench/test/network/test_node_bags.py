@@ -18,7 +18,6 @@ AGENT = "dtsa_agent.ros.agent_node"
 
 
 def words(agent: int, group: str, **more: object) -> list[str]:
-    """Parameters of a node."""
     values = {
         "id": agent, "agents": 2, "air": "udp", "interface": "lo", "group": group, "auth": False, "slot_ms": 20.0,
         "scenario": "waypoints", **more,
