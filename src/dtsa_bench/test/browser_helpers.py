@@ -9,7 +9,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from dtsa_bench.pages.view.server import ViewServer
 
@@ -61,10 +64,23 @@ class Browser:
         """A picture of the window as PNG."""
         return self._page.screenshot()
 
+    def paper(self) -> bytes:
+        """The page printed as PDF."""
+        return self._page.pdf()
+
     def complaints(self) -> list[str]:
         """Errors that the page or its script have given."""
         self._page.wait_for_timeout(0)  # takes in what has been said meanwhile
         return list(self._said)
+
+
+def colours(picture: bytes, directory: Path) -> int:
+    """How many different colours a picture has."""
+    from matplotlib.image import imread
+
+    path = directory / "picture.png"
+    path.write_bytes(picture)
+    return len(np.unique((imread(path)[:, :, :3] * 31).astype(np.uint8).reshape(-1, 3), axis=0))
 
 
 @contextmanager
