@@ -23,7 +23,7 @@ static long step(void)
 
 static void *next(const char *name)
 {
-    void *versioned = dlvsym(RTLD_NEXT, name, "GLIBC_2.3.2");  // of a condition there are two
+    void *versioned = dlvsym(RTLD_NEXT, name, "GLIBC_2.3.2"); // of a condition there are two
     return versioned ? versioned : dlsym(RTLD_NEXT, name);
 }
 
@@ -37,14 +37,14 @@ int clock_gettime(clockid_t clock, struct timespec *now)
 }
 
 // A function that waits until a time by the clock, which the kernel is told by its own.
-#define WAITS(name, parameters, ...)                                \
-    int name(parameters, const struct timespec *until)              \
-    {                                                               \
-        static int (*real)(parameters, const struct timespec *);    \
-        struct timespec right = *until;                             \
-        if (!real) *(void **)&real = next(#name);                   \
-        if (right.tv_sec > 500000000) right.tv_sec -= step();       \
-        return real(__VA_ARGS__, &right);                           \
+#define WAITS(name, parameters, ...)                                                               \
+    int name(parameters, const struct timespec *until)                                             \
+    {                                                                                              \
+        static int (*real)(parameters, const struct timespec *);                                   \
+        struct timespec right = *until;                                                            \
+        if (!real) *(void **)&real = next(#name);                                                  \
+        if (right.tv_sec > 500000000) right.tv_sec -= step();                                      \
+        return real(__VA_ARGS__, &right);                                                          \
     }
 #define BOTH(a, b) a, b
 WAITS(pthread_cond_timedwait, BOTH(pthread_cond_t *c, pthread_mutex_t *m), c, m)
