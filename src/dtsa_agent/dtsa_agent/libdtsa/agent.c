@@ -35,6 +35,30 @@ const char *dtsa_config_fault(const dtsa_config *c)
     return c->lease.open_every < 0 ? "open_every" : NULL;
 }
 
+static uint64_t divisor(uint64_t a, uint64_t b)
+{
+    while (b) {
+        const uint64_t rest = a % b;
+        a = b;
+        b = rest;
+    }
+    return a;
+}
+
+uint64_t dtsa_slot_cycle(const dtsa_config *c)
+{
+    const int rounds = c->lease.main_every ? c->lease.main_every : c->lease.anchor_every;
+    const uint64_t turns = (uint64_t)c->agents * (uint64_t)(rounds > 0 ? rounds : 1) * 2,
+                   open = c->lease.open_every > 0 ? (uint64_t)c->lease.open_every : 1,
+                   all = turns / divisor(turns, open) * open;
+    return ((uint64_t)1 << 32) / all * all;
+}
+
+uint32_t slot_on_air(const dtsa_config *c, int64_t slot)
+{
+    return slot >> 31 ? (uint32_t)((uint64_t)slot % dtsa_slot_cycle(c)) : (uint32_t)slot;
+}
+
 /* ---- memory ---- */
 
 /* Hands out parts of one block; with no block it only counts. */
@@ -177,7 +201,7 @@ int agent_speak(dtsa_agent *a, int64_t slot, uint8_t *out)
 {
     const dtsa_config *c = a->table->config;
     extended_frame e = {.own = {.profile = c->profile, .sender = a->self + 1}};
-    e.own.slot = (uint32_t)slot;
+    e.own.slot = slot_on_air(c, slot);
     e.own.c_r = agent_far_from_goal(a) ? c->c_r : 0;
     for (int i = 0; i < 3; i++) {
         e.own.p[i] = a->position[i];

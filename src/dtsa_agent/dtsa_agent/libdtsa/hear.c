@@ -28,10 +28,11 @@ int frame_admit(const dtsa_config *c, int64_t slot, const uint8_t *data, long le
                e->own.profile == DTSA_PROFILE_EXTENDED) {
         return HEARD_MALFORMED;
     }
-    const uint32_t late = (uint32_t)slot - e->own.slot;
+    const int late = e->own.slot != slot_on_air(c, slot);
     heard->sampled = slot - late;
     /* unknown agents, or a frame of another time (a replay) */
-    if (late > 1 || e->own.sender > c->agents) return HEARD_FOREIGN;
+    if (late && (slot < 1 || e->own.slot != slot_on_air(c, slot - 1))) return HEARD_FOREIGN;
+    if (e->own.sender > c->agents) return HEARD_FOREIGN;
     return !extended || known_ids(c->agents, e, heard->sampled) ? HEARD : HEARD_FOREIGN;
 }
 

@@ -151,6 +151,10 @@ typedef struct dtsa_config {
     int decay_len;                /* 1 or more with estimator intent */
 } dtsa_config;
 
+/* Slot numbers on the air count modulo this: the largest multiple, up to 2^32, of all that policies
+ * which agents can join count in slots. Who joins then takes the same turns as who has counted on. */
+DTSA_API uint64_t dtsa_slot_cycle(const dtsa_config *config);
+
 /* The name of a field that is out of range; NULL: all are fine. */
 DTSA_API const char *dtsa_config_fault(const dtsa_config *config);
 

@@ -1,0 +1,158 @@
+/* A station: one agent with a clock of its own. Datagrams and time in, datagrams and the time of the
+ * next wake-up out. It knows no clock, radio or vehicle and allocates no memory: on a computer, on a
+ * microcontroller and in the simulator the same code runs. The rules: docs/reference/protocol.md.
+ *
+ * Use:
+ *     size_t bytes = dtsa_station_bytes(&settings);                 once; 0: settings are not usable
+ *     dtsa_station *station = dtsa_station_start(memory, bytes, &settings, &agent, now);
+ *     for each datagram:  dtsa_station_receive(station, data, length, arrival);
+ *     when it is due:     due = dtsa_station_step(station, now, datagram, &length);
+ *                         length > 0: send these bytes now, then dtsa_station_sent(station, now, 1)
+ *
+ * Times are ns of the own clock. Datagrams are handed in by their time of arrival, before the step. */
+#ifndef DTSA_STATION_H
+#define DTSA_STATION_H
+
+#include "dtsa.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+enum { DTSA_DATAGRAM_MAX = 512, DTSA_HEADER_MAX = 8, DTSA_NAMES_MAX = 4 };
+
+/* What carries the datagrams; the same for all stations of a swarm. A datagram is the header, how
+ * late it left (2 bytes), names of heard agents (4 bytes each: id, and how late it is heard), the
+ * frame and its tag. */
+typedef struct dtsa_link {
+    uint8_t header[DTSA_HEADER_MAX]; /* equal for all of a swarm */
+    int header_length;               /* 8: with the magic bytes of a network; 0 to 4 elsewhere */
+    int says_late;                   /* datagrams say how late they left */
+    int names;                       /* heard agents that a datagram names, 0 to 4 */
+    int64_t flight_ns;               /* from the order to send until the arrival */
+    int64_t trust_ns; /* frames that are off by more do not show where slots begin */
+} dtsa_link;
+
+enum { DTSA_QUORUM_ALL_BUT_ONE = -1, DTSA_QUORUM_SHARE = -2 };
+
+typedef struct dtsa_station_settings {
+    int id, agents;
+    int anchor_every, main_every; /* an agent sends at least so often, in rounds; one that rests */
+    uint64_t slot_cycle;          /* dtsa_slot_cycle of the configuration */
+    int extended;                 /* profile of the frames */
+    int own_bytes;                /* that plug-ins append to a frame */
+    int frame_length;             /* with them, without a tag */
+    double position_step;         /* m */
+    int64_t slot_ns;
+    uint64_t seed;
+    int64_t moving_slots, resting_slots; /* after which an agent counts as silent; 0: max(2 M N, 0.5
+                                            s), 6 K M N */
+    int quorum;          /* others to hear and be heard by: a number, or DTSA_QUORUM_.. */
+    double quorum_share; /* of the others, 0 to 1 */
+    const uint8_t *key;  /* NULL: frames carry no tag */
+    int key_length;
+    uint64_t session;
+    int early_count; /* frames of slots still to come that are kept, 1 or more */
+    int begins;      /* all begin together: slot 0 starts at origin_ns, nobody listens first */
+    int64_t origin_ns;
+    dtsa_link link;
+} dtsa_station_settings;
+
+/* The agent behind a station. open: a slot opens; decide, return the length of the frame to send
+ * (0: silent), and whom it expects to send. hovers: it is to stay where it is. */
+typedef struct dtsa_station_agent {
+    void *context;
+    int (*open)(void *context, int64_t slot, int hovers, uint8_t frame[DTSA_DATAGRAM_MAX],
+                int *chosen);
+    int (*hear)(void *context, int64_t slot, const uint8_t *frame, long length); /* 1: accepted */
+    void (*unsent)(void *context);               /* the frame of this slot does not leave */
+    void (*close)(void *context, int64_t slot);  /* the slot is over */
+    void (*restart)(void *context);              /* it forgets all but settings, state and goal */
+    void (*leave)(void *context);                /* its next frames say that it leaves */
+    int (*on_probation)(void *context);          /* policy lease */
+} dtsa_station_agent;
+
+/* An agent of libdtsa; context: a dtsa_agent. */
+DTSA_API dtsa_station_agent dtsa_station_agent_of(dtsa_agent *agent);
+
+/* What became of a datagram. */
+typedef enum dtsa_verdict {
+    DTSA_ACCEPTED,
+    DTSA_NOT_OURS,
+    DTSA_WRONG_LENGTH,
+    DTSA_OTHER_SETTINGS,
+    DTSA_NO_FRAME,
+    DTSA_UNKNOWN_AGENT,
+    DTSA_REJECTED, /* its tag is wrong */
+    DTSA_REPEATED,
+    DTSA_OTHER_TIME,
+    DTSA_SAME_ID, /* another agent sends with the own id */
+    DTSA_TOO_EARLY,
+    DTSA_VERDICT_COUNT
+} dtsa_verdict;
+
+/* Why it hovers. */
+enum {
+    DTSA_FLIES,
+    DTSA_HOVERS_LISTENING, /* does not know yet which slot it is */
+    DTSA_HOVERS_NEW,       /* has not sent yet, or not heard a whole round, or is on probation */
+    DTSA_HOVERS_SAME_ID,   /* another agent sends with its id */
+    DTSA_HOVERS_QUORUM,    /* hears, or is heard by, too few */
+    DTSA_HOVER_COUNT
+};
+
+typedef struct dtsa_station_status {
+    int state;                                  /* DTSA_LISTENING.. */
+    int hovers;                                 /* DTSA_FLIES.. */
+    int64_t slot, first;                        /* present slot, and the one with which it began; -1 */
+    int others, hears, heard_by, both, needed;  /* agents, see the quorum */
+    int gone;                                   /* it has said that it leaves */
+    int in_step;                                /* agents heard in the own time, itself included */
+    int64_t flight_error_ns; /* how much longer frames are under way than the link says */
+    uint32_t slots, sent, unsent, heard, restarts, shifts, alignments;
+    uint32_t refused[DTSA_VERDICT_COUNT];
+    int64_t timed, off; /* frames of about the own time; off by over a quarter of a slot */
+} dtsa_station_status;
+
+/* Is told what happens, for a record; any function may be NULL. */
+typedef struct dtsa_station_events {
+    void *context;
+    void (*opened)(void *context, int64_t slot, int64_t start_ns, int64_t now_ns, int is_first);
+    void (*restarted)(void *context); /* the present slot is over, it begins anew with the next */
+    void (*heard)(void *context, int sender, int64_t slot, const uint8_t *datagram, int length,
+                  int64_t arrival_ns, int accepted); /* the slot has begun */
+    void (*refused)(void *context, int verdict, const uint8_t *datagram, long length,
+                    int64_t arrival_ns);
+} dtsa_station_events;
+
+typedef struct dtsa_station dtsa_station;
+
+DTSA_API size_t dtsa_station_bytes(const dtsa_station_settings *settings);
+/* In `memory`, aligned for doubles; NULL: too small, or settings are not usable. Settings are copied
+ * but for the key. It listens, or begins where settings say so. */
+DTSA_API dtsa_station *dtsa_station_start(void *memory, size_t bytes,
+                                          const dtsa_station_settings *settings,
+                                          const dtsa_station_agent *agent, int64_t now_ns);
+DTSA_API void dtsa_station_observe(dtsa_station *station, const dtsa_station_events *events);
+/* Anything may be handed in. */
+DTSA_API dtsa_verdict dtsa_station_receive(dtsa_station *station, const uint8_t *data, long length,
+                                           int64_t arrival_ns);
+/* Does one thing that is due; the agent's state at this moment counts. Returns when to call again at
+ * the latest (now: at once). datagram: room for DTSA_DATAGRAM_MAX bytes, or for the length of one. */
+DTSA_API int64_t dtsa_station_step(dtsa_station *station, int64_t now_ns, uint8_t *datagram,
+                                   int *length);
+/* What became of the datagram that the last step gave: taken 0: the port refused it. */
+DTSA_API void dtsa_station_sent(dtsa_station *station, int64_t now_ns, int taken);
+/* It says on the air that it leaves, where the frames can say so. */
+DTSA_API void dtsa_station_leave(dtsa_station *station);
+DTSA_API int dtsa_station_hovers(const dtsa_station *station); /* DTSA_FLIES.. in this slot */
+DTSA_API int64_t dtsa_station_slot_start(const dtsa_station *station, int64_t slot);
+DTSA_API int64_t dtsa_station_heard_ns(const dtsa_station *station, int id); /* INT64_MIN: never */
+DTSA_API void dtsa_station_get_status(const dtsa_station *station, dtsa_station_status *status);
+DTSA_API int dtsa_datagram_length(const dtsa_station_settings *settings);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,100 @@
+/* Whom an agent hears, which agents hear it, and whether it may fly: the quorum.
+ *
+ * Each datagram names some of the agents that its sender hears, in the order of ids, others each
+ * time. An agent that is missing between two neighbours of such a list is not heard by its sender. A
+ * lost datagram delays what is known; it makes nothing up. An agent hears this one as it has said
+ * last; one that has not said counts as most of those that have.
+ *
+ * All agents of the swarm count that have not said that they leave, whether they are heard or not. */
+#include <math.h>
+
+#include "station.h"
+
+/* Of an extended frame, see frame_extended.c; others have c_r at the same place. */
+enum { LEAVES = 255, MOVES = 1, PROBATION = 2, CYCLES = 8 };
+
+/* Whether the sender of a list hears an agent: 1, -1, or 0: the list does not tell. */
+static int said_of(int agent, const named_peer *names, int count, int most)
+{
+    for (int i = 0; i < count; i++)
+        if (names[i].id == agent) return 1;
+    if (count < most) return -1; /* the list is complete */
+    for (int i = 0; i + 1 < count; i++) {
+        const unsigned ahead = (unsigned)(agent - names[i].id) & 0xffff,
+                       next = (unsigned)(names[i + 1].id - names[i].id) & 0xffff;
+        if (ahead < next) return -1;
+    }
+    return 0;
+}
+
+void contacts_hear(dtsa_station *s, const parsed_datagram *d)
+{
+    peer *p = &s->peers[d->sender - 1];
+    const int names = s->settings.link.names;
+    const int extended = (d->frame[0] & 0xf) == DTSA_PROFILE_EXTENDED;
+    named_peer named[DTSA_NAMES_MAX];
+    int count = 0;
+    p->left = extended && d->frame[2] == LEAVES;
+    p->probation = extended && (d->frame[3] & PROBATION);
+    p->resting = p->probation || !(extended ? d->frame[3] & MOVES : d->frame[3]);
+    if (!names) return;
+    for (int i = 0; i < names; i++)
+        if (d->names[i].id) named[count++] = d->names[i];
+    p->unnamed++;
+    int hears = said_of(s->settings.id, named, count, names);
+    if (!hears && names == 1 && p->unnamed > CYCLES * (s->settings.agents - 1)) hears = -1;
+    if (hears) p->hears_us = (int8_t)hears;
+    if (hears > 0) p->unnamed = 0;
+    if (hears < 0 && p->probation) p->hears_us = 0; /* it has not heard all yet */
+}
+
+static int is_recent(const dtsa_station *s, const peer *p, int64_t when, int64_t now)
+{
+    return when != INT64_MIN && now - when <= (p->resting ? s->resting_ns : s->moving_ns);
+}
+
+int contacts_is_recent(const dtsa_station *s, const peer *p, int64_t now)
+{
+    return is_recent(s, p, p->heard_ns, now);
+}
+
+int contacts_hears(const dtsa_station *s, const peer *p, int64_t now)
+{
+    return !p->left && is_recent(s, p, p->near_ns, now);
+}
+
+static int needed(const dtsa_station *s, int others)
+{
+    const dtsa_station_settings *c = &s->settings;
+    if (c->quorum >= 0) return c->quorum;
+    if (c->quorum == DTSA_QUORUM_SHARE) return (int)ceil(others * c->quorum_share - 1e-9);
+    return others > 1 ? others - 1 : others;
+}
+
+int contacts_have_quorum(dtsa_station *s, int64_t now)
+{
+    dtsa_station_status *n = &s->counts;
+    int yes = 0, no = 0, silent = 0, unsaid = 0;
+    n->others = n->hears = n->heard_by = n->both = 0;
+    for (int k = 0; k < s->settings.agents; k++) {
+        const peer *p = &s->peers[k];
+        if (k == s->settings.id - 1 || p->left) continue;
+        const int hears = contacts_hears(s, p, now);
+        n->hears += hears;
+        n->both += hears && p->hears_us > 0;
+        unsaid += hears && !p->hears_us;
+        yes += p->hears_us > 0;
+        no += p->hears_us < 0;
+        silent += !p->hears_us;
+        n->others++;
+    }
+    n->heard_by = yes;
+    if (!s->settings.link.names || yes > no) {
+        n->heard_by += silent;
+        n->both += unsaid;
+    }
+    if (s->refused_since != INT64_MIN && now - s->refused_since > 500000000) /* nothing leaves it */
+        n->heard_by = n->both = 0;
+    n->needed = needed(s, n->others);
+    return n->both >= n->needed;
+}

@@ -1,0 +1,419 @@
+/* The loop of one agent: it listens, takes the time of the first frame that it hears or begins one of
+ * its own, and from then on opens slot after slot and sends when its turn has come. */
+#include <string.h>
+
+#include "core.h"
+#include "station.h"
+
+/* Of a slot, in thousandths: an agent that has heard all it waits for decides so long before the slot
+ * starts; one that waits for a frame only so long; and from the last moment at which a frame may still
+ * leave until the next slot, since clocks differ. */
+enum { LEAD = 700, LATEST_LEAD = 200, BETWEEN = 200 };
+enum { LEAVES = 255 };
+static const int64_t HALF_SECOND = 500000000;
+
+static int64_t share(int64_t slot_ns, int thousandths) { return slot_ns * thousandths / 1000; }
+
+/* ---- made ---- */
+
+static int is_usable(const dtsa_station_settings *c)
+{
+    const dtsa_link *link = &c->link;
+    const int times = (link->says_late ? 2 : 0) + 4 * link->names;
+    return c->agents >= 1 && c->agents <= DTSA_AGENTS_MAX && c->id >= 1 && c->id <= c->agents &&
+           c->anchor_every >= 1 && c->main_every >= c->anchor_every && c->slot_ns >= 1 &&
+           c->slot_cycle >= 1 && c->frame_length >= 8 && c->own_bytes >= 0 && c->early_count >= 1 && link->names >= 0 &&
+           link->names <= DTSA_NAMES_MAX && link->header_length >= 0 &&
+           link->header_length <= DTSA_HEADER_MAX && link->trust_ns >= 1 &&
+           (!c->key || (c->key_length >= 16 && c->key_length <= 32)) &&
+           link->header_length + times + c->frame_length + DTSA_TAG_BYTES <= DTSA_DATAGRAM_MAX;
+}
+
+static size_t rounded(size_t bytes) { return (bytes + 7) / 8 * 8; }
+
+int dtsa_datagram_length(const dtsa_station_settings *c)
+{
+    return c->link.header_length + (c->link.says_late ? 2 : 0) + 4 * c->link.names + c->frame_length +
+           (c->key ? DTSA_TAG_BYTES : 0);
+}
+
+size_t dtsa_station_bytes(const dtsa_station_settings *c)
+{
+    if (!is_usable(c)) return 0;
+    const size_t n = (size_t)c->agents, early = (size_t)c->early_count;
+    return rounded(sizeof(dtsa_station)) + n * sizeof(peer) + n * sizeof(int64_t) +
+           early * sizeof(early_frame) + rounded(DTSA_DATAGRAM_MAX) +
+           rounded(early * (size_t)dtsa_datagram_length(c));
+}
+
+static void lay_out(dtsa_station *s, uint8_t *at)
+{
+    const size_t n = (size_t)s->settings.agents, early = (size_t)s->settings.early_count;
+    s->peers = (peer *)at;
+    at += n * sizeof(peer);
+    s->sums = (int64_t *)at;
+    at += n * sizeof(int64_t);
+    s->early = (early_frame *)at;
+    at += early * sizeof(early_frame);
+    s->frame = at;
+    at += rounded(DTSA_DATAGRAM_MAX);
+    for (size_t i = 0; i < early; i++) s->early[i].datagram = at + i * (size_t)s->datagram_length;
+    for (size_t k = 0; k < n; k++)
+        s->peers[k] = (peer){.heard_ns = INT64_MIN, .near_ns = INT64_MIN, .last_slot = -1};
+}
+
+static void set_times(dtsa_station *s)
+{
+    const dtsa_station_settings *c = &s->settings;
+    const int64_t slot = c->slot_ns, anchors = (int64_t)c->anchor_every * c->agents * slot,
+                  mains = (int64_t)c->main_every * c->agents * slot;
+    s->round_ns = anchors;
+    s->moving_ns = c->moving_slots ? c->moving_slots * slot : larger(2 * anchors, HALF_SECOND);
+    s->resting_ns = c->resting_slots ? c->resting_slots * slot : larger(6 * mains, HALF_SECOND);
+    s->patience_ns = larger(2 * mains, HALF_SECOND);
+    s->lead_ns = share(slot, LEAD);
+    s->latest_lead_ns = share(slot, LATEST_LEAD);
+    s->latest_send_ns = larger(slot - c->link.flight_ns - share(slot, BETWEEN), slot / 10);
+    s->too_long_ns = larger(500 * slot, 3 * anchors);
+}
+
+static void restart(dtsa_station *s, int64_t now);
+
+dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_settings *settings,
+                                 const dtsa_station_agent *agent, int64_t now)
+{
+    const size_t needed = dtsa_station_bytes(settings);
+    if (!memory || !needed || bytes < needed || (uintptr_t)memory % sizeof(double)) return NULL;
+    dtsa_station *s = memory;
+    memset(memory, 0, needed);
+    s->settings = *settings;
+    s->agent = *agent;
+    s->datagram_length = dtsa_datagram_length(settings);
+    s->head_length =
+        s->datagram_length - settings->frame_length - (settings->key ? DTSA_TAG_BYTES : 0);
+    lay_out(s, (uint8_t *)memory + rounded(sizeof *s));
+    set_times(s);
+    s->aligner = (dtsa_aligner){
+        .receptions = 9, .share = 32768, .limit_ns = settings->link.trust_ns};
+    s->slot = s->first = -1;
+    s->same_id_until = s->refused_since = s->earlier_ns = INT64_MIN;
+    s->hovers = DTSA_HOVERS_LISTENING;
+    if (settings->begins) {
+        s->state = DTSA_JOINED;
+        s->origin_ns = settings->origin_ns;
+        s->in_step_ns = now;
+        s->first = 0;
+    } else {
+        /* Spread over a round of anchors: one agent is the first, and the others hear it while they
+         * still listen. */
+        const uint64_t mixed =
+            mix64(settings->seed * 0x9e3779b97f4a7c15ULL +
+                  (uint64_t)settings->id * 0xd1b54a32d192ed03ULL - 0x9e3779b97f4a7c15ULL);
+        s->state = DTSA_LISTENING;
+        s->deadline_ns = now + s->round_ns + (int64_t)(mixed % (uint64_t)s->round_ns);
+    }
+    return s;
+}
+
+void dtsa_station_observe(dtsa_station *s, const dtsa_station_events *events)
+{
+    s->events = *events;
+}
+
+/* ---- slots ---- */
+
+int64_t dtsa_station_slot_start(const dtsa_station *s, int64_t slot)
+{
+    return s->origin_ns + slot * s->settings.slot_ns;
+}
+
+static void close_slot(dtsa_station *s)
+{
+    if (!s->running) return;
+    if (s->frame_length) { /* it restarts before its turn has come */
+        s->agent.unsent(s->agent.context);
+        s->frame_length = 0;
+    }
+    s->agent.close(s->agent.context, s->slot);
+    s->counts.slots++;
+    s->running = 0;
+}
+
+/* From the next slot on it takes part, knowing nothing. */
+static void restart(dtsa_station *s, int64_t now)
+{
+    close_slot(s);
+    s->slot = clock_slot(s, now + s->lead_ns);
+    s->first = s->slot + 1;
+    s->awaits = s->has_sent = s->early_count = 0;
+    s->newcomer = 1;
+    s->hovers = DTSA_HOVERS_NEW;
+    delay_reset(s);
+    s->agent.restart(s->agent.context);
+    if (s->events.restarted) s->events.restarted(s->events.context);
+    s->counts.restarts++;
+}
+
+static void hear_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t *datagram,
+                       int64_t arrival)
+{
+    const int accepted = s->agent.hear(s->agent.context, slot, datagram + s->head_length,
+                                       s->settings.frame_length);
+    s->counts.heard += (uint32_t)accepted;
+    if (s->awaits && slot >= s->slot) s->awaits = 0;
+    if (s->events.heard)
+        s->events.heard(s->events.context, sender, slot, datagram, s->datagram_length, arrival,
+                        accepted);
+}
+
+/* Whether it hovers because the others do not know it yet, or it does not know them. */
+static int is_new(dtsa_station *s, int64_t slot)
+{
+    if (s->newcomer && s->has_sent && slot >= s->first + s->settings.agents &&
+        !s->agent.on_probation(s->agent.context))
+        s->newcomer = 0;
+    return s->newcomer;
+}
+
+static int why_it_hovers(dtsa_station *s, int64_t slot, int64_t now)
+{
+    const int quorum = contacts_have_quorum(s, now);
+    if (is_new(s, slot)) return DTSA_HOVERS_NEW;
+    if (now < s->same_id_until) return DTSA_HOVERS_SAME_ID;
+    return quorum ? DTSA_FLIES : DTSA_HOVERS_QUORUM;
+}
+
+static void hear_early(dtsa_station *s)
+{
+    int kept = 0;
+    for (int i = 0; i < s->early_count; i++) {
+        const early_frame e = s->early[i];
+        if (e.slot > s->slot) {
+            s->early[i] = s->early[kept];
+            s->early[kept++] = e;
+        } else {
+            hear_frame(s, e.sender, e.slot, e.datagram, e.arrival_ns);
+        }
+    }
+    s->early_count = kept;
+}
+
+static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
+{
+    int chosen = 0;
+    close_slot(s);
+    s->hovers = why_it_hovers(s, slot, now);
+    s->slot = slot;
+    s->frame_length = s->agent.open(s->agent.context, slot, s->hovers != DTSA_FLIES, s->frame, &chosen);
+    if (s->frame_length && s->newcomer && now < s->same_id_until) { /* the other was here before */
+        s->agent.unsent(s->agent.context);
+        s->frame_length = 0;
+    }
+    s->running = 1;
+    s->awaits = chosen && chosen != s->settings.id;
+    if (s->events.opened)
+        s->events.opened(s->events.context, slot, dtsa_station_slot_start(s, slot), now,
+                         slot == s->first);
+    hear_early(s);
+}
+
+/* ---- the own frame ---- */
+
+/* The frame that lies ready, unless it would disturb the next turn. */
+static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
+{
+    const int64_t late = now - dtsa_station_slot_start(s, s->slot);
+    if (late > s->latest_send_ns) {
+        s->agent.unsent(s->agent.context);
+        s->frame_length = 0;
+        s->counts.unsent++;
+        return 0;
+    }
+    datagram_write(s, now, late, datagram);
+    s->frame_length = 0;
+    s->sent_hashes[s->sent_index++ % SENT_HISTORY_LENGTH] =
+        datagram_hash(datagram, s->datagram_length);
+    s->counts.sent++;
+    s->has_sent = 1;
+    if (s->leaving && (!s->settings.extended || s->frame[2] == LEAVES)) s->gone = 1;
+    return s->datagram_length;
+}
+
+void dtsa_station_sent(dtsa_station *s, int64_t now, int taken)
+{
+    if (taken) {
+        s->refused_since = INT64_MIN;
+        return;
+    }
+    if (s->refused_since == INT64_MIN) s->refused_since = now;
+    s->agent.unsent(s->agent.context);
+    s->counts.sent--;
+    s->counts.unsent++;
+}
+
+void dtsa_station_leave(dtsa_station *s)
+{
+    if (!s->leaving) s->agent.leave(s->agent.context);
+    s->leaving = 1;
+}
+
+/* ---- what arrives ---- */
+
+static dtsa_verdict refuse(dtsa_station *s, dtsa_verdict verdict, const uint8_t *data, long length,
+                           int64_t arrival)
+{
+    s->counts.refused[verdict]++;
+    if (s->events.refused) s->events.refused(s->events.context, verdict, data, length, arrival);
+    return verdict;
+}
+
+/* A datagram with the own id: an echo or a replay of an own one, or another agent of that id. */
+static dtsa_verdict hear_own_id(dtsa_station *s, const uint8_t *data, long length, int64_t arrival,
+                                int64_t apart)
+{
+    const uint64_t hash = datagram_hash(data, length);
+    for (int i = 0; i < SENT_HISTORY_LENGTH; i++)
+        if (s->sent_hashes[i] == hash) return DTSA_REPEATED;
+    if (apart >= s->settings.slot_ns / 2 || apart <= -s->settings.slot_ns / 2) return DTSA_OTHER_TIME;
+    s->same_id_until = arrival + s->patience_ns;
+    return DTSA_SAME_ID;
+}
+
+static void keep_early(dtsa_station *s, int sender, int64_t slot, const uint8_t *data,
+                       int64_t arrival)
+{
+    if (s->early_count == s->settings.early_count) {
+        refuse(s, DTSA_TOO_EARLY, data, s->datagram_length, arrival);
+        return;
+    }
+    early_frame *e = &s->early[s->early_count++];
+    e->slot = slot;
+    e->sender = sender;
+    e->arrival_ns = arrival;
+    memcpy(e->datagram, data, (size_t)s->datagram_length);
+}
+
+static void note_offset(dtsa_station *s, int64_t off)
+{
+    enum { NEAR_SLOTS = 8 };
+    if (off < 0) off = -off;
+    if (s->state == DTSA_LISTENING || off > NEAR_SLOTS * s->settings.slot_ns) return;
+    s->counts.timed++;
+    s->counts.off += off > s->settings.slot_ns / 4;
+}
+
+dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long length, int64_t arrival)
+{
+    const dtsa_station_settings *c = &s->settings;
+    parsed_datagram d;
+    dtsa_verdict verdict = datagram_parse(s, data, length, &d);
+    if (!verdict && !datagram_has_frame(s, &d)) verdict = DTSA_NO_FRAME;
+    if (verdict) return refuse(s, verdict, data, length, arrival);
+    const int listens = s->state == DTSA_LISTENING;
+    const int64_t began = arrival - c->link.flight_ns - d.late_ns,
+                  start = began - s->flight_error_ns;
+    int64_t slot = listens ? (int64_t)d.slot : clock_unwrap(s, d.slot, start);
+    const int64_t expected = dtsa_station_slot_start(s, slot);
+    peer *p = &s->peers[d.sender - 1];
+    if (d.sender == c->id) {
+        verdict = listens ? DTSA_OTHER_TIME : hear_own_id(s, data, length, arrival, start - expected);
+        return refuse(s, verdict, data, length, arrival);
+    }
+    if (p->last_slot == d.slot && !listens) return refuse(s, DTSA_REPEATED, data, length, arrival);
+    p->last_slot = d.slot;
+    note_offset(s, start - expected);
+    const int outcome = clock_hear(s, d.sender - 1, start - slot * c->slot_ns, arrival);
+    if (outcome == OTHER) return refuse(s, DTSA_OTHER_TIME, data, length, arrival);
+    if (outcome == RESTARTED) {
+        slot = (int64_t)d.slot;
+        s->origin_ns = start - slot * c->slot_ns;
+        restart(s, arrival);
+    } else {
+        s->counts.shifts += outcome == SHIFTED;
+        delay_hear(s, &d, began - expected);
+        delay_shift(s, dtsa_station_slot_start(s, slot) - expected);
+    }
+    contacts_hear(s, &d);
+    if (slot > s->slot)
+        keep_early(s, d.sender, slot, data, arrival);
+    else if (slot >= s->first - 1)
+        hear_frame(s, d.sender, slot, data, arrival);
+    return DTSA_ACCEPTED;
+}
+
+/* ---- what is due ---- */
+
+int64_t dtsa_station_step(dtsa_station *s, int64_t now, uint8_t *datagram, int *length)
+{
+    *length = 0;
+    if (s->state == DTSA_LISTENING) {
+        if (now < s->deadline_ns) return s->deadline_ns;
+        /* Not slot 0: that is for agents that are told to begin together. */
+        s->origin_ns = now - s->round_ns;
+        s->state = DTSA_ALONE;
+        s->in_step_ns = now;
+        restart(s, now);
+    }
+    if (s->frame_length) {
+        const int64_t start = dtsa_station_slot_start(s, s->slot);
+        if (now < start) return start;
+        *length = send(s, now, datagram);
+        return now;
+    }
+    const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
+    const int64_t due = next - (s->awaits ? s->latest_lead_ns : s->lead_ns);
+    if (now < due) return due;
+    if (now - next > s->too_long_ns)
+        restart(s, now);
+    else
+        open_slot(s, s->slot + 1, now);
+    return now;
+}
+
+int dtsa_station_hovers(const dtsa_station *s) { return s->hovers; }
+
+int64_t dtsa_station_heard_ns(const dtsa_station *s, int id)
+{
+    return id >= 1 && id <= s->settings.agents ? s->peers[id - 1].heard_ns : INT64_MIN;
+}
+
+void dtsa_station_get_status(const dtsa_station *s, dtsa_station_status *status)
+{
+    *status = s->counts;
+    status->state = s->state;
+    status->hovers = s->hovers;
+    status->slot = s->slot;
+    status->first = s->first;
+    status->gone = s->gone;
+    status->flight_error_ns = s->flight_error_ns;
+    status->alignments = s->aligner.corrections;
+    status->in_step = s->state == DTSA_LISTENING ? 0 : clock_in_step(s, s->origin_ns + s->slot * s->settings.slot_ns);
+}
+
+/* ---- an agent of libdtsa behind it ---- */
+
+static int agent_open(void *context, int64_t slot, int hovers, uint8_t frame[DTSA_DATAGRAM_MAX],
+                      int *chosen)
+{
+    dtsa_agent_hover(context, hovers);
+    const int length = dtsa_agent_slot(context, slot, frame);
+    *chosen = dtsa_agent_decision(context).chosen;
+    return length;
+}
+
+static int agent_hear(void *context, int64_t slot, const uint8_t *frame, long length)
+{
+    return dtsa_agent_hear(context, slot, frame, length);
+}
+
+static void agent_unsent(void *context) { dtsa_agent_unsent(context); }
+static void agent_close(void *context, int64_t slot) { dtsa_agent_end(context, slot); }
+static void agent_restart(void *context) { dtsa_agent_restart(context); }
+static void agent_leave(void *context) { dtsa_agent_leave(context); }
+static int on_probation(void *context) { return dtsa_agent_status(context).probation; }
+
+dtsa_station_agent dtsa_station_agent_of(dtsa_agent *agent)
+{
+    return (dtsa_station_agent){agent,       agent_open,    agent_hear,  agent_unsent,
+                                agent_close, agent_restart, agent_leave, on_probation};
+}

@@ -1,0 +1,120 @@
+/* Inside a station. Which file does what: datagram.c reads and writes datagrams, clock.c says when
+ * slots begin, delay.c how long frames are under way, contacts.c who hears whom, station.c is the
+ * loop. The same in plain Python: core/reference/station.py. */
+#ifndef DTSA_STATION_INTERNAL_H
+#define DTSA_STATION_INTERNAL_H
+
+#include "dtsa_station.h"
+#include "frame.h"
+
+enum { SENT_HISTORY_LENGTH = 16 };
+
+/* An agent that a datagram names, and how much later than expected its sender hears it. */
+typedef struct named_peer {
+    int id; /* 0: none */
+    int64_t late_ns;
+} named_peer;
+
+typedef struct parsed_datagram {
+    int sender;
+    uint32_t slot; /* as on the air */
+    int64_t late_ns;
+    named_peer names[DTSA_NAMES_MAX];
+    const uint8_t *frame;
+    long frame_length; /* without the tag */
+} parsed_datagram;
+
+enum { KNOWS_OFFSET = 1, KNOWS_REPORT = 2, KNOWS_SUM = 4 };
+
+/* What is known of another agent. */
+typedef struct peer {
+    int64_t heard_ns, origin_ns; /* its last frame: arrival (INT64_MIN: none), start of its slot 0 */
+    int64_t near_ns; /* arrival of its last frame that fits the own slots; INT64_MIN: none */
+    int64_t last_slot;           /* of that frame, as on the air; -1: none */
+    int64_t offset_ns, report_ns, sum_ns; /* see delay.c */
+    int32_t unnamed;                      /* its datagrams since it named this agent */
+    int8_t hears_us;                      /* 1: yes, -1: no, 0: it has not said */
+    uint8_t steady; /* its last two frames show the same time */
+    uint8_t known, resting, probation, left;
+} peer;
+
+typedef struct early_frame {
+    int64_t slot, arrival_ns;
+    int sender;
+    long length;
+    uint8_t *datagram;
+} early_frame;
+
+struct dtsa_station {
+    dtsa_station_settings settings;
+    dtsa_station_agent agent;
+    dtsa_station_events events;
+    int datagram_length, head_length; /* bytes; of these before the frame */
+    int64_t moving_ns, resting_ns, patience_ns, round_ns;
+    int64_t lead_ns, latest_lead_ns, latest_send_ns, too_long_ns;
+
+    /* When slots begin. */
+    int state;
+    int64_t origin_ns, deadline_ns; /* start of slot 0; when listening ends */
+    dtsa_aligner aligner;
+    int64_t in_step_ns;                /* last frame of the own time, or the beginning */
+    int64_t earlier_since, earlier_ns; /* an earlier time is heard since, and was last; INT64_MIN */
+
+    /* How long frames are under way. */
+    int64_t flight_error_ns;
+    int64_t *sums; /* (agents) of all pairs, ascending */
+    int sum_count, name_turn;
+
+    peer *peers; /* (agents) */
+    int64_t same_id_until, refused_since; /* INT64_MIN: not so */
+
+    /* The loop. */
+    int64_t slot, first;
+    int running, awaits, newcomer, has_sent, hovers, leaving, gone;
+    int frame_length; /* of the frame that lies ready, 0: none */
+    uint8_t *frame;
+    early_frame *early;
+    int early_count;
+    uint64_t sent_hashes[SENT_HISTORY_LENGTH];
+    unsigned sent_index;
+    dtsa_station_status counts;
+};
+
+static inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
+
+static inline int64_t limited(int64_t value, int64_t limit)
+{
+    return value < -limit ? -limit : value > limit ? limit : value;
+}
+
+static inline int64_t floor_div(int64_t a, int64_t b) /* b > 0 */ { return a / b - (a % b < 0); }
+
+/* datagram.c */
+dtsa_verdict datagram_parse(const dtsa_station *s, const uint8_t *data, long length,
+                            parsed_datagram *out);
+int datagram_has_frame(const dtsa_station *s, const parsed_datagram *d);
+void datagram_write(dtsa_station *s, int64_t now, int64_t late_ns, uint8_t *out);
+uint64_t datagram_hash(const uint8_t *data, long length);
+
+/* clock.c */
+enum { IN_STEP, SHIFTED, RESTARTED, OTHER };
+/* A frame of peer k shows that slot 0 began at origin_ns. */
+int clock_hear(dtsa_station *s, int k, int64_t origin_ns, int64_t arrival_ns);
+int64_t clock_slot(const dtsa_station *s, int64_t now);
+int64_t clock_unwrap(const dtsa_station *s, uint32_t slot, int64_t now);
+int64_t clock_apart(const dtsa_station *s, int64_t a_ns, int64_t b_ns); /* a - b, of two origins */
+int clock_in_step(const dtsa_station *s, int64_t now); /* agents of the own time, with itself */
+
+/* delay.c */
+void delay_hear(dtsa_station *s, const parsed_datagram *d, int64_t offset_ns);
+void delay_shift(dtsa_station *s, int64_t by_ns);
+void delay_reset(dtsa_station *s);
+void delay_name(dtsa_station *s, int64_t now, named_peer out[DTSA_NAMES_MAX]);
+
+/* contacts.c */
+void contacts_hear(dtsa_station *s, const parsed_datagram *d);
+int contacts_is_recent(const dtsa_station *s, const peer *p, int64_t now);
+int contacts_hears(const dtsa_station *s, const peer *p, int64_t now);
+int contacts_have_quorum(dtsa_station *s, int64_t now); /* fills the counts */
+
+#endif
