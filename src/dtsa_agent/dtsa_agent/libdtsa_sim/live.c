@@ -494,7 +494,9 @@ static void change_goals(live *v)
         host *h = &v->host[i];
         if (!h->on || below(v, 2)) continue;
         const int there = (int)below(v, 2);
-        dtsa_agent_set_goal(h->agent, there ? h->away : h->home, 0);
+        const double *goal = there ? h->away : h->home;
+        dtsa_agent_set_goal(h->agent, goal, 0);
+        tell(v, (live_call){.host = i, .kind = 6, .position = {goal[0], goal[1], goal[2]}});
     }
     push(v, v->now + v->f->goal_every_ns, GOALS, 0);
 }

@@ -79,7 +79,7 @@ typedef struct live_result {
 
 /* A call of a station, for whoever makes them again: after it, its answer. */
 typedef struct live_call {
-    int host, kind; /* 0: started, 1: receive, 2: step, 3: sent, 4: leave, 5: ended */
+    int host, kind; /* 0: started, 1: receive, 2: step, 3: sent, 4: leave, 5: ended, 6: goal */
     int64_t now_ns;
     const uint8_t *data;
     long length;

@@ -68,7 +68,7 @@ typedef struct dtsa_station_agent {
     void (*unsent)(void *context);               /* the frame of this slot does not leave */
     void (*close)(void *context, int64_t slot);  /* the slot is over */
     void (*restart)(void *context);              /* it forgets all but settings, state and goal */
-    void (*leave)(void *context);                /* its next frames say that it leaves */
+    int (*leave)(void *context); /* 1: its next frame says that it leaves; 0: it is off */
     int (*on_probation)(void *context);          /* policy lease */
 } dtsa_station_agent;
 

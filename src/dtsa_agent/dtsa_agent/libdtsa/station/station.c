@@ -235,7 +235,7 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
         datagram_hash(datagram, s->datagram_length);
     s->counts.sent++;
     s->has_sent = 1;
-    if (s->leaving && (!s->settings.extended || s->frame[2] == LEAVES)) s->gone = 1;
+    if (s->leaving && s->frame[2] == LEAVES) s->gone = 1;
     return s->datagram_length;
 }
 
@@ -253,7 +253,7 @@ void dtsa_station_sent(dtsa_station *s, int64_t now, int taken)
 
 void dtsa_station_leave(dtsa_station *s)
 {
-    if (!s->leaving) s->agent.leave(s->agent.context);
+    if (!s->leaving && !s->agent.leave(s->agent.context)) s->gone = 1;
     s->leaving = 1;
 }
 
@@ -409,7 +409,12 @@ static int agent_hear(void *context, int64_t slot, const uint8_t *frame, long le
 static void agent_unsent(void *context) { dtsa_agent_unsent(context); }
 static void agent_close(void *context, int64_t slot) { dtsa_agent_end(context, slot); }
 static void agent_restart(void *context) { dtsa_agent_restart(context); }
-static void agent_leave(void *context) { dtsa_agent_leave(context); }
+static int agent_leave(void *context)
+{
+    dtsa_agent_leave(context);
+    return dtsa_agent_is_on(context);
+}
+
 static int on_probation(void *context) { return dtsa_agent_status(context).probation; }
 
 dtsa_station_agent dtsa_station_agent_of(dtsa_agent *agent)

@@ -1,0 +1,532 @@
+"""A station: one agent with a clock of its own. Datagrams and time in, datagrams and the time of the next wake-up out.
+
+Every frame shows when its sender's slot 0 began: its *origin*. An agent has an origin of its own and moves it a little
+towards those that it hears. A frame whose origin is off by more than the link is trusted with shows another time; see
+:meth:`Station._gives_way` for whose time counts where two groups meet. An agent flies only while it hears, and is heard
+by, a quorum of the others. All times are ns of the own clock; the same in C: ``libdtsa/station``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from . import tag
+from .agent import LEAVES, Agent, Foreign, Receiver, hear, parse
+from .arithmetic import mix64
+from .frame import Refused, decode
+from .rules import EXTENDED, OFF, Rules
+
+Datagram = bytes
+Ns = int  # ns, own clock
+
+ACCEPTED, NOT_OURS, WRONG_LENGTH, OTHER_SETTINGS, NO_FRAME, UNKNOWN_AGENT = range(6)
+REJECTED, REPEATED, OTHER_TIME, SAME_ID, TOO_EARLY = range(6, 11)  # what became of a datagram
+LISTENING, ALONE, JOINED = range(3)
+FLIES, HOVERS_LISTENING, HOVERS_NEW, HOVERS_SAME_ID, HOVERS_QUORUM = range(5)
+IN_STEP, SHIFTED, RESTARTED, OTHER = range(4)  # what a frame says of the time
+
+LATE_UNIT_NS = 10_000
+HALF_SECOND_NS = 500_000_000
+RECEPTIONS = 9  # offsets of frames that one alignment takes the median of
+SENT_HISTORY_LENGTH = 16
+LEAVING, PROBATION, MOVES = 255, 2, 1  # of an extended frame, bytes 2 and 3
+CYCLES = 8  # of lists of one name each, after which an agent that was not named is not heard
+ALL_BUT_ONE, SHARE = -1, -2
+
+
+class Link(NamedTuple):
+    """What carries the datagrams; the same for all stations of a swarm."""
+
+    header: bytes
+    says_late: bool
+    names: int  # heard agents that a datagram names
+    flight_ns: int
+    trust_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Of one station, beside the rules."""
+
+    id: int
+    slot_ns: int
+    seed: int
+    link: Link
+    quorum: int = ALL_BUT_ONE
+    quorum_share: float = 0.0
+    key: bytes = b""
+    session: int = 0
+    early_count: int = 64
+    begins_ns: int | None = None  # start of slot 0, where all begin together
+
+
+class Parsed(NamedTuple):
+    """What a datagram says."""
+
+    sender: int
+    slot: int  # as on the air
+    late_ns: int
+    names: tuple[tuple[int, int], ...]  # id, and how much later than expected its sender hears it, ns
+    frame: bytes
+
+
+@dataclass(slots=True)
+class Peer:
+    """What is known of another agent."""
+
+    heard_ns: int | None = None  # arrival of its last frame
+    origin_ns: int = 0  # ... and what that shows
+    near_ns: int | None = None  # arrival of its last frame that fits the own slots
+    last_slot: int = -1  # as on the air
+    steady: bool = False  # its last two frames show the same time
+    offset_ns: int | None = None  # how much later than expected it is heard
+    report_ns: int | None = None  # how much later than expected it says to hear this agent
+    sum_ns: int | None = None
+    unnamed: int = 0
+    hears_us: int = 0  # 1: yes, -1: no, 0: it has not said
+    resting: bool = False
+    probation: bool = False
+    left: bool = False
+
+
+@dataclass(slots=True)
+class Counts:
+    """How the others stand with an agent."""
+
+    others: int = 0
+    hears: int = 0
+    heard_by: int = 0
+    both: int = 0
+    needed: int = 0
+
+
+def slot_cycle(rules: Rules) -> int:
+    """Slot numbers on the air count modulo this: a multiple of all that policies count in slots."""
+    return 2**32 // (period := math.lcm(2 * rules.agents * rules.main_every, max(rules.open_every, 1))) * period
+
+
+def slot_on_air(rules: Rules, slot: int) -> int:
+    """The number of a slot as frames have it."""
+    return slot % slot_cycle(rules)
+
+
+def centred(a: int, b: int) -> int:
+    """``a`` modulo ``b``, from -b/2 to b/2."""
+    rest = a % b
+    return rest - b if rest > b // 2 else rest
+
+
+def limited(value: int, limit: int) -> int:
+    return min(max(value, -limit), limit)
+
+
+@dataclass
+class Station:
+    """See the module. ``sense`` sets the agent's state before each step."""
+
+    settings: Settings
+    rules: Rules
+    agent: Agent
+    now: Ns
+    rounds: int  # an agent that rests sends at least so often, in rounds
+    on_restart: Callable[[], None] = lambda: None
+    peers: list[Peer] = field(init=False)
+
+    def __post_init__(self) -> None:
+        c, n, slot_ns = self.settings, self.rules.agents, self.settings.slot_ns
+        anchors, mains = self.rules.anchor_every * n * slot_ns, self.rounds * n * slot_ns
+        self.peers = [Peer() for _ in range(n)]
+        self.cycle = slot_cycle(self.rules)
+        self.begun = tag.keyed(c.key, c.session) if c.key else None
+        self.head_length = len(c.link.header) + 2 * c.link.says_late + 4 * c.link.names
+        self.frame_length = {"paper": 19, "paper-intent": 23, EXTENDED: 56}[self.rules.profile]
+        self.datagram_length = self.head_length + self.frame_length + (tag.LENGTH if c.key else 0)
+        self.round_ns = anchors
+        self.moving_ns, self.resting_ns = max(2 * anchors, HALF_SECOND_NS), max(6 * mains, HALF_SECOND_NS)
+        self.patience_ns, self.too_long_ns = max(2 * mains, HALF_SECOND_NS), max(500 * slot_ns, 3 * anchors)
+        self.lead_ns, self.latest_lead_ns = slot_ns * 700 // 1000, slot_ns * 200 // 1000
+        self.latest_send_ns = max(slot_ns - c.link.flight_ns - slot_ns * 200 // 1000, slot_ns // 10)
+        self.offsets: list[int] = []
+        self.in_step_ns, self.earlier_since, self.earlier_ns = self.now, 0, None
+        self.flight_error_ns, self.sums, self.name_turn = 0, [], 0
+        self.same_id_until = self.refused_since = None
+        self.slot, self.first, self.origin_ns = -1, -1, 0
+        self.running = self.awaits = self.newcomer = self.has_sent = self.leaving = self.gone = False
+        self.hovers, self.frame, self.counts = HOVERS_LISTENING, b"", Counts()
+        self.early: list[tuple[int, int, bytes]] = []
+        self.sent_history: deque[bytes] = deque(maxlen=SENT_HISTORY_LENGTH)
+        if c.begins_ns is not None:
+            self.state, self.origin_ns, self.first = JOINED, c.begins_ns, 0
+        else:  # spread over a round of anchors: one is the first, and the others hear it while they still listen
+            mixed = mix64(c.seed * 0x9E3779B97F4A7C15 + c.id * 0xD1B54A32D192ED03 - 0x9E3779B97F4A7C15)
+            self.state, self.deadline_ns = LISTENING, self.now + self.round_ns + mixed % self.round_ns
+
+    # Datagrams.
+
+    def _parse(self, data: Datagram) -> Parsed | int:
+        """What a datagram says, or why it says nothing."""
+        link, agreed = self.settings.link, len(self.settings.link.header)
+        if agreed == 8 and (len(data) < 3 or data[:3] != link.header[:3]):
+            return NOT_OURS
+        if len(data) < agreed:
+            return WRONG_LENGTH
+        if data[:agreed] != link.header:
+            return OTHER_SETTINGS
+        if len(data) != self.datagram_length:
+            return WRONG_LENGTH
+        times, frame = data[agreed : self.head_length], data[self.head_length :]
+        if len(frame) < 8 or frame[0] >> 4 != 1 or frame[0] & 0xF > 2:
+            return NO_FRAME
+        sender = frame[1] if frame[0] & 0xF == 2 else int.from_bytes(frame[1:3], "little")
+        slot = int.from_bytes(frame[4:8], "little")
+        if not 1 <= sender <= self.rules.agents:
+            return UNKNOWN_AGENT
+        if self.begun is not None:
+            frame, given = frame[: -tag.LENGTH], frame[-tag.LENGTH :]
+            if tag.tag(self.begun, slot, frame + times) != given:
+                return REJECTED
+        if slot >= self.cycle:
+            return NO_FRAME
+        if self.begun is None:
+            try:
+                decode(frame, self.rules.position_step)
+            except Refused:
+                return NO_FRAME
+        late = int.from_bytes(times[:2], "little") * LATE_UNIT_NS if link.says_late else 0
+        at = times[2 * link.says_late :]
+        names = [
+            (int.from_bytes(at[i : i + 2], "little"), int.from_bytes(at[i + 2 : i + 4], "little", signed=True))
+            for i in range(0, len(at), 4)
+        ]
+        return Parsed(sender, slot, late, tuple((k, by * LATE_UNIT_NS) for k, by in names), frame)
+
+    def _write(self, late_ns: int, now: Ns) -> Datagram:
+        link = self.settings.link
+        times = min(max(late_ns // LATE_UNIT_NS, 0), 0xFFFF).to_bytes(2, "little") if link.says_late else b""
+        named = self._names(now)
+        for k, by in named + [(0, 0)] * (link.names - len(named)):
+            units = min(max(by // LATE_UNIT_NS, -0x8000), 0x7FFF)
+            times += k.to_bytes(2, "little") + units.to_bytes(2, "little", signed=True)
+        mac = b"" if self.begun is None else tag.tag(self.begun, slot_on_air(self.rules, self.slot), self.frame + times)
+        return link.header + times + self.frame + mac
+
+    # When slots begin.
+
+    def slot_start_ns(self, slot: int) -> Ns:
+        return self.origin_ns + slot * self.settings.slot_ns
+
+    def _slot_at(self, now: Ns) -> int:
+        return (now - self.origin_ns) // self.settings.slot_ns
+
+    def _apart(self, a_ns: Ns, b_ns: Ns) -> int:
+        return centred(a_ns - b_ns, self.cycle * self.settings.slot_ns)
+
+    def _is_same(self, a_ns: Ns, b_ns: Ns) -> bool:
+        return abs(self._apart(a_ns, b_ns)) <= self.settings.link.trust_ns
+
+    def _is_near(self, origin_ns: Ns) -> bool:
+        """Whether slots agree, if their numbers count from there."""
+        half = self.settings.slot_ns // 2
+        return -half < self._apart(origin_ns, self.origin_ns) < half
+
+    def in_step(self, now: Ns) -> int:
+        """Agents heard lately in the own time, with itself."""
+        return 1 + sum(self._is_recent(p, p.heard_ns, now) and self._is_same(p.origin_ns, self.origin_ns) for p in self.peers)
+
+    def _align(self, offset_ns: int) -> int:
+        """By how much the own slots move: half the median of some frames' offsets."""
+        self.offsets.append(offset_ns)
+        if len(self.offsets) < RECEPTIONS:
+            return 0
+        ordered = sorted(self.offsets)
+        twice = ordered[RECEPTIONS // 2] + ordered[~(RECEPTIONS // 2)]
+        self.offsets.clear()
+        size = (abs(twice) * 32768 + 65536) // 131072  # half away from zero: both directions weigh the same
+        return size if twice >= 0 else -size
+
+    def _gives_way(self, origin_ns: Ns, now: Ns) -> bool:
+        """Whether the time that a frame shows is taken over.
+
+        That is so when most of all agents heard lately are in it, or half of them and it is the earlier one; or, after
+        some patience, when no other agent is heard in the own one, or it is the earlier one and less than half of the
+        swarm is in the own one.
+        """
+        recent = [p for p in self.peers if self._is_recent(p, p.heard_ns, now)]
+        every = 1 + len(recent)
+        here = 1 + sum(self._is_same(p.origin_ns, self.origin_ns) for p in recent)
+        there = sum(p.steady and self._is_same(p.origin_ns, origin_ns) for p in recent)
+        earlier = self._apart(origin_ns, self.origin_ns) < 0
+        if 2 * there > every or (2 * there == every and earlier):
+            return True
+        if not there:
+            return False
+        if now - self.in_step_ns > self.patience_ns:
+            return True
+        if not earlier or 2 * here > self.rules.agents:
+            return False
+        if self.earlier_ns is None or now - self.earlier_ns > self.patience_ns:
+            self.earlier_since = now
+        self.earlier_ns = now
+        return now - self.earlier_since > self.patience_ns
+
+    def _take_over(self, origin_ns: Ns, now: Ns) -> None:
+        self.offsets.clear()
+        self.origin_ns, self.in_step_ns, self.earlier_ns, self.state = origin_ns, now, None, JOINED
+        for p in self.peers:
+            p.near_ns = p.heard_ns if self._is_near(p.origin_ns) else None
+
+    def _hear_time(self, p: Peer, origin_ns: Ns, arrival: Ns) -> int:
+        p.steady = p.heard_ns is not None and self._is_same(p.origin_ns, origin_ns)
+        p.heard_ns, p.origin_ns = arrival, origin_ns
+        if self.state == LISTENING:
+            self._take_over(origin_ns, arrival)
+            return RESTARTED
+        apart, near = self._apart(origin_ns, self.origin_ns), self._is_near(origin_ns)
+        if near:
+            p.near_ns = arrival
+        if self._is_same(origin_ns, self.origin_ns):
+            self.origin_ns += self._align(apart)
+            self.in_step_ns, self.state = arrival, JOINED
+            return IN_STEP
+        if not self._gives_way(origin_ns, arrival):
+            return IN_STEP if near else OTHER
+        self._take_over(self.origin_ns + apart if near else origin_ns, arrival)
+        return SHIFTED if near else RESTARTED
+
+    # How long frames are under way. What i hears of j comes later by d + o_j - o_i, what j hears of i by d + o_i - o_j.
+
+    def _hear_delay(self, p: Peer, names: Sequence[tuple[int, int]], offset_ns: int) -> None:
+        limit = self.settings.slot_ns // 4
+        p.offset_ns = limited(offset_ns, limit)
+        for name, late_ns in names:
+            if name == self.settings.id:
+                p.report_ns = limited(late_ns, limit)
+        if p.report_ns is not None:
+            if p.sum_ns is not None:
+                self.sums.remove(p.sum_ns)
+            p.sum_ns = p.offset_ns + p.report_ns
+            self.sums = sorted([*self.sums, p.sum_ns])
+        if self.sums:
+            twice = self.sums[len(self.sums) // 2] + self.sums[(len(self.sums) - 1) // 2]
+            self.flight_error_ns += limited(twice // 4 - self.flight_error_ns, 1_000_000) // 64
+
+    def _shift_delays(self, by_ns: int) -> None:
+        for p in self.peers:
+            p.offset_ns = None if p.offset_ns is None else p.offset_ns - by_ns
+            p.report_ns = None if p.report_ns is None else p.report_ns + by_ns
+
+    def _names(self, now: Ns) -> list[tuple[int, int]]:
+        """The heard agents in turn, in the order of ids, the last one again: a gap between neighbours tells as well."""
+        heard = [k for k, p in enumerate(self.peers) if p.offset_ns is not None and self._hears(p, now)]
+        count, turn = min(len(heard), self.settings.link.names), self.name_turn
+        named = [heard[(turn + i) % len(heard)] for i in range(count)]
+        if heard:
+            self.name_turn = (turn % len(heard) + (count - 1 if count > 1 else count)) % len(heard)
+        return [(k + 1, self.peers[k].offset_ns or 0) for k in named]
+
+    # Who hears whom.
+
+    def _is_recent(self, p: Peer, when: Ns | None, now: Ns) -> bool:
+        return when is not None and now - when <= (self.resting_ns if p.resting else self.moving_ns)
+
+    def _hears(self, p: Peer, now: Ns) -> bool:
+        return not p.left and self._is_recent(p, p.near_ns, now)
+
+    def _hear_contact(self, p: Peer, d: Parsed) -> None:
+        extended, most = d.frame[0] & 0xF == 2, self.settings.link.names
+        p.left = extended and d.frame[2] == LEAVING
+        p.probation = extended and bool(d.frame[3] & PROBATION)
+        p.resting = p.probation or not (d.frame[3] & MOVES if extended else d.frame[3])
+        if not most:
+            return
+        p.unnamed += 1
+        hears = said_of(self.settings.id, [k for k, _ in d.names if k], most)
+        if not hears and most == 1 and p.unnamed > CYCLES * (self.rules.agents - 1):
+            hears = -1
+        p.hears_us = hears or p.hears_us
+        p.unnamed = 0 if hears > 0 else p.unnamed
+        if hears < 0 and p.probation:  # it has not heard all yet
+            p.hears_us = 0
+
+    def _has_quorum(self, now: Ns) -> bool:
+        """Whether it hears, and is heard by, enough of those that have not left; the silent count as most others say."""
+        c, link = self.settings, self.settings.link
+        others = [p for k, p in enumerate(self.peers) if k != c.id - 1 and not p.left]
+        says = [p.hears_us for p in others]
+        trusts = not link.names or says.count(1) > says.count(-1)
+        heard_by = [p.hears_us > 0 or (trusts and not p.hears_us) for p in others]
+        hears = [self._hears(p, now) for p in others]
+        n = len(others)
+        if self.refused_since is not None and now - self.refused_since > HALF_SECOND_NS:
+            heard_by = [False] * n  # nothing leaves it
+        needed = c.quorum if c.quorum >= 0 else max(n - 1, min(n, 1))
+        if c.quorum == SHARE:
+            needed = math.ceil(n * c.quorum_share - 1e-9)
+        both = sum(a and b for a, b in zip(hears, heard_by, strict=True))
+        self.counts = Counts(n, sum(hears), sum(heard_by), both, needed)
+        return both >= needed
+
+    # The loop.
+
+    def _close_slot(self) -> None:
+        if self.running:
+            self.agent.remember_own(self.slot, self.said)
+            self.agent.end(self.slot)
+        self.running, self.frame = False, b""
+
+    def _restart(self, now: Ns) -> None:
+        """From the next slot on it takes part, knowing nothing."""
+        if self.frame:
+            self.said = b""
+        self._close_slot()
+        self.slot = self._slot_at(now + self.lead_ns)
+        self.first, self.newcomer, self.hovers = self.slot + 1, True, HOVERS_NEW
+        self.awaits = self.has_sent = False
+        self.early.clear()
+        for p in self.peers:
+            p.offset_ns = p.report_ns = p.sum_ns = None
+        self.sums = []
+        self.agent.restart()
+        self.on_restart()
+
+    def _hear_frame(self, slot: int, frame: bytes) -> None:
+        try:
+            parsed, sampled = parse(frame, slot, self.rules)
+            if self.agent.present:
+                hear([Receiver(self.agent.table, self.agent)], parsed, sampled, self.rules)
+        except (Refused, Foreign):
+            pass
+        if self.awaits and slot >= self.slot:
+            self.awaits = False
+
+    def _why_it_hovers(self, slot: int, now: Ns) -> int:
+        quorum = self._has_quorum(now)
+        on_probation = self.rules.policy == "lease" and self.agent.memory.probation
+        if self.has_sent and slot >= self.first + self.rules.agents and not on_probation:
+            self.newcomer = False
+        if self.newcomer:
+            return HOVERS_NEW
+        if self.same_id_until is not None and now < self.same_id_until:
+            return HOVERS_SAME_ID
+        return FLIES if quorum else HOVERS_QUORUM
+
+    def _open_slot(self, slot: int, now: Ns) -> None:
+        self._close_slot()
+        self.hovers, self.slot = self._why_it_hovers(slot, now), slot
+        chosen = self.agent.decide(slot).index + 1
+        self.said = self.frame = self.agent.frame(slot) if self.agent.sends else b""
+        if self.newcomer and self.same_id_until is not None and now < self.same_id_until:
+            self.said = self.frame = b""  # the other was here before
+        self.running, self.awaits = True, chosen not in (0, self.settings.id)
+        early, self.early = self.early, []
+        for one in early:
+            if one[0] > slot:
+                self.early.append(one)
+            else:
+                self._hear_frame(one[0], one[2])
+
+    def receive(self, data: Datagram, arrival: Ns) -> int:
+        """Accepts a datagram, or says why not. Anything may be handed in."""
+        d = self._parse(data)
+        if isinstance(d, int):
+            return d
+        c, slot_ns = self.settings, self.settings.slot_ns
+        listens, began = self.state == LISTENING, arrival - c.link.flight_ns - d.late_ns
+        start = began - self.flight_error_ns
+        here = d.slot if listens else self._slot_at(start)
+        slot = d.slot if listens else here + centred(d.slot - here, self.cycle)
+        expected = self.slot_start_ns(slot)
+        p = self.peers[d.sender - 1]
+        if d.sender == c.id:
+            return OTHER_TIME if listens else self._hear_own_id(data, arrival, start - expected)
+        if p.last_slot == d.slot and not listens:
+            return REPEATED
+        p.last_slot = d.slot
+        outcome = self._hear_time(p, start - slot * slot_ns, arrival)
+        if outcome == OTHER:
+            return OTHER_TIME
+        if outcome == RESTARTED:
+            slot, self.origin_ns = d.slot, start - d.slot * slot_ns
+            self._restart(arrival)
+        else:
+            self._hear_delay(p, d.names, began - expected)
+            self._shift_delays(self.slot_start_ns(slot) - expected)
+        self._hear_contact(p, d)
+        if slot > self.slot:
+            if len(self.early) < c.early_count:
+                self.early.append((slot, d.sender, d.frame))
+        elif slot >= self.first - 1:
+            self._hear_frame(slot, d.frame)
+        return ACCEPTED
+
+    def _hear_own_id(self, data: Datagram, arrival: Ns, apart: int) -> int:
+        """An echo or a replay of an own datagram, or another agent of the same id."""
+        half = self.settings.slot_ns // 2
+        if data in self.sent_history:
+            return REPEATED
+        if not -half < apart < half:
+            return OTHER_TIME
+        self.same_id_until = arrival + self.patience_ns
+        return SAME_ID
+
+    def step(self, now: Ns) -> tuple[Ns, Datagram]:
+        """Does one thing that is due; when to call again (now: at once), and what to send now."""
+        if self.state == LISTENING:
+            if now < self.deadline_ns:
+                return self.deadline_ns, b""
+            self.origin_ns, self.state, self.in_step_ns = now - self.round_ns, ALONE, now
+            self._restart(now)
+        if self.frame:
+            start = self.slot_start_ns(self.slot)
+            return (start, b"") if now < start else (now, self._send(now - start, now))
+        following = self.slot_start_ns(self.slot + 1)
+        due = following - (self.latest_lead_ns if self.awaits else self.lead_ns)
+        if now < due:
+            return due, b""
+        if now - following > self.too_long_ns:
+            self._restart(now)
+        else:
+            self._open_slot(self.slot + 1, now)
+        return now, b""
+
+    def _send(self, late_ns: int, now: Ns) -> Datagram:
+        if late_ns > self.latest_send_ns:  # it would disturb the next turn
+            self.frame = self.said = b""
+            return b""
+        datagram = self._write(late_ns, now)
+        self.gone = self.leaving and self.frame[2] == LEAVING
+        self.frame, self.has_sent = b"", True
+        self.sent_history.append(datagram)
+        return datagram
+
+    def sent(self, now: Ns, taken: bool) -> None:
+        """What became of the datagram that the last step gave."""
+        if taken:
+            self.refused_since = None
+            return
+        self.said = b""
+        if self.refused_since is None:
+            self.refused_since = now
+
+    def leave(self) -> None:
+        """It says on the air that it leaves, where frames can say so."""
+        self.leaving = True
+        if self.rules.policy == "lease":
+            self.agent.present = LEAVES
+        else:
+            self.agent.present, self.gone = OFF, True
+            self.agent.restart()
+
+
+def said_of(agent: int, names: Sequence[int], most: int) -> int:
+    """Whether the sender of a list of names hears an agent: 1, -1, or 0: the list does not tell."""
+    if agent in names:
+        return 1
+    if len(names) < most:  # all whom it hears
+        return -1
+    gaps = zip(names, names[1:], strict=False)
+    return -1 if any((agent - a) & 0xFFFF < (b - a) & 0xFFFF for a, b in gaps) else 0
