@@ -24,11 +24,16 @@
 #include "task.h"
 #include "usec_time.h"
 
-#include "board.h"
+#include "core.h"
+#include "dtsa_station.h"
 #include "safety.h"
 #include "watch.h"
 
 enum {
+    AGENTS_MAX = 20,        /* N at most */
+    AGENT_BYTES = 8704,     /* of an agent with so many */
+    STATION_BYTES = 4096,   /* ... and its station */
+    EARLY_COUNT = 4,        /* frames of slots still to come */
     QUEUE_LENGTH = 16,  /* datagrams between the radio's task and this one */
     CONTROL_US = 10000, /* from one set-point to the next */
     NEAR_US = 1500,     /* nearer than this to what is due it does not sleep */
@@ -65,7 +70,7 @@ static float oldest, nearest;
 
 typedef struct reception {
     uint64_t us;
-    uint8_t length, data[BOARD_DATAGRAM];
+    uint8_t length, data[DTSA_FRAME_MAX];
 } reception;
 
 STATIC_MEM_QUEUE_ALLOC(receptions, QUEUE_LENGTH, sizeof(reception));
@@ -82,10 +87,16 @@ static void on_packet(P2PPacket *packet)
 
 /* ---- the agent ---- */
 
-static board agent;
+static dtsa_config config;
+static dtsa_agent *agent;
+static dtsa_station *station;
+static dtsa_station_status status;
+static double agent_memory[AGENT_BYTES / sizeof(double)],
+    station_memory[STATION_BYTES / sizeof(double)];
+static int own_id;
 static safety guard;
-static double starts[3 * BOARD_AGENTS], targets[3 * BOARD_AGENTS];
-static uint8_t key[KEY_BYTES], sealed, ordered;
+static double starts[3 * AGENTS_MAX], targets[3 * AGENTS_MAX];
+static uint8_t key[KEY_BYTES], sealed, ordered, awaitsBegin;
 static uint64_t session, lots;
 static int64_t heardLast; /* ns */
 static float hold[3];     /* m, where it hovers */
@@ -94,18 +105,18 @@ static int64_t now_ns(void) { return (int64_t)usecTimestamp() * 1000; }
 
 static void configure(dtsa_config *c)
 {
-    static double places[6 * BOARD_AGENTS]; /* as many as there are: the three planes of libdtsa */
+    static double places[6 * AGENTS_MAX]; /* as many as there are: the three planes of libdtsa */
     const int n = agents;
     for (int i = 0; i < 3; i++)
         for (int k = 0; k < n; k++) {
-            places[i * n + k] = starts[i * BOARD_AGENTS + k];
-            places[(3 + i) * n + k] = targets[i * BOARD_AGENTS + k];
+            places[i * n + k] = starts[i * AGENTS_MAX + k];
+            places[(3 + i) * n + k] = targets[i * AGENTS_MAX + k];
         }
     *c = (dtsa_config){
         .agents = n,
         .slot_s = (double)slotUs * 1e-6,
         .steps = steps,
-        .policy = policy,
+        .policy = (int)policy,
         .estimator = estimator,
         .avoider = DTSA_AVOID_ORCA,
         .profile = policy == DTSA_POLICY_LEASE ? DTSA_PROFILE_EXTENDED : DTSA_PROFILE_PAPER,
@@ -135,46 +146,89 @@ static void configure(dtsa_config *c)
 /* To where the ground has said. Where goals change in flight none is known to be the last. */
 static void fly_to(int k)
 {
-    const double goal[3] = {targets[k], targets[BOARD_AGENTS + k], targets[2 * BOARD_AGENTS + k]};
-    dtsa_agent_set_goal(agent.agent, goal, goalsKnown);
+    const double goal[3] = {targets[k], targets[AGENTS_MAX + k], targets[2 * AGENTS_MAX + k]};
+    dtsa_agent_set_goal(agent, goal, goalsKnown);
+}
+
+/* Makes agent and station. begins_ns: all begin slot 0 then; 0: it listens. */
+static const char *begin(int which, int64_t begins_ns)
+{
+    static const int LENGTHS[DTSA_PROFILE_COUNT] = {19, 23, EXTENDED_LENGTH};
+    config.policy = which;
+    const char *fault = dtsa_config_fault(&config);
+    if (fault) return fault;
+    const dtsa_station_settings settings = {
+        .id = own_id,
+        .agents = agents,
+        .anchor_every = config.lease.anchor_every,
+        .main_every = config.lease.main_every,
+        .slot_cycle = dtsa_slot_cycle(&config),
+        .extended = config.profile == DTSA_PROFILE_EXTENDED,
+        .frame_length = LENGTHS[config.profile],
+        .position_step = config.position_step,
+        .slot_ns = (int64_t)slotUs * 1000,
+        .seed = seed,
+        .key = sealed ? key : NULL,
+        .key_length = KEY_BYTES,
+        .session = session,
+        .early_count = EARLY_COUNT,
+        .begins = begins_ns != 0,
+        .origin_ns = begins_ns,
+        .link = {.header = {(uint8_t)headerWord, (uint8_t)(headerWord >> 8)},
+                 .header_length = sealed ? 0 : 2,
+                 .says_late = !sealed,
+                 .flight_ns = (int64_t)flightUs * 1000,
+                 .trust_ns = 1000000},
+    };
+    if (dtsa_datagram_length(&settings) > DTSA_FRAME_MAX) return "profile";
+    agent = dtsa_agent_start(agent_memory, sizeof agent_memory, &config, own_id);
+    if (!agent) return "memory";
+    const dtsa_station_agent ours = dtsa_station_agent_of(agent);
+    station = dtsa_station_start(station_memory, sizeof station_memory, &settings, &ours, now_ns());
+    if (!station) return "station";
+    observe(station, agent);
+    fly_to(own_id - 1);
+    dtsa_station_get_status(station, &status);
+    return NULL;
 }
 
 static const char *start(void)
 {
-    const board_settings settings = {
-        .id = (int)(configblockGetRadioAddress() & 0xff),
-        .slot_ns = (int64_t)slotUs * 1000,
-        .flight_ns = (int64_t)flightUs * 1000,
-        .seed = seed,
-        .begin = beginSlot,
-        .header = {(uint8_t)headerWord, (uint8_t)(headerWord >> 8)},
-        .key = sealed ? key : NULL,
-        .key_length = KEY_BYTES,
-        .session = session,
-    };
-    if (agents < 1 || agents > BOARD_AGENTS) return "agents";
+    own_id = (int)(configblockGetRadioAddress() & 0xff);
+    if (agents < 1 || agents > AGENTS_MAX) return "agents";
+    if (own_id < 1 || own_id > agents) return "id";
+    if (slotUs < 1000) return "slot";
     if (estimator > DTSA_ESTIMATE_LINEAR) return "estimator";
-    configure(&agent.config);
-    agent.watch = WATCH;
+    configure(&config);
     safety_reset(&guard);
     heardLast = INT64_MIN;
     ordered = 0;
-    const char *fault = board_start(&agent, &settings, now_ns());
-    if (!fault) fly_to(settings.id - 1);
-    return fault;
+    awaitsBegin = beginSlot > 0;
+    return begin(awaitsBegin ? DTSA_POLICY_TDMA : policy, 0);
 }
 
-static void see(void)
+/* All have a common time: in slot beginSlot they begin with slot 0 and the policy that nobody can
+ * join. Who comes later stays out: its slots are of another time. */
+static void begin_together(void)
 {
-    const dtsa_decision d = dtsa_agent_decision(agent.agent);
-    slotNow = (uint32_t)agent.slot;
+    if (!awaitsBegin || status.state == DTSA_LISTENING || status.slot + 1 < (int64_t)beginSlot) return;
+    const int64_t origin = dtsa_station_slot_start(station, beginSlot);
+    if (now_ns() < origin - (int64_t)slotUs * 200) return; /* the last frame before has come */
+    awaitsBegin = 0;
+    begin(policy, origin);
+}
+
+static void publish(void)
+{
+    const dtsa_decision d = dtsa_agent_decision(agent);
+    slotNow = (uint32_t)status.slot;
     chosen = (uint8_t)d.chosen;
     reason = (uint8_t)d.reason;
     digest = d.digest;
-    sent = agent.counts.sent;
-    heard = agent.counts.heard;
-    unsent = agent.counts.unsent;
-    timeState = (uint8_t)agent.hearing.base.state;
+    sent = status.sent;
+    heard = status.heard;
+    unsent = status.unsent;
+    timeState = (uint8_t)status.state;
 }
 
 static void send(const uint8_t *data, int length)
@@ -202,11 +256,11 @@ static bool place(double *planes, const uint8_t *data, size_t length)
 {
     double at[3];
     const int k = (int)data[1] - 1;
-    if (length != 2 + sizeof at || k < 0 || k >= BOARD_AGENTS) return false;
+    if (length != 2 + sizeof at || k < 0 || k >= AGENTS_MAX) return false;
     memcpy(at, data + 2, sizeof at);
     for (int i = 0; i < 3; i++) {
         if (!isfinite(at[i])) return false;
-        planes[i * BOARD_AGENTS + k] = at[i];
+        planes[i * AGENTS_MAX + k] = at[i];
     }
     return true;
 }
@@ -217,7 +271,7 @@ static void obey(const uint8_t *data, size_t length)
     /* What is said on the ground counts from the next start on. */
     const bool flies = guard.mode != SAFETY_OFF;
     const char *fault = strchr("FTKDSL", data[0]) ? "length" : "order";
-    const bool changes = !goalsKnown && data[0] == ORDER_TO && data[1] == agent.settings.id;
+    const bool changes = !goalsKnown && data[0] == ORDER_TO && data[1] == own_id;
     if (data[0] == ORDER_FROM && !flies && place(starts, data, length))
         fault = NULL;
     else if (data[0] == ORDER_TO && flies && !changes)
@@ -286,23 +340,25 @@ static void set_point(const double velocity[3])
 /* Of the others; their places and the own one are in the frame map. */
 static void look_around(safety_view *v, const double place[3], int64_t now)
 {
+    const dtsa_table *t = agent->table;
+    const int n = config.agents;
     float rests = 0.0f;
     oldest = 0.0f;
     nearest = INFINITY;
-    for (int k = 0; k < agent.config.agents; k++) {
-        if (k == agent.settings.id - 1) continue;
-        const int64_t age = board_age(&agent, k);
-        const float age_s = (float)age * (float)slotUs * 1e-6f;
+    for (int k = 0; k < n; k++) {
+        if (k == own_id - 1) continue;
+        const int64_t sent_slot = t->sent_slot[k];
+        const float age_s = (float)(status.slot - sent_slot) * (float)slotUs * 1e-6f;
         float distance = 0.0f;
-        if (age < 0)
+        if (sent_slot < 0)
             oldest = -1.0f;
-        else if (board_rests(&agent, k))
+        else if (!t->in_ap[k])
             rests = fmaxf(rests, age_s);
         else if (oldest >= 0.0f)
             oldest = fmaxf(oldest, age_s);
-        if (age < 0) continue;
+        if (sent_slot < 0) continue;
         for (int i = 0; i < 3; i++) {
-            const float d = (float)(board_place(&agent, k, i) - place[i]);
+            const float d = (float)(t->sent_p[i * n + k] - place[i]);
             distance += d * d;
         }
         nearest = fminf(nearest, sqrtf(distance));
@@ -310,7 +366,28 @@ static void look_around(safety_view *v, const double place[3], int64_t now)
     v->oldest_s = oldest;
     v->rests_s = rests;
     v->unheard_s = heardLast == INT64_MIN ? -1.0f : (float)(now - heardLast) * 1e-9f;
-    if (agent.config.agents == 1) v->unheard_s = v->oldest_s = 0.0f;
+    if (n == 1) v->unheard_s = v->oldest_s = 0.0f;
+}
+
+/* Where to fly, m/s, in the present slot; 0: nowhere, it hovers. */
+static int fly(int64_t now, double command[3])
+{
+    if (status.hovers != DTSA_FLIES || status.slot < 0) return 0;
+    const int64_t since = now - dtsa_station_slot_start(station, status.slot);
+    const int64_t step = since < 0 ? 0 : since * steps / ((int64_t)slotUs * 1000);
+    dtsa_agent_command(agent, status.slot, (int)(step < steps ? step : steps - 1), command);
+    return 1;
+}
+
+/* The same for one that stays at a place (m, frame map) and gives way to those it has heard of. */
+static int stay(int64_t now, const double place[3], double command[3])
+{
+    double there[3];
+    memcpy(there, agent->goal, sizeof there);
+    memcpy(agent->goal, place, sizeof there);
+    const int flies = fly(now, command);
+    memcpy(agent->goal, there, sizeof there);
+    return flies;
 }
 
 /* Someone else steers: set-points of a higher priority, or the high-level commander. */
@@ -336,7 +413,7 @@ static void steer(const double position[3], const double place[3], int64_t now, 
         .ground = (before == SAFETY_FLY || before == SAFETY_HOVER) && ground_steers(),
         .can_fly = supervisorCanFly(),
         .in_air = supervisorIsFlying(),
-        .newcomer = agent.newcomer,
+        .newcomer = status.hovers != DTSA_FLIES,
         .battery_v = pmGetBatteryVoltage(),
         .position = {(float)position[0], (float)position[1], (float)position[2]},
     };
@@ -353,8 +430,8 @@ static void steer(const double position[3], const double place[3], int64_t now, 
         const int gives_way = next == SAFETY_HOVER && guard.reason == SAFETY_OLD_NEWS;
         const double there[3] = {(double)hold[0], (double)hold[1],
                                  (double)hold[2] - (double)height}; /* frame map */
-        const int flies = gives_way ? board_stay(&agent, now, there, command)
-                                    : next == SAFETY_FLY && board_command(&agent, now, command);
+        const int flies = gives_way ? stay(now, there, command)
+                                    : next == SAFETY_FLY && fly(now, command);
         set_point(flies ? command : NULL);
     } else if (next == SAFETY_LAND && before != SAFETY_LAND) {
         land(position);
@@ -372,7 +449,7 @@ static void steer(const double position[3], const double place[3], int64_t now, 
 static void take_in(const reception *r)
 {
     if (!started) return;
-    if (board_hear(&agent, r->data, r->length, (int64_t)r->us * 1000) == TAKEN)
+    if (dtsa_station_receive(station, r->data, r->length, (int64_t)r->us * 1000) == DTSA_ACCEPTED)
         heardLast = (int64_t)r->us * 1000;
     else
         refused++;
@@ -381,7 +458,7 @@ static void take_in(const reception *r)
 void appMain(void)
 {
     static const char *const NAMES[] = {"x", "y", "z", "vx", "vy", "vz"};
-    static uint8_t datagram[BOARD_DATAGRAM];
+    static uint8_t datagram[DTSA_FRAME_MAX];
     static reception r;
     uint64_t controlled = usecTimestamp();
     for (int i = 0; i < 6; i++) ids[i] = logGetVarId("stateEstimate", NAMES[i]);
@@ -399,14 +476,16 @@ void appMain(void)
         while (xQueueReceive(queue, &r, 0) == pdTRUE) take_in(&r);
         sense(position, velocity);
         const double place[3] = {position[0], position[1], position[2] - (double)height};
-        due = board_step(&agent, now_ns(), place, velocity, datagram, &length);
+        dtsa_agent_set_state(agent, place, velocity);
+        due = dtsa_station_step(station, now_ns(), datagram, &length);
         if (length > 0) {
-            const int64_t late =
-                now_ns() - dtsa_timebase_slot_start(&agent.hearing.base, agent.slot);
-            lateUs = (uint16_t)(late / 1000);
+            lateUs = (uint16_t)((now_ns() - dtsa_station_slot_start(station, status.slot)) / 1000);
             send(datagram, length);
+            dtsa_station_sent(station, now_ns(), 1);
         }
-        see();
+        dtsa_station_get_status(station, &status);
+        begin_together();
+        publish();
         const uint64_t us = usecTimestamp();
         if (us - controlled >= CONTROL_US) {
             steer(position, place, now_ns(), (float)(us - controlled) * 1e-6f);

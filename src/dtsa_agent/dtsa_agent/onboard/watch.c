@@ -21,19 +21,19 @@ typedef struct __attribute__((packed)) opened_note {
 typedef struct __attribute__((packed)) heard_note {
     uint8_t kind, accepted, sender, length;
     int64_t slot, at_ns;
-    uint8_t data[BOARD_DATAGRAM];
+    uint8_t data[DTSA_FRAME_MAX];
 } heard_note;
 
-static void opened(const board *b, int64_t now)
+static void opened(void *context, int64_t slot, int64_t start, int64_t now, int is_first)
 {
-    const dtsa_agent *a = b->agent;
+    const dtsa_agent *a = context;
     opened_note n = {
         .kind = 'O',
-        .anew = (uint8_t)b->anew,
+        .anew = (uint8_t)is_first,
         .reason = (uint8_t)a->decision.reason,
-        .length = (uint8_t)b->waiting,
-        .slot = b->slot,
-        .start_ns = dtsa_timebase_slot_start(&b->hearing.base, b->slot),
+        .length = a->frame_length,
+        .slot = slot,
+        .start_ns = start,
         .opened_ns = now,
         .present = a->present,
         .chosen = (uint16_t)a->decision.chosen,
@@ -42,33 +42,43 @@ static void opened(const board *b, int64_t now)
     };
     memcpy(n.position, a->position, sizeof n.position);
     memcpy(n.velocity, a->velocity, sizeof n.velocity);
-    memcpy(n.command, b->command, sizeof n.command);
+    memcpy(n.command, a->command, sizeof n.command);
     memcpy(n.goal, a->goal, sizeof n.goal);
-    memcpy(n.frame, b->frame, (size_t)b->waiting);
+    memcpy(n.frame, a->frame, a->frame_length);
     peerLabRecord(&n, sizeof n);
 }
 
-static void heard(const board *b, int sender, int64_t slot, const uint8_t *datagram, int length,
+static void note(char kind, int accepted, int sender, int64_t slot, const uint8_t *datagram,
+                 int length, int64_t at)
+{
+    heard_note n = {(uint8_t)kind, (uint8_t)accepted, (uint8_t)sender, (uint8_t)length, slot, at, {0}};
+    if (length) memcpy(n.data, datagram, (size_t)length);
+    peerLabRecord(&n, sizeof n);
+}
+
+static void heard(void *context, int sender, int64_t slot, const uint8_t *datagram, int length,
                   int64_t arrival, int accepted)
 {
-    heard_note n = {'H', (uint8_t)accepted, (uint8_t)sender, (uint8_t)length, slot, arrival, {0}};
-    (void)b;
-    memcpy(n.data, datagram, (size_t)length);
-    peerLabRecord(&n, sizeof n);
+    (void)context;
+    note('H', accepted, sender, slot, datagram, length, arrival);
 }
 
-static void anew(const board *b)
+static void restarted(void *context, int64_t slot)
 {
-    const heard_note n = {'A', 0, 0, 0, b->slot, 0, {0}};
-    peerLabRecord(&n, sizeof n);
+    (void)context;
+    note('A', 0, 0, slot, NULL, 0, 0);
 }
 
-static void sent(const board *b, const uint8_t *datagram, int length, int64_t now)
+static void sent(void *context, int64_t slot, const uint8_t *datagram, int length, int64_t now)
 {
-    heard_note n = {'S', 0, 0, (uint8_t)length, b->slot, now, {0}};
-    memcpy(n.data, datagram, (size_t)length);
-    peerLabRecord(&n, sizeof n);
+    (void)context;
+    note('S', 0, 0, slot, datagram, length, now);
 }
 
-const board_watch the_laboratory = {opened, anew, sent, heard};
+void observe(dtsa_station *station, dtsa_agent *agent)
+{
+    const dtsa_station_events events = {
+        .context = agent, .opened = opened, .restarted = restarted, .sent = sent, .heard = heard};
+    dtsa_station_observe(station, &events);
+}
 #endif

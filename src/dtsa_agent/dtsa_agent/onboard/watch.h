@@ -1,15 +1,17 @@
-/* Who is told what happens to an agent on board: the laboratory, where there is one. */
+/* Records what happens to an agent on board, in the laboratory; on a vehicle nothing does. */
 #ifndef DTSA_WATCH_H
 #define DTSA_WATCH_H
 
-#include "board.h"
-
-extern const board_watch the_laboratory;
+#include "dtsa_station.h"
 
 #ifdef PEER_LAB
-#define WATCH (&the_laboratory)
+void observe(dtsa_station *station, dtsa_agent *agent);
 #else
-#define WATCH NULL
+static inline void observe(dtsa_station *station, dtsa_agent *agent)
+{
+    (void)station;
+    (void)agent;
+}
 #endif
 
 #endif

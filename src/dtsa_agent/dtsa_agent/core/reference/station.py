@@ -242,25 +242,24 @@ class Station:
         self.offsets.append(offset_ns)
         if len(self.offsets) < RECEPTIONS:
             return 0
-        ordered = sorted(self.offsets)
-        twice = ordered[RECEPTIONS // 2] + ordered[~(RECEPTIONS // 2)]
+        median = sorted(self.offsets)[RECEPTIONS // 2]
         self.offsets.clear()
-        size = (abs(twice) * 32768 + 65536) // 131072  # half away from zero: both directions weigh the same
-        return size if twice >= 0 else -size
+        size = (abs(median) + 1) // 2  # half away from zero: both directions weigh the same
+        return size if median >= 0 else -size
 
     def _gives_way(self, origin_ns: Ns, now: Ns) -> bool:
         """Whether the time that a frame shows is taken over.
 
-        That is so when most of all agents heard lately are in it, or half of them and it is the earlier one; or, after
-        some patience, when no other agent is heard in the own one, or it is the earlier one and less than half of the
-        swarm is in the own one.
+        That is so when most of all agents heard lately are in it; when it is the earlier one and half of them are, or
+        no frame was ever heard in the own one; or, after some patience, when no other agent is heard in the own one, or it is
+        the earlier one and less than half of the swarm is in the own one.
         """
         recent = [p for p in self.peers if self._is_recent(p, p.heard_ns, now)]
         every = 1 + len(recent)
         here = 1 + sum(self._is_same(p.origin_ns, self.origin_ns) for p in recent)
         there = sum(p.steady and self._is_same(p.origin_ns, origin_ns) for p in recent)
         earlier = self._apart(origin_ns, self.origin_ns) < 0
-        if 2 * there > every or (2 * there == every and earlier):
+        if 2 * there > every or (earlier and (self.state == ALONE or 2 * there == every)):
             return True
         if not there:
             return False

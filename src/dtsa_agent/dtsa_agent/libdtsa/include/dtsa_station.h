@@ -91,6 +91,13 @@ typedef enum dtsa_verdict {
     DTSA_VERDICT_COUNT
 } dtsa_verdict;
 
+/* Whether it knows which slot it is. */
+enum {
+    DTSA_LISTENING,
+    DTSA_ALONE,  /* it has begun by its own clock, and heard no frame of this time */
+    DTSA_JOINED
+};
+
 /* Why it hovers. */
 enum {
     DTSA_FLIES,
@@ -118,7 +125,8 @@ typedef struct dtsa_station_status {
 typedef struct dtsa_station_events {
     void *context;
     void (*opened)(void *context, int64_t slot, int64_t start_ns, int64_t now_ns, int is_first);
-    void (*restarted)(void *context); /* the present slot is over, it begins anew with the next */
+    void (*restarted)(void *context, int64_t slot); /* it restarts with the next slot */
+    void (*sent)(void *context, int64_t slot, const uint8_t *datagram, int length, int64_t now_ns);
     void (*heard)(void *context, int sender, int64_t slot, const uint8_t *datagram, int length,
                   int64_t arrival_ns, int accepted); /* the slot has begun */
     void (*refused)(void *context, int verdict, const uint8_t *datagram, long length,

@@ -1,12 +1,12 @@
 /* When slots begin. Every frame shows when its sender's slot 0 began: its origin. An agent has an
- * origin of its own, and moves it a little towards those that it hears (see dtsa_align).
+ * origin of its own, and moves it a little towards those that it hears (see align).
  *
  * Frames whose origin is off by more than the link is trusted with show another time. The sender may
  * be of another group, or the frame was under way for long; a frame is never early. Each agent counts
  * for the time of its last frame, and for another time only when two frames in a row have shown it.
  * An agent takes another time over
  *   - when most of all agents heard lately, itself included, are in it,
- *   - or half of them, and it is the earlier one,
+ *   - or half of them, and it is the earlier one; at once when no frame was ever heard in the own,
  *   - or after some patience: when no other agent is heard in the own one, or it is the earlier one and
  *     less than half of the swarm is heard in the own one. This ends what the first two rules leave open
  *     where agents do not all hear each other.
@@ -14,19 +14,20 @@
  * agent moves its slots and goes on; else it restarts, and knows nothing of the turns. */
 #include "station.h"
 
-int64_t dtsa_align(dtsa_aligner *a, int64_t offset)
+/* By how much the own slots move for a frame that came later than expected: mostly not at all, else
+ * by half the median of some frames. A median shrugs off single delays; and since all move towards all
+ * others, the swarm agrees on a time that drifts with the mean of its clocks. */
+static int64_t align(dtsa_station *s, int64_t offset)
 {
-    if (offset < -a->limit_ns || offset > a->limit_ns) return 0;
-    int at = a->count++;
-    for (; at > 0 && a->offsets[at - 1] > offset; at--) a->offsets[at] = a->offsets[at - 1];
-    a->offsets[at] = offset;
-    if (a->count < a->receptions) return 0;
-    const int64_t twice = a->offsets[a->count / 2] + a->offsets[(a->count - 1) / 2];
-    a->count = 0;
-    a->corrections++;
+    int at = s->offset_count++;
+    for (; at > 0 && s->offsets[at - 1] > offset; at--) s->offsets[at] = s->offsets[at - 1];
+    s->offsets[at] = offset;
+    if (s->offset_count < RECEPTIONS) return 0;
+    s->offset_count = 0;
+    s->counts.alignments++;
     /* Rounded half away from zero, so that both directions weigh the same. */
-    const int64_t size = ((twice < 0 ? -twice : twice) * a->share + 65536) / 131072;
-    return twice < 0 ? -size : size;
+    const int64_t median = s->offsets[RECEPTIONS / 2];
+    return median < 0 ? -((1 - median) / 2) : (median + 1) / 2;
 }
 
 int64_t clock_slot(const dtsa_station *s, int64_t now)
@@ -79,7 +80,7 @@ static int gives_way(dtsa_station *s, int64_t origin_ns, int64_t now)
         here += is_same(s, p->origin_ns, s->origin_ns);
         there += p->steady && is_same(s, p->origin_ns, origin_ns);
     }
-    if (2 * there > all || (2 * there == all && earlier)) return 1;
+    if (2 * there > all || (earlier && (s->state == DTSA_ALONE || 2 * there == all))) return 1;
     if (!there) return 0;
     if (now - s->in_step_ns > s->patience_ns) return 1;
     if (!earlier || 2 * here > s->settings.agents) return 0;
@@ -97,7 +98,7 @@ static int is_near(const dtsa_station *s, int64_t origin_ns)
 
 static void take_over(dtsa_station *s, int64_t origin_ns, int64_t now)
 {
-    s->aligner.count = 0;
+    s->offset_count = 0;
     s->origin_ns = origin_ns;
     for (int k = 0; k < s->settings.agents; k++)
         s->peers[k].near_ns = is_near(s, s->peers[k].origin_ns) ? s->peers[k].heard_ns : INT64_MIN;
@@ -120,7 +121,7 @@ int clock_hear(dtsa_station *s, int k, int64_t origin_ns, int64_t arrival_ns)
     const int near = is_near(s, origin_ns);
     if (near) p->near_ns = arrival_ns;
     if (is_same(s, origin_ns, s->origin_ns)) {
-        s->origin_ns += dtsa_align(&s->aligner, apart);
+        s->origin_ns += align(s, apart);
         s->in_step_ns = arrival_ns;
         s->state = DTSA_JOINED;
         return IN_STEP;

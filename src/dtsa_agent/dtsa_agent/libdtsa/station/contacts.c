@@ -6,8 +6,6 @@
  * last; one that has not said counts as most of those that have.
  *
  * All agents of the swarm count that have not said that they leave, whether they are heard or not. */
-#include <math.h>
-
 #include "station.h"
 
 /* Of an extended frame, see frame_extended.c; others have c_r at the same place. */
@@ -67,7 +65,10 @@ static int needed(const dtsa_station *s, int others)
 {
     const dtsa_station_settings *c = &s->settings;
     if (c->quorum >= 0) return c->quorum;
-    if (c->quorum == DTSA_QUORUM_SHARE) return (int)ceil(others * c->quorum_share - 1e-9);
+    if (c->quorum == DTSA_QUORUM_SHARE) {
+        const double share = others * c->quorum_share - 1e-9;
+        return (int)share + ((int)share < share);
+    }
     return others > 1 ? others - 1 : others;
 }
 

@@ -93,8 +93,6 @@ dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_
         s->datagram_length - settings->frame_length - (settings->key ? DTSA_TAG_BYTES : 0);
     lay_out(s, (uint8_t *)memory + rounded(sizeof *s));
     set_times(s);
-    s->aligner = (dtsa_aligner){
-        .receptions = 9, .share = 32768, .limit_ns = settings->link.trust_ns};
     s->slot = s->first = -1;
     s->same_id_until = s->refused_since = s->earlier_ns = INT64_MIN;
     s->hovers = DTSA_HOVERS_LISTENING;
@@ -150,7 +148,7 @@ static void restart(dtsa_station *s, int64_t now)
     s->hovers = DTSA_HOVERS_NEW;
     delay_reset(s);
     s->agent.restart(s->agent.context);
-    if (s->events.restarted) s->events.restarted(s->events.context);
+    if (s->events.restarted) s->events.restarted(s->events.context, s->slot);
     s->counts.restarts++;
 }
 
@@ -236,6 +234,8 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
     s->counts.sent++;
     s->has_sent = 1;
     if (s->leaving && s->frame[2] == LEAVES) s->gone = 1;
+    if (s->events.sent)
+        s->events.sent(s->events.context, s->slot, datagram, s->datagram_length, now);
     return s->datagram_length;
 }
 
@@ -386,7 +386,6 @@ void dtsa_station_get_status(const dtsa_station *s, dtsa_station_status *status)
     status->first = s->first;
     status->gone = s->gone;
     status->flight_error_ns = s->flight_error_ns;
-    status->alignments = s->aligner.corrections;
     status->in_step = s->state == DTSA_LISTENING ? 0 : clock_in_step(s, s->origin_ns + s->slot * s->settings.slot_ns);
 }
 

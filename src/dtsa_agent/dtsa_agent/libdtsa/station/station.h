@@ -7,7 +7,7 @@
 #include "dtsa_station.h"
 #include "frame.h"
 
-enum { SENT_HISTORY_LENGTH = 16 };
+enum { SENT_HISTORY_LENGTH = 16, RECEPTIONS = 9 };
 
 /* An agent that a datagram names, and how much later than expected its sender hears it. */
 typedef struct named_peer {
@@ -56,7 +56,8 @@ struct dtsa_station {
     /* When slots begin. */
     int state;
     int64_t origin_ns, deadline_ns; /* start of slot 0; when listening ends */
-    dtsa_aligner aligner;
+    int64_t offsets[RECEPTIONS]; /* of frames since the slots were aligned last, ascending */
+    int offset_count;
     int64_t in_step_ns;                /* last frame of the own time, or the beginning */
     int64_t earlier_since, earlier_ns; /* an earlier time is heard since, and was last; INT64_MIN */
 
