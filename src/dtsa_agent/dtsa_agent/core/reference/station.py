@@ -483,9 +483,9 @@ class Station:
             start = self.slot_start_ns(self.slot)
             return (start, b"") if now < start else (now, self._send(now - start, now))
         following = self.slot_start_ns(self.slot + 1)
-        due = following - (self.latest_lead_ns if self.awaits else self.lead_ns)
-        if now < due:
-            return due, b""
+        for due in (following - self.lead_ns, following - self.latest_lead_ns if self.awaits else 0):
+            if now < due:
+                return due, b""
         if now - following > self.too_long_ns:
             self._restart(now)
         else:

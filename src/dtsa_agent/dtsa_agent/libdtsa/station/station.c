@@ -361,8 +361,8 @@ int64_t dtsa_station_step(dtsa_station *s, int64_t now, uint8_t *datagram, int *
         return now;
     }
     const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
-    const int64_t due = next - (s->awaits ? s->latest_lead_ns : s->lead_ns);
-    if (now < due) return due;
+    if (now < next - s->lead_ns) return next - s->lead_ns;
+    if (s->awaits && now < next - s->latest_lead_ns) return next - s->latest_lead_ns;
     if (now - next > s->too_long_ns)
         restart(s, now);
     else
@@ -371,6 +371,12 @@ int64_t dtsa_station_step(dtsa_station *s, int64_t now, uint8_t *datagram, int *
 }
 
 int dtsa_station_hovers(const dtsa_station *s) { return s->hovers; }
+
+int dtsa_station_awaits_frame(const dtsa_station *s, int64_t now)
+{
+    const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
+    return s->state == DTSA_LISTENING || (s->awaits && !s->frame_length && now >= next - s->lead_ns);
+}
 
 int64_t dtsa_station_heard_ns(const dtsa_station *s, int id)
 {
