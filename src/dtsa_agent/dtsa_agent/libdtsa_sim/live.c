@@ -37,7 +37,7 @@ typedef struct host {
     int64_t sent_slot; /* of its last frame */
     int64_t sent_at;
     int64_t *received; /* (hosts) when it got the last frame of each */
-    int64_t wrong_slots; /* flown without a quorum since it had one */
+    int64_t wrong_ns, checked_at; /* flown without a quorum since it had one; time of the check */
 } host;
 
 typedef struct live {
@@ -269,19 +269,21 @@ static void fly(live *v, host *h)
 static void check_quorum(live *v, int i)
 {
     host *h = &v->host[i];
-    const int64_t limit = v->quorum_slack_ns;
+    const int64_t limit = v->quorum_slack_ns, slot = v->f->station.slot_ns;
+    const int64_t since = v->now - h->checked_at < slot ? v->now - h->checked_at : slot;
     dtsa_station_status s;
     int both = 0;
+    h->checked_at = v->now;
     dtsa_station_get_status(h->station, &s);
     for (int j = 0; j < v->n; j++) {
-        int is_heard = 0; /* by whoever has that id */
+        int is_heard = !v->f->station.link.names; /* by whoever has that id; unknown without names */
         for (int k = 0; k < v->hosts; k++)
             is_heard |= v->host[k].id == j + 1 && v->host[k].received[h->id - 1] >= v->now - limit;
         both += j != h->id - 1 && h->received[j] >= v->now - limit && is_heard;
     }
     if (both >= s.needed)
-        h->wrong_slots = 0;
-    else if (s.hovers == DTSA_FLIES && ++h->wrong_slots * v->f->station.slot_ns > limit)
+        h->wrong_ns = 0;
+    else if (s.hovers == DTSA_FLIES && (h->wrong_ns += since) > limit)
         violate(v, LIVE_WITHOUT_QUORUM, i, both);
 }
 
@@ -610,8 +612,9 @@ int live_fly(const live_flight *f, live_result *r, live_observer observer, void 
     v.hosts = v.n + 2;
     if (v.hosts > LIVE_HOSTS_MAX) return 0;
     v.random = f->seed;
-    v.quorum_slack_ns = 6LL * f->station.main_every * v.n * f->station.slot_ns +
-                        f->station.slot_ns * v.n * f->station.main_every * (v.n / 3 + 2);
+    const dtsa_station_settings *c = &f->station; /* silence, and then all have to say so */
+    const int names = c->link.names, lists = names > 1 ? (v.n - 1) / (names - 1) + 2 : 8 * v.n;
+    v.quorum_slack_ns = (6 + 2 * lists) * (int64_t)c->main_every * v.n * c->slot_ns;
     if (open_hosts(&v)) {
         for (int k = 0; k < f->fault_count; k++) {
             push(&v, f->faults[k].at_ns, BEGIN, 0)->index = k;
