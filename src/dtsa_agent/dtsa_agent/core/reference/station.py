@@ -416,6 +416,8 @@ class Station:
     def _open_slot(self, slot: int, now: Ns) -> None:
         self._close_slot()
         self.hovers, self.slot = self._why_it_hovers(slot, now), slot
+        if self.leaving and not self.gone:  # its last frame did not leave
+            self.agent.present = LEAVES
         chosen = self.agent.decide(slot).index + 1
         self.said = self.frame = self.agent.frame(slot) if self.agent.sends else b""
         if self.newcomer and self.same_id_until is not None and now < self.same_id_until:

@@ -68,7 +68,7 @@ typedef struct dtsa_station_agent {
     void (*unsent)(void *context);               /* the frame of this slot does not leave */
     void (*close)(void *context, int64_t slot);  /* the slot is over */
     void (*restart)(void *context);              /* it forgets all but settings, state and goal */
-    int (*leave)(void *context); /* 1: its next frame says that it leaves; 0: it is off */
+    int (*leave)(void *context); /* 1: its next frame says that it leaves; 0: it is off. Maybe again */
     int (*on_probation)(void *context);          /* policy lease */
 } dtsa_station_agent;
 
@@ -133,6 +133,31 @@ typedef struct dtsa_station_events {
                     int64_t arrival_ns);
 } dtsa_station_events;
 
+/* What a datagram says. An agent that it names is one that its sender hears, and how much later than
+ * expected. */
+typedef struct dtsa_named {
+    int id; /* 0: none */
+    int64_t late_ns;
+} dtsa_named;
+
+typedef struct dtsa_datagram {
+    int sender;
+    uint32_t slot;
+    int64_t late_ns;
+    dtsa_named names[DTSA_NAMES_MAX];
+    const uint8_t *frame; /* in the datagram */
+    long frame_length;    /* without the tag */
+} dtsa_datagram;
+
+/* Anything may be handed in; *out counts if it is DTSA_ACCEPTED. */
+DTSA_API dtsa_verdict dtsa_datagram_read(const dtsa_station_settings *settings, const uint8_t *data,
+                                         long length, dtsa_datagram *out);
+/* The length of the datagram of a frame; out: room for DTSA_DATAGRAM_MAX bytes. */
+DTSA_API int dtsa_datagram_write(const dtsa_station_settings *settings, const uint8_t *frame,
+                                 uint32_t slot, int64_t late_ns,
+                                 const dtsa_named names[DTSA_NAMES_MAX], uint8_t *out);
+DTSA_API int dtsa_datagram_length(const dtsa_station_settings *settings);
+
 typedef struct dtsa_station dtsa_station;
 
 DTSA_API size_t dtsa_station_bytes(const dtsa_station_settings *settings);
@@ -159,7 +184,6 @@ DTSA_API int dtsa_station_hovers(const dtsa_station *station); /* DTSA_FLIES.. i
 DTSA_API int64_t dtsa_station_slot_start(const dtsa_station *station, int64_t slot);
 DTSA_API int64_t dtsa_station_heard_ns(const dtsa_station *station, int id); /* INT64_MIN: never */
 DTSA_API void dtsa_station_get_status(const dtsa_station *station, dtsa_station_status *status);
-DTSA_API int dtsa_datagram_length(const dtsa_station_settings *settings);
 
 #ifdef __cplusplus
 }

@@ -12,7 +12,7 @@
 enum { LEAVES = 255, MOVES = 1, PROBATION = 2, CYCLES = 8 };
 
 /* Whether the sender of a list hears an agent: 1, -1, or 0: the list does not tell. */
-static int said_of(int agent, const named_peer *names, int count, int most)
+static int said_of(int agent, const dtsa_named *names, int count, int most)
 {
     for (int i = 0; i < count; i++)
         if (names[i].id == agent) return 1;
@@ -25,12 +25,12 @@ static int said_of(int agent, const named_peer *names, int count, int most)
     return 0;
 }
 
-void contacts_hear(dtsa_station *s, const parsed_datagram *d)
+void contacts_hear(dtsa_station *s, const dtsa_datagram *d)
 {
     peer *p = &s->peers[d->sender - 1];
     const int names = s->settings.link.names;
     const int extended = (d->frame[0] & 0xf) == DTSA_PROFILE_EXTENDED;
-    named_peer named[DTSA_NAMES_MAX];
+    dtsa_named named[DTSA_NAMES_MAX];
     int count = 0;
     p->left = extended && d->frame[2] == LEAVES;
     p->probation = extended && (d->frame[3] & PROBATION);

@@ -24,7 +24,7 @@ static void set_sum(dtsa_station *s, peer *p, int64_t sum)
     s->sums[at] = sum;
 }
 
-void delay_hear(dtsa_station *s, const parsed_datagram *d, int64_t offset_ns)
+void delay_hear(dtsa_station *s, const dtsa_datagram *d, int64_t offset_ns)
 {
     const int64_t limit = s->settings.slot_ns / 4;
     peer *p = &s->peers[d->sender - 1];
@@ -64,7 +64,7 @@ static int is_named(const dtsa_station *s, int k, int64_t now)
 
 /* Whom the next datagram names: the heard agents in turn, in the order of ids, the last one again, so
  * that an agent that is missing between two neighbours is known not to be heard. */
-void delay_name(dtsa_station *s, int64_t now, named_peer out[DTSA_NAMES_MAX])
+void delay_name(dtsa_station *s, int64_t now, dtsa_named out[DTSA_NAMES_MAX])
 {
     int heard = 0, index = 0;
     for (int k = 0; k < s->settings.agents; k++) heard += is_named(s, k, now);
@@ -72,7 +72,7 @@ void delay_name(dtsa_station *s, int64_t now, named_peer out[DTSA_NAMES_MAX])
     for (int k = 0; k < s->settings.agents && count; k++) {
         if (!is_named(s, k, now)) continue;
         const int place = (index++ - s->name_turn % heard + heard) % heard;
-        if (place < count) out[place] = (named_peer){k + 1, s->peers[k].offset_ns};
+        if (place < count) out[place] = (dtsa_named){k + 1, s->peers[k].offset_ns};
     }
     if (heard) s->name_turn = (s->name_turn % heard + (count > 1 ? count - 1 : count)) % heard;
 }

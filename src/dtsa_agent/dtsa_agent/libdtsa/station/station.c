@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "core.h"
+#include "policy/policy.h"
 #include "station.h"
 
 /* Of a slot, in thousandths: an agent that has heard all it waits for decides so long before the slot
@@ -19,23 +20,16 @@ static int64_t share(int64_t slot_ns, int thousandths) { return slot_ns * thousa
 static int is_usable(const dtsa_station_settings *c)
 {
     const dtsa_link *link = &c->link;
-    const int times = (link->says_late ? 2 : 0) + 4 * link->names;
     return c->agents >= 1 && c->agents <= DTSA_AGENTS_MAX && c->id >= 1 && c->id <= c->agents &&
            c->anchor_every >= 1 && c->main_every >= c->anchor_every && c->slot_ns >= 1 &&
            c->slot_cycle >= 1 && c->frame_length >= 8 && c->own_bytes >= 0 && c->early_count >= 1 && link->names >= 0 &&
            link->names <= DTSA_NAMES_MAX && link->header_length >= 0 &&
            link->header_length <= DTSA_HEADER_MAX && link->trust_ns >= 1 &&
            (!c->key || (c->key_length >= 16 && c->key_length <= 32)) &&
-           link->header_length + times + c->frame_length + DTSA_TAG_BYTES <= DTSA_DATAGRAM_MAX;
+           datagram_head(link) + c->frame_length + DTSA_TAG_BYTES <= DTSA_DATAGRAM_MAX;
 }
 
 static size_t rounded(size_t bytes) { return (bytes + 7) / 8 * 8; }
-
-int dtsa_datagram_length(const dtsa_station_settings *c)
-{
-    return c->link.header_length + (c->link.says_late ? 2 : 0) + 4 * c->link.names + c->frame_length +
-           (c->key ? DTSA_TAG_BYTES : 0);
-}
 
 size_t dtsa_station_bytes(const dtsa_station_settings *c)
 {
@@ -89,8 +83,7 @@ dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_
     s->settings = *settings;
     s->agent = *agent;
     s->datagram_length = dtsa_datagram_length(settings);
-    s->head_length =
-        s->datagram_length - settings->frame_length - (settings->key ? DTSA_TAG_BYTES : 0);
+    s->head_length = datagram_head(&settings->link);
     lay_out(s, (uint8_t *)memory + rounded(sizeof *s));
     set_times(s);
     s->slot = s->first = -1;
@@ -202,6 +195,7 @@ static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
     close_slot(s);
     s->hovers = why_it_hovers(s, slot, now);
     s->slot = slot;
+    if (s->leaving && !s->gone) s->agent.leave(s->agent.context); /* its last frame did not leave */
     s->frame_length = s->agent.open(s->agent.context, slot, s->hovers != DTSA_FLIES, s->frame, &chosen);
     if (s->frame_length && s->newcomer && now < s->same_id_until) { /* the other was here before */
         s->agent.unsent(s->agent.context);
@@ -227,7 +221,10 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
         s->counts.unsent++;
         return 0;
     }
-    datagram_write(s, now, late, datagram);
+    dtsa_named names[DTSA_NAMES_MAX] = {{0, 0}};
+    delay_name(s, now, names);
+    dtsa_datagram_write(&s->settings, s->frame, (uint32_t)((uint64_t)s->slot % s->settings.slot_cycle),
+                        late, names, datagram);
     s->frame_length = 0;
     s->sent_hashes[s->sent_index++ % SENT_HISTORY_LENGTH] =
         datagram_hash(datagram, s->datagram_length);
@@ -253,8 +250,8 @@ void dtsa_station_sent(dtsa_station *s, int64_t now, int taken)
 
 void dtsa_station_leave(dtsa_station *s)
 {
-    if (!s->leaving && !s->agent.leave(s->agent.context)) s->gone = 1;
     s->leaving = 1;
+    if (!s->agent.leave(s->agent.context)) s->gone = 1;
 }
 
 /* ---- what arrives ---- */
@@ -305,9 +302,8 @@ static void note_offset(dtsa_station *s, int64_t off)
 dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long length, int64_t arrival)
 {
     const dtsa_station_settings *c = &s->settings;
-    parsed_datagram d;
-    dtsa_verdict verdict = datagram_parse(s, data, length, &d);
-    if (!verdict && !datagram_has_frame(s, &d)) verdict = DTSA_NO_FRAME;
+    dtsa_datagram d;
+    dtsa_verdict verdict = dtsa_datagram_read(c, data, length, &d);
     if (verdict) return refuse(s, verdict, data, length, arrival);
     const int listens = s->state == DTSA_LISTENING;
     const int64_t began = arrival - c->link.flight_ns - d.late_ns,
@@ -416,8 +412,10 @@ static void agent_close(void *context, int64_t slot) { dtsa_agent_end(context, s
 static void agent_restart(void *context) { dtsa_agent_restart(context); }
 static int agent_leave(void *context)
 {
-    dtsa_agent_leave(context);
-    return dtsa_agent_is_on(context);
+    dtsa_agent *a = context;
+    if (a->policy->says_leaving) return a->present = PRESENT_LEAVING, 1;
+    dtsa_agent_leave(a);
+    return 0;
 }
 
 static int on_probation(void *context) { return dtsa_agent_status(context).probation; }

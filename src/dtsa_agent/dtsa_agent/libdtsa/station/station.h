@@ -9,21 +9,6 @@
 
 enum { SENT_HISTORY_LENGTH = 16, RECEPTIONS = 9 };
 
-/* An agent that a datagram names, and how much later than expected its sender hears it. */
-typedef struct named_peer {
-    int id; /* 0: none */
-    int64_t late_ns;
-} named_peer;
-
-typedef struct parsed_datagram {
-    int sender;
-    uint32_t slot; /* as on the air */
-    int64_t late_ns;
-    named_peer names[DTSA_NAMES_MAX];
-    const uint8_t *frame;
-    long frame_length; /* without the tag */
-} parsed_datagram;
-
 enum { KNOWS_OFFSET = 1, KNOWS_REPORT = 2, KNOWS_SUM = 4 };
 
 /* What is known of another agent. */
@@ -91,10 +76,7 @@ static inline int64_t limited(int64_t value, int64_t limit)
 static inline int64_t floor_div(int64_t a, int64_t b) /* b > 0 */ { return a / b - (a % b < 0); }
 
 /* datagram.c */
-dtsa_verdict datagram_parse(const dtsa_station *s, const uint8_t *data, long length,
-                            parsed_datagram *out);
-int datagram_has_frame(const dtsa_station *s, const parsed_datagram *d);
-void datagram_write(dtsa_station *s, int64_t now, int64_t late_ns, uint8_t *out);
+int datagram_head(const dtsa_link *link); /* bytes before the frame */
 uint64_t datagram_hash(const uint8_t *data, long length);
 
 /* clock.c */
@@ -107,13 +89,13 @@ int64_t clock_apart(const dtsa_station *s, int64_t a_ns, int64_t b_ns); /* a - b
 int clock_in_step(const dtsa_station *s, int64_t now); /* agents of the own time, with itself */
 
 /* delay.c */
-void delay_hear(dtsa_station *s, const parsed_datagram *d, int64_t offset_ns);
+void delay_hear(dtsa_station *s, const dtsa_datagram *d, int64_t offset_ns);
 void delay_shift(dtsa_station *s, int64_t by_ns);
 void delay_reset(dtsa_station *s);
-void delay_name(dtsa_station *s, int64_t now, named_peer out[DTSA_NAMES_MAX]);
+void delay_name(dtsa_station *s, int64_t now, dtsa_named out[DTSA_NAMES_MAX]);
 
 /* contacts.c */
-void contacts_hear(dtsa_station *s, const parsed_datagram *d);
+void contacts_hear(dtsa_station *s, const dtsa_datagram *d);
 int contacts_is_recent(const dtsa_station *s, const peer *p, int64_t now);
 int contacts_hears(const dtsa_station *s, const peer *p, int64_t now);
 int contacts_have_quorum(dtsa_station *s, int64_t now); /* fills the counts */
