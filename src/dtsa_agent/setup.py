@@ -26,11 +26,10 @@ COMPILE_FLAGS = [
 
 LIBRARY, SIMULATOR = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim"
 # What Python sees of both: all that these headers declare, in the order in which they include each other.
-HEADERS = [f"{LIBRARY}/{name}.h" for name in ("include/dtsa", "frame", "core", "avoider/avoider")]
-HEADERS += [f"{SIMULATOR}/{name}.h" for name in ("vehicle", "swarm", "metrics")]
-HEARING, SOCKET = "dtsa_agent/air/_hearing", "dtsa_agent/air/udp/_socket"
-QUEUE = "dtsa_agent/air/_queue"
-OF_THE_LIBRARY = ("draw", "frame", "tag", "timebase")  # what an agent on a network uses without Python between
+HEADERS = [f"{LIBRARY}/{name}.h" for name in ("include/dtsa", "include/dtsa_station", "frame", "core", "avoider/avoider")]
+HEADERS += [f"{SIMULATOR}/{name}.h" for name in ("vehicle", "swarm", "metrics", "live")]
+# What C calls in Python: an agent behind a station, and what is told of it (core/station.py).
+CALLBACKS = "dtsa_agent/core/callbacks.h"
 
 
 def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR)) -> list[str]:
@@ -41,6 +40,7 @@ def files(suffix: str, folders: tuple[str, ...] = (LIBRARY, SIMULATOR)) -> list[
 def binding() -> str:
     """Write the C code by which Python calls what HEADERS declare (cffi, limited API); return its path."""
     text = "\n".join(Path(header).read_text(encoding="utf-8") for header in HEADERS)
+    text += f'extern "Python" {{ {Path(CALLBACKS).read_text(encoding="utf-8")} }}'
     text = re.sub(r"/\*.*?\*/|#ifdef __cplusplus.*?#endif", "", text, flags=re.DOTALL)
     text = re.sub(r"^#define (DTSA_VERSION) (\d+)$", r"enum { \1 = \2 };", text, flags=re.MULTILINE)
     text = re.sub(r"^#.*$|\bDTSA_API\b", "", text, flags=re.MULTILINE)
@@ -66,32 +66,6 @@ setup(
             extra_compile_args=COMPILE_FLAGS,
             py_limited_api=True,  # cffi's code says so, too: one compiled file for Python 3.10 and later
             libraries=["m"],
-        ),
-        Extension(
-            "dtsa_agent.air._hearing",
-            sources=[*files(".c", (HEARING,)), *(f"{LIBRARY}/{name}.c" for name in OF_THE_LIBRARY)],
-            depends=[*files(".h", (LIBRARY, HEARING)), "setup.py"],
-            include_dirs=[f"{LIBRARY}/include", LIBRARY, HEARING],
-            define_macros=[("_GNU_SOURCE", None)],  # ppoll
-            extra_compile_args=COMPILE_FLAGS,
-            py_limited_api=True,
-        ),
-        Extension(
-            "dtsa_agent.air.udp._socket",
-            sources=files(".c", (SOCKET,)),
-            depends=[*files(".h", (HEARING, SOCKET)), "setup.py"],
-            include_dirs=[HEARING, SOCKET],  # of the hearing: port.h alone
-            define_macros=[("_GNU_SOURCE", None)],  # recvmmsg
-            extra_compile_args=COMPILE_FLAGS,
-            py_limited_api=True,
-        ),
-        Extension(
-            "dtsa_agent.air._queue",
-            sources=files(".c", (QUEUE,)),
-            depends=[*files(".h", (HEARING,)), "setup.py"],
-            include_dirs=[HEARING],  # port.h alone
-            extra_compile_args=COMPILE_FLAGS,
-            py_limited_api=True,
         ),
         Extension(
             "dtsa_agent.ros.common.workarounds._endless",

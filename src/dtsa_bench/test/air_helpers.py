@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_port
 from dtsa_agent.air.record import SlotRecord
@@ -56,7 +56,7 @@ class Flying:
     def __init__(self, own: AgentSettings, config: SwarmConfig, settings: PortSettings, path: Path) -> None:
         self.port = open_port(settings)
         self.said: list[str] = []  # in flight
-        self.agent = AirAgent(own, config, self.port, say=self.said.append)
+        self.agent = LiveAgent(own, config, self.port, say=self.said.append)
         self.recorder = AgentRecorder(path, own, config, settings)
         self.agent.watcher = self
         self.stop = Stop()

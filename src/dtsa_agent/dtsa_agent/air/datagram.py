@@ -7,7 +7,7 @@
 | 3 | 0 |
 | 4-7 | of the settings that all agents share, and of the session: 32 bits of their hash, little-endian |
 | 8-9 | how much later than its sender's slot the frame left, in 10 us, little-endian; the tag covers it |
-| 10-25 | four of those that its sender hears (:mod:`.delay`): id, 0: nobody; how much later than expected, in 10 us |
+| 10-25 | four agents that its sender hears: id, 0: none; how much later than expected, in 10 us |
 | 26-.. | the frame, sealed or not |
 
 Where bytes are dear a port has a shorter header (:class:`.port.PortProperties`): two to four bytes of the hash in place
@@ -19,26 +19,18 @@ A computer that is busy sends late. Its clock is not late, and says by how much 
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 from dtsa_agent.core.agents.pacing import BETWEEN
-from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.frame import named_in
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
+from dtsa_agent.core.station import Link
 
-from .delay import Peer
 from .port import Header, PortProperties
 
 NETWORK = PortProperties("udp")  # with the longest header
 HEADER = NETWORK.header(sealed=True).size  # bytes before the frame
-NOT_OURS, LENGTH, OTHER_SETTINGS = "not ours", "length", "other settings"
-NO_FRAME, UNKNOWN, REJECTED = "no frame", "unknown agent", "rejected"
-OTHER_TIME, REPEATED, OWN_ID, EARLY = "other time", "repeated", "own id", "too early"
 _MAGIC = b"DT\x01\x00"
 _WITH_MAGIC = 8  # bytes of the header that are the same in all datagrams of a swarm; fewer: they have no magic
 _TRUST_NS = 1_000_000
@@ -130,84 +122,8 @@ def header_of(config: SwarmConfig, port: PortProperties = NETWORK) -> bytes:
     return _MAGIC + agreed[:4] if count == _WITH_MAGIC else agreed[:count]
 
 
-class Said(NamedTuple):
-    """What a datagram says; ``fault`` why it says nothing, or an empty text."""
-
-    fault: str
-    sender: int = 0
-    slot: int = 0
-    late_ns: int = 0
-    peers: tuple[Peer, ...] = ()  # whom the sender hears how late
-    frame: bytes = b""  # without its tag
-
-
-class Wrapping:
-    """Puts frames into datagrams and takes them out.
-
-    :param config: what all agents share.
-    :param authenticator: seals and opens frames; None: they are not sealed.
-    :param port: what carries them.
-    """
-
-    def __init__(
-        self,
-        config: SwarmConfig,
-        authenticator: Authenticator | None,
-        port: PortProperties = NETWORK,
-    ) -> None:
-        self.header = header_of(config, port)
-        self.layout = port.header(config.auth)
-        self.peers = self.layout.peers // 4  # of those that it hears a datagram names so many
-        self._before = self.layout.size
-        self._times = struct.Struct("<" + self.peers * "Hh")
-        self.length = self._before + config.frame_length  # bytes of a datagram
-        self._agents, self._authenticator = config.agents, authenticator
-
-    @property
-    def sealed_with(self) -> tuple[bytes, int]:
-        """Key and session; no key: frames are not sealed."""
-        return (b"", 0) if self._authenticator is None else self._authenticator.key_and_session
-
-    def wrap(self, frame: bytes, slot: int, late_ns: int = 0, peers: Sequence[Peer] = ()) -> bytes:
-        """The datagram of a frame.
-
-        :param frame: the frame, not sealed yet.
-        :param slot: number of the slot in which it is sent.
-        :param late_ns: ns, how much later than its slot it leaves.
-        :param peers: whom its sender hears how late, as many at most as the port has room for.
-        """
-        told = [number for peer, late in peers for number in (peer, min(max(late // _UNIT_NS, -0x8000), 0x7FFF))]
-        told += [0] * (2 * self.peers - len(told))
-        late = min(max(late_ns, 0) // _UNIT_NS, 0xFFFF).to_bytes(2, "little")[: self.layout.late]
-        times = late + self._times.pack(*told)
-        sealed = frame if self._authenticator is None else self._authenticator.seal(frame, slot, times)
-        return self.header + times + sealed
-
-    def read(self, data: bytes) -> Said:
-        """What a datagram says.
-
-        :param data: the datagram.
-        """
-        agreed = len(self.header)
-        if agreed == _WITH_MAGIC and data[:3] != _MAGIC[:3]:
-            return Said(NOT_OURS)
-        if data[:agreed] != self.header:
-            return Said(OTHER_SETTINGS if len(data) >= agreed else LENGTH)
-        if len(data) != self.length:
-            return Said(LENGTH)
-        times, frame = data[agreed : self._before], data[self._before :]
-        named = named_in(frame)
-        if named is None:
-            return Said(NO_FRAME)
-        sender, slot = named
-        if not 1 <= sender <= self._agents:
-            return Said(UNKNOWN)
-        if self._authenticator is not None:
-            opened = self._authenticator.open(frame, slot, beside=times)
-            if opened is None:
-                return Said(REJECTED)
-            frame = opened
-        late = int.from_bytes(times[: self.layout.late], "little")
-        told = self._times.unpack(times[self.layout.late :])
-        peers = tuple((peer, by * _UNIT_NS) for peer, by in zip(told[::2], told[1::2], strict=True) if peer)
-        return Said("", sender, slot, late * _UNIT_NS, peers, frame)
+def link_of(config: SwarmConfig, port: PortProperties = NETWORK) -> Link:
+    """What carries the datagrams of a swarm, for its stations."""
+    layout = port.header(config.auth)
+    header, late = header_of(config, port), layout.late > 0
+    return Link(header, late, layout.peers // 4, flight_ns(config, port), trust_ns(config, port))

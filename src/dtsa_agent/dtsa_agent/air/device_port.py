@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Generic, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 
-from . import _queue
-from .port import Datagram, PortProperties
+from .port import ReceivedDatagram, PortProperties
 
 _END_S = 2.0  # a device that hangs ends with the process
+_ROOM = 256  # datagrams that wait for the agent
 _LOOK_S = 0.5  # between two looks whether a device that has gone is back
 
 
@@ -44,7 +47,9 @@ class DevicePort(ABC, Generic[D]):
     def __init__(self, name: str, kind: str, properties: PortProperties, device: D) -> None:
         self.properties = properties
         self.say: Callable[[str], None] | None = None  # is told a line when the device goes, and when it is back
-        self.compiled = _queue.open_queue()
+        self._arrived: deque[ReceivedDatagram] = deque()
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)  # readable while something waits
+        self.overflowed = 0  # datagrams for which there was no room
         self._name, self._missing = name, f"the {kind} is not there"
         self._device: D | None = device
         self._unplugged = 0
@@ -90,7 +95,7 @@ class DevicePort(ABC, Generic[D]):
 
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
-        return _queue.descriptor(self.compiled)
+        return self._event
 
     def send(self, data: bytes) -> str:
         """Hands a datagram to the device; why that was not possible, or an empty text.
@@ -106,12 +111,24 @@ class DevicePort(ABC, Generic[D]):
                 return str(error)
         return ""
 
-    def receive(self, most: int) -> list[Datagram]:
-        """What has arrived, in this order; empty if nothing has.
+    def receive(self, most: int) -> list[ReceivedDatagram]:
+        """What has arrived, in this order, so many at most; empty if nothing has."""
+        if not self._arrived:
+            return []
+        with suppress(BlockingIOError):
+            os.eventfd_read(self._event)
+        found = [self._arrived.popleft() for _ in range(min(most, len(self._arrived)))]
+        if self._arrived:
+            os.eventfd_write(self._event, 1)
+        return found
 
-        :param most: unused: 16 datagrams at most come at a time.
-        """
-        return [Datagram(*one) for one in _queue.get(self.compiled)]
+    def _put(self, data: bytes, arrival_ns: int, own: bool) -> None:
+        """The thread that reads has found a datagram."""
+        if len(self._arrived) >= _ROOM:
+            self.overflowed += 1
+            return
+        self._arrived.append(ReceivedDatagram(data, arrival_ns, own))
+        os.eventfd_write(self._event, 1)
 
     def _run(self) -> None:
         while not self._stopped.is_set():
@@ -153,6 +170,9 @@ class DevicePort(ABC, Generic[D]):
         if self._device is not None:
             self._device.close()
             self._device = None
+        if self._event >= 0:
+            os.close(self._event)
+            self._event = -1
 
     def __enter__(self) -> DevicePort[D]:
         return self

@@ -46,7 +46,7 @@ class PortProperties:
         return Header(self.agreed_bytes, 2, 4 * self.peers)
 
 
-class Datagram(NamedTuple):
+class ReceivedDatagram(NamedTuple):
     """What has arrived."""
 
     data: bytes
@@ -54,47 +54,34 @@ class Datagram(NamedTuple):
     own: bool  # this very port has sent it
 
 
-class DatagramPort(Protocol):
-    """What an agent with a clock of its own asks of the port that carries its datagrams."""
-
-    properties: PortProperties
-    compiled: Any  # a capsule: what the compiled hearing reads (_hearing/port.h)
-    say: Callable[[str], None] | None  # set by the agent: is told a line in flight when the port fails or is back
-
-    def send(self, data: bytes) -> str:
-        """Sends a datagram at once; why the port has not taken it, or an empty text.
-
-        :param data: the datagram.
-        """
-
-    def counts(self) -> dict[str, int]:
-        """What it counts, by name, for the agent's summary."""
-
-    def __enter__(self) -> DatagramPort: ...
-
-    def __exit__(self, *unused: object) -> None: ...
-
-
 class Listener(Protocol):
-    """What hears the datagrams of a swarm and sends none."""
+    """What hears the datagrams of a swarm."""
 
-    say: Callable[[str], None] | None  # is told a line when the port fails or is back
+    say: Callable[[str], None] | None  # prints a line when the port fails or is back; its user sets it
 
     def fileno(self) -> int:
         """For ``select``: readable when something has arrived."""
 
-    def receive(self, most: int) -> list[Datagram]:
-        """What has arrived, in this order; empty if nothing has.
-
-        :param most: number of datagrams at a time.
-        """
+    def receive(self, most: int) -> list[ReceivedDatagram]:
+        """Return what has arrived, so many datagrams at most, in this order; empty if nothing has."""
 
     def counts(self) -> dict[str, int]:
-        """What it counts, by name, for the summary."""
+        """Return what it counts, by name, for the summary."""
 
     def __enter__(self) -> Listener: ...
 
     def __exit__(self, *unused: object) -> None: ...
+
+
+class DatagramPort(Listener, Protocol):
+    """What an agent with a clock of its own asks of the port that carries its datagrams."""
+
+    properties: PortProperties
+
+    def send(self, data: bytes) -> str:
+        """Send a datagram at once; returns why the port has not taken it, or an empty text."""
+
+    def __enter__(self) -> DatagramPort: ...
 
 
 class PortSettings(Protocol):

@@ -19,7 +19,7 @@ class _Kind(NamedTuple):
 
 
 _KINDS = {
-    "udp": _Kind("udp.settings.UdpSettings", "udp.port.UdpPort", "udp.sockets.MulticastSocket"),
+    "udp": _Kind("udp.settings.UdpSettings", "udp.port.UdpPort", "udp.port.UdpPort"),
     "crazyradio": _Kind(
         "crazyradio.settings.CrazyradioSettings", "crazyradio.port.CrazyradioPort", "crazyradio.port.CrazyradioPort"
     ),

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from dtsa_agent.core.settings.config import MAX_AGENTS
 from dtsa_agent.core.settings.declaration import REQUIRED, Settings, check, setting
+from dtsa_agent.core.station import ALL_BUT_ONE, QUORUMS, parse_quorum
 
-from .quorum import ALL_BUT_ONE, ALLOWED, Quorum
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class AgentSettings(Settings):
         0.0, "it ends by itself after this time; 0: with a signal only", unit="s", minimum=0, maximum=1e6
     )
     quorum: str = setting(
-        ALL_BUT_ONE, f"it hovers unless it hears, and is heard by, so many of the others: {ALLOWED}", custom=True
+        ALL_BUT_ONE, f"it hovers unless it hears, and is heard by, so many of the others: {QUORUMS}", custom=True
     )
     priority: int = setting(20, "real-time priority, where allowed; 0: none", minimum=0, maximum=90)
     clock_offset_ns: int = setting(
@@ -34,4 +34,4 @@ class AgentSettings(Settings):
 
     def __post_init__(self) -> None:
         check(self)
-        Quorum(self.quorum)
+        parse_quorum(self.quorum)

@@ -1,4 +1,4 @@
-"""What an agent counts about itself."""
+"""What a live agent counts about itself; of bounded size, however long it flies."""
 
 from __future__ import annotations
 
@@ -8,110 +8,100 @@ from collections import Counter
 from typing import Any
 
 from dtsa_agent.core.agents.delays import Delays
+from dtsa_agent.core.station import STATES
 
 _ON_TIME_NS = 1_000_000
 TOO_LATE = "too late"  # an own frame that would have disturbed the next turn
 
 
 class Tally:
-    """Counts of one agent; of bounded size, however long it flies."""
+    """Counts of one agent. Times are CLOCK_MONOTONIC."""
 
     def __init__(self) -> None:
-        self.refused: Counter[str] = Counter()  # datagrams not taken in, by reason
-        self.slots = 0  # slots that are over
-        self.heard = 0  # frames of others taken in
-        self.unsent: Counter[str] = Counter()  # own frames that did not leave, by reason
-        self.began_ns = self.ended_ns = 0  # CLOCK_MONOTONIC
-        self.first_slot = -1  # with which it began for the first time
-        self.joined_ns = -1  # CLOCK_MONOTONIC, when
+        self.refused: Counter[str] = Counter()  # datagrams not accepted, by reason
+        self.unsent: Counter[str] = Counter()  # own frames that the port has not taken, by reason
+        self.began_ns = self.ended_ns = 0
+        self.first_slot = self.joined_ns = -1  # with which it began for the first time, and when
+        self.hovered = [0, 0]  # slots without a quorum, before it flew for the first time and since then
+        self.flew = False
         self._joined_s = 0.0  # processor time until then
-        self._there = self._hears = 0  # others that are there, and of these those that it hears, over all looks
+        self._others = self._hears = 0  # agents that are there, and those heard of them, over all looks
         self._last: dict[int, int] = {}  # slot of the last frame, by sender
-        self._oldest, self._oldest_of = 0, 0  # slots, and of whom
+        self._oldest, self._oldest_of = 0, 0  # slots, and of which agent
         self._late = Delays()  # frames sent, by how late they left
         self._off: Delays | None = None  # frames heard, by how far off they arrived
         self._on_time = 0
 
-    def begun(self, slot: int, now_ns: int) -> None:
-        """It begins, or begins anew: then slots count differently, and who was heard before counts as not heard yet.
-
-        :param slot: the first slot.
-        :param now_ns: ns, CLOCK_MONOTONIC.
-        """
+    def begun(self, slot: int) -> None:
+        """It begins, or restarts: who was heard before counts as not heard yet."""
         if self.first_slot < 0:
-            self.first_slot, self.joined_ns, self._joined_s = slot, now_ns, _processor_s()
+            self.first_slot, self.joined_ns, self._joined_s = slot, time.monotonic_ns(), _processor_s()
         self._last.clear()
 
     def hear(self, sender: int, slot: int, leaves: bool) -> None:
-        """A frame of another agent was taken in.
-
-        :param sender: id.
-        :param slot: in which it was sent.
-        :param leaves: it says that it leaves: its silence is no outage.
-        """
-        self.heard += 1
-        age = slot - self._last.get(sender, slot)
-        if age > self._oldest and self._there:
-            self._oldest, self._oldest_of = age, sender
+        """A frame was accepted; the silence of an agent that leaves is no outage."""
+        self._note_age(sender, slot - self._last.get(sender, slot))
         self._last[sender] = slot
         if leaves:
             del self._last[sender]
 
-    def look(self, there: int, hears: int) -> None:
-        """How it stands with the others while it flies, or could.
+    def _note_age(self, sender: int, age: int) -> None:
+        if age > self._oldest and self._others:
+            self._oldest, self._oldest_of = age, sender
 
-        :param there: number of others that are there.
-        :param hears: of these, those that it hears.
-        """
-        self._there += there
+    def look(self, others: int, hears: int) -> None:
+        """How it stands with the others while it flies, or could."""
+        self._others += others
         self._hears += hears
 
     def sent(self, late_ns: int) -> None:
-        """A frame was sent.
-
-        :param late_ns: ns, how much later than its slot started.
-        """
+        """A frame was sent so much later than its slot started."""
         self._late.add(late_ns)
         self._on_time += late_ns <= _ON_TIME_NS
 
     def off(self, off_ns: int) -> None:
-        """A frame was heard over a port whose arrivals vary.
-
-        :param off_ns: ns, how much earlier or later than expected it arrived.
-        """
-        if self._off is None:
-            self._off = Delays()
+        """A frame arrived so much earlier or later than expected, over a port whose arrivals vary."""
+        self._off = self._off or Delays()
         self._off.add(abs(off_ns))
 
-    def summary(self, slot: int = -1) -> dict[str, Any]:
+    def summary(self, slot: int, status: Any) -> dict[str, Any]:
         """The counts as plain values.
 
         :param slot: the present one.
+        :param status: a ``dtsa_station_status``.
         """
         for sender, last in self._last.items():
-            if slot - last > self._oldest and self._there:
-                self._oldest, self._oldest_of = slot - last, sender
-        sent = self._late.count()
-        used = _processor_s()
-        ended = self.ended_ns or time.monotonic_ns()
+            self._note_age(sender, slot - last)
+        used, ended = _processor_s(), self.ended_ns or time.monotonic_ns()
+        late = status.unsent - self.unsent.total()
+        unsent = self.unsent + Counter({TOO_LATE: max(0, late)})
+        never = self.hovered[0] and not self.flew
         return {
             "wall_time_s": (ended - self.began_ns) / 1e9,
             "first_slot": self.first_slot if self.first_slot >= 0 else None,
             "joined_after_s": (self.joined_ns - self.began_ns) / 1e9 if self.joined_ns >= 0 else None,
-            "slots": self.slots,
-            "sent": sent,
-            "unsent": self.unsent.total(),
-            "unsent_because": dict(sorted(self.unsent.items())),
-            "sends_on_time_share": self._on_time / sent if sent else None,
+            "slots": status.slots,
+            "sent": status.sent,
+            "unsent": unsent.total(),
+            "unsent_because": dict(sorted(unsent.items())),
+            "sends_on_time_share": self._on_time / status.sent if status.sent else None,
             "send_late_ms": _quantiles(self._late),
-            "heard": self.heard,
+            "heard": status.heard,
             **({} if self._off is None else {"arrivals_off_ms": _quantiles(self._off)}),
-            "heard_share": self._hears / self._there if self._there else None,
-            "oldest_heard_slots": self._oldest if self._there else None,
+            "heard_share": self._hears / self._others if self._others else None,
+            "oldest_heard_slots": self._oldest if self._others else None,
             "oldest_heard_of": self._oldest_of or None,
             "processor_s": used,
-            "processor_us_per_slot": (used - self._joined_s) / self.slots * 1e6 if self.slots else None,
+            "processor_us_per_slot": (used - self._joined_s) / status.slots * 1e6 if status.slots else None,
             "memory_mb": _memory_mb(),
+            "state": STATES[status.state],
+            "times_taken_over": max(0, status.restarts - 1),
+            "times_corrected": status.shifts,
+            "alignments": status.alignments,
+            "flight_time_error_us": status.flight_error_ns / 1e3,
+            "never_flew": f"never had its quorum, and hovered for {self.hovered[0]} slots" if never else "",
+            "held_at_start_slots": self.hovered[0],
+            "held_slots": self.hovered[1],
         }
 
 

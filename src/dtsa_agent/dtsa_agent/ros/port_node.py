@@ -12,7 +12,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.ports import make_settings, open_port, settings_class
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
@@ -51,7 +51,7 @@ def fly_over_port(node: Node, air: str, agent: int, stop: Stop) -> int:
     logger = node.get_logger()
     try:
         with open_port(chosen) as port:
-            flying = AirAgent(own, config, port, vehicle=vehicle, say=logger.warning)
+            flying = LiveAgent(own, config, port, vehicle=vehicle, say=logger.warning)
             with nullcontext() if record is None else record(out, flying, chosen) as recorder:
                 flying.run(stop)
             summary = flying.summary() if recorder is None else recorder.summary

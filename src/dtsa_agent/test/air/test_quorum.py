@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.contacts import Contact
 from dtsa_agent.air.quorum import ALL_BUT_ONE, Hold, Quorum
 from dtsa_agent.air.settings import AgentSettings
@@ -43,9 +43,9 @@ def test_other_words_are_refused(text: str) -> None:
 def test_a_number_that_can_never_be_there_is_refused() -> None:
     config = SwarmConfig(agents=3, policy="tdma")
     with UdpPort(UdpSettings(interface="lo")) as port:
-        AirAgent(AgentSettings(id=1, quorum="2"), config, port)
+        LiveAgent(AgentSettings(id=1, quorum="2"), config, port)
         with pytest.raises(ConfigError, match="at most 2, the number of the others"):
-            AirAgent(AgentSettings(id=1, quorum="3"), config, port)
+            LiveAgent(AgentSettings(id=1, quorum="3"), config, port)
 
 
 @given(percent=st.integers(0, 100), there=st.integers(0, 1023))

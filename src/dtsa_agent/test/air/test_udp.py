@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from plain_hearing import SlotTime
 
-from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.clock import OwnClock
 from dtsa_agent.air.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
 from dtsa_agent.air.delay import Delay
@@ -70,7 +70,7 @@ def test_agents_that_cannot_fly_are_refused_by_name(
 ) -> None:
     monkeypatch.setenv("DTSA_AUTH_KEY", key)
     with UdpPort(UdpSettings(interface="lo")) as port, pytest.raises(ConfigError) as error:
-        AirAgent(AgentSettings(id=own), config, port)
+        LiveAgent(AgentSettings(id=own), config, port)
     assert error.value.field == field
 
 
@@ -269,7 +269,7 @@ def test_who_wakes_late_sends_as_long_as_the_next_turn_is_not_disturbed(
     config = SwarmConfig(agents=2, policy="tdma", auth=False)
     udp = UdpSettings(interface="lo", group=f"239.255.78.78:{20_000 + os.getpid() % 10_000}", flight_time_ns=flight_ns)
     with UdpPort(udp) as port:
-        agent = AirAgent(AgentSettings(id=1), config, port)
+        agent = LiveAgent(AgentSettings(id=1), config, port)
         now = [time.monotonic_ns()]
         monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
         monkeypatch.setattr(agent, "_late_ns", lambda slot: now[0] - agent.hearing.slot_start_ns(slot))
@@ -289,7 +289,7 @@ def test_what_the_network_refuses_does_not_count_as_sent(monkeypatch: pytest.Mon
     udp = UdpSettings(interface="lo", group=f"239.255.79.79:{20_000 + os.getpid() % 10_000}")
     config = SwarmConfig(agents=2, policy="tdma")
     with UdpPort(udp) as port:
-        agent = AirAgent(AgentSettings(id=1), config, port, watcher := Records())
+        agent = LiveAgent(AgentSettings(id=1), config, port, watcher := Records())
         agent.hearing.hear_slot(101, time.monotonic_ns())
         agent._begin_anew()
         own = agent.slot + 2 - agent.slot % 2  # a turn of agent 1
@@ -322,7 +322,7 @@ def test_other_settings_and_another_key_are_said_in_flight(monkeypatch: pytest.M
     said: list[str] = []
     second, now = 1_000_000_000, [time.monotonic_ns()]
     with UdpPort(udp) as port:
-        agent = AirAgent(AgentSettings(id=1), config, port, say=said.append)
+        agent = LiveAgent(AgentSettings(id=1), config, port, say=said.append)
         frame = framed(2, 7)
         slow = Wrapping(others, Authenticator(KEY, 1)).wrap(frame, 7)
         strange = Wrapping(config, Authenticator(KEY[::-1], 1)).wrap(frame, 7)

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_port
 from dtsa_agent.air.settings import AgentSettings
@@ -44,7 +44,7 @@ def check(job: AgentJob, seconds: float) -> int:
     say(f"checks for {duration:.0f} s who is heard; its vehicle is held")
     watcher = Check(own.id, job.config, job.port.properties)
     with Stop() as stop, open_port(job.port) as port:
-        AirAgent(own, job.config, port, watcher, HeldVehicle(), say=say).run(stop)
+        LiveAgent(own, job.config, port, watcher, HeldVehicle(), say=say).run(stop)
     result = watcher.result()
     print(json.dumps(result, indent=2) + "\n" if job.as_json else table(result), end="")
     if result["missing"]:
@@ -61,7 +61,7 @@ def fly(job: AgentJob) -> int:
     failure = ""
     say = _speaker(job.own.id)
     with Stop() as stop, open_port(job.port) as port:
-        agent = AirAgent(job.own, job.config, port, say=say)
+        agent = LiveAgent(job.own, job.config, port, say=say)
         if job.out is None:
             agent.run(stop)
             summary = agent.summary()

@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
 import dtsa
-from dtsa_agent.air.agent import AirAgent
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
@@ -408,7 +408,7 @@ def test_a_second_agent_of_the_same_id_does_not_begin(tmp_path: Path) -> None:
         other = helpers.Flying(AgentSettings(id=2), config, udp, tmp_path / "again.mcap")
         wait_for(lambda: len(other.slots) > 5)  # who comes back is welcome
         with pytest.raises(ConfigError, match="id: got 1"), UdpPort(udp) as port:
-            AirAgent(AgentSettings(id=1), config, port).run(Stop())
+            LiveAgent(AgentSettings(id=1), config, port).run(Stop())
     finally:
         other.end()
         first.end()

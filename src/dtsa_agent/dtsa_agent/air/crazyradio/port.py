@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 
-from dtsa_agent.air import _queue
 from dtsa_agent.air.device_port import DevicePort
-from dtsa_agent.air.precision import going_first
+from dtsa_agent.air.process import going_first
 
 from .dongle import Dongle
 from .packets import Packet, PacketReader, broadcast, datagram_in
@@ -34,7 +33,7 @@ class CrazyradioPort(DevicePort[Dongle]):
         """What the dongle has lost, what else was on the air, and how often it was unplugged."""
         return {
             "dropped_by_dongle": self._dropped_before + self._dropped,
-            "dropped_by_computer": _queue.overflowed(self.compiled),
+            "dropped_by_computer": self.overflowed,
             "other_packets": self._others,
             "garbled_transfers": self._garbled,
             "strange_stamps": self._strange,
@@ -71,7 +70,7 @@ class CrazyradioPort(DevicePort[Dongle]):
         if datagram is None:
             self._others += 1
         else:
-            _queue.put(self.compiled, datagram, arrival_ns, False)
+            self._put(datagram, arrival_ns, False)
 
     def _lost(self) -> None:
         self._dropped_before, self._dropped = self._dropped_before + self._dropped, 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import deque
 
-from dtsa_agent.air import _queue
 from dtsa_agent.air.device_port import DevicePort
 
 from .device import Device
@@ -44,7 +43,7 @@ class SerialPort(DevicePort[Device]):
             "garbled_pieces": self._reader.garbled,
             "garbled_bytes": self._reader.garbled_bytes,
             "echoes": self._echoes,
-            "dropped_by_computer": _queue.overflowed(self.compiled),
+            "dropped_by_computer": self.overflowed,
             "times_unplugged": self._unplugged,
         }
 
@@ -70,7 +69,7 @@ class SerialPort(DevicePort[Device]):
             self._echoes += own
             self._datagrams += 1
             # The bytes after it in the same piece have taken their time on the line.
-            _queue.put(self.compiled, datagram, now_ns - after * self._byte_ns, own)
+            self._put(datagram, now_ns - after * self._byte_ns, own)
             if own:
                 self._tell_once("echoes", "gives back what it is given: own frames are left out")
         self._look_at_garbage()

@@ -2,6 +2,5 @@
 
 from .port import UdpPort
 from .settings import UdpSettings
-from .sockets import MulticastSocket
 
-__all__ = ["MulticastSocket", "UdpPort", "UdpSettings"]
+__all__ = ["UdpPort", "UdpSettings"]

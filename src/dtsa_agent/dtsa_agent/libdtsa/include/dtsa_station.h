@@ -181,6 +181,7 @@ DTSA_API void dtsa_station_leave(dtsa_station *station);
 /* Whether a datagram may make it due earlier: before that the others may wait in the port. */
 DTSA_API int dtsa_station_awaits_frame(const dtsa_station *station, int64_t now_ns);
 DTSA_API int dtsa_station_hovers(const dtsa_station *station); /* DTSA_FLIES.. in this slot */
+DTSA_API int64_t dtsa_station_slot(const dtsa_station *station); /* -1: none yet */
 DTSA_API int64_t dtsa_station_slot_start(const dtsa_station *station, int64_t slot);
 DTSA_API int64_t dtsa_station_heard_ns(const dtsa_station *station, int id); /* INT64_MIN: never */
 DTSA_API void dtsa_station_get_status(const dtsa_station *station, dtsa_station_status *status);

@@ -368,6 +368,8 @@ int64_t dtsa_station_step(dtsa_station *s, int64_t now, uint8_t *datagram, int *
 
 int dtsa_station_hovers(const dtsa_station *s) { return s->hovers; }
 
+int64_t dtsa_station_slot(const dtsa_station *s) { return s->slot; }
+
 int dtsa_station_awaits_frame(const dtsa_station *s, int64_t now)
 {
     const int64_t next = dtsa_station_slot_start(s, s->slot + 1);

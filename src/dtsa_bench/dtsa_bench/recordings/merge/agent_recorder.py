@@ -22,7 +22,7 @@ from dtsa_bench.runs.options import new_directory
 from .json_bag import JsonBag, described
 
 if TYPE_CHECKING:
-    from dtsa_agent.air.agent import AirAgent
+    from dtsa_agent.air.driver import LiveAgent
 
 SLOT, REFUSED = "slot", "refused"  # topics
 METADATA, SUMMARY = "dtsa_agent", "dtsa_summary"  # metadata records
@@ -149,7 +149,7 @@ class AgentRecorder(JsonBag):
 
 
 @contextmanager
-def recorded(out: str, agent: AirAgent, port: PortSettings) -> Iterator[AgentRecorder]:
+def recorded(out: str, agent: LiveAgent, port: PortSettings) -> Iterator[AgentRecorder]:
     """The directory of an agent that flies within the context: its bag, and at the end ``summary.json``.
 
     It is an entry point, so that the agent's node finds it (``dtsa.recorders``).

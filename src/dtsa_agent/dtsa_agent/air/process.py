@@ -17,12 +17,6 @@ def wake_precisely() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, _SLACK_NS, 0, 0, 0)
 
 
-def give_back_memory() -> None:
-    """Gives back to Linux what was needed before a flight only, where the C library can."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 @contextmanager
 def going_first(level: int) -> Iterator[str]:
     """Lets this thread run before everything ordinary (SCHED_RR) until the end of the context; not what it starts.

@@ -1,0 +1,272 @@
+"""One live agent: a station, connected with a clock, a port and a vehicle. What it does itself is wait.
+
+The rules are the station's (``core.station``). The loop sleeps until the station is due, hands in what has arrived, sends
+what the station gives, and flies the vehicle.
+"""
+
+from __future__ import annotations
+
+import gc
+import select
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.frame import condition_in
+from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.settings.config import SwarmConfig
+from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, Station, StationSettings, check_joinable
+from dtsa_agent.keys import authenticator, check_session
+from dtsa_agent.stop import Stop
+
+from .datagram import check_fits, late_in, link_of
+from .port import DatagramPort
+from .process import going_first, wake_precisely
+from .record import Heard, SlotRecord, Watcher
+from .reports import Reports
+from .settings import AgentSettings
+from .tally import Tally
+from .vehicle import SimulatedVehicle, Vehicle
+
+_SECOND = _PPB = 1_000_000_000
+_SIGNAL_POLL_S = 0.05  # a signal is noticed after this time at the latest
+_LEAVING_NS = 900_000_000  # a signal is obeyed within a second
+_LOOK_NS = 40_000_000  # from one look at the station's status to the next
+_BURST = 16  # datagrams that are read at a time: whatever comes, the own slots go on
+
+
+class ClockMap:
+    """An agent's clock: CLOCK_MONOTONIC, in trials with an offset and a drift.
+
+    :param offset_ns: by how much it is ahead when it is made.
+    :param drift_ppb: parts per billion by which it runs fast.
+    """
+
+    __slots__ = ("_began", "_drift", "_offset")
+
+    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0) -> None:
+        self._began, self._offset, self._drift = time.monotonic_ns(), offset_ns, drift_ppb
+
+    def local_ns(self, monotonic_ns: int) -> int:
+        """What the clock shows at a time of CLOCK_MONOTONIC."""
+        return monotonic_ns + self._offset + (monotonic_ns - self._began) * self._drift // _PPB
+
+    def monotonic_ns(self, local_ns: int) -> int:
+        """When the clock shows a time, CLOCK_MONOTONIC, to 2 ns."""
+        elapsed = local_ns - self._offset - self._began
+        return self._began + elapsed - elapsed * self._drift // (_PPB + self._drift)
+
+
+class LiveAgent:
+    """An agent that begins its slots by its own clock, and whose frames go over a port.
+
+    :param own: this agent.
+    :param config: the settings that all agents share.
+    :param port: what carries its datagrams; the caller keeps it open while the agent flies.
+    :param watcher: is told what happens; None: nobody is.
+    :param vehicle: what it flies; None: a simulated one.
+    :param say: prints a line in flight; None: nothing is printed.
+    :raises ConfigError: for an id or a policy that cannot fly here, or a missing key or session.
+    """
+
+    def __init__(
+        self,
+        own: AgentSettings,
+        config: SwarmConfig,
+        port: DatagramPort,
+        watcher: Watcher | None = None,
+        vehicle: Vehicle | None = None,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        if own.id > config.agents:
+            raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
+        check_joinable(config.policy)
+        check_session(config)
+        check_fits(config, port.properties)
+        link = link_of(config, port.properties)
+        self.own, self.config, self.port, self.watcher = own, config, port, watcher
+        self._settings = StationSettings(config, link, authenticator(config), own.id, own.quorum)
+        self.swarm = make_swarm(config, local=[own.id])
+        self.clock = ClockMap(own.clock_offset_ns, own.clock_drift_ppb)
+        self.station = self._start()
+        self.slot = -1  # the present slot
+        self.tally = Tally()
+        self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
+        port.say = say
+        self._reports = Reports(own.id, config.slot_ms, say, time.monotonic_ns())
+        self._next_look_ns = 0
+        self._flight_ns = link.flight_ns
+        self._layout = port.properties.header(config.auth) if port.properties.varies else None
+        self._says_leaving = config.policy_row.says_leaving
+        self._record: SlotRecord | None = None  # of the present slot
+        self._before: list[Heard] = []  # heard after it began anew and before its first slot
+        self._no_priority = ""  # why it has none
+        self._leaves_by: int | None = None  # CLOCK_MONOTONIC, ns
+        self._signals = 0
+
+    def _start(self) -> Station:
+        now = self.clock.local_ns(time.monotonic_ns())
+        return Station(self.swarm, self._settings, now, lambda slot: self._vehicle.sense(self.swarm), self)
+
+    # The loop.
+
+    def run(self, stop: Stop) -> None:
+        """Fly until a signal comes or the time is over; with policy ``lease`` it first says that it leaves."""
+        wake_precisely()
+        gc.collect()
+        gc.freeze()  # nothing made so far is garbage: do not look at it again and again
+        with going_first(self.own.priority) as self._no_priority:
+            self._run(stop)
+        self.tally.ended_ns = time.monotonic_ns()
+
+    def _run(self, stop: Stop) -> None:
+        began = self.tally.began_ns = time.monotonic_ns()
+        end = began + round(self.own.duration_s * _SECOND) if self.own.duration_s else None
+        while not self._vehicle.ready():
+            now = time.monotonic_ns()
+            self._reports.state("waits for the vehicle's odometry", now)
+            if stop or (end is not None and now >= end):
+                return
+            time.sleep(_SIGNAL_POLL_S)
+        station = self.station = self._start()
+        local, receive, step, descriptor = self.clock.local_ns, self.port.receive, station.step, [self.port.fileno()]
+        while not ((stop.signal or end is not None) and self._has_ended(stop, end)):
+            arrived = receive(_BURST)
+            for data, arrival_ns, own in arrived:
+                if not own:
+                    station.receive(data, local(arrival_ns))
+            while True:
+                now = time.monotonic_ns()
+                shown = local(now)
+                due, datagram = step(shown)
+                if datagram:
+                    self._send(datagram)
+                elif station.slot != self.slot:
+                    self._fly(station.slot, now)
+                elif due > shown:
+                    break
+            if len(arrived) == _BURST:
+                continue
+            if self.slot < 0:
+                self._reports.state("listens for others", now)
+            left = min((self.clock.monotonic_ns(due) - time.monotonic_ns()) / 1e9, _SIGNAL_POLL_S)
+            if left > 0 and station.awaits_frame(shown):
+                select.select(descriptor, (), (), left)
+            elif left > 0:  # one wake-up a slot: datagrams wait in the port, which has noted when they arrived
+                time.sleep(left)
+        self._close_record()
+
+    def _has_ended(self, stop: Stop, end: int | None) -> bool:
+        """Whether to end now: after a second signal, when it has said that it leaves, or has no time left to."""
+        now = time.monotonic_ns()
+        if not stop and (end is None or now < end):
+            return False
+        if self._leaves_by is None:
+            if not self._says_leaving or self.slot < 0:
+                return True
+            turns = (self.config.main_every + 1) * self.config.agents * self.config.slot_ns
+            self._leaves_by, self._signals = now + min(_LEAVING_NS, turns), stop.count
+            self.station.leave()
+        return self.station.status.gone or now >= self._leaves_by or stop.count > self._signals
+
+    def _fly(self, slot: int, now: int) -> None:
+        """A slot has begun: fly through it."""
+        tally, hovers = self.tally, self.station.hovers
+        self.slot = slot
+        self._vehicle.fly(self.swarm, slot)
+        if hovers == FLIES:
+            tally.flew = True
+        elif hovers == NO_QUORUM:
+            tally.hovered[tally.flew] += 1
+        if now >= self._next_look_ns:
+            self._next_look_ns = now + _LOOK_NS
+            status = self.station.status
+            if hovers != IS_NEW:
+                tally.look(status.others, status.hears)
+            self._reports.status(status, now)
+
+    def _send(self, datagram: bytes) -> None:
+        refusal = self.port.send(datagram)
+        now = time.monotonic_ns()
+        self.station.sent(self.clock.local_ns(now), not refusal)
+        if refusal:
+            self.tally.unsent[refusal] += 1
+            self._reports.refused(refusal, now)
+        else:
+            self._reports.taken(now)
+
+    # Events of the station.
+
+    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
+        """Record the decision for a slot."""
+        self._close_record()
+        if self.watcher is None:
+            return
+        swarm, before, self._before = self.swarm, self._before, []
+        self._record = SlotRecord(
+            slot, start_ns, now_ns, is_first, int(swarm.present[0]), int(swarm.chosen[0]), int(swarm.reason[0]),
+            int(swarm.digest[0]), float(swarm.score[0]), swarm.track[:, :, 0].copy(), swarm.velocity[:, 0].copy(),
+            swarm.command[:, 0].copy(), swarm.goal[:, 0].copy(), swarm.frame(0), before=before,
+        )  # fmt: skip
+
+    def restarted(self, slot: int) -> None:
+        """The agent begins anew with the next slot."""
+        self._close_record()
+        self._before.clear()
+        self.slot = slot
+        self.tally.begun(slot + 1)
+
+    def sent(self, slot: int, datagram: bytes, now_ns: int) -> None:
+        """Count and record an own datagram."""
+        self.tally.sent(max(0, now_ns - self.station.slot_start_ns(slot)))
+        if self._record is not None:
+            self._record.sent_ns, self._record.datagram = now_ns, datagram
+
+    def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
+        """Count and record a frame."""
+        if accepted:
+            frame = datagram[-self.config.frame_length :]
+            self.tally.hear(sender, slot, self._says_leaving and condition_in(frame)[0])
+            if self._layout is not None:
+                start, late = self.station.slot_start_ns(slot), late_in(datagram, self._layout)
+                self.tally.off(arrival_ns - start - self._flight_ns - late)
+        if self.watcher is not None:
+            heard = Heard(sender, slot, arrival_ns, datagram, accepted)
+            (self._before if self._record is None else self._record.heard).append(heard)
+
+    def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
+        """Count and record a datagram that was not accepted."""
+        self.tally.refused[fault] += 1
+        self._reports.foreign(fault, time.monotonic_ns())
+        if self.watcher is not None:
+            self.watcher.other(fault, datagram, arrival_ns)
+
+    def _close_record(self) -> None:
+        record, self._record = self._record, None
+        if record is not None and self.watcher is not None:
+            self.watcher.slot(record)
+
+    def summary(self) -> dict[str, Any]:
+        """What came of it, as plain values."""
+        swarm, away = self.swarm, self.swarm.goal[:, 0] - self.swarm.position[:, 0]
+        refused = self.tally.refused + Counter({"malformed": swarm.malformed, "foreign": swarm.foreign})
+        return {
+            "id": self.own.id,
+            "agents": self.config.agents,
+            "policy": self.config.policy,
+            "slot_ms": self.config.slot_ms,
+            "sealed": self.config.auth,
+            "no_priority": self._no_priority,
+            "quorum": self.own.quorum,
+            **self.tally.summary(self.slot, self.station.status),
+            "slots_too_short": self._reports.slots_too_short,
+            "heard_of": sorted(int(k) + 1 for k in np.flatnonzero(swarm.sent_slot[0] >= 0) if k + 1 != self.own.id),
+            "not_taken_in": dict(sorted(refused.items())),
+            **self.port.counts(),
+            "position_m": [round(float(x), 4) for x in swarm.position[:, 0]],
+            "arrived": bool(np.sqrt((away * away).sum()) <= self.config.r_min and swarm.final[0]),
+        }

@@ -1,0 +1,356 @@
+"""A station: one agent with a clock of its own. Datagrams and time in, datagrams and the time of the next wake-up out.
+
+It knows no clock and no I/O; the rules are ``libdtsa/station``, and once more in plain Python ``core/reference/station``.
+Times are ns of the own clock.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from .authentication import Authenticator
+from .errors import ConfigError
+from .frame import TAG_LENGTH, position_step
+from .kernel import ffi, lib
+from .registry import POLICIES
+from .settings.config import SwarmConfig
+from .swarm import PRESENT_LEAVING, Swarm
+
+#: What became of a datagram, in the order of ``dtsa_verdict``; empty: it was accepted.
+VERDICTS = (
+    "", "not ours", "length", "other settings", "no frame", "unknown agent", "rejected", "repeated", "other time",
+    "own id", "too early",
+)  # fmt: skip
+STATES = ("listening", "alone", "joined")
+FLIES, LISTENS, IS_NEW, SAME_ID, NO_QUORUM = range(5)  # why an agent hovers
+ALL_BUT_ONE = "all-but-one"
+QUORUMS = f"{ALL_BUT_ONE}, a share of the others (80%), or a number of them (0: it never hovers for this)"
+FOR_EVER = 1 << 31  # slots
+EARLY_COUNT = 64  # frames of slots still to come that are kept
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """What carries the datagrams of a swarm."""
+
+    header: bytes  # with which all of them begin
+    says_late: bool  # they say how late they left
+    names: int  # heard agents that each names
+    flight_ns: int  # from the order to send one until it arrives
+    trust_ns: int  # frames that are off by more do not show where slots begin
+
+
+class Named(NamedTuple):
+    """An agent that a datagram names: one that its sender hears."""
+
+    id: int
+    late_ns: int  # how much later than expected
+
+
+class ParsedDatagram(NamedTuple):
+    """What a datagram says; ``fault`` why it says nothing, or an empty text."""
+
+    fault: str
+    sender: int = 0
+    slot: int = 0
+    late_ns: int = 0
+    names: tuple[Named, ...] = ()
+    frame: bytes = b""  # without its tag
+
+
+class Events(Protocol):
+    """Who records what happens to a station."""
+
+    def opened(self, slot: int, start_ns: int, now_ns: int, is_first: bool) -> None:
+        """A slot is open: the agent has decided."""
+
+    def restarted(self, slot: int) -> None:
+        """A slot is over, and the agent begins anew with the next."""
+
+    def sent(self, slot: int, datagram: bytes, now_ns: int) -> None:
+        """A datagram is handed to the port."""
+
+    def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
+        """The slot of a frame has begun, and the agent has heard it."""
+
+    def refused(self, fault: str, datagram: bytes, arrival_ns: int) -> None:
+        """A datagram was not accepted."""
+
+
+def check_joinable(policy: str) -> None:
+    """Refuse a policy with which agents cannot come into a flight that is under way.
+
+    :raises ConfigError: if it is one.
+    """
+    row = POLICIES.row(policy)
+    if not row.may_join or row.unslotted:
+        joinable = [row.name for row in POLICIES.rows.values() if row.may_join]
+        raise ConfigError("policy", policy, f"{', '.join(joinable)}, to come into a flight that is under way")
+
+
+def parse_quorum(text: str) -> tuple[int, float]:
+    """The quorum that a text means, for ``dtsa_station_settings``: number and share.
+
+    :raises ConfigError: for another text.
+    """
+    share = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)%", text) if isinstance(text, str) else None
+    if share and float(share[1]) <= 100.0:
+        return lib.DTSA_QUORUM_SHARE, float(share[1]) / 100.0
+    if text == ALL_BUT_ONE:
+        return lib.DTSA_QUORUM_ALL_BUT_ONE, 0.0
+    if isinstance(text, str) and text.isascii() and text.isdigit():
+        return int(text), 0.0
+    raise ConfigError("quorum", text, QUORUMS)
+
+
+def _limits(config: SwarmConfig) -> tuple[int, int]:
+    """Slots after which an agent counts as silent: one that moves, one that rests; 0: what libdtsa says."""
+    row, round_ = config.policy_row, config.agents
+    turn = max(2 * config.anchor_every * round_, round(0.5 / config.slot_s))
+    if "received" in row.port and not row.extended:  # agents send by chance, and those that have arrived need not
+        return max(turn, 6 * config.main_every * round_), FOR_EVER
+    return (0, 0) if row.extended else (turn, turn)
+
+
+class StationSettings:
+    """The settings of a station as C has them; they also read and write datagrams.
+
+    :param config: the settings that all agents share.
+    :param link: what carries the datagrams.
+    :param authenticator: key and session, if frames are signed.
+    :param id: own id; 1 where only datagrams are read.
+    :raises ConfigError: for a quorum that cannot be.
+    """
+
+    def __init__(
+        self,
+        config: SwarmConfig,
+        link: Link,
+        authenticator: Authenticator | None = None,
+        id: int = 1,
+        quorum: str = "0",
+        origin_ns: int | None = None,
+    ) -> None:
+        key, session = (b"", 0) if authenticator is None else authenticator.key_and_session
+        number, share = parse_quorum(quorum)
+        if number >= config.agents:
+            raise ConfigError("quorum", quorum, f"at most {config.agents - 1}, the number of the others")
+        moving, resting = _limits(config)
+        self._key = ffi.new("uint8_t[]", key)
+        rests = config.policy_row.probation  # agents that rest send in main anchors alone
+        lease = {"anchor_every": config.anchor_every, "main_every": config.main_every, "open_every": config.open_period}
+        cycle = lib.dtsa_slot_cycle(ffi.new("dtsa_config *", {"agents": config.agents, "lease": lease}))
+        self.c = ffi.new("dtsa_station_settings *", {
+            "id": id, "agents": config.agents, "anchor_every": config.anchor_every,
+            "main_every": config.main_every if rests else config.anchor_every, "slot_cycle": cycle,
+            "extended": config.extended, "own_bytes": config.own_bytes,
+            "frame_length": config.frame_length - (TAG_LENGTH if config.auth else 0),
+            "position_step": position_step(config.extent_m), "slot_ns": config.slot_ns, "seed": config.seed,
+            "moving_slots": moving, "resting_slots": resting, "quorum": number, "quorum_share": share,
+            "key": self._key if key else ffi.NULL, "key_length": len(key), "session": session,
+            "early_count": EARLY_COUNT, "begins": origin_ns is not None, "origin_ns": origin_ns or 0,
+            "link": {
+                "header": link.header, "header_length": len(link.header), "says_late": link.says_late,
+                "names": link.names, "flight_ns": link.flight_ns, "trust_ns": link.trust_ns,
+            },
+        })  # fmt: skip
+        self.names = link.names
+        self.length: int = lib.dtsa_datagram_length(self.c)  # of all datagrams, bytes
+
+    def read(self, data: bytes) -> ParsedDatagram:
+        """What a datagram says."""
+        out = ffi.new("dtsa_datagram *")
+        verdict = lib.dtsa_datagram_read(self.c, data, len(data), out)
+        if verdict:
+            return ParsedDatagram(VERDICTS[verdict])
+        names = tuple(Named(one.id, one.late_ns) for one in list(out.names)[: self.names] if one.id)
+        frame = bytes(ffi.buffer(out.frame, out.frame_length))
+        return ParsedDatagram("", out.sender, out.slot, out.late_ns, names, frame)
+
+    def write(self, frame: bytes, slot: int, late_ns: int = 0, names: tuple[tuple[int, int], ...] = ()) -> bytes:
+        """The datagram of a frame that carries no tag yet.
+
+        :param late_ns: how much later than its slot it leaves.
+        :param names: ids of heard agents, and how much later than expected each is heard, ns.
+        """
+        if len(frame) != self.c.frame_length:
+            raise ValueError(f"frame: got {len(frame)} bytes; allowed: {self.c.frame_length}")
+        out = ffi.new("uint8_t[]", lib.DTSA_DATAGRAM_MAX)
+        named = ffi.new("dtsa_named[]", [*names, *((0, 0),) * (lib.DTSA_NAMES_MAX - len(names))])
+        length = lib.dtsa_datagram_write(self.c, frame, slot % self.c.slot_cycle, late_ns, named, out)
+        return bytes(ffi.buffer(out, length))
+
+
+class Station:
+    """One agent of a swarm, from its first frame to its last.
+
+    :param swarm: the agent, alone in its :class:`Swarm`.
+    :param settings: see there.
+    :param now_ns: when it begins to listen.
+    :param before_slot: is called before the agent decides for a slot; writes its state.
+    :param events: is told what happens.
+    """
+
+    def __init__(
+        self,
+        swarm: Swarm,
+        settings: StationSettings,
+        now_ns: int,
+        before_slot: Callable[[int], None] | None = None,
+        events: Events | None = None,
+    ) -> None:
+        self.swarm, self._settings, self._before, self.events = swarm, settings, before_slot, events
+        self.fault: BaseException | None = None  # raised in a callback; the caller of C raises it again
+        self._flies = swarm.scenario.moving[swarm.local] if swarm.course is None else None
+        self._probation = swarm.config.policy_row.probation
+        self._handle = ffi.new_handle(self)
+        size = lib.dtsa_station_bytes(settings.c)
+        self._memory = ffi.new("double[]", size // 8 + 1)
+        self.c = lib.dtsa_station_start(self._memory, size, settings.c, self._agent(), now_ns)
+        if not self.c:
+            raise ValueError("a station cannot be made of these settings")
+        if events is not None:
+            lib.dtsa_station_observe(self.c, self._observer())
+        self._out = ffi.new("uint8_t[]", lib.DTSA_DATAGRAM_MAX)
+        self._buffer, self._length = ffi.buffer(self._out), ffi.new("int *")
+        self._status = ffi.new("dtsa_station_status *")
+        self._receive, self._step = lib.dtsa_station_receive, lib.dtsa_station_step
+
+    def _agent(self) -> Any:
+        return ffi.new("dtsa_station_agent *", [
+            self._handle, lib.station_open, lib.station_hear, lib.station_unsent, lib.station_close,
+            lib.station_restart, lib.station_leave, lib.station_on_probation,
+        ])  # fmt: skip
+
+    def _observer(self) -> Any:
+        return ffi.new("dtsa_station_events *", [
+            self._handle, lib.station_opened, lib.station_restarted, lib.station_sent, lib.station_heard,
+            lib.station_refused,
+        ])  # fmt: skip
+
+    def receive(self, data: bytes, arrival_ns: int) -> int:
+        """Hand in a datagram, whatever it is, in the order of arrival; returns an index into ``VERDICTS``."""
+        verdict: int = self._receive(self.c, data, len(data), arrival_ns)
+        if self.fault is not None:
+            self._raise()
+        return verdict
+
+    def step(self, now_ns: int) -> tuple[int, bytes]:
+        """Do one thing that is due. Returns when to call again at the latest (now: at once), and what to send now."""
+        due: int = self._step(self.c, now_ns, self._out, self._length)
+        if self.fault is not None:
+            self._raise()
+        length = self._length[0]
+        return due, self._buffer[:length] if length else b""
+
+    def sent(self, now_ns: int, taken: bool) -> None:
+        """Say what became of the datagram that the last step gave; False: the port has refused it."""
+        lib.dtsa_station_sent(self.c, now_ns, taken)
+
+    def leave(self) -> None:
+        """Announce on the air that the agent leaves, where frames can."""
+        lib.dtsa_station_leave(self.c)
+
+    def awaits_frame(self, now_ns: int) -> bool:
+        """Whether a datagram may make it due earlier; until then datagrams may wait in the port."""
+        return bool(lib.dtsa_station_awaits_frame(self.c, now_ns))
+
+    @property
+    def slot(self) -> int:
+        """The present slot, -1: none yet."""
+        return int(lib.dtsa_station_slot(self.c))
+
+    def slot_start_ns(self, slot: int) -> int:
+        """When a slot starts; it may still move a little with what is heard."""
+        return int(lib.dtsa_station_slot_start(self.c, slot))
+
+    def heard_ns(self, id: int) -> int | None:
+        """When the last frame of an agent arrived; None: none has."""
+        when = lib.dtsa_station_heard_ns(self.c, id)
+        return None if when == -(1 << 63) else when
+
+    @property
+    def status(self) -> Any:
+        """A ``dtsa_station_status``, good until it is asked for again."""
+        lib.dtsa_station_get_status(self.c, self._status)
+        return self._status
+
+    @property
+    def hovers(self) -> int:
+        """Why the agent hovers in the present slot; ``FLIES``: it does not."""
+        return int(lib.dtsa_station_hovers(self.c))
+
+    def _raise(self) -> None:
+        fault, self.fault = self.fault, None
+        assert fault is not None
+        raise fault
+
+    # What C calls.
+
+    def open(self, slot: int, hovers: int, frame: Any, chosen: Any) -> int:
+        swarm = self.swarm
+        if self._before is not None:
+            self._before(slot)
+        if self._flies is not None:
+            swarm.active[:] = self._flies
+        swarm.scenario.advance(slot, swarm)
+        if hovers:
+            swarm.active[0] = 0
+        sends = swarm.begin(slot)
+        chosen[0] = swarm.chosen[0]
+        if not sends:
+            return 0
+        data = swarm.frame(0)
+        ffi.memmove(frame, data, len(data))
+        return len(data)
+
+    def leave_air(self) -> int:
+        if not self.swarm.config.policy_row.says_leaving:
+            self.swarm.present[0] = 0
+            return 0
+        self.swarm.present[0] = PRESENT_LEAVING
+        return 1
+
+    def probation(self) -> bool:
+        return self._probation and bool(self.swarm.lease_status(0)["probation"])
+
+
+def _callback(act: Callable[..., Any], name: str) -> None:
+    """Let C call a function of (station, ...); an exception ends the call of the station's user."""
+
+    is_void = ffi.typeof(getattr(lib, name)).result.cname == "void"
+
+    def call(context: Any, *values: Any) -> int | None:
+        station: Station = ffi.from_handle(context)
+        try:
+            answer = act(station, *values)
+            return None if is_void else int(answer)
+        except BaseException as error:
+            station.fault = station.fault or error
+            return None if is_void else 0
+
+    ffi.def_extern(name)(call)
+
+
+def _bytes(data: Any, length: int) -> bytes:
+    return bytes(ffi.buffer(data, length))
+
+
+_callback(Station.open, "station_open")
+_callback(lambda s, slot, data, n: s.swarm.hear(slot, _bytes(data, n)), "station_hear")
+_callback(lambda s: s.swarm.drop(0), "station_unsent")
+_callback(lambda s, slot: s.swarm.end(slot), "station_close")
+_callback(lambda s: s.swarm.restart(0), "station_restart")
+_callback(Station.leave_air, "station_leave")
+_callback(Station.probation, "station_on_probation")
+_callback(lambda s, slot, start, now, first: s.events.opened(slot, start, now, bool(first)), "station_opened")
+_callback(lambda s, slot: s.events.restarted(slot), "station_restarted")
+_callback(lambda s, slot, data, n, now: s.events.sent(slot, _bytes(data, n), now), "station_sent")
+_callback(
+    lambda s, sender, slot, data, n, arrival, ok: s.events.heard(sender, slot, _bytes(data, n), arrival, bool(ok)),
+    "station_heard",
+)
+_callback(lambda s, verdict, data, n, at: s.events.refused(VERDICTS[verdict], _bytes(data, n), at), "station_refused")
