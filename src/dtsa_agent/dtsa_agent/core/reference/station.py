@@ -85,11 +85,11 @@ class Peer:
     steady: bool = False  # its last two frames show the same time
     offset_ns: int | None = None  # how much later than expected it is heard
     report_ns: int | None = None  # how much later than expected it says to hear this agent
+    reported_ns: int = 0  # when it said so last
     sum_ns: int | None = None
     unnamed: int = 0
     hears_us: int = 0  # 1: yes, -1: no, 0: it has not said
-    resting: bool = False
-    probation: bool = False
+    resting: bool = False  # it sends in main anchors alone: it rests, or is on probation
     left: bool = False
 
 
@@ -151,8 +151,9 @@ class Station:
         self.lead_ns, self.latest_lead_ns = slot_ns * 700 // 1000, slot_ns * 200 // 1000
         self.latest_send_ns = max(slot_ns - c.link.flight_ns - slot_ns * 200 // 1000, slot_ns // 10)
         self.offsets: list[int] = []
-        self.in_step_ns, self.earlier_since, self.earlier_ns = self.now, 0, None
-        self.flight_error_ns, self.sums, self.name_turn = 0, [], 0
+        self.heard_ns = self.in_step_ns = self.now  # last frame of others, and of the own time; or the beginning
+        self.earlier_since, self.earlier_ns = 0, None
+        self.flight_error_ns, self.name_turn = 0, 0
         self.same_id_until = self.refused_since = None
         self.slot, self.first, self.origin_ns = -1, -1, 0
         self.running = self.awaits = self.newcomer = self.has_sent = self.leaving = self.gone = False
@@ -162,8 +163,12 @@ class Station:
         if c.begins_ns is not None:
             self.state, self.origin_ns, self.first = JOINED, c.begins_ns, 0
         else:  # spread over a round of anchors: one is the first, and the others hear it while they still listen
-            mixed = mix64(c.seed * 0x9E3779B97F4A7C15 + c.id * 0xD1B54A32D192ED03 - 0x9E3779B97F4A7C15)
-            self.state, self.deadline_ns = LISTENING, self.now + self.round_ns + mixed % self.round_ns
+            self.state, self.deadline_ns = LISTENING, self.now + self.round_ns + self._draw(0) % self.round_ns
+
+    def _draw(self, what: int) -> int:
+        """A number that looks random, of 64 bits."""
+        seed, id = self.settings.seed, self.settings.id
+        return mix64(seed * 0x9E3779B97F4A7C15 + id * 0xD1B54A32D192ED03 + what * 0x8CB92BA72F3D8DD7 - 0x9E3779B97F4A7C15)
 
     # Datagrams.
 
@@ -298,20 +303,20 @@ class Station:
 
     # How long frames are under way. What i hears of j comes later by d + o_j - o_i, what j hears of i by d + o_i - o_j.
 
-    def _hear_delay(self, p: Peer, names: Sequence[tuple[int, int]], offset_ns: int) -> None:
-        limit = self.settings.slot_ns // 4
+    def _hear_delay(self, p: Peer, names: Sequence[tuple[int, int]], offset_ns: int, arrival: Ns) -> None:
+        limit, target = self.settings.slot_ns // 4, 0  # without a pair the link is believed
         p.offset_ns = limited(offset_ns, limit)
         for name, late_ns in names:
             if name == self.settings.id:
-                p.report_ns = limited(late_ns, limit)
+                p.report_ns, p.reported_ns = limited(late_ns, limit), arrival
+        if arrival - p.reported_ns > self.resting_ns:
+            p.report_ns = p.sum_ns = None
         if p.report_ns is not None:
-            if p.sum_ns is not None:
-                self.sums.remove(p.sum_ns)
             p.sum_ns = p.offset_ns + p.report_ns
-            self.sums = sorted([*self.sums, p.sum_ns])
-        if self.sums:
-            twice = self.sums[len(self.sums) // 2] + self.sums[(len(self.sums) - 1) // 2]
-            self.flight_error_ns += limited(twice // 4 - self.flight_error_ns, 1_000_000) // 64
+        sums = sorted(q.sum_ns for q in self.peers if q.sum_ns is not None)
+        if sums:
+            target = (sums[len(sums) // 2] + sums[(len(sums) - 1) // 2]) // 4
+        self.flight_error_ns += limited(target - self.flight_error_ns, 1_000_000) // 64
 
     def _shift_delays(self, by_ns: int) -> None:
         for p in self.peers:
@@ -338,8 +343,7 @@ class Station:
     def _hear_contact(self, p: Peer, d: Parsed) -> None:
         extended, most = d.frame[0] & 0xF == 2, self.settings.link.names
         p.left = extended and d.frame[2] == LEAVING
-        p.probation = extended and bool(d.frame[3] & PROBATION)
-        p.resting = p.probation or not (d.frame[3] & MOVES if extended else d.frame[3])
+        p.resting = not d.frame[3] & MOVES or bool(d.frame[3] & PROBATION) if extended else not d.frame[3]
         if not most:
             return
         p.unnamed += 1
@@ -348,8 +352,8 @@ class Station:
             hears = -1
         p.hears_us = hears or p.hears_us
         p.unnamed = 0 if hears > 0 else p.unnamed
-        if hears < 0 and p.probation:  # it has not heard all yet
-            p.hears_us = 0
+        if hears < 0:
+            p.report_ns = p.sum_ns = None
 
     def _has_quorum(self, now: Ns) -> bool:
         """Whether it hears, and is heard by, enough of those that have not left; the silent count as most others say."""
@@ -388,7 +392,6 @@ class Station:
         self.early.clear()
         for p in self.peers:
             p.offset_ns = p.report_ns = p.sum_ns = None
-        self.sums = []
         self.agent.restart()
         self.on_restart()
 
@@ -413,6 +416,12 @@ class Station:
             return HOVERS_SAME_ID
         return FLIES if quorum else HOVERS_QUORUM
 
+    def _leaves_out(self, slot: int, now: Ns) -> bool:
+        """An agent that is new sends nothing while another sends with its id: that one was here before. One that hears
+        nothing leaves out half of its frames: those of agents in other times may cover them."""
+        is_second = self.newcomer and self.same_id_until is not None and now < self.same_id_until
+        return is_second or (now - self.heard_ns > self.patience_ns and bool(self._draw(slot) & 1))
+
     def _open_slot(self, slot: int, now: Ns) -> None:
         self._close_slot()
         self.hovers, self.slot = self._why_it_hovers(slot, now), slot
@@ -420,8 +429,8 @@ class Station:
             self.agent.present = LEAVES
         chosen = self.agent.decide(slot).index + 1
         self.said = self.frame = self.agent.frame(slot) if self.agent.sends else b""
-        if self.newcomer and self.same_id_until is not None and now < self.same_id_until:
-            self.said = self.frame = b""  # the other was here before
+        if self.frame and self._leaves_out(slot, now):
+            self.said = self.frame = b""
         self.running, self.awaits = True, chosen not in (0, self.settings.id)
         early, self.early = self.early, []
         for one in early:
@@ -446,7 +455,7 @@ class Station:
             return OTHER_TIME if listens else self._hear_own_id(data, arrival, start - expected)
         if p.last_slot == d.slot and not listens:
             return REPEATED
-        p.last_slot = d.slot
+        p.last_slot, self.heard_ns = d.slot, arrival
         outcome = self._hear_time(p, start - slot * slot_ns, arrival)
         if outcome == OTHER:
             return OTHER_TIME
@@ -454,7 +463,7 @@ class Station:
             slot, self.origin_ns = d.slot, start - d.slot * slot_ns
             self._restart(arrival)
         else:
-            self._hear_delay(p, d.names, began - expected)
+            self._hear_delay(p, d.names, began - expected, arrival)
             self._shift_delays(self.slot_start_ns(slot) - expected)
         self._hear_contact(p, d)
         if slot > self.slot:

@@ -33,8 +33,7 @@ void contacts_hear(dtsa_station *s, const dtsa_datagram *d)
     dtsa_named named[DTSA_NAMES_MAX];
     int count = 0;
     p->left = extended && d->frame[2] == LEAVES;
-    p->probation = extended && (d->frame[3] & PROBATION);
-    p->resting = p->probation || !(extended ? d->frame[3] & MOVES : d->frame[3]);
+    p->resting = extended ? !(d->frame[3] & MOVES) || d->frame[3] & PROBATION : !d->frame[3];
     if (!names) return;
     for (int i = 0; i < names; i++)
         if (d->names[i].id) named[count++] = d->names[i];
@@ -43,7 +42,7 @@ void contacts_hear(dtsa_station *s, const dtsa_datagram *d)
     if (!hears && names == 1 && p->unnamed > CYCLES * (s->settings.agents - 1)) hears = -1;
     if (hears) p->hears_us = (int8_t)hears;
     if (hears > 0) p->unnamed = 0;
-    if (hears < 0 && p->probation) p->hears_us = 0; /* it has not heard all yet */
+    if (hears < 0) delay_forget_report(s, p);
 }
 
 static int is_recent(const dtsa_station *s, const peer *p, int64_t when, int64_t now)

@@ -71,6 +71,14 @@ static void set_times(dtsa_station *s)
     s->too_long_ns = larger(500 * slot, 3 * anchors);
 }
 
+/* A number that looks random. */
+static uint64_t draw(const dtsa_station *s, uint64_t what)
+{
+    return mix64(s->settings.seed * 0x9e3779b97f4a7c15ULL +
+                 (uint64_t)s->settings.id * 0xd1b54a32d192ed03ULL + what * 0x8cb92ba72f3d8dd7ULL -
+                 0x9e3779b97f4a7c15ULL);
+}
+
 static void restart(dtsa_station *s, int64_t now);
 
 dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_settings *settings,
@@ -89,6 +97,7 @@ dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_
     s->slot = s->first = -1;
     s->same_id_until = s->refused_since = s->earlier_ns = INT64_MIN;
     s->hovers = DTSA_HOVERS_LISTENING;
+    s->heard_ns = now;
     if (settings->begins) {
         s->state = DTSA_JOINED;
         s->origin_ns = settings->origin_ns;
@@ -97,11 +106,8 @@ dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_
     } else {
         /* Spread over a round of anchors: one agent is the first, and the others hear it while they
          * still listen. */
-        const uint64_t mixed =
-            mix64(settings->seed * 0x9e3779b97f4a7c15ULL +
-                  (uint64_t)settings->id * 0xd1b54a32d192ed03ULL - 0x9e3779b97f4a7c15ULL);
         s->state = DTSA_LISTENING;
-        s->deadline_ns = now + s->round_ns + (int64_t)(mixed % (uint64_t)s->round_ns);
+        s->deadline_ns = now + s->round_ns + (int64_t)(draw(s, 0) % (uint64_t)s->round_ns);
     }
     return s;
 }
@@ -189,6 +195,14 @@ static void hear_early(dtsa_station *s)
     s->early_count = kept;
 }
 
+/* An agent that is new sends nothing while another one sends with its id: that one was here before. One
+ * that hears nothing leaves out half of its frames: those of agents in other times may cover them. */
+static int leaves_out(const dtsa_station *s, int64_t slot, int64_t now)
+{
+    return (s->newcomer && now < s->same_id_until) ||
+           (now - s->heard_ns > s->patience_ns && draw(s, (uint64_t)slot) & 1);
+}
+
 static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
 {
     int chosen = 0;
@@ -197,7 +211,7 @@ static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
     s->slot = slot;
     if (s->leaving && !s->gone) s->agent.leave(s->agent.context); /* its last frame did not leave */
     s->frame_length = s->agent.open(s->agent.context, slot, s->hovers != DTSA_FLIES, s->frame, &chosen);
-    if (s->frame_length && s->newcomer && now < s->same_id_until) { /* the other was here before */
+    if (s->frame_length && leaves_out(s, slot, now)) {
         s->agent.unsent(s->agent.context);
         s->frame_length = 0;
     }
@@ -317,6 +331,7 @@ dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long len
     }
     if (p->last_slot == d.slot && !listens) return refuse(s, DTSA_REPEATED, data, length, arrival);
     p->last_slot = d.slot;
+    s->heard_ns = arrival;
     note_offset(s, start - expected);
     const int outcome = clock_hear(s, d.sender - 1, start - slot * c->slot_ns, arrival);
     if (outcome == OTHER) return refuse(s, DTSA_OTHER_TIME, data, length, arrival);
@@ -326,7 +341,7 @@ dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long len
         restart(s, arrival);
     } else {
         s->counts.shifts += outcome == SHIFTED;
-        delay_hear(s, &d, began - expected);
+        delay_hear(s, &d, began - expected, arrival);
         delay_shift(s, dtsa_station_slot_start(s, slot) - expected);
     }
     contacts_hear(s, &d);

@@ -16,11 +16,12 @@ typedef struct peer {
     int64_t heard_ns, origin_ns; /* its last frame: arrival (INT64_MIN: none), start of its slot 0 */
     int64_t near_ns; /* arrival of its last frame that fits the own slots; INT64_MIN: none */
     int64_t last_slot;           /* of that frame, as on the air; -1: none */
-    int64_t offset_ns, report_ns, sum_ns; /* see delay.c */
+    int64_t offset_ns, report_ns, reported_ns, sum_ns; /* see delay.c */
     int32_t unnamed;                      /* its datagrams since it named this agent */
     int8_t hears_us;                      /* 1: yes, -1: no, 0: it has not said */
     uint8_t steady; /* its last two frames show the same time */
-    uint8_t known, resting, probation, left;
+    uint8_t known, left;
+    uint8_t resting; /* it sends in main anchors alone: it rests, or is on probation */
 } peer;
 
 typedef struct early_frame {
@@ -43,7 +44,7 @@ struct dtsa_station {
     int64_t origin_ns, deadline_ns; /* start of slot 0; when listening ends */
     int64_t offsets[RECEPTIONS]; /* of frames since the slots were aligned last, ascending */
     int offset_count;
-    int64_t in_step_ns;                /* last frame of the own time, or the beginning */
+    int64_t heard_ns, in_step_ns; /* last frame of others, and of the own time; or the beginning */
     int64_t earlier_since, earlier_ns; /* an earlier time is heard since, and was last; INT64_MIN */
 
     /* How long frames are under way. */
@@ -89,7 +90,8 @@ int64_t clock_apart(const dtsa_station *s, int64_t a_ns, int64_t b_ns); /* a - b
 int clock_in_step(const dtsa_station *s, int64_t now); /* agents of the own time, with itself */
 
 /* delay.c */
-void delay_hear(dtsa_station *s, const dtsa_datagram *d, int64_t offset_ns);
+void delay_hear(dtsa_station *s, const dtsa_datagram *d, int64_t offset_ns, int64_t arrival);
+void delay_forget_report(dtsa_station *s, peer *p);
 void delay_shift(dtsa_station *s, int64_t by_ns);
 void delay_reset(dtsa_station *s);
 void delay_name(dtsa_station *s, int64_t now, dtsa_named out[DTSA_NAMES_MAX]);
