@@ -77,7 +77,7 @@ class Agent:
         rules = self.rules
         c_r = rules.c_r if self.far_from_goal() else 0
         intent = None if rules.profile == PAPER else self.command
-        own = Frame(self.index + 1, slot & 0xFFFFFFFF, c_r, self.position, self.velocity, intent)
+        own = Frame(self.index + 1, rules.slot_on_air(slot), c_r, self.position, self.velocity, intent)
         if rules.profile != EXTENDED:
             return encode(own, rules.position_step)
         said = Said()
@@ -136,9 +136,9 @@ def parse(data: bytes, slot: int, rules: Rules) -> tuple[Frame | ExtendedFrame, 
         frame = own = decode(data, rules.position_step)
         if data[0] & 0xF == PROFILE_EXTENDED:
             raise Refused(WRONG_HEADER, data)
-    late = (slot - own.slot) & 0xFFFFFFFF
+    late = own.slot != rules.slot_on_air(slot)
     sampled = slot - late
-    if late > 1 or own.sender > rules.agents:
+    if sampled < 0 or own.slot != rules.slot_on_air(sampled) or own.sender > rules.agents:
         raise Foreign
     if isinstance(frame, ExtendedFrame) and not gossip.known(frame, sampled, rules):
         raise Foreign

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 OFF, ON, LEAVES = 0, 1, 2  # of an agent: not there, there, about to be switched off
@@ -39,6 +40,16 @@ class Rules:
     adoption: bool = True
     depth_rate: float = 0.2  # c
     lease_share: float = 1.0
+
+    @property
+    def slot_cycle(self) -> int:
+        """Slot numbers on the air count modulo this: a multiple of all that policies count in slots."""
+        period = math.lcm(2 * self.agents * self.main_every, max(self.open_every, 1))
+        return 2**32 // period * period
+
+    def slot_on_air(self, slot: int) -> int:
+        """The number of a slot as frames have it."""
+        return slot % self.slot_cycle
 
     @property
     def dt(self) -> float:

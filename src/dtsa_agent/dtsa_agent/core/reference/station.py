@@ -8,13 +8,13 @@ by, a quorum of the others. All times are ns of the own clock; the same in C: ``
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from . import tag
 from .agent import LEAVES, Agent, Foreign, Receiver, hear, parse
 from .arithmetic import mix64
 from .frame import Refused, decode
@@ -29,6 +29,7 @@ LISTENING, ALONE, JOINED = range(3)
 FLIES, HOVERS_LISTENING, HOVERS_NEW, HOVERS_SAME_ID, HOVERS_QUORUM = range(5)
 IN_STEP, SHIFTED, RESTARTED, OTHER = range(4)  # what a frame says of the time
 
+TAG_LENGTH = 4
 LATE_UNIT_NS = 10_000
 HALF_SECOND_NS = 500_000_000
 RECEPTIONS = 9  # offsets of frames that one alignment takes the median of
@@ -104,16 +105,6 @@ class Counts:
     needed: int = 0
 
 
-def slot_cycle(rules: Rules) -> int:
-    """Slot numbers on the air count modulo this: a multiple of all that policies count in slots."""
-    return 2**32 // (period := math.lcm(2 * rules.agents * rules.main_every, max(rules.open_every, 1))) * period
-
-
-def slot_on_air(rules: Rules, slot: int) -> int:
-    """The number of a slot as frames have it."""
-    return slot % slot_cycle(rules)
-
-
 def centred(a: int, b: int) -> int:
     """``a`` modulo ``b``, from -b/2 to b/2."""
     rest = a % b
@@ -140,11 +131,10 @@ class Station:
         c, n, slot_ns = self.settings, self.rules.agents, self.settings.slot_ns
         anchors, mains = self.rules.anchor_every * n * slot_ns, self.rounds * n * slot_ns
         self.peers = [Peer() for _ in range(n)]
-        self.cycle = slot_cycle(self.rules)
-        self.begun = tag.keyed(c.key, c.session) if c.key else None
+        self.cycle = self.rules.slot_cycle
         self.head_length = len(c.link.header) + 2 * c.link.says_late + 4 * c.link.names
         self.frame_length = {"paper": 19, "paper-intent": 23, EXTENDED: 56}[self.rules.profile]
-        self.datagram_length = self.head_length + self.frame_length + (tag.LENGTH if c.key else 0)
+        self.datagram_length = self.head_length + self.frame_length + (TAG_LENGTH if c.key else 0)
         self.round_ns = anchors
         self.moving_ns, self.resting_ns = max(2 * anchors, HALF_SECOND_NS), max(6 * mains, HALF_SECOND_NS)
         self.patience_ns, self.too_long_ns = max(2 * mains, HALF_SECOND_NS), max(500 * slot_ns, 3 * anchors)
@@ -190,13 +180,13 @@ class Station:
         slot = int.from_bytes(frame[4:8], "little")
         if not 1 <= sender <= self.rules.agents:
             return UNKNOWN_AGENT
-        if self.begun is not None:
-            frame, given = frame[: -tag.LENGTH], frame[-tag.LENGTH :]
-            if tag.tag(self.begun, slot, frame + times) != given:
+        if self.settings.key:
+            frame, given = frame[:-TAG_LENGTH], frame[-TAG_LENGTH:]
+            if self._tag(slot, frame + times) != given:
                 return REJECTED
         if slot >= self.cycle:
             return NO_FRAME
-        if self.begun is None:
+        if not self.settings.key:
             try:
                 decode(frame, self.rules.position_step)
             except Refused:
@@ -216,8 +206,14 @@ class Station:
         for k, by in named + [(0, 0)] * (link.names - len(named)):
             units = min(max(by // LATE_UNIT_NS, -0x8000), 0x7FFF)
             times += k.to_bytes(2, "little") + units.to_bytes(2, "little", signed=True)
-        mac = b"" if self.begun is None else tag.tag(self.begun, slot_on_air(self.rules, self.slot), self.frame + times)
-        return link.header + times + self.frame + mac
+        code = self._tag(self.rules.slot_on_air(self.slot), self.frame + times) if self.settings.key else b""
+        return link.header + times + self.frame + code
+
+    def _tag(self, slot: int, covered: bytes) -> bytes:
+        """The code that only holders of the key can make."""
+        begin = self.settings.session.to_bytes(8, "little") + slot.to_bytes(8, "little")
+        key, person = self.settings.key, b"dtsa v1"
+        return hashlib.blake2s(begin + covered, key=key, digest_size=TAG_LENGTH, person=person).digest()
 
     # When slots begin.
 
