@@ -293,6 +293,8 @@ class Station:
             self.in_step_ns, self.state = arrival, JOINED
             return IN_STEP
         if not self._gives_way(origin_ns, arrival):
+            if not near and p.steady:  # it has gone to another time, and hears this agent no more
+                p.near_ns = None
             return IN_STEP if near else OTHER
         self._take_over(self.origin_ns + apart if near else origin_ns, arrival)
         return SHIFTED if near else RESTARTED
@@ -388,6 +390,7 @@ class Station:
         self.early.clear()
         for p in self.peers:
             p.offset_ns = p.report_ns = p.sum_ns = None
+            p.hears_us = 0
         self.agent.restart()
         self.on_restart()
 

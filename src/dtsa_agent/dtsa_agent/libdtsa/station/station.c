@@ -146,6 +146,7 @@ static void restart(dtsa_station *s, int64_t now)
     s->newcomer = 1;
     s->hovers = DTSA_HOVERS_NEW;
     delay_reset(s);
+    for (int k = 0; k < s->settings.agents; k++) s->peers[k].hears_us = 0;
     s->agent.restart(s->agent.context);
     if (s->events.restarted) s->events.restarted(s->events.context, s->slot);
     s->counts.restarts++;
