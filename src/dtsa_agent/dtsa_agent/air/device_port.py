@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 
 from dtsa_agent.core.errors import ConfigError
 
-from .port import ReceivedDatagram, PortProperties
+from .port import PortProperties, ReceivedDatagram
 
 _END_S = 2.0  # a device that hangs ends with the process
 _ROOM = 256  # datagrams that wait for the agent

@@ -9,7 +9,6 @@ from dtsa_agent.core.settings.declaration import REQUIRED, Settings, check, sett
 from dtsa_agent.core.station import ALL_BUT_ONE, QUORUMS, parse_quorum
 
 
-
 @dataclass(frozen=True, slots=True)
 class AgentSettings(Settings):
     """One agent of a swarm, and its clock.

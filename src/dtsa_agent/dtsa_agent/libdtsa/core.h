@@ -85,9 +85,9 @@ struct dtsa_agent {
 };
 
 /* agent.c */
-uint32_t slot_on_air(const dtsa_config *config, int64_t slot);    /* see dtsa_slot_cycle */
-int agent_far_from_goal(const dtsa_agent *agent); /* eq:remaining_t_slots */
-void agent_forget(dtsa_agent *agent);             /* table and policy's state */
+uint32_t slot_on_air(const dtsa_config *config, int64_t slot); /* see dtsa_slot_cycle */
+int agent_far_from_goal(const dtsa_agent *agent);              /* eq:remaining_t_slots */
+void agent_forget(dtsa_agent *agent);                          /* table and policy's state */
 void agent_decide(dtsa_agent *agent, int64_t slot);
 int agent_speak(dtsa_agent *agent, int64_t slot, uint8_t *out); /* -> length of its frame */
 void agent_steer(dtsa_agent *agent, int64_t slot,

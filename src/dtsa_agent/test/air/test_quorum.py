@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.contacts import Contact
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.quorum import ALL_BUT_ONE, Hold, Quorum
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpPort, UdpSettings

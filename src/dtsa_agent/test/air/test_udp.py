@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 from plain_hearing import SlotTime
 
-from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.clock import OwnClock
 from dtsa_agent.air.datagram import LENGTH, NO_FRAME, NOT_OURS, OTHER_SETTINGS, REJECTED, UNKNOWN, Wrapping
 from dtsa_agent.air.delay import Delay
+from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.precision import going_first
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings

@@ -158,7 +158,9 @@ class Station:
     def _draw(self, what: int) -> int:
         """A number that looks random, of 64 bits."""
         seed, id = self.settings.seed, self.settings.id
-        return mix64(seed * 0x9E3779B97F4A7C15 + id * 0xD1B54A32D192ED03 + what * 0x8CB92BA72F3D8DD7 - 0x9E3779B97F4A7C15)
+        return mix64(
+            seed * 0x9E3779B97F4A7C15 + id * 0xD1B54A32D192ED03 + what * 0x8CB92BA72F3D8DD7 - 0x9E3779B97F4A7C15
+        )
 
     # Datagrams.
 
@@ -236,7 +238,9 @@ class Station:
 
     def in_step(self, now: Ns) -> int:
         """Agents heard lately in the own time, with itself."""
-        return 1 + sum(self._is_recent(p, p.heard_ns, now) and self._is_same(p.origin_ns, self.origin_ns) for p in self.peers)
+        return 1 + sum(
+            self._is_recent(p, p.heard_ns, now) and self._is_same(p.origin_ns, self.origin_ns) for p in self.peers
+        )
 
     def _align(self, offset_ns: int) -> int:
         """By how much the own slots move: half the median of some frames' offsets."""

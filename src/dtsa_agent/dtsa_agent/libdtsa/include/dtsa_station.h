@@ -30,7 +30,7 @@ typedef struct dtsa_link {
     int says_late;                   /* datagrams say how late they left */
     int names;                       /* heard agents that a datagram names, 0 to 4 */
     int64_t flight_ns;               /* from the order to send until the arrival */
-    int64_t trust_ns; /* frames that are off by more do not show where slots begin */
+    int64_t trust_ns;                /* frames that are off by more do not show where slots begin */
 } dtsa_link;
 
 enum { DTSA_QUORUM_ALL_BUT_ONE = -1, DTSA_QUORUM_SHARE = -2 };
@@ -65,11 +65,12 @@ typedef struct dtsa_station_agent {
     int (*open)(void *context, int64_t slot, int hovers, uint8_t frame[DTSA_DATAGRAM_MAX],
                 int *chosen);
     int (*hear)(void *context, int64_t slot, const uint8_t *frame, long length); /* 1: accepted */
-    void (*unsent)(void *context);               /* the frame of this slot does not leave */
-    void (*close)(void *context, int64_t slot);  /* the slot is over */
-    void (*restart)(void *context);              /* it forgets all but settings, state and goal */
-    int (*leave)(void *context); /* 1: its next frame says that it leaves; 0: it is off. Maybe again */
-    int (*on_probation)(void *context);          /* policy lease */
+    void (*unsent)(void *context);              /* the frame of this slot does not leave */
+    void (*close)(void *context, int64_t slot); /* the slot is over */
+    void (*restart)(void *context);             /* it forgets all but settings, state and goal */
+    int (*leave)(
+        void *context); /* 1: its next frame says that it leaves; 0: it is off. Maybe again */
+    int (*on_probation)(void *context); /* policy lease */
 } dtsa_station_agent;
 
 /* An agent of libdtsa; context: a dtsa_agent. */
@@ -94,7 +95,7 @@ typedef enum dtsa_verdict {
 /* Whether it knows which slot it is. */
 enum {
     DTSA_LISTENING,
-    DTSA_ALONE,  /* it has begun by its own clock, and heard no frame of this time */
+    DTSA_ALONE, /* it has begun by its own clock, and heard no frame of this time */
     DTSA_JOINED
 };
 
@@ -109,12 +110,12 @@ enum {
 };
 
 typedef struct dtsa_station_status {
-    int state;                                  /* DTSA_LISTENING.. */
-    int hovers;                                 /* DTSA_FLIES.. */
-    int64_t slot, first;                        /* present slot, and the one with which it began; -1 */
-    int others, hears, heard_by, both, needed;  /* agents, see the quorum */
-    int gone;                                   /* it has said that it leaves */
-    int in_step;                                /* agents heard in the own time, itself included */
+    int state;           /* DTSA_LISTENING.. */
+    int hovers;          /* DTSA_FLIES.. */
+    int64_t slot, first; /* present slot, and the one with which it began; -1 */
+    int others, hears, heard_by, both, needed; /* agents, see the quorum */
+    int gone;                                  /* it has said that it leaves */
+    int in_step;                               /* agents heard in the own time, itself included */
     int64_t flight_error_ns; /* how much longer frames are under way than the link says */
     uint32_t slots, sent, unsent, heard, restarts, shifts, alignments;
     uint32_t refused[DTSA_VERDICT_COUNT];
@@ -180,7 +181,7 @@ DTSA_API void dtsa_station_sent(dtsa_station *station, int64_t now_ns, int taken
 DTSA_API void dtsa_station_leave(dtsa_station *station);
 /* Whether a datagram may make it due earlier: before that the others may wait in the port. */
 DTSA_API int dtsa_station_awaits_frame(const dtsa_station *station, int64_t now_ns);
-DTSA_API int dtsa_station_hovers(const dtsa_station *station); /* DTSA_FLIES.. in this slot */
+DTSA_API int dtsa_station_hovers(const dtsa_station *station);   /* DTSA_FLIES.. in this slot */
 DTSA_API int64_t dtsa_station_slot(const dtsa_station *station); /* -1: none yet */
 DTSA_API int64_t dtsa_station_slot_start(const dtsa_station *station, int64_t slot);
 DTSA_API int64_t dtsa_station_heard_ns(const dtsa_station *station, int id); /* INT64_MIN: never */

@@ -128,7 +128,8 @@ int clock_hear(dtsa_station *s, int k, int64_t origin_ns, int64_t arrival_ns)
     }
     if (!gives_way(s, origin_ns, arrival_ns)) {
         if (near) return IN_STEP;
-        if (p->steady) p->near_ns = INT64_MIN; /* it has gone to another time, and hears this agent no more */
+        if (p->steady)
+            p->near_ns = INT64_MIN; /* it has gone to another time, and hears this agent no more */
         return OTHER;
     }
     take_over(s, near ? s->origin_ns + apart : origin_ns, arrival_ns);

@@ -15,7 +15,10 @@ static void put_time(uint8_t *at, int64_t time_ns, int64_t least, int64_t most)
     at[1] = (uint8_t)(value >> 8);
 }
 
-static int times_length(const dtsa_link *link) { return (link->says_late ? 2 : 0) + 4 * link->names; }
+static int times_length(const dtsa_link *link)
+{
+    return (link->says_late ? 2 : 0) + 4 * link->names;
+}
 
 int datagram_head(const dtsa_link *link) { return link->header_length + times_length(link); }
 

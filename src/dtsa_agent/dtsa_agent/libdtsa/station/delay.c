@@ -52,7 +52,8 @@ void delay_hear(dtsa_station *s, const dtsa_datagram *d, int64_t offset_ns, int6
         p->reported_ns = arrival;
         p->known |= KNOWS_REPORT;
     }
-    if (p->known & KNOWS_REPORT && arrival - p->reported_ns > s->resting_ns) delay_forget_report(s, p);
+    if (p->known & KNOWS_REPORT && arrival - p->reported_ns > s->resting_ns)
+        delay_forget_report(s, p);
     if (p->known & KNOWS_REPORT) set_sum(s, p, p->offset_ns + p->report_ns);
     if (s->sum_count)
         target = floor_div(s->sums[s->sum_count / 2] + s->sums[(s->sum_count - 1) / 2], 4);

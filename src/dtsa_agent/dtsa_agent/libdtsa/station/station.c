@@ -22,8 +22,8 @@ static int is_usable(const dtsa_station_settings *c)
     const dtsa_link *link = &c->link;
     return c->agents >= 1 && c->agents <= DTSA_AGENTS_MAX && c->id >= 1 && c->id <= c->agents &&
            c->anchor_every >= 1 && c->main_every >= c->anchor_every && c->slot_ns >= 1 &&
-           c->slot_cycle >= 1 && c->frame_length >= 8 && c->own_bytes >= 0 && c->early_count >= 1 && link->names >= 0 &&
-           link->names <= DTSA_NAMES_MAX && link->header_length >= 0 &&
+           c->slot_cycle >= 1 && c->frame_length >= 8 && c->own_bytes >= 0 && c->early_count >= 1 &&
+           link->names >= 0 && link->names <= DTSA_NAMES_MAX && link->header_length >= 0 &&
            link->header_length <= DTSA_HEADER_MAX && link->trust_ns >= 1 &&
            (!c->key || (c->key_length >= 16 && c->key_length <= 32)) &&
            datagram_head(link) + c->frame_length + DTSA_TAG_BYTES <= DTSA_DATAGRAM_MAX;
@@ -155,8 +155,8 @@ static void restart(dtsa_station *s, int64_t now)
 static void hear_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t *datagram,
                        int64_t arrival)
 {
-    const int accepted = s->agent.hear(s->agent.context, slot, datagram + s->head_length,
-                                       s->settings.frame_length);
+    const int accepted =
+        s->agent.hear(s->agent.context, slot, datagram + s->head_length, s->settings.frame_length);
     s->counts.heard += (uint32_t)accepted;
     if (s->awaits && slot >= s->slot) s->awaits = 0;
     if (s->events.heard)
@@ -211,7 +211,8 @@ static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
     s->hovers = why_it_hovers(s, slot, now);
     s->slot = slot;
     if (s->leaving && !s->gone) s->agent.leave(s->agent.context); /* its last frame did not leave */
-    s->frame_length = s->agent.open(s->agent.context, slot, s->hovers != DTSA_FLIES, s->frame, &chosen);
+    s->frame_length =
+        s->agent.open(s->agent.context, slot, s->hovers != DTSA_FLIES, s->frame, &chosen);
     if (s->frame_length && leaves_out(s, slot, now)) {
         s->agent.unsent(s->agent.context);
         s->frame_length = 0;
@@ -238,8 +239,9 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
     }
     dtsa_named names[DTSA_NAMES_MAX] = {{0, 0}};
     delay_name(s, now, names);
-    dtsa_datagram_write(&s->settings, s->frame, (uint32_t)((uint64_t)s->slot % s->settings.slot_cycle),
-                        late, names, datagram);
+    dtsa_datagram_write(&s->settings, s->frame,
+                        (uint32_t)((uint64_t)s->slot % s->settings.slot_cycle), late, names,
+                        datagram);
     s->frame_length = 0;
     s->sent_hashes[s->sent_index++ % SENT_HISTORY_LENGTH] =
         datagram_hash(datagram, s->datagram_length);
@@ -286,7 +288,8 @@ static dtsa_verdict hear_own_id(dtsa_station *s, const uint8_t *data, long lengt
     const uint64_t hash = datagram_hash(data, length);
     for (int i = 0; i < SENT_HISTORY_LENGTH; i++)
         if (s->sent_hashes[i] == hash) return DTSA_REPEATED;
-    if (apart >= s->settings.slot_ns / 2 || apart <= -s->settings.slot_ns / 2) return DTSA_OTHER_TIME;
+    if (apart >= s->settings.slot_ns / 2 || apart <= -s->settings.slot_ns / 2)
+        return DTSA_OTHER_TIME;
     s->same_id_until = arrival + s->patience_ns;
     return DTSA_SAME_ID;
 }
@@ -314,7 +317,8 @@ static void note_offset(dtsa_station *s, int64_t off)
     s->counts.off += off > s->settings.slot_ns / 4;
 }
 
-dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long length, int64_t arrival)
+dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long length,
+                                  int64_t arrival)
 {
     const dtsa_station_settings *c = &s->settings;
     dtsa_datagram d;
@@ -327,7 +331,8 @@ dtsa_verdict dtsa_station_receive(dtsa_station *s, const uint8_t *data, long len
     const int64_t expected = dtsa_station_slot_start(s, slot);
     peer *p = &s->peers[d.sender - 1];
     if (d.sender == c->id) {
-        verdict = listens ? DTSA_OTHER_TIME : hear_own_id(s, data, length, arrival, start - expected);
+        verdict =
+            listens ? DTSA_OTHER_TIME : hear_own_id(s, data, length, arrival, start - expected);
         return refuse(s, verdict, data, length, arrival);
     }
     if (p->last_slot == d.slot && !listens) return refuse(s, DTSA_REPEATED, data, length, arrival);
@@ -389,7 +394,8 @@ int64_t dtsa_station_slot(const dtsa_station *s) { return s->slot; }
 int dtsa_station_awaits_frame(const dtsa_station *s, int64_t now)
 {
     const int64_t next = dtsa_station_slot_start(s, s->slot + 1);
-    return s->state == DTSA_LISTENING || (s->awaits && !s->frame_length && now >= next - s->lead_ns);
+    return s->state == DTSA_LISTENING ||
+           (s->awaits && !s->frame_length && now >= next - s->lead_ns);
 }
 
 int64_t dtsa_station_heard_ns(const dtsa_station *s, int id)
@@ -406,7 +412,9 @@ void dtsa_station_get_status(const dtsa_station *s, dtsa_station_status *status)
     status->first = s->first;
     status->gone = s->gone;
     status->flight_error_ns = s->flight_error_ns;
-    status->in_step = s->state == DTSA_LISTENING ? 0 : clock_in_step(s, s->origin_ns + s->slot * s->settings.slot_ns);
+    status->in_step = s->state == DTSA_LISTENING
+                          ? 0
+                          : clock_in_step(s, s->origin_ns + s->slot * s->settings.slot_ns);
 }
 
 /* ---- an agent of libdtsa behind it ---- */

@@ -13,13 +13,14 @@ enum { KNOWS_OFFSET = 1, KNOWS_REPORT = 2, KNOWS_SUM = 4 };
 
 /* What is known of another agent. */
 typedef struct peer {
-    int64_t heard_ns, origin_ns; /* its last frame: arrival (INT64_MIN: none), start of its slot 0 */
-    int64_t near_ns; /* arrival of its last frame that fits the own slots; INT64_MIN: none */
-    int64_t last_slot;           /* of that frame, as on the air; -1: none */
+    int64_t heard_ns,
+        origin_ns;     /* its last frame: arrival (INT64_MIN: none), start of its slot 0 */
+    int64_t near_ns;   /* arrival of its last frame that fits the own slots; INT64_MIN: none */
+    int64_t last_slot; /* of that frame, as on the air; -1: none */
     int64_t offset_ns, report_ns, reported_ns, sum_ns; /* see delay.c */
-    int32_t unnamed;                      /* its datagrams since it named this agent */
-    int8_t hears_us;                      /* 1: yes, -1: no, 0: it has not said */
-    uint8_t steady; /* its last two frames show the same time */
+    int32_t unnamed;                                   /* its datagrams since it named this agent */
+    int8_t hears_us;                                   /* 1: yes, -1: no, 0: it has not said */
+    uint8_t steady;                                    /* its last two frames show the same time */
     uint8_t known, left;
     uint8_t resting; /* it sends in main anchors alone: it rests, or is on probation */
 } peer;
@@ -42,7 +43,7 @@ struct dtsa_station {
     /* When slots begin. */
     int state;
     int64_t origin_ns, deadline_ns; /* start of slot 0; when listening ends */
-    int64_t offsets[RECEPTIONS]; /* of frames since the slots were aligned last, ascending */
+    int64_t offsets[RECEPTIONS];    /* of frames since the slots were aligned last, ascending */
     int offset_count;
     int64_t heard_ns, in_step_ns; /* last frame of others, and of the own time; or the beginning */
     int64_t earlier_since, earlier_ns; /* an earlier time is heard since, and was last; INT64_MIN */
@@ -52,7 +53,7 @@ struct dtsa_station {
     int64_t *sums; /* (agents) of all pairs, ascending */
     int sum_count, name_turn;
 
-    peer *peers; /* (agents) */
+    peer *peers;                          /* (agents) */
     int64_t same_id_until, refused_since; /* INT64_MIN: not so */
 
     /* The loop. */
