@@ -1,4 +1,4 @@
-"""Clocks of the agents, and keeping their slots together by what is heard."""
+"""Clocks of the agents; that slots stay together: tools/test/test_own_clocks.py."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core.errors import ConfigError
-from dtsa_agent.core.reference.timebase import ClockAligner
 from dtsa_channel_sim import ClockConfig, make_clocks
-
-MS = 1_000_000
 
 
 def test_clocks_depend_on_seed_and_agent_alone():
@@ -31,22 +28,3 @@ def test_bad_clock_settings(name, value):
     with pytest.raises(ConfigError) as caught:
         ClockConfig.from_dict({name: value})
     assert caught.value.field == name
-
-
-def test_aligner_moves_by_half_the_median():
-    aligner = ClockAligner()
-    offsets = [100, 900_000, 300, 200, 400, -800_000, 600, 500, 700]
-    assert [aligner.hear(offset) for offset in offsets] == [0] * 8 + [200]
-    assert [aligner.hear(-offset) for offset in offsets] == [0] * 8 + [-200]
-    assert aligner.corrections == 2
-    even = ClockAligner(receptions=2, gain=1.0)
-    assert [even.hear(offset) for offset in (10, 30)] == [0, 20]
-
-
-def test_aligner_ignores_what_is_far_off():
-    aligner = ClockAligner(receptions=1)
-    assert aligner.hear(1_000_000) == 500_000
-    assert [aligner.hear(offset) for offset in (1_000_001, -1_000_001)] == [0, 0]
-    assert (aligner.ignored, aligner.ignored_in_a_row) == (2, 2)
-    assert aligner.hear(2) == 1
-    assert (aligner.ignored, aligner.ignored_in_a_row) == (2, 0)

@@ -16,7 +16,6 @@ from dtsa_dev.network.hosts import why_not
 from dtsa_dev.network.switch import Intruder, Links
 from trials import WHOLE, Trial, apart, fly
 
-from dtsa_agent.air.contacts import limits_of
 from dtsa_agent.air.datagram import NETWORK
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.recordings.bag.run import load_run
@@ -27,7 +26,7 @@ AGENTS = 12
 OVERLAP = 0.001  # of slots
 AGE_MARGIN, ERROR_MARGIN = 0.05, 0.15  # mean age and mean error may differ from the simulator's by this share
 # Slots of each: agents that begin later are there at once, and name it within three cycles of their lists at most.
-HELD_SLOTS = limits_of(SwarmConfig(agents=AGENTS, policy="lease"), NETWORK.peers).named
+HELD_SLOTS = 3 * AGENTS * -(-(AGENTS - 1) // (NETWORK.peers - 1))
 FLIGHT_S, FAULT_S = 12.0, 3.0
 ON_THE_AIR: dict[str, dict[str, Any]] = {"jam": {"jam": True}, "partition": {"partition": apart(AGENTS)}}
 LINKS = Links(delay_ns=200_000, jitter_ns=500_000, double=0.1)

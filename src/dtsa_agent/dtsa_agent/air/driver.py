@@ -1,7 +1,7 @@
 """One live agent: a station, connected with a clock, a port and a vehicle. What it does itself is wait.
 
-The rules are the station's (``core.station``). The loop sleeps until the station is due, hands in what has arrived, sends
-what the station gives, and flies the vehicle.
+The rules are the station's (``core.station``). The loop sleeps until the station is due, hands in what has arrived,
+sends what the station gives, and flies the vehicle.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class LiveAgent:
                 shown = local(now)
                 due, datagram = step(shown)
                 if datagram:
-                    self._send(datagram)
+                    self._send(datagram, shown)
                 elif station.slot != self.slot:
                     self._fly(station.slot, now)
                 elif due > shown:
@@ -189,15 +189,19 @@ class LiveAgent:
                 tally.look(status.others, status.hears)
             self._reports.status(status, now)
 
-    def _send(self, datagram: bytes) -> None:
+    def _send(self, datagram: bytes, shown: int) -> None:
+        """Hand a datagram to the port; shown: what the own clock showed when it was due."""
         refusal = self.port.send(datagram)
         now = time.monotonic_ns()
         self.station.sent(self.clock.local_ns(now), not refusal)
         if refusal:
             self.tally.unsent[refusal] += 1
             self._reports.refused(refusal, now)
-        else:
-            self._reports.taken(now)
+            return
+        self._reports.taken(now)
+        self.tally.sent(max(0, shown - self.station.slot_start_ns(self.station.slot)))
+        if self._record is not None:
+            self._record.sent_ns, self._record.datagram = shown, datagram
 
     # Events of the station.
 
@@ -219,12 +223,6 @@ class LiveAgent:
         self._before.clear()
         self.slot = slot
         self.tally.begun(slot + 1)
-
-    def sent(self, slot: int, datagram: bytes, now_ns: int) -> None:
-        """Count and record an own datagram."""
-        self.tally.sent(max(0, now_ns - self.station.slot_start_ns(slot)))
-        if self._record is not None:
-            self._record.sent_ns, self._record.datagram = now_ns, datagram
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """Count and record a frame."""

@@ -8,7 +8,6 @@ int station_leave(void *context);
 int station_on_probation(void *context);
 void station_opened(void *context, int64_t slot, int64_t start_ns, int64_t now_ns, int is_first);
 void station_restarted(void *context, int64_t slot);
-void station_sent(void *context, int64_t slot, const uint8_t *datagram, int length, int64_t now_ns);
 void station_heard(void *context, int sender, int64_t slot, const uint8_t *datagram, int length,
                    int64_t arrival_ns, int accepted);
 void station_refused(void *context, int verdict, const uint8_t *datagram, long length,

@@ -1,7 +1,7 @@
 """A station: one agent with a clock of its own. Datagrams and time in, datagrams and the time of the next wake-up out.
 
-It knows no clock and no I/O; the rules are ``libdtsa/station``, and once more in plain Python ``core/reference/station``.
-Times are ns of the own clock.
+It knows no clock and no I/O; the rules are ``libdtsa/station``, and once more in plain Python
+``core/reference/station``. Times are ns of the own clock.
 """
 
 from __future__ import annotations
@@ -69,9 +69,6 @@ class Events(Protocol):
 
     def restarted(self, slot: int) -> None:
         """A slot is over, and the agent begins anew with the next."""
-
-    def sent(self, slot: int, datagram: bytes, now_ns: int) -> None:
-        """A datagram is handed to the port."""
 
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """The slot of a frame has begun, and the agent has heard it."""
@@ -170,6 +167,11 @@ class StationSettings:
         frame = bytes(ffi.buffer(out.frame, out.frame_length))
         return ParsedDatagram("", out.sender, out.slot, out.late_ns, names, frame)
 
+    def hears(self, names: tuple[Named, ...], agent: int) -> bool | None:
+        """Whether the sender of a datagram with these names hears an agent; None: it does not say."""
+        told: int = lib.dtsa_names_hear(ffi.new("dtsa_named[]", list(names)), len(names), self.names, agent)
+        return told > 0 if told else None
+
     def write(self, frame: bytes, slot: int, late_ns: int = 0, names: tuple[tuple[int, int], ...] = ()) -> bytes:
         """The datagram of a frame that carries no tag yet.
 
@@ -227,7 +229,7 @@ class Station:
 
     def _observer(self) -> Any:
         return ffi.new("dtsa_station_events *", [
-            self._handle, lib.station_opened, lib.station_restarted, lib.station_sent, lib.station_heard,
+            self._handle, lib.station_opened, lib.station_restarted, lib.station_heard,
             lib.station_refused,
         ])  # fmt: skip
 
@@ -348,7 +350,6 @@ _callback(Station.leave_air, "station_leave")
 _callback(Station.probation, "station_on_probation")
 _callback(lambda s, slot, start, now, first: s.events.opened(slot, start, now, bool(first)), "station_opened")
 _callback(lambda s, slot: s.events.restarted(slot), "station_restarted")
-_callback(lambda s, slot, data, n, now: s.events.sent(slot, _bytes(data, n), now), "station_sent")
 _callback(
     lambda s, sender, slot, data, n, arrival, ok: s.events.heard(sender, slot, _bytes(data, n), arrival, bool(ok)),
     "station_heard",

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from waiting import wait_for
 
 from dtsa_agent.air.datagram import check_fits, flight_ns, shortest_slot_ns
-from dtsa_agent.air.port import Datagram
+from dtsa_agent.air.port import ReceivedDatagram
 from dtsa_agent.air.serial.frames import LineReader, to_line
 from dtsa_agent.air.serial.lengths import LONGEST, OVERHEAD
 from dtsa_agent.air.serial.modems import MODEMS, lora_ns
@@ -160,9 +160,9 @@ def line(tmp_path: Path) -> Iterator[Line]:
     made.unplug()
 
 
-def heard(port: SerialPort, count: int) -> list[Datagram]:
+def heard(port: SerialPort, count: int) -> list[ReceivedDatagram]:
     """What has arrived, when so much has."""
-    found: list[Datagram] = []
+    found: list[ReceivedDatagram] = []
 
     def enough() -> bool:
         found.extend(port.receive(16))

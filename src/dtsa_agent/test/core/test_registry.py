@@ -10,11 +10,12 @@ import pytest
 from slot_helpers import one_slot
 
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig, registry
-from dtsa_agent.core.agents.joining import Listeners, check_joinable
+from dtsa_agent.core.agents.joining import Listeners
 from dtsa_agent.core.kernel import NAMES
 from dtsa_agent.core.registry import ESTIMATORS, POLICIES, PORT, PolicyRow
 from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.core.settings.flight_models import AVOIDERS, AvoiderParams, flight_model
+from dtsa_agent.core.station import check_joinable
 
 
 def flown(policy: str, shared: bool) -> Swarm:

@@ -6,7 +6,7 @@ import argparse
 
 from dtsa_agent.air.datagram import check_fits
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.core.agents.joining import check_joinable
+from dtsa_agent.core.station import check_joinable
 from dtsa_bench.runs.options import add_options, given, number
 
 from .network_options import add_network_options, add_results, read_network_options

@@ -10,8 +10,8 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from dtsa_agent.core.agents.joining import check_joinable
 from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.station import check_joinable
 from dtsa_agent.ros.common.graph.names import named
 from dtsa_agent.ros.common.workarounds.dds import clean_shared_memory
 from dtsa_channel_sim.ros.attendance import LOST_AFTER_S

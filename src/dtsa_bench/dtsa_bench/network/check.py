@@ -7,14 +7,14 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtsa_agent.air.contacts import said_of
-from dtsa_agent.air.datagram import Wrapping
+from dtsa_agent.air.datagram import link_of
 from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.vehicle import SimulatedVehicle
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.agents.pacing import BETWEEN
 from dtsa_agent.core.frame import condition_in
+from dtsa_agent.core.station import StationSettings
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.keys import authenticator
 
@@ -71,7 +71,7 @@ class Check:
 
     def __init__(self, agent: int, config: SwarmConfig, port: PortProperties) -> None:
         self._agent, self._config = agent, config
-        self._wrapping = Wrapping(config, authenticator(config), port=port)
+        self._datagrams = StationSettings(config, link_of(config, port), authenticator(config))
         self._others: dict[int, _Other] = {}
         self._refused: Counter[str] = Counter()
         self._last = -1
@@ -104,15 +104,14 @@ class Check:
 
     def _read(self, other: _Other, datagram: bytes) -> None:
         """Whether the sender is new, and whom it says to hear."""
-        said = self._wrapping.read(datagram)
-        other.left, _, other.new = condition_in(said.frame)
-        if other.left or not self._wrapping.peers:  # an agent that leaves need hear nobody
+        parsed = self._datagrams.read(datagram)
+        other.left, _, other.new = condition_in(parsed.frame)
+        if other.left or not self._datagrams.names:  # an agent that leaves need hear nobody
             return
-        names = [peer for peer, _ in said.peers]
         for agent in range(1, self._config.agents + 1):
-            says = said_of(agent, names, self._wrapping.peers)
-            if agent != said.sender and says is not None:
-                other.says[agent] = other.says.get(agent, 0) + (1 if says else -1)
+            hears = self._datagrams.hears(parsed.names, agent)
+            if agent != parsed.sender and hears is not None:
+                other.says[agent] = other.says.get(agent, 0) + (1 if hears else -1)
 
     def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
         """A datagram has not been taken in.
@@ -167,7 +166,7 @@ class Check:
             found.append(f"{share:.0%} of {told['expected']} frames of cf{agent} heard in time, {ENOUGH:.0%} needed")
         if told["hears_this_agent"] is False:
             found.append(f"cf{agent} does not hear cf{self._agent}")
-        if told["hears_this_agent"] is None and self._wrapping.peers:
+        if told["hears_this_agent"] is None and self._datagrams.names:
             found.append(f"cf{agent} has not said yet that it hears cf{self._agent}")
         return found + [f"cf{agent} does not hear cf{k}" for k in told["does_not_hear"] if k not in lost]
 

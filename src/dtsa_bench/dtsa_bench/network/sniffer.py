@@ -10,11 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dtsa_agent.air.datagram import Wrapping, frame_in
+from dtsa_agent.air.datagram import frame_in, link_of
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import DtsaError
+from dtsa_agent.core.station import StationSettings
 from dtsa_agent.keys import authenticator
 from dtsa_agent.stop import Stop
 from dtsa_bench.recordings.merge.agent_recorder import about_port
@@ -53,7 +54,7 @@ class Sniffer:
         say: Callable[[str], None] | None = None,
     ) -> None:
         self._config, self._judge = config, Judge(config)
-        self._wrapping = Wrapping(config, authenticator(config), port=port.properties)
+        self._datagrams = StationSettings(config, link_of(config, port.properties), authenticator(config))
         self._slots: dict[int, dict[int, bytes]] = {}  # not judged yet
         self._judged = -1  # last slot
         self.refused: Counter[str] = Counter()
@@ -100,7 +101,7 @@ class Sniffer:
             self._judged = over
 
     def _read(self, data: bytes) -> tuple[int, int, str]:
-        fault, sender, slot, *_ = self._wrapping.read(data)
+        fault, sender, slot, *_ = self._datagrams.read(data)
         if fault:
             return 0, 0, fault
         # Of a group that lies behind, or the same frame once more.

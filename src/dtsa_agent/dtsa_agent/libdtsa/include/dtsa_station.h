@@ -127,7 +127,6 @@ typedef struct dtsa_station_events {
     void *context;
     void (*opened)(void *context, int64_t slot, int64_t start_ns, int64_t now_ns, int is_first);
     void (*restarted)(void *context, int64_t slot); /* it restarts with the next slot */
-    void (*sent)(void *context, int64_t slot, const uint8_t *datagram, int length, int64_t now_ns);
     void (*heard)(void *context, int sender, int64_t slot, const uint8_t *datagram, int length,
                   int64_t arrival_ns, int accepted); /* the slot has begun */
     void (*refused)(void *context, int verdict, const uint8_t *datagram, long length,
@@ -157,6 +156,9 @@ DTSA_API dtsa_verdict dtsa_datagram_read(const dtsa_station_settings *settings, 
 DTSA_API int dtsa_datagram_write(const dtsa_station_settings *settings, const uint8_t *frame,
                                  uint32_t slot, int64_t late_ns,
                                  const dtsa_named names[DTSA_NAMES_MAX], uint8_t *out);
+/* Whether the sender of a list of `count` names, of `most` that fit, hears an agent: 1, -1, or 0: the
+ * list does not tell. */
+DTSA_API int dtsa_names_hear(const dtsa_named *names, int count, int most, int agent);
 DTSA_API int dtsa_datagram_length(const dtsa_station_settings *settings);
 
 typedef struct dtsa_station dtsa_station;

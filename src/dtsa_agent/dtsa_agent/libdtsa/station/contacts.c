@@ -11,8 +11,7 @@
 /* Of an extended frame, see frame_extended.c; others have c_r at the same place. */
 enum { LEAVES = 255, MOVES = 1, PROBATION = 2, CYCLES = 8 };
 
-/* Whether the sender of a list hears an agent: 1, -1, or 0: the list does not tell. */
-static int said_of(int agent, const dtsa_named *names, int count, int most)
+int dtsa_names_hear(const dtsa_named *names, int count, int most, int agent)
 {
     for (int i = 0; i < count; i++)
         if (names[i].id == agent) return 1;
@@ -38,7 +37,7 @@ void contacts_hear(dtsa_station *s, const dtsa_datagram *d)
     for (int i = 0; i < names; i++)
         if (d->names[i].id) named[count++] = d->names[i];
     p->unnamed++;
-    int hears = said_of(s->settings.id, named, count, names);
+    int hears = dtsa_names_hear(named, count, names, s->settings.id);
     if (!hears && names == 1 && p->unnamed > CYCLES * (s->settings.agents - 1)) hears = -1;
     if (hears) p->hears_us = (int8_t)hears;
     if (hears > 0) p->unnamed = 0;

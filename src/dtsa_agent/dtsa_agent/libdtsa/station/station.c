@@ -248,8 +248,6 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
     s->counts.sent++;
     s->has_sent = 1;
     if (s->leaving && s->frame[2] == LEAVES) s->gone = 1;
-    if (s->events.sent)
-        s->events.sent(s->events.context, s->slot, datagram, s->datagram_length, now);
     return s->datagram_length;
 }
 

@@ -10,24 +10,15 @@ from collections import Counter, deque
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.datagram import (
-    EARLY,
-    NO_FRAME,
-    OTHER_TIME,
-    REPEATED,
-    Said,
-    Wrapping,
-    flight_ns,
-    frame_in,
-)
+from dtsa_agent.air.datagram import frame_in, link_of
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig, make_scenario
-from dtsa_agent.core.agents.joining import check_joinable
-from dtsa_agent.core.agents.pacing import MOST_EARLY, too_long_ns
+from dtsa_agent.core.agents.pacing import too_long_ns
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_extended, decode_frame
 from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core.station import EARLY_COUNT, ParsedDatagram, StationSettings, check_joinable
 from dtsa_agent.keys import authenticator
 from dtsa_bench.pages.html import pack
 from dtsa_bench.recordings.merge.known_pairs import all_known_after
@@ -75,17 +66,17 @@ class HeardRun:
         seen = {"live": True, "control": False, "mode": air, "listener": True}
         track.begin(run_info(track.name, RunConfig(config, mode=REALTIME), self._scenario) | seen)
 
-    def hear(self, said: Said, sealed: bytes, zero_ns: int, now_ns: int) -> str:
+    def hear(self, said: ParsedDatagram, sealed: bytes, zero_ns: int, now_ns: int) -> str:
         """Takes in a frame of a slot that is still open; why not, or an empty text.
 
         :param sealed: the frame as it was on the air.
         :param zero_ns: ns, CLOCK_MONOTONIC, when slot 0 began by this frame.
         """
-        if said.slot not in self._frames and len(self._frames) >= MOST_EARLY:
-            return EARLY
+        if said.slot not in self._frames and len(self._frames) >= EARLY_COUNT:
+            return "too early"
         frames = self._frames.setdefault(said.slot, {})
         if said.sender in frames:
-            return REPEATED
+            return "repeated"
         frames[said.sender] = sealed, said.frame
         self.heard_ns = now_ns
         self._late_ns.append(said.late_ns)
@@ -175,8 +166,9 @@ class NetworkListener:
         if config.estimator_row.needs_everybody:
             raise ConfigError("estimator", config.estimator, "one that needs only what is heard")
         self._track, self._config = track, config
-        self._wrapping = Wrapping(config, authenticator(config), port=port.properties)
-        self._air, self._flight_ns = port.properties.name, flight_ns(config, port.properties)
+        link = link_of(config, port.properties)
+        self._datagrams = StationSettings(config, link, authenticator(config))
+        self._air, self._flight_ns = port.properties.name, link.flight_ns
         self._too_long_ns = too_long_ns(config)
         self._where = port.where
         self._listener = open_listener(port)
@@ -197,15 +189,15 @@ class NetworkListener:
 
     def take(self, data: bytes, arrival_ns: int, now_ns: int) -> str:
         """Take in a datagram (times: ns, CLOCK_MONOTONIC); why not, or an empty text."""
-        said = self._wrapping.read(data)
+        said = self._datagrams.read(data)
         if said.fault:
             return said.fault
         if not self._is_frame(said.frame):
-            return NO_FRAME
+            return "no frame"
         zero_ns = arrival_ns - self._flight_ns - said.late_ns - said.slot * self._config.slot_ns
         run = self._run
         if run is not None and said.slot < run.slot and now_ns - run.heard_ns < _SILENCE_NS:
-            return OTHER_TIME
+            return "other time"
         if run is None or said.slot < run.slot or run.zero_ns - zero_ns > self._too_long_ns:
             run = self._run = HeardRun(self._track, self._config, self._air, said.slot, zero_ns)
         return run.hear(said, frame_in(data, self._config), zero_ns, now_ns)
