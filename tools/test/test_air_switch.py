@@ -21,8 +21,9 @@ from dtsa_dev.network.switch import Intruder, Links, Switch
 from trials import Trial, TrialError, flight_time, under_way
 
 import dtsa
-from dtsa_agent.air.datagram import Wrapping
+from dtsa_agent.air.datagram import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
+from dtsa_agent.core.station import StationSettings
 from dtsa_bench.recordings.merge.merge import Merge, verified
 from dtsa_bench.recordings.merge.merged_run import lay
 from dtsa_bench.recordings.merge.merged_writer import write
@@ -43,7 +44,7 @@ def ethernet(payload: bytes, group: tuple[str, int] = GROUP, protocol: int = 17)
 
 def frame(sender: int, slot: int) -> bytes:
     state = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
-    return ethernet(Wrapping(CONFIG, None).wrap(encode_frame(Frame(sender, slot, 1, *state)), slot))
+    return ethernet(StationSettings(CONFIG, link_of(CONFIG)).write(encode_frame(Frame(sender, slot, 1, *state)), slot))
 
 
 class Cables:

@@ -21,7 +21,7 @@ from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_port
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import MulticastSocket, UdpSettings
+from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.network.sniffer import Sniffer
@@ -39,7 +39,7 @@ def own_group() -> str:
 def need_multicast() -> None:
     """Skips the test where the loopback interface carries no multicast."""
     try:
-        with MulticastSocket(UdpSettings(interface="lo", group=own_group())) as end:
+        with UdpPort(UdpSettings(interface="lo", group=own_group())) as end:
             end.send(b"x")
             for _ in range(100):
                 if end.receive(1):
@@ -117,7 +117,7 @@ class Stranger:
     """Sends what it likes to a group of the loopback interface, and hears what is said there."""
 
     def __init__(self, group: str) -> None:
-        self.socket = MulticastSocket(UdpSettings(interface="lo", group=group))
+        self.socket = UdpPort(UdpSettings(interface="lo", group=group))
 
     def hear(self, count: int) -> list[bytes]:
         """Datagrams of others."""
@@ -144,7 +144,7 @@ class TwoWays:
     """
 
     def __init__(self, near: str, far: str) -> None:
-        self._ends = [MulticastSocket(UdpSettings(interface="lo", group=group)) for group in (near, far)]
+        self._ends = [UdpPort(UdpSettings(interface="lo", group=group)) for group in (near, far)]
         self.to_far = self.to_near = True
         self._stopped = False
         self._thread = threading.Thread(target=self._run)
@@ -176,7 +176,7 @@ class OneWay:
     """
 
     def __init__(self, source: str, target: str, delay_s: float) -> None:
-        self._ends = [MulticastSocket(UdpSettings(interface="lo", group=group)) for group in (source, target)]
+        self._ends = [UdpPort(UdpSettings(interface="lo", group=group)) for group in (source, target)]
         self._delay_s = delay_s
         self._stopped = False
         self._thread = threading.Thread(target=self._run)

@@ -19,9 +19,10 @@ pytest.importorskip("usb")
 
 from dtsa_agent.air.crazyradio import CrazyradioSettings
 from dtsa_agent.air.crazyradio.packets import broadcast, datagram_in
-from dtsa_agent.air.datagram import Wrapping
+from dtsa_agent.air.datagram import link_of
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
+from dtsa_agent.core.station import StationSettings
 from dtsa_agent.keys import authenticator
 from dtsa_bench.commands.cli import main
 from dtsa_bench.crazyflies.peer_lab.app import LabSettings
@@ -171,16 +172,16 @@ def test_a_computer_reads_what_the_app_on_board_says(auth: bool, tmp_path: Path)
         flight.finish()
     heard = CrazyradioSettings(uri="radio://0/80/2M")
     assert port == heard.p2p_port
-    wrapping = Wrapping(swarm, authenticator(swarm), port=heard.properties)
+    datagrams = StationSettings(swarm, link_of(swarm, heard.properties), authenticator(swarm))
     said = [record for k in (1, 2, 3) for record in read(tmp_path / f"cf{k}.mcap").slots if record.datagram]
     assert len(said) > 100
     for record in said:
         datagram = datagram_in(broadcast(record.datagram, heard.p2p_port)[5:], heard.p2p_port)
         assert datagram is not None
-        told = wrapping.read(datagram)
+        told = datagrams.read(datagram)
         assert (told.fault, told.slot, told.frame) == ("", record.slot, record.frame)
     last = said[-1]
-    assert wrapping.wrap(last.frame, last.slot, told.late_ns) == last.datagram
+    assert datagrams.write(last.frame, last.slot, told.late_ns) == last.datagram
 
 
 def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> None:

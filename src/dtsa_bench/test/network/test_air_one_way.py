@@ -29,22 +29,9 @@ MS = 1_000_000
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """cf1 and cf2 hear each other; cf3 hears them after 100 ms, and nobody hears cf3.
-
-    Nobody corrects the clock of an agent that is not heard: on a busy machine it may lose the others' time for good.
-    Then they fly again; each time the same has to come about.
-    """
+    """cf1 and cf2 hear each other; cf3 hears them after 100 ms, and nobody hears cf3."""
     helpers.need_multicast()
-    for patience_s in (20.0, 20.0, 120.0):
-        paths, apart = _flown(tmp_path_factory.mktemp("one_way"), patience_s)
-        if apart is None:
-            return paths
-    raise apart
-
-
-def _flown(directory: Path, patience_s: float) -> tuple[list[Path], AssertionError | None]:
-    """The bags, and what is said if the agents did not hear each other within the time."""
-    apart = None
+    directory = tmp_path_factory.mktemp("one_way")
     near, far = helpers.own_group(), helpers.own_group()
     paths = [directory / f"cf{agent}" / f"cf{agent}.mcap" for agent in (1, 2, 3)]
     flying: list[helpers.Flying] = []
@@ -56,16 +43,14 @@ def _flown(directory: Path, patience_s: float) -> tuple[list[Path], AssertionErr
             flying.append(helpers.Flying(AgentSettings(id=agent), CONFIG, udp, path))
         first, second, third = flying
         heard = (first.heard, 2), (second.heard, 1), (third.heard, 1), (third.heard, 2)
-        wait_for(lambda: all(frames[sender] > 20 for frames, sender in heard), patience_s)
+        wait_for(lambda: all(frames[sender] > 20 for frames, sender in heard), 60.0)
         seen = len(third.slots)
-        wait_for(lambda: len(third.slots) > seen + 100, patience_s)
-    except AssertionError as error:
-        apart = error
+        wait_for(lambda: len(third.slots) > seen + 100, 60.0)
     finally:
         for one in flying:
             one.end()
         carrier.end()
-    return paths, apart
+    return paths
 
 
 def _merged(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, dict[str, Any], str]:

@@ -12,9 +12,10 @@ import air_helpers as helpers
 import numpy as np
 import pytest
 
-from dtsa_agent.air.datagram import NETWORK, Wrapping
+from dtsa_agent.air.datagram import NETWORK, link_of
 from dtsa_agent.air.record import Heard, SlotRecord
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
+from dtsa_agent.core.station import StationSettings
 from dtsa_bench.network.check import Check, lasts_s, table
 
 CONFIG = SwarmConfig(agents=4, policy="tdma", slot_ms=20.0)
@@ -30,7 +31,7 @@ def record(slot: int, chosen: int, heard: list[Heard], anew: bool = False) -> Sl
 def said(sender: int, slot: int, delay_ns: int, hears: Sequence[int]) -> Heard:
     """A frame that arrives so long after its slot has started; its sender names whom it hears."""
     frame = encode_frame(Frame(sender, slot, 1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0)))
-    data = Wrapping(CONFIG, None).wrap(frame, slot, 0, [(k, 0) for k in hears])
+    data = StationSettings(CONFIG, link_of(CONFIG)).write(frame, slot, 0, tuple((k, 0) for k in hears))
     return Heard(sender, slot, slot * SLOT + delay_ns, data, accepted=True)
 
 

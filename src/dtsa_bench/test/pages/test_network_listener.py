@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dtsa_agent.air.datagram import Wrapping
+from dtsa_agent.air.datagram import link_of
 from dtsa_agent.core import Frame, SwarmConfig, encode_frame
+from dtsa_agent.core.station import StationSettings
 from dtsa_bench.pages.view.network_listener import HeardRun
 from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
 
@@ -23,7 +24,7 @@ class Heard:
     def __init__(self) -> None:
         self._track = Track("listener")
         self._run = HeardRun(self._track, CONFIG, "udp", FIRST, 0)
-        self._wrapping = Wrapping(CONFIG, None)
+        self._datagrams = StationSettings(CONFIG, link_of(CONFIG))
 
     def slots(self, first: int, end: int, senders: tuple[int, ...]) -> None:
         """Slots go by; in its turn each of the senders says that it flies along x at 1 m/s."""
@@ -33,7 +34,7 @@ class Heard:
             if sender in senders:
                 place = ((slot - FIRST) * CONFIG.slot_s, float(sender), 1.0)
                 frame = encode_frame(Frame(sender, slot, 1, place, (1.0, 0.0, 0.0)))
-                said = self._wrapping.read(self._wrapping.wrap(frame, slot))
+                said = self._datagrams.read(self._datagrams.write(frame, slot))
                 assert (said.fault, self._run.hear(said, said.frame, 0, now)) == ("", "")
             self._run.tell(Counter(), now)
 
