@@ -229,7 +229,7 @@ class Station:
 
     def _observer(self) -> Any:
         return ffi.new("dtsa_station_events *", [
-            self._handle, lib.station_opened, lib.station_restarted, lib.station_heard,
+            self._handle, lib.station_opened, lib.station_restarted, ffi.NULL, lib.station_heard,
             lib.station_refused,
         ])  # fmt: skip
 

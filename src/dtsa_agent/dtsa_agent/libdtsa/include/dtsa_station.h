@@ -127,6 +127,8 @@ typedef struct dtsa_station_events {
     void *context;
     void (*opened)(void *context, int64_t slot, int64_t start_ns, int64_t now_ns, int is_first);
     void (*restarted)(void *context, int64_t slot); /* it restarts with the next slot */
+    void (*sent)(void *context, int64_t slot, const uint8_t *datagram, int length,
+                 int64_t now_ns); /* a step gives it to be sent */
     void (*heard)(void *context, int sender, int64_t slot, const uint8_t *datagram, int length,
                   int64_t arrival_ns, int accepted); /* the slot has begun */
     void (*refused)(void *context, int verdict, const uint8_t *datagram, long length,

@@ -213,15 +213,15 @@ static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
     if (s->leaving && !s->gone) s->agent.leave(s->agent.context); /* its last frame did not leave */
     s->frame_length =
         s->agent.open(s->agent.context, slot, s->hovers != DTSA_FLIES, s->frame, &chosen);
-    if (s->frame_length && leaves_out(s, slot, now)) {
-        s->agent.unsent(s->agent.context);
-        s->frame_length = 0;
-    }
     s->running = 1;
     s->awaits = chosen && chosen != s->settings.id;
     if (s->events.opened)
         s->events.opened(s->events.context, slot, dtsa_station_slot_start(s, slot), now,
                          slot == s->first);
+    if (s->frame_length && leaves_out(s, slot, now)) {
+        s->agent.unsent(s->agent.context);
+        s->frame_length = 0;
+    }
     hear_early(s);
 }
 
@@ -248,6 +248,8 @@ static int send(dtsa_station *s, int64_t now, uint8_t *datagram)
     s->counts.sent++;
     s->has_sent = 1;
     if (s->leaving && s->frame[2] == LEAVES) s->gone = 1;
+    if (s->events.sent)
+        s->events.sent(s->events.context, s->slot, datagram, s->datagram_length, now);
     return s->datagram_length;
 }
 
