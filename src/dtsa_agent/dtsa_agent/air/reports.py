@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, SAME_ID
+from dtsa_agent.core.station import FLIES, IS_NEW, NO_QUORUM, SAME_ID, STATES
 
 _SECOND = 1_000_000_000
 _STATE_NS = _SECOND  # a state that lasts is reported after this time, and the next one not before twice that
@@ -61,7 +61,7 @@ class Reports:
             FLIES: f"flies: {contact}", SAME_ID: f"hovers: another agent sends as {self._id}",
             NO_QUORUM: f"hovers: {contact}", IS_NEW: f"is new, and hovers until the others know it: {contact}",
         }  # fmt: skip
-        alone = status.hovers != FLIES and status.in_step == 1
+        alone = status.hovers != FLIES and STATES[status.state] == "alone"
         self.state("is alone, and hovers until it hears others" if alone else texts[status.hovers], now_ns)
         self._check_lengths(status.timed, status.off)
         if self._foreign_due_ns and now_ns >= self._foreign_due_ns:

@@ -14,7 +14,7 @@ from dtsa_agent.air.reports import Reports
 from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
-from dtsa_agent.core.station import ALL_BUT_ONE, FLIES, IS_NEW, NO_QUORUM, Station, StationSettings
+from dtsa_agent.core.station import ALL_BUT_ONE, FLIES, IS_NEW, NO_QUORUM, STATES, Station, StationSettings
 
 SECOND = 10**9
 
@@ -67,10 +67,10 @@ def test_a_share_is_never_less_than_said(percent: int, others: int) -> None:
     assert 0 <= found <= others
 
 
-def status(hovers: int, hears: int, heard_by: int) -> SimpleNamespace:
+def status(hovers: int, hears: int, heard_by: int, state: int = 2) -> SimpleNamespace:
     """What a station of a swarm of six says."""
     return SimpleNamespace(
-        hovers=hovers, others=5, hears=hears, heard_by=heard_by, needed=4, in_step=1 + hears, timed=0, off=0
+        hovers=hovers, others=5, hears=hears, heard_by=heard_by, needed=4, state=state, timed=0, off=0
     )
 
 
@@ -99,5 +99,5 @@ def test_an_agent_that_hears_nobody_says_that_it_is_alone() -> None:
     lines: list[str] = []
     reports = Reports(1, 10.0, lines.append, 0)
     for second in range(10):
-        reports.status(status(NO_QUORUM, 0, 0), second * SECOND)
+        reports.status(status(NO_QUORUM, 0, 0, STATES.index("alone")), second * SECOND)
     assert lines == ["is alone, and hovers until it hears others"]

@@ -231,7 +231,7 @@ def test_other_settings_and_another_key_are_said_in_flight() -> None:
     lines: list[str] = []
     second, now = 1_000_000_000, [0]
     reports = Reports(1, config.slot_ms, lines.append, 0)
-    flies = SimpleNamespace(hovers=FLIES, others=2, hears=2, heard_by=2, needed=1, in_step=3, timed=0, off=0)
+    flies = SimpleNamespace(hovers=FLIES, others=2, hears=2, heard_by=2, needed=1, state=2, timed=0, off=0)
 
     def arrives(*data: bytes) -> list[str]:
         for one in data:

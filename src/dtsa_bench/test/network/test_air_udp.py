@@ -22,12 +22,10 @@ from rosbags.rosbag2 import Reader
 from waiting import wait_for
 
 import dtsa
-from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import UdpPort, UdpSettings
+from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.core.errors import DtsaError
-from dtsa_agent.stop import Stop
 from dtsa_bench.commands.cli import main
 from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.pages.view.network_listener import NetworkListener
@@ -396,7 +394,7 @@ def test_offsets_and_drifts_are_found_among_frames_that_were_held_up() -> None:
     assert max(here) - min(here) < 3_000
 
 
-def test_a_second_agent_of_the_same_id_does_not_begin(tmp_path: Path) -> None:
+def test_a_second_agent_of_the_same_id_hovers_and_sends_nothing(tmp_path: Path) -> None:
     helpers.need_multicast()
     config = SwarmConfig(agents=2, policy="tdma")
     udp = UdpSettings(interface="lo", group=helpers.own_group())
@@ -407,8 +405,12 @@ def test_a_second_agent_of_the_same_id_does_not_begin(tmp_path: Path) -> None:
         other.end()
         other = helpers.Flying(AgentSettings(id=2), config, udp, tmp_path / "again.mcap")
         wait_for(lambda: len(other.slots) > 5)  # who comes back is welcome
-        with pytest.raises(ConfigError, match="id: got 1"), UdpPort(udp) as port:
-            LiveAgent(AgentSettings(id=1), config, port).run(Stop())
+        second = helpers.Flying(AgentSettings(id=1), config, udp, tmp_path / "second.mcap")
+        try:
+            wait_for(lambda: "hovers: another agent sends as 1" in second.said)
+        finally:
+            second.end()
+        assert second.agent.summary()["sent"] == 0
     finally:
         other.end()
         first.end()
@@ -421,7 +423,20 @@ def _command(*words: str) -> list[str]:
 def test_the_command_flies_until_a_signal_and_merges(tmp_path: Path) -> None:
     helpers.need_multicast()
     out = tmp_path / "cf2"
-    words = ["agent", "--id", "2", "--agents", "2", "--interface", "lo", "--group", helpers.own_group(), "--no-seal"]
+    words = [
+        "agent",
+        "--id",
+        "2",
+        "--agents",
+        "2",
+        "--interface",
+        "lo",
+        "--group",
+        helpers.own_group(),
+        "--no-seal",
+        "--quorum",
+        "0",
+    ]
     with subprocess.Popen(_command(*words, "--json", "--out", str(out)), stdout=subprocess.PIPE, text=True) as process:
         wait_for(lambda: (out / "cf2.mcap").exists() and (out / "cf2.mcap").stat().st_size > 4000)
         process.send_signal(signal.SIGTERM)

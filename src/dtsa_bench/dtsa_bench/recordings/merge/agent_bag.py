@@ -38,7 +38,7 @@ class AgentBag:
     swarm: SwarmConfig
     port: PortProperties
     started_ns: int  # own clock, when its process began
-    slots: list[SlotRecord] = field(default_factory=list)  # ascending
+    slots: list[SlotRecord] = field(default_factory=list)  # ascending, but where it took over another time
     refused: Counter[str] = field(default_factory=Counter)  # datagrams not taken in, by reason
     summary: dict[str, Any] = field(default_factory=dict)  # its own; empty: it was killed
     broken_off: bool = False  # the file was not finished
@@ -159,7 +159,7 @@ def _message(bag: AgentBag, topic: str, said: dict[str, Any]) -> None:
         heard = {name: [_heard(one) for one in said.pop(name)] for name in ("before", "heard")}
         data = {name: bytes.fromhex(said.pop(name)) for name in ("frame", "datagram")}
         record = SlotRecord(**said, **arrays, **heard, **data)
-        if bag.slots and record.slot <= bag.slots[-1].slot:
+        if bag.slots and record.slot <= bag.slots[-1].slot and not record.anew:
             raise UnusableBag(bag.path, f"slot {record.slot} comes after slot {bag.slots[-1].slot}")
         bag.slots.append(record)
 

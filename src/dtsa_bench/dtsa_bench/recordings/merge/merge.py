@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -53,9 +54,9 @@ class Merge:
         """
         lives, line, common_slot = self.lives, self.line, self.turns.common_slot
         replays = {life: Replay(bag) for life, bag in lives.items()}
-        on_line = {life: lives[life] for life in line.clocks}
+        on_line = {life: lives[life] for life in line.clocks if life[1] >= 0}
         flown = ended(fly(on_line, replays, senders_of(lives, self.sent), common_slot))
-        for life in lives.keys() - line.clocks.keys():  # slots of its own, which are nobody else's
+        for life in lives.keys() - on_line.keys():  # slots of its own, which are nobody else's
             for record in lives[life].slots:
                 replays[life].fly(record)
         here = {agent for agent, _ in lives}
@@ -64,11 +65,12 @@ class Merge:
         heard = sum(len(record.before) + len(record.heard) for bag in lives.values() for record in bag.slots)
         hearing = of_datagrams(len(here), slots, len(self.sent), heard, refused)
         return {
-            "bags": len(lives),
+            "bags": sum(number >= 0 for _, number in lives),
+            "slots_of_times_given_up": sum(len(bag.slots) for (_, number), bag in lives.items() if number < 0),
             "missing": [agent for agent in range(1, self.config.agents + 1) if agent not in here],
             "broken_off": [named(life) for life, bag in lives.items() if bag.broken_off],
             "nothing_written": self.nothing_written,
-            "not_on_the_time_line": [named(life) for life in lives if life not in line.clocks],
+            "not_on_the_time_line": [named(life) for life in lives if life not in line.clocks and life[1] >= 0],
             "not_determined": self.apart,
             "time_line": line.summary(),
             **self.turns.summary(),
@@ -109,7 +111,7 @@ def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
     if not any(bag.slots for bag in bags):
         raise ConfigError("bags", str(bags[0].path) if bags else "", "bags with a slot in them")
     found: dict[Life, AgentBag] = {}
-    for bag in sorted(bags, key=lambda bag: (bag.agent, bag.slots[0].slot if bag.slots else -1)):
+    for bag in sorted(map(_last_time, bags), key=lambda bag: (bag.agent, bag.slots[0].slot if bag.slots else -1)):
         if bag.swarm != bags[0].swarm:
             theirs, ours = bag.swarm.to_dict(), bags[0].swarm.to_dict()
             other = ", ".join(
@@ -121,7 +123,24 @@ def _lives(bags: Sequence[AgentBag]) -> dict[Life, AgentBag]:
         if before is not None and before.slots and (not bag.slots or bag.slots[0].slot <= before.slots[-1].slot):
             raise ConfigError("bag", str(bag.path), f"one process of cf{bag.agent} at a time: {before.path} is another")
         found[(bag.agent, number)] = bag
-    return found
+    return found | {life: time for bag in bags for life, time in _earlier_times(bag)}
+
+
+def _times(bag: AgentBag) -> list[list[SlotRecord]]:
+    """The slots of an agent, split where they count back: there it took over another time."""
+    starts = [0, *(k for k in range(1, len(bag.slots)) if bag.slots[k].slot <= bag.slots[k - 1].slot), len(bag.slots)]
+    return [bag.slots[a:b] for a, b in pairwise(starts)]
+
+
+def _last_time(bag: AgentBag) -> AgentBag:
+    return dataclasses.replace(bag, slots=_times(bag)[-1])
+
+
+def _earlier_times(bag: AgentBag) -> list[tuple[Life, AgentBag]]:
+    """What an agent flew before it took over a time with smaller slot numbers: lives with negative numbers."""
+    earlier = _times(bag)[:-1]
+    empty = dataclasses.replace(bag, summary={}, refused=Counter())
+    return [((bag.agent, k - len(earlier)), dataclasses.replace(empty, slots=slots)) for k, slots in enumerate(earlier)]
 
 
 def _apart(lives: Mapping[Life, AgentBag], line: TimeLine) -> list[list[str]]:
@@ -130,7 +149,7 @@ def _apart(lives: Mapping[Life, AgentBag], line: TimeLine) -> list[list[str]]:
     A process that sent nothing could not be heard: it makes no group, and is not on the time line either.
     """
     sharing = {life for group in line.groups for life in group}
-    alone = [(life,) for life in lives if life not in sharing]
+    alone = [(life,) for life in lives if life not in sharing and life[1] >= 0]
     groups = [group for group in (*line.groups, *alone) if any(r.datagram for one in group for r in lives[one].slots)]
     return [[named(life) for life in group] for group in groups] if len(groups) > 1 else []
 
@@ -139,7 +158,7 @@ def sent_of(lives: Mapping[Life, AgentBag]) -> dict[tuple[int, int], Sent]:
     """All frames that were sent, by slot and sender."""
     return {
         (record.slot, life[0]): Sent(life, record)
-        for life, bag in lives.items()
+        for life, bag in sorted(lives.items())
         for record in bag.slots
         if record.datagram
     }
@@ -173,10 +192,13 @@ def _crossings(
     whole: set[int] = set()
     if complete:
         whole = {agent for agent, _ in lives} - {agent for (agent, _), bag in lives.items() if bag.broken_off}
+    earlier = sent_of({life: bag for life, bag in lives.items() if life[1] < 0})
     for receiver, bag in lives.items():
         for record in bag.slots:
             for heard in (*record.before, *record.heard):
                 origin = sent.get((heard.slot, heard.sender))
+                if origin is None or origin.record.datagram != heard.datagram:
+                    origin = earlier.get((heard.slot, heard.sender), origin)
                 if origin is not None and origin.record.datagram == heard.datagram:
                     found.append(Crossing(origin.life, receiver, origin.record.sent_ns, heard.arrival_ns))
                 elif origin is not None or heard.sender in whole:
@@ -215,7 +237,7 @@ class _Turns:
     def __init__(self, lives: Mapping[Life, AgentBag], line: TimeLine, slot_ns: int) -> None:
         self._started = [line.clocks[life].common_ns(bag.started_ns) for life, bag in lives.items()
                          if life in line.clocks and life[1] == 0]  # fmt: skip
-        on_line = {life: bag for life, bag in lives.items() if life in line.clocks and bag.slots}
+        on_line = {life: bag for life, bag in lives.items() if life in line.clocks and bag.slots and life[1] >= 0}
         starts: dict[int, list[int]] = {}
         for life, bag in on_line.items():
             for record in bag.slots:
