@@ -1,7 +1,7 @@
 """A station: one agent with a clock of its own. Datagrams and time in, datagrams and the time of the next wake-up out.
 
-It knows no clock and no I/O; the rules are ``libdtsa/station``, and once more in plain Python
-``core/reference/station``. Times are ns of the own clock.
+It knows no clock and no I/O. The rules: ``libdtsa/station``, and in plain Python ``core/reference/station``. Times are
+ns of the own clock.
 """
 
 from __future__ import annotations

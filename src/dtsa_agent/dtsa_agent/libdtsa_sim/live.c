@@ -84,7 +84,7 @@ static int64_t clock_of(const host *h, int64_t t)
 static int64_t time_of(const host *h, int64_t clock)
 {
     const int64_t d = clock - h->clock_ref;
-    int64_t t = h->time_ref + d - d / 1000 * h->drift / 1000000;
+    int64_t t = h->time_ref + d - d / 1000 * h->drift / (1000000 + h->drift / 1000);
     while (clock_of(h, t) < clock) t++;
     return t;
 }
@@ -299,12 +299,12 @@ static void step(live *v, int i)
         sense(h);
         const int64_t due = dtsa_station_step(h->station, now, datagram, &length);
         v->r->steps++;
+        dtsa_station_get_status(h->station, &after);
         tell(v, (live_call){.host = i, .kind = 2, .now_ns = now, .answer = due, .out = datagram,
-                            .out_length = length,
+                            .out_length = length, .status = &after,
                             .position = {h->position[0], h->position[1], h->position[2]},
                             .velocity = {h->velocity[0], h->velocity[1], h->velocity[2]}});
         if (length) send(v, i, datagram, length);
-        dtsa_station_get_status(h->station, &after);
         if (after.slots != before.slots || after.slot != before.slot) {
             fly(v, h);
             check_quorum(v, i);
@@ -362,7 +362,7 @@ static void start(live *v, int i)
     h->on = 1;
     h->queue_count = 0;
     h->sent_at = INT64_MIN / 2;
-    tell(v, (live_call){.host = i, .kind = 0, .now_ns = now});
+    tell(v, (live_call){.host = i, .kind = 0, .now_ns = now, .answer = h->id});
     step(v, i);
 }
 

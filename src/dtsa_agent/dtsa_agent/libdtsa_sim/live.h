@@ -83,10 +83,11 @@ typedef struct live_call {
     int64_t now_ns;
     const uint8_t *data;
     long length;
-    int64_t answer; /* verdict, or next wake-up */
+    int64_t answer; /* verdict, next wake-up, or the id that started */
     const uint8_t *out;
     int out_length;
     double position[3], velocity[3];
+    const dtsa_station_status *status; /* after a step; else NULL */
 } live_call;
 
 typedef void (*live_observer)(void *context, const live_call *call);

@@ -1,18 +1,19 @@
 """Live agents on virtual time: N stations in one process, one medium, clocks, ports, and faults drawn from one seed.
 
-The stations are those that fly (``libdtsa/station``); the flight is ``libdtsa_sim/live.c``. Checked at every step: no two
-agents that are in step send in one slot, and none flies without a quorum for longer than it takes to notice. After the
-faults all must be in step, hear each other and fly within :func:`bound_ns`. The same seed gives the same bytes, as
-``LiveResult.hash`` shows.
+The stations are those that fly (``libdtsa/station``); the flight is ``libdtsa_sim/live.c``. Checked at every step: no
+two agents that are in step send in one slot, and none flies without a quorum for longer than it takes to notice. After
+the faults all must be in step, hear each other and fly within :func:`bound_ns`. The same seed gives the same bytes, as
+``LiveResult.hash`` shows. Memory is fixed: a station lives in the ``dtsa_station_bytes`` that it begins with.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.kernel import ffi, lib
 
 MS, S = 1_000_000, 1_000_000_000
@@ -22,6 +23,7 @@ FAULTS = (
 )  # fmt: skip
 VIOLATIONS = ("", "two senders in a slot", "flies without a quorum", "not together in time", "does not come to rest")
 _KEY = bytes(range(16))
+_AGENTS_MAX = lib.LIVE_HOSTS_MAX - 2  # and two processes of an id that is there already
 _CLOCKS_S = 10**6  # clocks show anything up to this when a flight begins
 
 
@@ -55,7 +57,23 @@ class LiveFlight:
     first_slot: int = 0  # all begin together with this slot; 0: they listen first
     goal_every_ns: int = 0
     lasts_ns: int = 10 * S  # until the faults are over
-    faults: tuple[LiveFault, ...] = field(default=())
+    faults: tuple[LiveFault, ...] = ()
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "seed": (self.seed, 0, 2**63 - 1), "agents": (self.agents, 1, _AGENTS_MAX), "slot_ns": (self.slot_ns, 1, S),
+            "names": (self.names, 0, 4), "drift_ppm": (self.drift_ppm, 0, 100_000),
+            "faults": (len(self.faults), 0, lib.LIVE_FAULTS_MAX),
+            **{f"faults[{k}].agent": (fault.agent, 0, self.agents - 1) for k, fault in enumerate(self.faults)},
+        }  # fmt: skip
+        for name, (value, least, most) in ranges.items():
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise ConfigError(name, value, f"{least} to {most}")
+        if self.policy not in ("lease", "tdma"):
+            raise ConfigError("policy", self.policy, "lease, tdma")
+        for fault in self.faults:
+            if fault.kind not in FAULTS:
+                raise ConfigError("kind", fault.kind, ", ".join(FAULTS))
 
     @property
     def main_every(self) -> int:
@@ -84,8 +102,8 @@ class LiveResult:
 def bound_ns(flight: LiveFlight) -> int:
     """Within this time after the last fault all are in step, hear each other and fly.
 
-    12 K M N slots: an agent that restarts listens for up to 2 M N, is on probation for as long as K M N, is heard by all
-    others within K M N, and its names reach all within K M N for each list; and at least 20 s for frames that are lost.
+    12 K M N slots: an agent that restarts listens for up to 2 M N, is on probation for up to 2 K M N, is heard by all
+    others within K M N, and all have named it K M N later for each list; at least 20 s, since frames may be lost.
     """
     return max(12 * flight.main_every * flight.agents * flight.slot_ns, 20 * S)
 
@@ -126,7 +144,9 @@ def _c_flight(flight: LiveFlight) -> tuple[Any, list[Any]]:
         "profile": lib.DTSA_PROFILE_EXTENDED if lease else lib.DTSA_PROFILE_PAPER,
         "estimator": lib.DTSA_ESTIMATE_LINEAR, "avoider": lib.DTSA_AVOID_NONE, "r_min": 0.3, "targets_known": 1,
         "gossip": 1, "avoid": {"v_max": 1.0, "gain": 2.0}, "start": start, "target": away,
-        "lease": {"anchor_every": 5, "main_every": 15, "open_every": 11, "adoption": 1, "depth_rate": 0.2, "share": 1.0},
+        "lease": {
+            "anchor_every": 5, "main_every": 15, "open_every": 11, "adoption": 1, "depth_rate": 0.2, "share": 1.0,
+        },
     })  # fmt: skip
     station = {
         "agents": n, "anchor_every": 5, "main_every": flight.main_every, "slot_cycle": lib.dtsa_slot_cycle(config),
@@ -166,7 +186,11 @@ def _c_flight(flight: LiveFlight) -> tuple[Any, list[Any]]:
 
 
 def draw_flight(seed: int) -> LiveFlight:
-    """A flight with anything that can happen to it."""
+    """Return a flight with anything that can happen to it.
+
+    :raises ConfigError: for a seed that is no whole number from 0 on.
+    """
+    LiveFlight(seed)
     draw = random.Random(seed)
     agents, slot_ns = draw.choice([2, 3, 4, 5, 6, 8, 12]), draw.choice([5, 10, 10, 20, 33]) * MS
     lasts_ns = draw.choice([5, 20, 60]) * S
@@ -224,3 +248,27 @@ def _simpler(flight: LiveFlight) -> Iterator[LiveFlight]:
     last = max([S, *(fault.at_ns + fault.lasts_ns for fault in flight.faults)])
     if last < flight.lasts_ns:
         yield replace(flight, lasts_ns=last)
+
+
+def command_of(flight: LiveFlight) -> str:
+    """Return the command that flies a flight again, and prints its result."""
+    return f'python -c "from {__name__} import *; print(fly({_in_words(flight)}))"'
+
+
+def report_failure(seed: int) -> str:
+    """Fly a seed; what is wrong, with the command of the simplest flight that shows it, or an empty text."""
+    flight = draw_flight(seed)
+    result = fly(flight)
+    if not result.violation:
+        return ""
+    where = f"{result.violation}, agents {result.agent}, {result.other}, at {result.at_ns / S:.3f} s"
+    return f"seed {seed}: {where}; shrunk:\n{command_of(shrink(flight))}"
+
+
+def _in_words(value: object) -> str:
+    if isinstance(value, tuple):
+        return "(" + "".join(_in_words(part) + ", " for part in value) + ")"
+    if not isinstance(value, LiveFlight | LiveFault):
+        return repr(value)
+    given = {one.name: getattr(value, one.name) for one in fields(value) if getattr(value, one.name) != one.default}
+    return f"{type(value).__name__}({', '.join(f'{name}={_in_words(part)}' for name, part in given.items())})"

@@ -18,7 +18,7 @@ Nothing that is installed imports it; tests and ``dtsa_dev`` do. One file, one s
 * :mod:`.policies`: who sends, by priorities and counters
 * :mod:`.lease`: the policy that needs no equal tables
 * :mod:`.agent`: one agent in a slot
-* :mod:`.timebase`: which slot it is
+* :mod:`.station`: an agent with a clock of its own
 
 It needs no NumPy, but for :mod:`.stepper`, which makes a swarm of it for flights beside the compiled one.
 """

@@ -13,12 +13,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
-from .agent import LEAVES, Agent, Foreign, Receiver, hear, parse
+from .agent import Agent, Foreign, Receiver, hear, parse
 from .arithmetic import mix64
 from .frame import Refused, decode
-from .rules import EXTENDED, OFF, Rules
+from .rules import EXTENDED, LEAVES, OFF, Rules
 
 Datagram = bytes
 Ns = int  # ns, own clock
@@ -142,9 +143,11 @@ class Station:
         self.latest_send_ns = max(slot_ns - c.link.flight_ns - slot_ns * 200 // 1000, slot_ns // 10)
         self.offsets: list[int] = []
         self.heard_ns = self.in_step_ns = self.now  # last frame of others, and of the own time; or the beginning
-        self.earlier_since, self.earlier_ns = 0, None
+        self.earlier_since = 0
+        self.earlier_ns: Ns | None = None
         self.flight_error_ns, self.name_turn = 0, 0
-        self.same_id_until = self.refused_since = None
+        self.same_id_until: Ns | None = None
+        self.refused_since: Ns | None = None
         self.slot, self.first, self.origin_ns = -1, -1, 0
         self.running = self.awaits = self.newcomer = self.has_sent = self.leaving = self.gone = False
         self.hovers, self.frame, self.counts = HOVERS_LISTENING, b"", Counts()
@@ -256,8 +259,8 @@ class Station:
         """Whether the time that a frame shows is taken over.
 
         That is so when most of all agents heard lately are in it; when it is the earlier one and half of them are, or
-        no frame was ever heard in the own one; or, after some patience, when no other agent is heard in the own one, or it is
-        the earlier one and less than half of the swarm is in the own one.
+        no frame was ever heard in the own one; or, after some patience, when no other agent is heard in the own one, or
+        it is the earlier one and less than half of the swarm is in the own one.
         """
         recent = [p for p in self.peers if self._is_recent(p, p.heard_ns, now)]
         every = 1 + len(recent)
@@ -358,7 +361,7 @@ class Station:
             p.report_ns = p.sum_ns = None
 
     def _has_quorum(self, now: Ns) -> bool:
-        """Whether it hears, and is heard by, enough of those that have not left; the silent count as most others say."""
+        """Whether it hears, and is heard by, enough of those that have not left; one that has not said: as most say."""
         c, link = self.settings, self.settings.link
         others = [p for k, p in enumerate(self.peers) if k != c.id - 1 and not p.left]
         says = [p.hears_us for p in others]
@@ -543,5 +546,4 @@ def said_of(agent: int, names: Sequence[int], most: int) -> int:
         return 1
     if len(names) < most:  # all whom it hears
         return -1
-    gaps = zip(names, names[1:], strict=False)
-    return -1 if any((agent - a) & 0xFFFF < (b - a) & 0xFFFF for a, b in gaps) else 0
+    return -1 if any((agent - a) & 0xFFFF < (b - a) & 0xFFFF for a, b in pairwise(names)) else 0
