@@ -36,7 +36,7 @@ typedef struct host {
     int queue_count;
     int64_t sent_slot; /* of its last frame */
     int64_t sent_at;
-    int64_t *received; /* (hosts) when it got the last frame of each */
+    int64_t *received;            /* (hosts) when it got the last frame of each */
     int64_t wrong_ns, checked_at; /* flown without a quorum since it had one; time of the check */
 } host;
 
@@ -122,7 +122,8 @@ static event *push(live *v, int64_t at, int kind, int host)
     e->index = 0;
     e->length = 0;
     int i = v->count++;
-    for (; i && is_before(e, v->heap[(i - 1) / 2]); i = (i - 1) / 2) v->heap[i] = v->heap[(i - 1) / 2];
+    for (; i && is_before(e, v->heap[(i - 1) / 2]); i = (i - 1) / 2)
+        v->heap[i] = v->heap[(i - 1) / 2];
     v->heap[i] = e;
     return e;
 }
@@ -276,7 +277,8 @@ static void check_quorum(live *v, int i)
     h->checked_at = v->now;
     dtsa_station_get_status(h->station, &s);
     for (int j = 0; j < v->n; j++) {
-        int is_heard = !v->f->station.link.names; /* by whoever has that id; unknown without names */
+        int is_heard =
+            !v->f->station.link.names; /* by whoever has that id; unknown without names */
         for (int k = 0; k < v->hosts; k++)
             is_heard |= v->host[k].id == j + 1 && v->host[k].received[h->id - 1] >= v->now - limit;
         both += j != h->id - 1 && h->received[j] >= v->now - limit && is_heard;
@@ -300,8 +302,13 @@ static void step(live *v, int i)
         const int64_t due = dtsa_station_step(h->station, now, datagram, &length);
         v->r->steps++;
         dtsa_station_get_status(h->station, &after);
-        tell(v, (live_call){.host = i, .kind = 2, .now_ns = now, .answer = due, .out = datagram,
-                            .out_length = length, .status = &after,
+        tell(v, (live_call){.host = i,
+                            .kind = 2,
+                            .now_ns = now,
+                            .answer = due,
+                            .out = datagram,
+                            .out_length = length,
+                            .status = &after,
                             .position = {h->position[0], h->position[1], h->position[2]},
                             .velocity = {h->velocity[0], h->velocity[1], h->velocity[2]}});
         if (length) send(v, i, datagram, length);
@@ -333,7 +340,11 @@ static void receive(live *v, int i, const uint8_t *data, int length, int64_t at)
     const int64_t arrival = clock_of(h, at);
     const dtsa_verdict verdict = dtsa_station_receive(h->station, data, length, arrival);
     if (verdict == DTSA_ACCEPTED) note_reception(v, i, data, v->now);
-    tell(v, (live_call){.host = i, .kind = 1, .now_ns = arrival, .data = data, .length = length,
+    tell(v, (live_call){.host = i,
+                        .kind = 1,
+                        .now_ns = arrival,
+                        .data = data,
+                        .length = length,
                         .answer = verdict});
 }
 
@@ -411,14 +422,16 @@ static void apply(live *v)
         const live_fault *a = &v->f->faults[k];
         if (!(v->active >> k & 1)) continue;
         if (a->kind == LIVE_LOSS && a->amount > v->loss) v->loss = a->amount;
-        if (a->kind == LIVE_JITTER && (int64_t)a->amount > v->jitter) v->jitter = (int64_t)a->amount;
+        if (a->kind == LIVE_JITTER && (int64_t)a->amount > v->jitter)
+            v->jitter = (int64_t)a->amount;
         if (a->kind == LIVE_DUPLICATE) v->duplicate = a->amount;
         if (a->kind == LIVE_CORRUPT) v->corrupt = a->amount;
         for (int i = 0; i < v->hosts; i++) {
             const uint64_t own = (uint64_t)1 << i;
             if (a->kind == LIVE_PARTITION) v->cut[i] |= a->group & own ? ~a->group : a->group;
             if (a->kind == LIVE_ONE_WAY && a->group & own) v->cut[i] |= (uint64_t)1 << a->agent;
-            if (a->kind == LIVE_MUTE || a->kind == LIVE_SUSPEND) v->cut[i] |= (uint64_t)1 << a->agent;
+            if (a->kind == LIVE_MUTE || a->kind == LIVE_SUSPEND)
+                v->cut[i] |= (uint64_t)1 << a->agent;
             if ((a->kind == LIVE_DEAF || a->kind == LIVE_SUSPEND) && i == a->agent)
                 v->cut[i] = ~(uint64_t)0;
         }
@@ -622,7 +635,8 @@ int live_fly(const live_flight *f, live_result *r, live_observer observer, void 
         }
         if (f->goal_every_ns) push(&v, f->goal_every_ns, GOALS, 0);
         run(&v, f->heal_ns);
-        for (int64_t t = f->heal_ns; t < f->heal_ns + f->bound_ns && r->together_ns < 0; t += part) {
+        for (int64_t t = f->heal_ns; t < f->heal_ns + f->bound_ns && r->together_ns < 0;
+             t += part) {
             run(&v, t + part);
             if (v.failed || r->violation) break;
             if (is_together(&v)) r->together_ns = v.now - f->heal_ns;

@@ -37,8 +37,8 @@ typedef struct live_fault {
 } live_fault;
 
 typedef struct live_host {
-    int64_t start_ns;     /* when its process starts */
-    int64_t clock_ns;     /* what its clock shows at time 0 */
+    int64_t start_ns; /* when its process starts */
+    int64_t clock_ns; /* what its clock shows at time 0 */
     int64_t drift_ppb;
 } live_host;
 
@@ -46,9 +46,10 @@ typedef struct live_flight {
     dtsa_config config;
     dtsa_station_settings station; /* id, key and origin apart: the same for all */
     uint64_t seed;
-    int64_t latency_ns, jitter_ns, wake_ns; /* least delay, and at random; a process wakes late by up
+    int64_t latency_ns, jitter_ns,
+        wake_ns;               /* least delay, and at random; a process wakes late by up
                                                to this */
-    int64_t airtime_ns; /* frames that overlap are lost; 0: they do not disturb each other */
+    int64_t airtime_ns;        /* frames that overlap are lost; 0: they do not disturb each other */
     int64_t heal_ns, bound_ns; /* when all faults are over; after which all shall be in step */
     int64_t first_slot;        /* 0: all listen; else all begin together with this slot */
     int64_t goal_every_ns;     /* goals change so often, 0: never */
@@ -72,8 +73,9 @@ typedef struct live_result {
     int64_t together_ns; /* after healing, -1: not */
     uint64_t hash;       /* of every byte sent, and when */
     double agent_s;
-    uint64_t sent, steps, collided, shared; /* frames; calls; lost by overlap; slots with two senders */
-    uint64_t hovered, flown;                /* slots */
+    uint64_t sent, steps, collided,
+        shared;              /* frames; calls; lost by overlap; slots with two senders */
+    uint64_t hovered, flown; /* slots */
     uint32_t restarts, shifts;
 } live_result;
 

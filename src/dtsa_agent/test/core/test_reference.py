@@ -24,7 +24,7 @@ from dtsa_agent.core import (
 )
 from dtsa_agent.core.frame import TAG_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended, position_step
 from dtsa_agent.core.kernel import ffi, lib
-from dtsa_agent.core.reference import arithmetic, frame, frame_extended, policies, timebase
+from dtsa_agent.core.reference import arithmetic, frame, frame_extended, policies
 from dtsa_agent.core.reference.frame import tag
 from dtsa_agent.core.reference.stepper import ReferenceSwarm
 from dtsa_agent.core.registry import REASONS
@@ -203,40 +203,6 @@ def random_frame(random: np.random.Generator, agents: int, slot: int, whole: boo
     )
     c_s, probation = int(random.choice([0, 0, 1, agents - 1])), bool(random.random() < 0.2)
     return encode_extended(ExtendedFrame(own, c_s, bool(random.random() < 0.05), probation, others[:2], leases))
-
-
-OUTCOMES = (timebase.ALIGNED, timebase.RESTARTED, timebase.FOREIGN)
-STATES = (timebase.LISTENING, timebase.ALONE, timebase.JOINED)
-
-
-@settings(max_examples=60)
-@given(st.integers(0, 2**32 - 1))
-def test_the_same_is_heard_at_the_same_times_in_the_same_slots(seed: int) -> None:
-    """Time base and alignment: random frames of one's own time and of others, on a clock that runs on."""
-    random = np.random.default_rng(seed)
-    agents, every = int(random.integers(1, 255)), int(random.integers(1, 16))
-    slot_ns = int(random.choice([10**6, 10**7]))
-    agent, now = int(random.integers(1, agents + 1)), int(random.integers(0, 10**15))
-    plain = timebase.TimeBase(agents=agents, anchor_every=every, slot_ns=slot_ns, agent=agent, seed=seed)
-    compiled = ffi.new("dtsa_timebase *")
-    assert lib.dtsa_timebase_init(compiled, agents, every, slot_ns, agent, seed) == 1
-    deadline = plain.start(now)
-    assert lib.dtsa_timebase_start(compiled, now) == deadline
-    if random.random() < 0.4:
-        now = deadline + int(random.integers(-1, 2))
-        assert lib.dtsa_timebase_wake(compiled, now) == plain.wake(now)
-    for _ in range(120):
-        now += int(random.integers(0, 3 * slot_ns))
-        expected = plain.slot(now)
-        slot = int(random.integers(0, 10**6)) if expected is None or random.random() < 0.05 else expected
-        late = int(random.choice([-(10**6) - 1, -400_000, 3, 250_001, 10**6, slot_ns // 2, 3 * slot_ns]))
-        start = now if expected is None else plain.slot_start_ns(slot) + late + int(random.integers(-9, 10))
-        assert OUTCOMES[lib.dtsa_timebase_hear(compiled, slot, start)] == plain.hear(slot, start)
-        assert lib.dtsa_timebase_slot(compiled, now) == plain.slot(now)
-        assert lib.dtsa_timebase_slot_start(compiled, slot) == plain.slot_start_ns(slot)
-        assert (STATES[compiled.state], compiled.restarts) == (plain.state, plain.restarts)
-    ours, theirs = compiled.aligner, plain.aligner
-    assert (ours.corrections, ours.ignored) == (theirs.corrections, theirs.ignored)
 
 
 @given(st.binary(min_size=16, max_size=32), st.integers(0, 2**64 - 1), st.integers(0, 2**40), st.binary(max_size=300))
