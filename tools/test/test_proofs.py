@@ -24,7 +24,7 @@ def skipped_if_not_here() -> Iterator[None]:
         pytest.skip(str(error))
 
 
-@pytest.mark.parametrize(("target", "inputs"), [("frames", 200_000), ("agents", 10_000), ("hearing", 20_000)])
+@pytest.mark.parametrize(("target", "inputs"), [("frames", 200_000), ("agents", 10_000), ("station", 20_000)])
 def test_fuzzing_finds_nothing(target: str, inputs: int, tmp_path: Path) -> None:
     with skipped_if_not_here():
         program = build(target, tmp_path)

@@ -11,9 +11,7 @@ from dtsa_agent.core.errors import DtsaError
 
 from .library import HERE, LIBRARY, NotHere, compile_program, sources, tool
 
-TARGETS = {"frames": 64, "agents": 1024, "hearing": 1024}  # largest input, bytes
-_AIR = LIBRARY.parent / "air"
-_HEARING, _SOCKET = _AIR / "_hearing", _AIR / "udp" / "_socket"  # what agents on a network hear, and by what
+TARGETS = {"frames": 64, "agents": 1024, "station": 1024}  # largest input, bytes
 _FLAGS = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -36,12 +34,10 @@ def build(target: str, directory: Path, library: Path = LIBRARY) -> Path:
     parts = sources(library)
     if target == "frames":
         parts = [path for path in parts if path.name.startswith("frame")]
-    files, flags = [HERE / f"fuzz_{target}.c", *parts], list(_FLAGS)
-    if target == "hearing":
-        files += [_HEARING / "hearing.c", _HEARING / "contacts.c", _SOCKET / "stamps.c"]
-        flags += ["-D_GNU_SOURCE", f"-I{_HEARING}", f"-I{_SOCKET}"]
     try:
-        return compile_program(clang, directory / f"fuzz_{target}", files, flags, library)
+        return compile_program(
+            clang, directory / f"fuzz_{target}", [HERE / f"fuzz_{target}.c", *parts], _FLAGS, library
+        )
     except DtsaError as error:
         if "libclang_rt" in str(error):
             raise NotHere("missing: clang's runtime; on Debian: sudo apt install libclang-rt-14-dev") from error

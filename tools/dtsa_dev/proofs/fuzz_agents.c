@@ -1,7 +1,7 @@
 /* Fuzzed: streams of events. The first bytes choose the settings; then each byte is an event of one
  * of two agents: a slot (with or without the other's frame, changed or not), a slot number, a
- * state, a goal, a restart, a leave, a frame of any bytes; besides, a time base hears what it
- * likes, and tags are opened. Nothing may crash, and a digest stays one. */
+ * state, a goal, a restart, a leave, a frame of any bytes; and tags are opened. Nothing may crash,
+ * and a digest stays one. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -146,24 +146,6 @@ static void event(input *in, dtsa_agent **agents, const dtsa_config *c, int64_t 
     }
 }
 
-static void clocks(input *in)
-{
-    dtsa_timebase base;
-    dtsa_timebase_init(&base, 3, 2, 1000000, 1 + (int)(next(in) & 3), next(in));
-    int64_t now = 0;
-    dtsa_timebase_start(&base, now);
-    for (int i = 0; i < 40 && in->left; i++) {
-        const int64_t slot = (int64_t)next(in), jitter = (int64_t)next(in) * 8000 - 1000000;
-        now += (int64_t)next(in) * 100000;
-        dtsa_timebase_wake(&base, now);
-        dtsa_timebase_hear(
-            &base,
-            base.state == DTSA_LISTENING ? slot : dtsa_timebase_slot(&base, now) + (slot & 1),
-            now + jitter);
-        if (base.aligner.count < 0 || base.aligner.count >= DTSA_ALIGN_MAX) abort();
-    }
-}
-
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
     static double places[6 * MOST];
@@ -184,7 +166,6 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         for (int k = 0; k < AGENTS; k++)
             if (digest_of(agents[k]) != *agents[k]->table->hash) abort();
     }
-    clocks(&in);
     for (int i = 0; i < AGENTS; i++) free(agents[i]);
     return 0;
 }
