@@ -128,6 +128,15 @@ def test_an_agent_that_nobody_hears_or_that_hears_nobody_hovers(kind: str, agent
 
 
 @both_policies
+@pytest.mark.parametrize("names", [1, 4])
+def test_an_agent_that_restarts_and_that_nobody_hears_does_not_fly(names: int, policy: str) -> None:
+    """None of the others has said yet that it does not hear this agent."""
+    faults = fault("mute", 4, 40, 1), fault("crash", 20, 1, 1)
+    watch = Watch(LiveFlight(1, 6, policy, names=names, drift_ppm=20, faults=faults))
+    assert watch.flown_share(1, 20.5, 44) == 0
+
+
+@both_policies
 @pytest.mark.parametrize("at_s", [0.0, 0.3, 3.0, 14.0])
 def test_of_two_processes_with_one_id_the_second_never_flies(at_s: float, policy: str) -> None:
     watch = Watch(LiveFlight(2, 5, policy, drift_ppm=20, faults=(fault("same-id", at_s, 30, 1),)))
