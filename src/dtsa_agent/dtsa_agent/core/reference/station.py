@@ -416,19 +416,23 @@ class Station:
     def _why_it_hovers(self, slot: int, now: Ns) -> int:
         quorum = self._has_quorum(now)
         on_probation = self.rules.policy == "lease" and self.agent.memory.probation
+        if self._is_doubled(now):
+            return HOVERS_SAME_ID
         if self.has_sent and slot >= self.first + self.rules.agents and not on_probation:
             self.newcomer = False
         if self.newcomer:
             return HOVERS_NEW
-        if self.same_id_until is not None and now < self.same_id_until:
-            return HOVERS_SAME_ID
         return FLIES if quorum else HOVERS_QUORUM
+
+    def _is_doubled(self, now: Ns) -> bool:
+        """Whether another agent has sent with the own id lately."""
+        return self.same_id_until is not None and now < self.same_id_until
 
     def _leaves_out(self, slot: int, now: Ns) -> bool:
         """An agent that is new sends nothing while another sends with its id: that one was here before. One that hears
         nothing leaves out half of its frames: those of agents in other times may cover them."""
-        is_second = self.newcomer and self.same_id_until is not None and now < self.same_id_until
-        return is_second or (now - self.heard_ns > self.patience_ns and bool(self._draw(slot) & 1))
+        is_deaf = now - self.heard_ns > self.patience_ns
+        return (self.newcomer and self._is_doubled(now)) or (is_deaf and bool(self._draw(slot) & 1))
 
     def _open_slot(self, slot: int, now: Ns) -> None:
         self._close_slot()

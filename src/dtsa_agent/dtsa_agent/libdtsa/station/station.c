@@ -167,10 +167,10 @@ static void hear_frame(dtsa_station *s, int sender, int64_t slot, const uint8_t 
 }
 
 /* Whether it hovers because the others do not know it yet, or it does not know them. */
-static int is_new(dtsa_station *s, int64_t slot)
+static int is_new(dtsa_station *s, int64_t slot, int64_t now)
 {
     if (s->newcomer && s->has_sent && slot >= s->first + s->settings.agents &&
-        !s->agent.on_probation(s->agent.context))
+        now >= s->same_id_until && !s->agent.on_probation(s->agent.context))
         s->newcomer = 0;
     return s->newcomer;
 }
@@ -178,8 +178,9 @@ static int is_new(dtsa_station *s, int64_t slot)
 static int why_it_hovers(dtsa_station *s, int64_t slot, int64_t now)
 {
     const int quorum = contacts_have_quorum(s, now);
-    if (is_new(s, slot)) return DTSA_HOVERS_NEW;
+    const int newcomer = is_new(s, slot, now);
     if (now < s->same_id_until) return DTSA_HOVERS_SAME_ID;
+    if (newcomer) return DTSA_HOVERS_NEW;
     return quorum ? DTSA_FLIES : DTSA_HOVERS_QUORUM;
 }
 
