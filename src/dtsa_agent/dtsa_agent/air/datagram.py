@@ -21,11 +21,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dtsa_agent.core.agents.pacing import BETWEEN
 from dtsa_agent.core.errors import ConfigError
 from dtsa_agent.core.registry import POLICIES
 from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings, settings_hash
-from dtsa_agent.core.station import Link
+from dtsa_agent.core.station import BETWEEN, Link
 
 from .port import Header, PortProperties
 

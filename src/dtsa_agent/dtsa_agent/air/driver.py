@@ -44,19 +44,21 @@ class ClockMap:
 
     :param offset_ns: by how much it is ahead when it is made.
     :param drift_ppb: parts per billion by which it runs fast.
+    :param began_ns: when it is ahead by the offset, in place of now.
     """
 
     __slots__ = ("_began", "_drift", "_offset")
 
-    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0) -> None:
-        self._began, self._offset, self._drift = time.monotonic_ns(), offset_ns, drift_ppb
+    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0, began_ns: int | None = None) -> None:
+        self._began = time.monotonic_ns() if began_ns is None else began_ns
+        self._offset, self._drift = offset_ns, drift_ppb
 
     def local_ns(self, monotonic_ns: int) -> int:
         """What the clock shows at a time of CLOCK_MONOTONIC."""
         return monotonic_ns + self._offset + (monotonic_ns - self._began) * self._drift // _PPB
 
     def monotonic_ns(self, local_ns: int) -> int:
-        """When the clock shows a time, CLOCK_MONOTONIC, to 2 ns."""
+        """The first ns of CLOCK_MONOTONIC at which the clock shows a time, or is past it."""
         elapsed = local_ns - self._offset - self._began
         return self._began + elapsed - elapsed * self._drift // (_PPB + self._drift)
 

@@ -29,6 +29,8 @@ FLIES, LISTENS, IS_NEW, SAME_ID, NO_QUORUM = range(5)  # why an agent hovers
 ALL_BUT_ONE = "all-but-one"
 QUORUMS = f"{ALL_BUT_ONE}, a share of the others (80%), or a number of them (0: it never hovers for this)"
 FOR_EVER = 1 << 31  # slots
+KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS = range(3)  # slots move as the rules say; with frames that fit; never
+BETWEEN = 0.2  # of a slot, between a frame that left late and the next slot: clocks differ, nobody waits any longer
 EARLY_COUNT = 64  # frames of slots still to come that are kept
 
 
@@ -77,6 +79,15 @@ class Events(Protocol):
         """A datagram was not accepted."""
 
 
+def check_slotted(policy: str) -> None:
+    """Refuse a policy whose frames may begin at any instant: only `simulate` and `sweep` carry those.
+
+    :raises ConfigError: if it is one.
+    """
+    if POLICIES.row(policy).unslotted:
+        raise ConfigError("policy", policy, "a policy with slots; those without fly in simulate and sweep only")
+
+
 def check_joinable(policy: str) -> None:
     """Refuse a policy with which agents cannot come into a flight that is under way.
 
@@ -86,6 +97,11 @@ def check_joinable(policy: str) -> None:
     if not row.may_join or row.unslotted:
         joinable = [row.name for row in POLICIES.rows.values() if row.may_join]
         raise ConfigError("policy", policy, f"{', '.join(joinable)}, to come into a flight that is under way")
+
+
+def too_long_ns(config: SwarmConfig) -> int:
+    """After how long a stand-still an agent begins anew, ns: others may think it dead, and it knows too little."""
+    return max(500, 3 * config.anchor_every * config.agents) * config.slot_ns
 
 
 def parse_quorum(text: str) -> tuple[int, float]:
@@ -119,6 +135,9 @@ class StationSettings:
     :param link: what carries the datagrams.
     :param authenticator: key and session, if frames are signed.
     :param id: own id; 1 where only datagrams are read.
+    :param origin_ns: when slot 0 starts, by the own clock; None: that is not known.
+    :param listens: it listens first, and goes by ``origin_ns`` only if it hears no frame.
+    :param keeps_time: whether slots move with what is heard.
     :raises ConfigError: for a quorum that cannot be.
     """
 
@@ -130,6 +149,8 @@ class StationSettings:
         id: int = 1,
         quorum: str = "0",
         origin_ns: int | None = None,
+        listens: bool = True,
+        keeps_time: int = KEEPS_NOTHING,
     ) -> None:
         key, session = (b"", 0) if authenticator is None else authenticator.key_and_session
         number, share = parse_quorum(quorum)
@@ -137,6 +158,9 @@ class StationSettings:
             raise ConfigError("quorum", quorum, f"at most {config.agents - 1}, the number of the others")
         moving, resting = _limits(config)
         self._key = ffi.new("uint8_t[]", key)
+        begins = lib.DTSA_BEGINS_LATE if listens else lib.DTSA_BEGINS_TOGETHER
+        if origin_ns is None:
+            begins = lib.DTSA_BEGINS_LISTENING
         rests = config.policy_row.probation  # agents that rest send in main anchors alone
         lease = {"anchor_every": config.anchor_every, "main_every": config.main_every, "open_every": config.open_period}
         cycle = lib.dtsa_slot_cycle(ffi.new("dtsa_config *", {"agents": config.agents, "lease": lease}))
@@ -148,7 +172,8 @@ class StationSettings:
             "position_step": position_step(config.extent_m), "slot_ns": config.slot_ns, "seed": config.seed,
             "moving_slots": moving, "resting_slots": resting, "quorum": number, "quorum_share": share,
             "key": self._key if key else ffi.NULL, "key_length": len(key), "session": session,
-            "early_count": EARLY_COUNT, "begins": origin_ns is not None, "origin_ns": origin_ns or 0,
+            "early_count": EARLY_COUNT, "begins": begins, "origin_ns": origin_ns or 0,
+            "keeps_time": keeps_time, "equal_tables": not config.policy_row.may_join,
             "link": {
                 "header": link.header, "header_length": len(link.header), "says_late": link.says_late,
                 "names": link.names, "flight_ns": link.flight_ns, "trust_ns": link.trust_ns,

@@ -10,17 +10,17 @@ from typing import Any
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
-from dtsa_agent.core import Swarm, SwarmConfig
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.errors import ConfigError, DtsaError
 from dtsa_agent.core.plugins.entry_points import make_swarm, shareable
 from dtsa_agent.core.settings.declaration import Settings, setting
-from dtsa_agent.keys import with_key
+from dtsa_agent.keys import authenticator, with_key
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import check_parameters, declare_settings
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.priority import PrioritySettings, give_way_by
 
-from .swarm_node import SwarmNode
+from .swarm_node import AgentsNode, SwarmNode
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +89,11 @@ def host_agents(
         raise ConfigError("shared_table", True, f"false with policy {config.policy}")
     host = HostSettings(**declare_settings(node, HostSettings))
     priority = PrioritySettings(**declare_settings(node, PrioritySettings)).priority
-    swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared and host.mode == "lockstep"))
     if host.mode == "lockstep":
-        agents: SwarmNode = SwarmNode(node, swarm, space)
+        swarm = with_key(make_swarm(config, local=sorted(ids), shared_table=shared))
+        agents: AgentsNode = SwarmNode(node, swarm, space)
     else:
-        agents = _realtime(node, swarm, space, priority)
+        agents = _realtime(node, config, sorted(ids), space, priority)
     if host.odometry:
         agents.offer_odometry(spaces)
     logger = node.get_logger()
@@ -109,10 +109,10 @@ def host_agents(
         agents.loop.close()
 
 
-def _realtime(node: Node, swarm: Swarm, space: str, priority: int) -> SwarmNode:
+def _realtime(node: Node, config: SwarmConfig, ids: Sequence[int], space: str, priority: int) -> AgentsNode:
     from .realtime import RealtimeNode
 
-    count = len(swarm.ids)
+    count = len(ids)
     text = "offset of each agent's clock at the start, one for all or one an agent; positive: early (ns)"
     offset = _whole_numbers(node, "clock_offset_ns", [0], count, text)
     drift = _whole_numbers(
@@ -140,8 +140,10 @@ def _realtime(node: Node, swarm: Swarm, space: str, priority: int) -> SwarmNode:
         raise ConfigError("resume_at", places, f"{3 * count} numbers with a decimal point: x, y, z of each agent")
     return RealtimeNode(
         node,
-        swarm,
+        config,
+        ids,
         space,
+        authenticator=authenticator(config),
         offset_ns=offset,
         drift_ppb=drift,
         jitter_ns=clocks.clock_jitter_ns,

@@ -3,24 +3,24 @@
 How a flight in real time works, and where each part stands ("channel": `dtsa_channel_sim/ros`):
 
 1. **The time line.** The channel calls all processes (`roll_call`), then sends START with the time of slot 0 on
-   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own, off by an offset and a
-   drift; `slot_clocks` says when its slots begin on the time line.
-2. **A slot here.** :meth:`RealtimeNode._step` takes in messages until a lead before the slot's start
-   (`core/agents/pacing.py`). :meth:`~RealtimeNode._open` ends the slot before, decides, sends, and moves the vehicles.
-   A frame is published with the time at which its transmission starts; one that would leave half a slot late is not
-   sent.
+   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/driver.ClockMap`), off
+   by an offset and a drift.
+2. **A slot here.** Each agent is a station (`core/station`, `realtime_agent`), and says when it is due:
+   :meth:`RealtimeNode._serve`. It ends the slot before, decides, and gives the frame to send. That is published with the
+   time at which its transmission starts, mostly some time ahead; then the vehicles move. A frame that would leave half a
+   slot late is not sent.
 3. **On the air.** The channel (`realtime_channel`) puts each frame on the time line (`live_air`, `model/air`). Once no
    frame that overlaps it can come any more, it is settled: who heard it, by reach, overlap and losses. A RUN message
    delivers it to all processes with the receivers' bits.
-4. **Heard.** :meth:`~RealtimeNode._take_frames` hands it to those agents whose bit is set, in the slot in which it was
-   sent. The lateness of its start moves their own slots (`core/reference/timebase.py`).
+4. **Heard.** :meth:`~RealtimeNode._hear` hands it to the stations of those agents whose bit is set. The time of its
+   arrival shows which slot it is of, and moves their own slots.
 5. **Told.** Some ten times a second a process reports what its agents decided, took in and flew (`reporter`). The
    channel fills an account for each slot (`accounts`); it closes when all have reported or have been given up. The
    recorder, the metrics and the live view get closed accounts only: what agents had, not what they should have had.
-6. **Late.** Nobody is waited for. A process that is behind by too much begins anew with the present slot, in probation.
+6. **Late.** Nobody is waited for. An agent that is behind by too much begins anew with the present slot, in probation.
    `pace` says how far the channel itself is behind; a flight that cannot keep up is ended with the reason.
-7. **Coming and going.** A late process listens, takes the time from the first frame it hears, and begins in probation
-   (`core/agents/joining.py`). One that gets a signal says in its own turns that it leaves, and ends then
+7. **Coming and going.** A late agent listens, takes the time from the first frame that it hears, and hovers until the
+   others know it: all rules of the station. One that gets a signal says in its own turns that it leaves, and ends then
    (:meth:`~RealtimeNode._ended`).
 """
 
@@ -29,19 +29,28 @@ from __future__ import annotations
 import os
 import time
 from array import array
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
 import numpy as np
 from dtsa_msgs.msg import Frame, Report, Slot
-from numpy.typing import NDArray
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.task import Future
 
-from dtsa_agent.core.agents.joining import Listeners, check_joinable
-from dtsa_agent.core.agents.pacing import LATEST_LEAD, LEAD, MOST_EARLY, too_long_ns
-from dtsa_agent.core.errors import LocalProtocolError
+from dtsa_agent.air.driver import ClockMap
+from dtsa_agent.core import SwarmConfig, make_scenario
+from dtsa_agent.core.agents.agent import REFUSED
+from dtsa_agent.core.authentication import Authenticator
+from dtsa_agent.core.station import (
+    KEEPS_NOTHING,
+    KEEPS_NUMBERS,
+    KEEPS_STARTS,
+    Link,
+    StationSettings,
+    check_joinable,
+)
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import Stop
 from dtsa_agent.ros.common.process.priority import take_priority
@@ -50,36 +59,38 @@ from dtsa_agent.ros.common.wire.packing import split_frames, unpack_received
 from dtsa_agent.ros.common.wire.slot_fields import SlotFields
 from dtsa_agent.ros.common.wire.stamps import header_of, time_of
 
-from .leaving import Leaving
+from .realtime_agent import RealtimeAgent
 from .reporter import Reporter
-from .send_times import SendTimes
-from .slot_clocks import SlotClocks
-from .swarm_node import SwarmNode
+from .swarm_node import AgentsNode
 
 _PPB = 1_000_000_000
 _LONGEST_LEAD_NS = 60_000_000_000  # from the start message to slot 0
 _PATIENCE_NS = 50_000_000
 _DELIVERY = Duration(seconds=0.2)  # longest wait for the channel to have the last report of an agent that leaves
-_DOUBTS = 9  # frames in a row that do not fit the time which an agent took from a single one
-# With a policy that needs all tables equal it waits beyond the start: a late frame costs less than tables that differ.
-_LATEST, _LATEST_NS = 0.3, 3_000_000
+_TRUST_NS = 1_000_000  # frames that are off by more do not move slots
 _BURST = 64  # messages taken in at a time: whatever comes, the own slots go on
+_MALFORMED = ("length", "no frame")  # of the reasons for which a station refuses frames
+_REJECTED = "rejected"
+_REPEATED = "repeated"
 
 
-class RealtimeNode(SwarmNode):
-    """A :class:`SwarmNode` whose agents begin their slots by themselves.
+class RealtimeNode(AgentsNode):
+    """Agents that begin their slots by themselves.
 
     The time line is the channel's: ns from the start of slot 0. An agent's slot starts when its own clock says so; that
     is off by an offset and a drift, and by what the agent has learned from others' frames. As on a vehicle, where a
-    timer sends what lies ready, decisions are made a little before. All agents of one process are served when the first
-    of them is due; a frame carries the time at which its agent starts to send it: its slot's start, or later if it was
-    not ready by then.
+    timer sends what lies ready, decisions are made a little before. A frame carries the time at which its agent starts
+    to send it: its slot's start, or later if it was not ready by then.
 
     A process that was there at the channel's call begins with slot 0. One that comes later is told where the time line
     lies, too, because the stamps of messages are on it; but its agents take the time of their slots from the first
-    frame that each hears, and know nothing: :mod:`dtsa_agent.core.agents.joining`.
+    frame that each hears, and know nothing.
 
-    :param args: as for :class:`SwarmNode`.
+    :param node: the ROS node.
+    :param config: the settings that all agents share.
+    :param ids: ids of the agents that live here, ascending.
+    :param swarm_namespace: namespace of the swarm's topics.
+    :param authenticator: holds the key, if the settings say that frames are authenticated.
     :param offset_ns: (L,) ns, offset of each agent's clock: positive clocks are early.
     :param drift_ppb: (L,) parts per billion by which each runs fast.
     :param jitter_ns: ns, standard deviation of the time of a single transmission.
@@ -95,7 +106,12 @@ class RealtimeNode(SwarmNode):
 
     def __init__(
         self,
-        *args: Any,
+        node: Node,
+        config: SwarmConfig,
+        ids: Sequence[int],
+        swarm_namespace: str = names.SWARM,
+        *,
+        authenticator: Authenticator | None = None,
         offset_ns: Sequence[int],
         drift_ppb: Sequence[int],
         jitter_ns: float = 0.0,
@@ -103,38 +119,36 @@ class RealtimeNode(SwarmNode):
         flight_time_ns: tuple[int, int] = (0, 0),
         priority: int = 0,
         resume_at: Sequence[float] = (),
-        **kwargs: Any,
     ) -> None:
-        super().__init__(*args, waiting=names.REALTIME_WAITING, **kwargs)
-        count = len(self.swarm.ids)
-        self.slot_ns = self.config.slot_ns
-        self._lead_ns, self._latest_lead_ns = round(LEAD * self.slot_ns), round(LATEST_LEAD * self.slot_ns)
-        if not self.config.policy_row.may_join:
-            self._latest_lead_ns = -min(_LATEST_NS, round(_LATEST * self.slot_ns))
-        self._own_or_nobody = {0, *self.swarm.ids}
-        self._awaits = False  # somebody here takes another one for the slot's sender, and has not heard it yet
-        self.unsent = 0  # frames that would have left half a slot late or more
-        self._clocks = SlotClocks(self.slot_ns, offset_ns, drift_ppb, align)
-        self._lengths: NDArray[np.uint8] = np.zeros(count, dtype=np.uint8)  # bytes sent in the present slot
-        self._send_times = SendTimes(self.swarm, jitter_ns, flight_time_ns)
+        self.slot_ns = config.slot_ns
+        self._authenticator, self._align = authenticator, align
+        self._flight_ns = flight_time_ns[0] + flight_time_ns[1] * config.frame_length
+        scenario = make_scenario(config)
+        self.agents = [
+            RealtimeAgent(
+                agent, config, scenario, ClockMap(offset, drift, 0), jitter_ns,
+                partial(self._accepted, index), self._refuse,
+            )
+            for index, (agent, offset, drift) in enumerate(zip(ids, offset_ns, drift_ppb, strict=True))
+        ]  # fmt: skip
+        self._columns = np.array(ids) - 1
+        self._refused = 0  # frames that reached an agent and were not taken in, over all agents
+        self._faults: set[str] = set()  # why agents have refused the present frame
+        self._dropped: Counter[str] = Counter()  # frames that any agent has refused, by reason
         self._priority = priority  # still to be taken
-        self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3).T
+        self._resume_at = np.array(resume_at, dtype=np.float64).reshape(-1, 3)
         self._called = False  # was there when the channel asked who is
-        self._listeners: Listeners | None = None
-        # Came late, and takes its time from the next frame.
-        self._timeless: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
-        self._first = 0  # slot with which this process began, or began anew
-        self._too_long_ns = too_long_ns(self.config)
-        self._leaving = Leaving(self.swarm)
         self._zero = 0  # CLOCK_MONOTONIC at the start of slot 0, ns; 0: not known yet
-        self._complete = False  # the step before took in all that was waited for: no need to look for more
-        self._early: list[SlotFields] = []  # frames of a slot that is still to come here
+        self._heard_ns = 0  # ns on the time line, when frames are taken in
+        self._leaves_by: int | None = None  # slot: all have left then at the latest; None: nobody leaves
+        self._signals = 0  # when that began
+        super().__init__(node, config, ids, swarm_namespace, names.REALTIME_WAITING)
 
     def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
         create = self.node.create_publisher
         self._air = create(Frame, f"{swarm_namespace}/{names.AIR_FRAME}", qos)
         self._telemetry = create(Report, f"{swarm_namespace}/{names.REPORT}", qos)
-        self._reporter = Reporter(self._telemetry, self.swarm)
+        self._reporter = Reporter(self._telemetry, self.config, self.ids)
 
     def _plausible(self, message: SlotFields) -> None:
         now = time.monotonic_ns()
@@ -146,14 +160,20 @@ class RealtimeNode(SwarmNode):
                 raise Unusable(SIZES, "a delivery without a frame")
             here = max(self.slot, (now - self._zero) // self.slot_ns)
             check_start(message.heard_slot * self.slot_ns, here * self.slot_ns)
-            check_start(self._began_ns(message), now - self._zero)
+            check_start(message.time_ns - names.TIME_ZERO_NS - self._flight_ns, now - self._zero)
 
-    def attach(self) -> Future:
-        """Agents with clocks of their own need the loop's timing.
+    def _dropped_frames(self) -> dict[str, int]:
+        malformed = max(agent.swarm.malformed for agent in self.agents)
+        foreign = max(agent.swarm.foreign for agent in self.agents)
+        for fault, count in self._dropped.items():
+            malformed += count * (fault in _MALFORMED)
+            foreign += count * (fault not in (*_MALFORMED, _REJECTED))
+        rejected = self._dropped[_REJECTED]
+        return {
+            "frame malformed": malformed, "frame foreign": foreign, "frame rejected": rejected, REFUSED: self._refused,
+        }  # fmt: skip
 
-        :raises LocalProtocolError: always.
-        """
-        raise LocalProtocolError("agents in real time run in a loop of their own, not in an executor")
+    # From the call to the end.
 
     def run(self, stop: Stop) -> None:
         """Flies until the run is over or a signal comes; with policy ``lease`` agents first say that they leave.
@@ -165,7 +185,7 @@ class RealtimeNode(SwarmNode):
                 message = self.loop.wait()
                 if message is not None and not self._prepare(message):
                     return
-            elif not (self._listen() if self._listeners else self._step()):
+            elif not self._serve():
                 return
             if self.loop.housekeeping():
                 self.idle()
@@ -174,12 +194,18 @@ class RealtimeNode(SwarmNode):
         """Whether to end now because of a signal: the second one, or when all agents here have left after the first."""
         if not stop:
             return False
-        leaving = self._leaving
-        if not leaving.begun and (self.slot < self._first or not leaving.begin(stop.count, self.slot)):
-            return True
-        if leaving.goes_on(stop.count, self.slot):
+        if self._leaves_by is None:
+            if not self.config.policy_row.says_leaving or self.slot < 0:
+                return True
+            self._signals = stop.count
+            self._leaves_by = self.slot + (self.config.main_every + 1) * self.config.agents
+            for agent in self.agents:
+                if agent.slot >= 0:
+                    agent.station.leave()
+        in_time = stop.count == self._signals and self.slot <= self._leaves_by
+        if in_time and any(agent.leaves for agent in self.agents):
             return not self.loop.subscription.get_publisher_count()
-        self._reporter.publish(self.run_id)
+        self._reporter.publish(self.run_id, self.slot)
         for publisher in (self._air, self._telemetry):
             publisher.wait_for_all_acked(_DELIVERY)
         return True
@@ -190,19 +216,12 @@ class RealtimeNode(SwarmNode):
             self._called = True
             if message.slot > names.FIRST_CALL:
                 self._go_first()
-            self._reporter.add_slot(message.slot, self._clocks.starts(0), self._lengths)
-            self._reporter.publish(message.run)
+            for index, agent in enumerate(self.agents):
+                self._reporter.add_slot(index, message.slot, agent.clock.monotonic_ns(0), 0, agent.swarm)
+            self._reporter.publish(message.run, message.slot)
         elif message.phase == Slot.START and (self._called or self._may_join()):
             self._go_first()
-            self._begin(message.run)
-            self._zero = message.time_ns
-            if not self._called:
-                now = self._clocks.local_ns(time.monotonic_ns() - self._zero)
-                self._listeners = Listeners(self.config, self.swarm.ids, now.tolist())
-                self._timeless[:] = True
-                if self._resume_at.size:
-                    self.swarm.position[:] = self._resume_at
-                    self.swarm.track[:] = self._resume_at
+            self._begin(message.run, message.time_ns)
         return message.phase != Slot.END
 
     def _go_first(self) -> None:
@@ -227,165 +246,115 @@ class RealtimeNode(SwarmNode):
             self._air.get_subscription_count() and self._telemetry.get_subscription_count()
         )
 
-    def _listen(self) -> bool:
-        """Waits for frames that say what time it is; False when the run is over."""
-        assert self._listeners is not None
-        message = self.loop.wait(_PATIENCE_NS)
-        if message is not None and message.phase == Slot.END:
-            return False
-        if message is not None and message.phase == Slot.RUN:
-            self._overhear(message)
-        now = time.monotonic_ns() - self._zero
-        if self._listeners.ready(self._clocks.local_ns(now).tolist()):
-            self._listeners = None
-            self._begin_anew(now)
-        return True
+    def _begin(self, run: int, zero: int) -> None:
+        """The run begins for these agents.
 
-    def _begin_anew(self, now: int) -> None:
-        """From the next slot on all agents here take part, knowing nothing.
-
-        :param now: ns on the channel's time line.
+        :param zero: CLOCK_MONOTONIC at the start of slot 0, ns.
         """
-        ahead = now + self._lead_ns
-        following = (ahead - int(self._clocks.starts(ahead // self.slot_ns).min())) // self.slot_ns + 1
-        self._first, self.slot = following, following - 1
-        for index in range(len(self.swarm.ids)):
-            self.agents.restart(index, following)
-        self._clocks.forget()
+        self.membership.begin(run)
+        self._zero = zero
+        if self._authenticator is not None and not self.config.auth_session:
+            self._authenticator.begin(self.membership.session)
+        keeps = KEEPS_NUMBERS if self._called else KEEPS_NOTHING  # the channel has said what time it is, or not
+        link = Link(b"", says_late=False, names=0, flight_ns=self._flight_ns, trust_ns=_TRUST_NS)
+        for agent in self.agents:
+            settings = StationSettings(
+                self.config, link, self._authenticator, agent.id, origin_ns=0, listens=not self._called,
+                keeps_time=keeps if self._align else KEEPS_STARTS,
+            )  # fmt: skip
+            agent.begin(settings, zero)
+        for agent, place in zip(self.agents, self._resume_at if not self._called else (), strict=False):
+            agent.swarm.position[:, 0] = agent.swarm.track[:, :, 0] = place
 
-    def _step(self) -> bool:
-        """Waits for the next slot or message; False when the run is over."""
-        lead_ns = self._latest_lead_ns if self._awaits else self._lead_ns
-        due = self._zero + (self.slot + 1) * self.slot_ns + int(self._clocks.starts(self.slot + 1).min()) - lead_ns
-        remaining = due - time.monotonic_ns()
+    # Slots.
+
+    def _serve(self) -> bool:
+        """Waits until an agent is due or a message comes; False when the run is over."""
+        remaining = self._zero + min(agent.due_ns for agent in self.agents) - time.monotonic_ns()
         if remaining > 0:
             message = self.loop.wait(min(remaining, _PATIENCE_NS))
-            goes_on = message is None or self._take(message)
-            self._complete = message is not None and not self._awaits
-            if self._complete:
-                os.sched_yield()  # all agents of this machine hear a frame before any of them goes on
+            if message is None:
+                return True
+            goes_on = self._take(message)
+            os.sched_yield()  # all agents of this machine hear a frame before any of them goes on
             return goes_on
-        complete, self._complete = self._complete, False
-        for _ in range(0 if complete else _BURST):
+        for _ in range(_BURST):
             message = self.loop.take()
             if message is None:
                 break
             if not self._take(message):
                 return False
-        if -remaining > self._too_long_ns and self.config.policy_row.probation:
-            self._begin_anew(time.monotonic_ns() - self._zero)
-        else:
-            self._open(self.slot + 1)
+        self._sense()
+        opened = []
+        self._heard_ns = time.monotonic_ns() - self._zero
+        for index, agent in enumerate(self.agents):
+            while agent.due_ns <= self._heard_ns:
+                if agent.step():
+                    opened.append(index)
+                    self._send(agent)
+                    break
+        if opened:
+            self._fly_on(opened)
         return True
 
     def _take(self, message: SlotFields) -> bool:
-        if message.phase == Slot.END:
-            return False
         if message.phase == Slot.RUN:
-            if message.heard_slot > self.slot:
-                if len(self._early) < MOST_EARLY:
-                    self._early.append(message)
-            else:
-                self._take_frames(message)
-        return True
+            self._hear(message)
+        return message.phase != Slot.END
 
-    def _take_frames(self, message: SlotFields) -> None:
-        if message.heard_slot < self._first - 1:
-            return  # from before it began
-        # In the slot in which it was sent, even if this process, or the channel's, has been kept waiting since.
-        masks = self._hear(message, message.heard_slot)
-        self._awaits &= message.heard_slot < self.slot
-        if masks is not None:
-            now = time.monotonic_ns() - self._zero
-            for sender, mask in zip(message.sender, masks, strict=True):
-                if mask.any():
-                    self._reporter.add_heard(sender, message.heard_slot, self.slot, now, mask)
-        if masks is None or not (self._clocks.align or self._timeless.any()):
-            return
-        late = self._lateness(message)
-        for index in np.flatnonzero(masks[0]):
-            if self._timeless[index]:
-                self._take_time(index, late)
-                if abs(late[index]) >= self.slot_ns // 2:
-                    self.agents.restart(index, self.slot + 1)
-            elif self._clocks.align:
-                misfits = self._clocks.hear(index, int(late[index]))
-                # The frame that a newcomer took its time from may have left late.
-                self._timeless[index] = not self._called and misfits >= _DOUBTS
-
-    def _overhear(self, message: SlotFields) -> None:
-        """Takes in a frame of which only the time counts."""
-        assert self._listeners is not None
-        heard = unpack_received(message.received, len(message.sender), self.config.agents)
-        (frame,) = split_frames(message.data, message.length)
-        if self.swarm.unseal(frame, message.heard_slot) is None:
-            return
-        late, began = self._lateness(message), self._clocks.local_ns(self._began_ns(message))
-        for index in np.flatnonzero(heard[0, self.swarm.local]):
-            if self._listeners.hear(index, message.heard_slot, int(began[index])):
-                self._take_time(index, late)
-
-    def _take_time(self, index: np.intp, late: NDArray[np.int64]) -> None:
-        self._clocks.take(index, int(late[index]))
-        self._timeless[index] = False
-
-    def _began_ns(self, message: SlotFields) -> int:
-        """When the transmission of a frame began, by its arrival and length: ns on the channel's time line."""
+    def _hear(self, message: SlotFields) -> None:
+        """Hands frames to the agents that receive them."""
+        self._heard_ns = time.monotonic_ns() - self._zero
         arrival = message.time_ns - names.TIME_ZERO_NS
-        return arrival - self._send_times.under_way_ns(int(message.length[0]))
+        received = unpack_received(message.received, len(message.sender), self.config.agents)
+        for frame, mask in zip(split_frames(message.data, message.length), received, strict=True):
+            self._faults.clear()
+            for index in np.flatnonzero(mask[self._columns]).tolist():
+                self.agents[index].receive(frame, arrival)
+            self._dropped.update(self._faults)
 
-    def _lateness(self, message: SlotFields) -> NDArray[np.int64]:
-        """How much later than each agent expects a frame has begun, ns."""
-        slot = int(message.heard_slot)
-        return np.asarray(self._began_ns(message) - slot * self.slot_ns - self._clocks.starts(slot))
+    def _accepted(self, index: int, sender: int, slot: int, here: int) -> None:
+        self._reporter.add_heard(index, sender, slot, here, self._heard_ns)
 
-    def _open(self, slot: int) -> None:
-        """Closes the last slot and opens the next: decide, send, fly."""
-        swarm = self.swarm
-        if slot > self._first:
-            self.agents.on_slot_end()
-        self._leaving.mark()
-        senders = self.agents.on_slot(slot)
-        starts = self._clocks.starts(slot)
-        offsets = self._send(slot, senders, starts)
-        self.slot = slot
-        self._awaits = not self._own_or_nobody.issuperset(swarm.chosen.tolist())
-        self._reporter.add_slot(slot, offsets, self._lengths)
-        if self._watched:
-            self._publish_odometry(time_of(names.slot_time_ns(slot, self.slot_ns)))
-        self._fly(slot)
-        early, self._early = self._early, []
-        for message in early:
-            self._take(message)
-        if self._reporter.due():
-            self._reporter.publish(self.run_id)
+    def _refuse(self, fault: str) -> None:
+        if fault == _REPEATED:  # it has it
+            return
+        self._refused += 1
+        if fault:
+            self._faults.add(fault)
 
-    def _fly(self, slot: int) -> None:
-        """Flies the vehicles through a slot."""
-        self.swarm.fly(slot)
+    def _send(self, agent: RealtimeAgent) -> None:
+        """Hands the frame of an agent over to the channel, before anything else is done."""
+        if not agent.frame:
+            return
+        header, data = header_of(names.TIME_ZERO_NS + agent.start_ns), array("B", agent.frame)
+        self._air.publish(Frame(header=header, run=self.run_id, slot=agent.slot, agent=agent.id, data=data))
 
-    def _send(self, slot: int, senders: Sequence[int], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Hands the frames of a slot over to the channel, before anything else is done.
+    def _fly_on(self, opened: Sequence[int]) -> None:
+        """Reports the slots that agents have opened, and flies their vehicles through them.
 
-        :param senders: positions of the agents that send.
-        :param starts: (L,) ns, start of each agent's slot, from the channel's start of the slot.
-        :returns: (L,) ns, the same, but of the transmission where there is one.
+        :param opened: their places among those here.
         """
-        swarm, began = self.swarm, self._zero + slot * self.slot_ns
-        offsets = starts.copy()
-        self._lengths[:] = 0
-        for index in senders:
-            data = swarm.frame(index)
-            start = self._send_times.start_ns(index, began + int(starts[index]))
-            if start is None:
-                swarm.drop(index)
-                self.unsent += 1
-                continue
-            offset = start - began
-            offsets[index], self._lengths[index] = offset, len(data)
-            header = header_of(names.slot_time_ns(slot, self.slot_ns) + offset)
-            self._air.publish(
-                Frame(header=header, run=self.run_id, slot=slot, agent=swarm.ids[index], data=array("B", data))
-            )
-            self._leaving.sent(index, data)
-        return offsets
+        for index in opened:
+            agent = self.agents[index]
+            self.slot = max(self.slot, agent.slot)
+            offset = agent.start_ns - agent.slot * self.slot_ns
+            self._reporter.add_slot(index, agent.slot, offset, len(agent.frame), agent.swarm)
+        for index, _ in self._watched:
+            if index in opened:
+                swarm, stamp = self.agents[index].swarm, names.slot_time_ns(self.agents[index].slot, self.slot_ns)
+                place, speed = swarm.position[:, 0].tolist(), swarm.velocity[:, 0].tolist()
+                self._publish_odometry(index, time_of(stamp), place, speed)
+        for index in opened:
+            self._fly(index)
+        complete = min(agent.slot for agent in self.agents if agent.slot >= 0)
+        if self._reporter.due(complete):
+            self._reporter.publish(self.run_id, complete)
+
+    def _sense(self) -> None:
+        """Takes note of where vehicles are that fly elsewhere."""
+
+    def _fly(self, index: int) -> None:
+        """Flies the vehicle of an agent through its slot."""
+        agent = self.agents[index]
+        agent.swarm.fly(agent.slot)

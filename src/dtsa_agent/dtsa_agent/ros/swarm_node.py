@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,7 +20,7 @@ from rclpy.task import Future
 from dtsa_agent.core import AgentGroup, Swarm
 from dtsa_agent.core.agents.agent import REFUSED
 from dtsa_agent.core.errors import ConfigError, DtsaError
-from dtsa_agent.core.settings.config import agreed_settings
+from dtsa_agent.core.settings.config import SwarmConfig, agreed_settings
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.loop import HOUSEKEEPING_S, Loop, Stop
 from dtsa_agent.ros.common.process.waiting import Waiting
@@ -37,27 +38,23 @@ _STRANGERS = 32  # messages that may wait beside the channel's
 _ODOMETRY_DEPTH = 10  # messages for a slow reader; reliable, because RViz asks for that
 
 
-class SwarmNode:
-    """Agents that answer every slot message of the channel with one transmission message.
-
-    On the message that opens slot i: hear what the air carried in slot i-1, close that slot, decide for slot i, answer,
-    and only then fly through slot i, while the channel is already at work.
+class AgentsNode(ABC):
+    """What nodes of agents have in common: membership of a run, its loop, odometry.
 
     :param node: the ROS node.
-    :param swarm: the agents that live here.
+    :param config: the settings that all agents share.
+    :param ids: ids of the agents that live here, ascending.
     :param swarm_namespace: namespace of the swarm's topics.
-    :param waiting: a quarter of the messages that may wait to be read: 1 is enough in lockstep.
+    :param waiting: a quarter of the messages that may wait to be read.
     """
 
-    mode = "lockstep"
+    mode: str
 
-    def __init__(self, node: Node, swarm: Swarm, swarm_namespace: str = names.SWARM, waiting: int = 1) -> None:
-        self.node = node
-        self.config = config = swarm.config
-        self.agents = AgentGroup(swarm)
-        self.slot = -1  # the slot that has been answered
-        self._goal = b""  # as last told
-        self._nothing = np.zeros((0, config.agents), dtype=np.uint8)  # heard by whom, in a slot without frames
+    def __init__(
+        self, node: Node, config: SwarmConfig, ids: Sequence[int], swarm_namespace: str, waiting: int
+    ) -> None:
+        self.node, self.config, self.ids = node, config, tuple(ids)
+        self.slot = -1  # the last slot that has begun here
         self._odometry: list[tuple[int, Publisher]] = []
         self._frames: list[str] = []  # of the bodies in odometry
         self._watched: list[tuple[int, Publisher]] = []
@@ -67,59 +64,42 @@ class SwarmNode:
         self._begun = False
         self._make_publishers(swarm_namespace, qos)
         settings = agreed_settings(config, self.mode)
-        self.membership = Membership(node, swarm.ids, settings, swarm_namespace, self._dropped_frames, self._plausible)
+        self.membership = Membership(node, ids, settings, swarm_namespace, self._dropped_frames, self._plausible)
         intake = self.membership.intake
         topic = f"{swarm_namespace}/{names.SLOT}"
         # Messages of strangers must not push the channel's out before they are read.
         reading = names.lockstep_qos(max(waiting, _STRANGERS // 4))
         self.loop = Loop(node, Slot, topic, reading, intake=intake, admits=self.membership.admits, read=read_slot)
 
-    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
-        self._agent_ids = array("H", self.swarm.ids)
-        self._bytes = b""  # the last answer
-        self._publisher = self.node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
+    @abstractmethod
+    def run(self, stop: Stop) -> None:
+        """Fly until the run is over or a signal comes."""
 
-    @property
-    def swarm(self) -> Swarm:
-        """The agents that live here."""
-        return self.agents.swarm
+    @abstractmethod
+    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None: ...
+
+    @abstractmethod
+    def _dropped_frames(self) -> dict[str, int]:
+        """Frames that this process has kept out so far, by reason, and from how many agents in all."""
+
+    @abstractmethod
+    def _plausible(self, message: SlotFields) -> None:
+        """Whether a slot message can be the next one.
+
+        :raises Unusable: if it cannot.
+        """
 
     @property
     def run_id(self) -> int:
         """The run that these agents take part in; 0: none yet."""
         return self.membership.run
 
-    def _dropped_frames(self) -> dict[str, int]:
-        """Frames that this process has kept out so far, by reason, and from how many agents in all."""
-        swarm = self.agents.swarm
-        return {
-            "frame malformed": swarm.malformed,
-            "frame foreign": swarm.foreign,
-            "frame rejected": swarm.rejected,
-            REFUSED: self.agents.refused,
-        }
-
-    def _plausible(self, message: SlotFields) -> None:
-        """Whether a slot message can be the next one.
-
-        :raises Unusable: if it cannot.
-        """
-        # The channel waits for this node's answer: it can be nowhere else.
-        if message.phase == Slot.RUN and not 0 <= message.slot - self.slot <= 1:
-            raise Unusable(SLOT, f"slot {message.slot} after slot {self.slot}")
-
-    def _begin(self, run: int) -> None:
-        """The run begins for these agents."""
-        self.membership.begin(run)
-        if self.config.auth and not self.config.auth_session:
-            self.swarm.begin_session(self.membership.session)
-
     def offer_odometry(self, namespaces: Sequence[str] | None = None) -> None:
         """Offers each agent's true motion as ``odom``; published only while somebody subscribes.
 
         :param namespaces: one an agent; default: ``/cf1``, ``/cf2``, ... in the swarm's.
         """
-        default = [names.agent_namespace(agent, self._namespace) for agent in self.swarm.ids]
+        default = [names.agent_namespace(agent, self._namespace) for agent in self.ids]
         for index, space in enumerate(namespaces or default):
             topic = f"{space.rstrip('/')}/{names.ODOMETRY}"
             publisher = self.node.create_publisher(Odometry, topic, _ODOMETRY_DEPTH)
@@ -146,6 +126,67 @@ class SwarmNode:
         topic = self.loop.subscription.topic_name
         self._waiting.tell("waiting for slot 0: the channel is there" if there else f"waiting for a channel on {topic}")
 
+    def _publish_odometry(self, index: int, stamp: Time, position: Sequence[float], velocity: Sequence[float]) -> None:
+        """Publish where an agent is, if anybody listens.
+
+        :param index: its place among those here.
+        """
+        message = Odometry()
+        message.pose.covariance = POSE_COVARIANCE
+        message.twist.covariance = TWIST_COVARIANCE
+        message.header.frame_id = names.FRAME
+        message.header.stamp = stamp
+        # The attitude is not modelled, it is the identity: the body's axes are those of the map.
+        message.child_frame_id = self._frames[index]
+        place, speed = message.pose.pose.position, message.twist.twist.linear
+        place.x, place.y, place.z = position
+        speed.x, speed.y, speed.z = velocity
+        self._odometry[index][1].publish(message)
+
+
+class SwarmNode(AgentsNode):
+    """Agents that answer every slot message of the channel with one transmission message.
+
+    On the message that opens slot i: hear what the air carried in slot i-1, close that slot, decide for slot i, answer,
+    and only then fly through slot i, while the channel is already at work.
+
+    :param node: the ROS node.
+    :param swarm: the agents that live here.
+    :param swarm_namespace: namespace of the swarm's topics.
+    """
+
+    mode = "lockstep"
+
+    def __init__(self, node: Node, swarm: Swarm, swarm_namespace: str = names.SWARM) -> None:
+        self.agents = AgentGroup(swarm)
+        self._goal = b""  # as last told
+        self._nothing = np.zeros((0, swarm.config.agents), dtype=np.uint8)  # heard by whom, in a slot without frames
+        super().__init__(node, swarm.config, swarm.ids, swarm_namespace, 1)
+
+    def _make_publishers(self, swarm_namespace: str, qos: QoSProfile) -> None:
+        self._agent_ids = array("H", self.ids)
+        self._bytes = b""  # the last answer
+        self._publisher = self.node.create_publisher(Transmission, f"{swarm_namespace}/{names.TRANSMISSION}", qos)
+
+    @property
+    def swarm(self) -> Swarm:
+        """The agents that live here."""
+        return self.agents.swarm
+
+    def _dropped_frames(self) -> dict[str, int]:
+        swarm = self.agents.swarm
+        return {
+            "frame malformed": swarm.malformed,
+            "frame foreign": swarm.foreign,
+            "frame rejected": swarm.rejected,
+            REFUSED: self.agents.refused,
+        }
+
+    def _plausible(self, message: SlotFields) -> None:
+        # The channel waits for this node's answer: it can be nowhere else.
+        if message.phase == Slot.RUN and not 0 <= message.slot - self.slot <= 1:
+            raise Unusable(SLOT, f"slot {message.slot} after slot {self.slot}")
+
     def run(self, stop: Stop) -> None:
         """Answers slot messages until the run is over or a signal comes."""
         self.loop.run(self.on_slot, self.idle, stop)
@@ -153,7 +194,7 @@ class SwarmNode:
     def attach(self) -> Future:
         """Lets an ordinary executor serve these agents, instead of :meth:`run`: slower, with the same results.
 
-        Add :attr:`node` to the executor. In lockstep only: agents with clocks of their own need the loop's timing.
+        Add :attr:`node` to the executor.
 
         :returns: done when the run is over; holds the error if one ended it.
         """
@@ -197,7 +238,9 @@ class SwarmNode:
             self._publisher.publish(self._bytes)
             return True
         if not slot:
-            self._begin(message.run)
+            self.membership.begin(message.run)
+            if self.config.auth and not self.config.auth_session:
+                self.swarm.begin_session(self.membership.session)
         if slot:
             self._hear(message, slot - 1)
             self.agents.on_slot_end()
@@ -205,8 +248,9 @@ class SwarmNode:
         time_ns = names.slot_time_ns(slot, self.config.slot_ns)
         self._answer(slot, time_ns, self.agents.on_slot(slot))
         self.slot = slot
-        if self._watched:
-            self._publish_odometry(time_of(time_ns))
+        for index, _ in self._watched:
+            place, speed = self.swarm.position[:, index].tolist(), self.swarm.velocity[:, index].tolist()
+            self._publish_odometry(index, time_of(time_ns), place, speed)
         self.swarm.fly(slot)
         return True
 
@@ -249,20 +293,6 @@ class SwarmNode:
         self._goal = goal
         self._bytes = pack_transmission(fields, self.config.steps)
         self._publisher.publish(self._bytes)
-
-    def _publish_odometry(self, stamp: Time) -> None:
-        message = Odometry()
-        message.pose.covariance = POSE_COVARIANCE
-        message.twist.covariance = TWIST_COVARIANCE
-        message.header.frame_id = names.FRAME
-        message.header.stamp = stamp
-        place, speed = message.pose.pose.position, message.twist.twist.linear
-        for index, publisher in self._watched:
-            # The attitude is not modelled, it is the identity: the body's axes are those of the map.
-            message.child_frame_id = self._frames[index]
-            place.x, place.y, place.z = self.swarm.position[:, index].tolist()
-            speed.x, speed.y, speed.z = self.swarm.velocity[:, index].tolist()
-            publisher.publish(message)
 
 
 def parse_ids(value: Any, agents: int) -> list[int]:

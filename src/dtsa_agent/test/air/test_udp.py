@@ -27,7 +27,7 @@ from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.air.udp.port import StampClock
 from dtsa_agent.core import ConfigError, Frame, Swarm, SwarmConfig, encode_frame
 from dtsa_agent.core.authentication import Authenticator
-from dtsa_agent.core.station import FLIES, Station, StationSettings
+from dtsa_agent.core.station import BETWEEN, FLIES, Station, StationSettings
 from dtsa_agent.stop import Stop
 
 SLOT_NS = 10_000_000
@@ -190,7 +190,7 @@ def test_the_tally_knows_how_late_frames_left() -> None:
 def test_who_wakes_late_sends_as_long_as_the_next_turn_is_not_disturbed(flight_ns: int) -> None:
     config = SwarmConfig(agents=2, policy="tdma")
     link = dataclasses.replace(link_of(config), flight_ns=flight_ns)
-    latest = SLOT_NS - flight_ns - SLOT_NS // 5
+    latest = SLOT_NS - flight_ns - round(BETWEEN * SLOT_NS)
     assert latest > 0
     station = Station(Swarm(config, local=[1]), StationSettings(config, link, origin_ns=0), 0)
     for slot, late, sends in ((0, latest, 1), (1, 0, 0), (2, latest + 1, 0), (3, 0, 0), (4, 1_000, 1)):

@@ -1,4 +1,4 @@
-"""Coming into a swarm that is under way: listening for the time, and hovering until one is known."""
+"""Coming into a swarm that is under way: hovering until one is known."""
 
 from __future__ import annotations
 
@@ -6,29 +6,15 @@ import numpy as np
 import pytest
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.agents.joining import Listeners, Newcomers
-
-MS = 1_000_000
-
-
-def test_each_takes_its_time_from_the_first_frame_it_hears() -> None:
-    config = SwarmConfig(agents=4, policy="lease", slot_ms=10.0)
-    listeners = Listeners(config, [2, 4], [0, 0])
-    assert not listeners.ready([0, 0])
-    assert listeners.hear(1, 70, 5 * MS)
-    assert not listeners.hear(1, 71, 15 * MS)
-    assert not listeners.ready([30 * MS, 30 * MS])
-    assert listeners.hear(0, 72, 25 * MS)
-    assert listeners.ready([30 * MS, 30 * MS])
+from dtsa_agent.core.agents.agent import Newcomers
+from dtsa_agent.core.errors import ConfigError
+from dtsa_agent.core.station import check_joinable
 
 
-def test_who_hears_nobody_begins_after_one_to_two_rounds_of_anchors() -> None:
-    config = SwarmConfig(agents=4, policy="lease", slot_ms=10.0, anchor_every=5)
-    rounds = 5 * 4 * 10 * MS
-    for agent in range(1, 5):
-        listeners = Listeners(config, [agent], [1000])
-        assert not listeners.ready([1000 + rounds - 1])
-        assert listeners.ready([1000 + 2 * rounds])
+@pytest.mark.parametrize("policy", ["dtsa", "age"])
+def test_who_must_have_the_same_table_as_all_cannot_come_late(policy: str) -> None:
+    with pytest.raises(ConfigError, match="policy"):
+        check_joinable(policy)
 
 
 @pytest.mark.parametrize("policy", ["tdma", "aloha", "lease"])

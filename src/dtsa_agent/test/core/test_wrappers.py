@@ -48,7 +48,7 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
     config = SwarmConfig(agents=4, moving=2, policy="tdma", seed=2)
     sent: list[np.ndarray] = []
     plain, outside = Swarm(config), Swarm(config)
-    vehicles = ExternalVehicles(outside, 2, lambda command: sent.append(command.copy()))
+    vehicles = ExternalVehicles([outside], 2, lambda _, command: sent.append(command.copy()))
     for swarm in (plain, outside):
         swarm.scenario.advance(0, swarm)
     still = plain.active == 0
@@ -85,7 +85,7 @@ def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple
     )  # fmt: skip
     commands = np.zeros((3, 12))
     swarm = Swarm(config)
-    vehicles = ExternalVehicles(swarm, 1, lambda c: np.copyto(commands, c))
+    vehicles = ExternalVehicles([swarm], 1, lambda _, c: np.copyto(commands, c))
     swarm.scenario.advance(0, swarm)
     place, velocity, closest = swarm.scenario.start.copy(), np.zeros((3, 12)), np.inf
     for now in range(slot + 200):

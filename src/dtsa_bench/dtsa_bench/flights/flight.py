@@ -37,8 +37,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from dtsa_agent.core import Scenario, SwarmConfig, make_scenario
-from dtsa_agent.core.agents.joining import check_joinable, check_slotted
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.station import check_joinable, check_slotted
 from dtsa_agent.keys import check_key
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.names import named
@@ -111,8 +111,9 @@ def check_options(run: RunConfig, options: FlightOptions) -> None:
     agents = run.swarm.agents
     if options.processes is not None and options.processes > agents:
         raise ConfigError("processes", options.processes, f"per-agent, or 1 to {agents}, the number of agents")
-    if run.swarm.estimator_row.needs_everybody and (options.processes or agents) > 1:
-        raise ConfigError("estimator", "oracle", "hold, linear or intent; the oracle only with --processes 1")
+    if run.swarm.estimator_row.needs_everybody and (run.mode != LOCKSTEP or (options.processes or agents) > 1):
+        allowed = "hold, linear or intent; the oracle in lockstep with --processes 1 only"
+        raise ConfigError("estimator", "oracle", allowed)
     _check_policy(run, options)
     late = dict(options.late)
     for name, value in (("respawn", options.respawn), ("late", late or None)):

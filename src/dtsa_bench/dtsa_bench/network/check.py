@@ -12,9 +12,8 @@ from dtsa_agent.air.port import PortProperties
 from dtsa_agent.air.record import SlotRecord
 from dtsa_agent.air.vehicle import SimulatedVehicle
 from dtsa_agent.core import SwarmConfig
-from dtsa_agent.core.agents.pacing import BETWEEN
 from dtsa_agent.core.frame import condition_in
-from dtsa_agent.core.station import StationSettings
+from dtsa_agent.core.station import BETWEEN, StationSettings
 from dtsa_agent.core.swarm import Swarm
 from dtsa_agent.keys import authenticator
 

@@ -38,6 +38,7 @@ SENT_HISTORY_LENGTH = 16
 LEAVING, PROBATION, MOVES = 255, 2, 1  # of an extended frame, bytes 2 and 3
 CYCLES = 8  # of lists of one name each, after which an agent that was not named is not heard
 ALL_BUT_ONE, SHARE = -1, -2
+KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS = range(3)  # slots move as the rules say; a little; never
 
 
 class Link(NamedTuple):
@@ -64,6 +65,9 @@ class Settings:
     session: int = 0
     early_count: int = 64
     begins_ns: int | None = None  # start of slot 0, where all begin together
+    late_ns: int | None = None  # start of slot 0, where it listens first and hears no frame
+    keeps_time: int = KEEPS_NOTHING  # whatever it hears, its slots keep their numbers
+    equal_tables: bool = False  # the policy needs equal tables: it waits longer for frames, and never restarts by itself
 
 
 class Parsed(NamedTuple):
@@ -140,6 +144,8 @@ class Station:
         self.moving_ns, self.resting_ns = max(2 * anchors, HALF_SECOND_NS), max(6 * mains, HALF_SECOND_NS)
         self.patience_ns, self.too_long_ns = max(2 * mains, HALF_SECOND_NS), max(500 * slot_ns, 3 * anchors)
         self.lead_ns, self.latest_lead_ns = slot_ns * 700 // 1000, slot_ns * 200 // 1000
+        if c.equal_tables:  # a late frame costs less than tables that differ
+            self.latest_lead_ns, self.too_long_ns = -min(slot_ns * 300 // 1000, 3_000_000), (1 << 63) - 1
         self.latest_send_ns = max(slot_ns - c.link.flight_ns - slot_ns * 200 // 1000, slot_ns // 10)
         self.offsets: list[int] = []
         self.heard_ns = self.in_step_ns = self.now  # last frame of others, and of the own time; or the beginning
@@ -296,8 +302,11 @@ class Station:
         if near:
             p.near_ns = arrival
         if self._is_same(origin_ns, self.origin_ns):
-            self.origin_ns += self._align(apart)
+            if self.settings.keeps_time != KEEPS_STARTS:
+                self.origin_ns += self._align(apart)
             self.in_step_ns, self.state = arrival, JOINED
+            return IN_STEP
+        if self.settings.keeps_time:
             return IN_STEP
         if not self._gives_way(origin_ns, arrival):
             if not near and p.steady:  # it has gone to another time, and hears this agent no more
@@ -431,7 +440,7 @@ class Station:
     def _leaves_out(self, slot: int, now: Ns) -> bool:
         """An agent that is new sends nothing while another sends with its id: that one was here before. One that hears
         nothing leaves out half of its frames: those of agents in other times may cover them."""
-        is_deaf = now - self.heard_ns > self.patience_ns
+        is_deaf = now - self.heard_ns > self.patience_ns and not self.settings.keeps_time
         return (self.newcomer and self._is_doubled(now)) or (is_deaf and bool(self._draw(slot) & 1))
 
     def _open_slot(self, slot: int, now: Ns) -> None:
@@ -500,7 +509,9 @@ class Station:
         if self.state == LISTENING:
             if now < self.deadline_ns:
                 return self.deadline_ns, b""
-            self.origin_ns, self.state, self.in_step_ns = now - self.round_ns, ALONE, now
+            late_ns = self.settings.late_ns
+            self.origin_ns, self.state = now - self.round_ns if late_ns is None else late_ns, ALONE
+            self.in_step_ns = now
             self._restart(now)
         if self.frame:
             start = self.slot_start_ns(self.slot)

@@ -23,11 +23,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
 
-from dtsa_agent.core import Swarm
-from dtsa_agent.core.plugins.entry_points import make_swarm
+from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.settings.declaration import Settings, setting
 from dtsa_agent.crazyflie.state.conversions import rotate
-from dtsa_agent.keys import with_key
+from dtsa_agent.keys import authenticator
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.namespaces import swarm_wide_node
 from dtsa_agent.ros.common.graph.parameters import declare_settings
@@ -51,16 +50,13 @@ STOP_HERE = "/all/stop_here"  # of the ground station: nobody flies on to its go
 class StationNode(RealtimeNode):
     """Agents that begin their slots by the station's clock and whose vehicles are flown elsewhere.
 
-    :param node: the ROS node.
-    :param swarm: the agents that live here.
     :param command_hz: rate of the commands, Hz; at most one a slot.
     """
 
-    def __init__(self, node: Node, swarm: Swarm, *args: Any, command_hz: float, **more: Any) -> None:
-        every = max(1, round(1.0 / command_hz / swarm.config.slot_s))
-        self._vehicles = ExternalVehicles(swarm, every, self._command)
-        super().__init__(node, swarm, *args, **more)
-        count = len(self.swarm.ids)
+    def __init__(self, node: Node, config: SwarmConfig, *args: Any, command_hz: float, **more: Any) -> None:
+        super().__init__(node, config, *args, **more)
+        every, swarms = max(1, round(1.0 / command_hz / config.slot_s)), [agent.swarm for agent in self.agents]
+        self._vehicles, count = ExternalVehicles(swarms, every, self._command), len(swarms)
         self._heard = np.full(count, -np.inf)  # s, monotonic: when each vehicle's odometry last came
         self._measured = np.zeros((3, count))  # m, where each was by its last odometry
         self._stamp = np.zeros(count)  # s, system clock, of that
@@ -68,7 +64,7 @@ class StationNode(RealtimeNode):
         self._bridges: list[OnePublisher] = []  # who tells where each vehicle is
         self._outputs = []
         self._stop_here = Feed(node, Empty, STOP_HERE, LATEST, intake=self.membership.intake)
-        for agent in self.swarm.ids:
+        for agent in self.ids:
             space = names.agent_namespace(agent, self._namespace)
             topic = f"{space}/{names.ODOMETRY}"
             self._inputs.append(Feed(node, Odometry, topic, LATEST, intake=self.membership.intake))
@@ -91,7 +87,8 @@ class StationNode(RealtimeNode):
                     self._note(index, message)
         # What was measured is as old as its stamp: a vehicle at 1 m/s has moved on by centimetres since.
         age = np.clip(time.time() - self._stamp, 0.0, LONGEST_PREDICTION_S)
-        self._vehicles.place(self._measured + self.swarm.velocity * age)
+        velocity = np.concatenate([agent.swarm.velocity for agent in self.agents], axis=1)
+        self._vehicles.place(self._measured + velocity * age)
 
     def _check(self, index: int, message: Odometry, feed: Feed) -> None:
         """Whether odometry can be that of a vehicle, and of the bridge that has told of it so far.
@@ -100,25 +97,22 @@ class StationNode(RealtimeNode):
         """
         check_odometry(message)
         if not self._bridges[index].admits(feed.number, time.monotonic(), feed.sender):
-            raise Unusable(OTHER_SENDER, f"odometry of cf{self.swarm.ids[index]} from two publishers")
+            raise Unusable(OTHER_SENDER, f"odometry of cf{self.ids[index]} from two publishers")
 
     def _note(self, index: int, message: Odometry) -> None:
         place, q, speed = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
         self._measured[:, index] = place.x, place.y, place.z
         self._stamp[index] = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         # The twist of an odometry message is in the body's frame (REP-103).
-        self.swarm.velocity[:, index] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
+        self.agents[index].swarm.velocity[:, 0] = rotate((q.x, q.y, q.z, q.w), (speed.x, speed.y, speed.z))
         self._heard[index] = time.monotonic()
 
-    def _command(self, velocities: NDArray[np.float64]) -> None:
-        """Publishes the commands to the vehicles, (3, L), m/s, frame map."""
-        now = time.monotonic()
-        message = VelocityWorld()
-        for index, publisher in enumerate(self._outputs):
-            if now - self._heard[index] < STALE_S:
-                v = message.vel
-                v.x, v.y, v.z = velocities[:, index].tolist()
-                publisher.publish(message)
+    def _command(self, index: int, velocity: NDArray[np.float64]) -> None:
+        """Publishes the command to a vehicle, (3, 1), m/s, frame map."""
+        if time.monotonic() - self._heard[index] < STALE_S:
+            message = VelocityWorld()
+            message.vel.x, message.vel.y, message.vel.z = velocity[:, 0].tolist()
+            self._outputs[index].publish(message)
 
     def _prepare(self, message: SlotFields) -> bool:
         self._sense()
@@ -126,12 +120,8 @@ class StationNode(RealtimeNode):
             return True
         return super()._prepare(message)
 
-    def _open(self, slot: int) -> None:
-        self._sense()
-        super()._open(slot)
-
-    def _fly(self, slot: int) -> None:
-        self._vehicles.fly(slot)
+    def _fly(self, index: int) -> None:
+        self._vehicles.fly(self.agents[index].slot, index)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,9 +146,8 @@ def _body(stop: Stop, supervised: bool) -> None:
         take_priority(station.priority)
         ids = parse_ids(ids, config.agents)
         zero = [0] * len(ids)  # one station, one clock: no offsets, and nothing to align
-        swarm = with_key(make_swarm(config, local=ids))
-        rate = station.command_hz
-        agents = StationNode(node, swarm, space, command_hz=rate, offset_ns=zero, drift_ppb=zero, align=False)
+        more = {"authenticator": authenticator(config), "offset_ns": zero, "drift_ppb": zero, "align": False}
+        agents = StationNode(node, config, ids, space, command_hz=station.command_hz, **more)
         try:
             agents.run(stop)
         finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,22 +17,25 @@ PUSH_M = 0.3  # farther than this at once nobody makes way
 
 
 class ExternalVehicles:
-    """Vehicles that a swarm steers and somebody else flies.
+    """Vehicles that agents steer and somebody else flies.
 
-    :param swarm: the agents; positions and velocities are written into it from outside.
+    :param swarms: the agents, in one or several swarms; positions and velocities are written into them from outside.
     :param every: slots between two commands.
-    :param send: takes the commanded velocities, (3, L), m/s, frame map.
+    :param send: takes the place of a swarm and its agents' commanded velocities, m/s, frame map.
     """
 
-    def __init__(self, swarm: Swarm, every: int, send: Callable[[NDArray[np.float64]], None]) -> None:
-        self.swarm, self._every, self._send = swarm, every, send
-        self._hold = swarm.scenario.start[:, swarm.local].copy()  # (3, L) m, frame map
+    def __init__(
+        self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None]
+    ) -> None:
+        self._swarms, self._every, self._send = swarms, every, send
+        ends = np.cumsum([len(swarm.ids) for swarm in swarms]).tolist()
+        self._columns = [slice(end - len(swarm.ids), end) for swarm, end in zip(swarms, ends, strict=True)]
         self._stopping = False
 
     def place(self, position: NDArray[np.float64]) -> None:
         """Takes in where the vehicles are, (3, L) m, frame map."""
-        self.swarm.position[:] = position
-        self.swarm.track[:] = position
+        for swarm, columns in zip(self._swarms, self._columns, strict=True):
+            swarm.position[:] = swarm.track[:] = position[:, columns]
 
     def stop_here(self) -> None:
         """From now on nobody flies to its goal: all come to rest, and nobody above another one.
@@ -41,25 +44,25 @@ class ExternalVehicles:
         """
         self._stopping = True
 
-    def fly(self, slot: int) -> None:
-        """Sends the commands of a slot."""
+    def fly(self, slot: int, index: int = 0) -> None:
+        """Sends the commands of a slot to the vehicles of a swarm."""
         if slot % self._every:
             return
-        swarm = self.swarm
+        swarm = self._swarms[index]
         goal = swarm.goal.copy()  # the protocol still counts with it
         if self._stopping:
-            swarm.goal[:] = swarm.position + self._way()
+            swarm.goal[:] = swarm.position + self._way()[:, self._columns[index]]
         swarm.steer(slot, 0)
         swarm.goal[:] = goal
         still = swarm.active == 0
         if still.any():
-            away = self._hold[:, still] - swarm.position[:, still]
+            away = (swarm.scenario.start[:, swarm.local] - swarm.position)[:, still]
             swarm.command[:, still] = np.clip(HOLD_GAIN * away, -HOLD_MPS, HOLD_MPS)
-        self._send(swarm.command)
+        self._send(index, swarm.command)
 
     def _way(self) -> NDArray[np.float64]:
         """Where each goes to make way for those that are near horizontally, at whatever height, (3, L) m."""
-        position = self.swarm.position
+        position = np.concatenate([swarm.position for swarm in self._swarms], axis=1)
         apart = position[:2, :, None] - position[:2, None, :]
         distance = np.linalg.norm(apart, axis=0)
         index = np.arange(distance.shape[0])

@@ -53,10 +53,20 @@ typedef struct dtsa_station_settings {
     int key_length;
     uint64_t session;
     int early_count; /* frames of slots still to come that are kept, 1 or more */
-    int begins;      /* all begin together: slot 0 starts at origin_ns, nobody listens first */
+    int begins; /* DTSA_BEGINS_.. */
     int64_t origin_ns;
+    int keeps_time;   /* DTSA_KEEPS_..: whatever it hears, its slots keep their numbers */
+    int equal_tables; /* the policy needs equal tables: it waits longer for frames, and never restarts
+                         by itself */
     dtsa_link link;
 } dtsa_station_settings;
+
+/* What it does at first: it listens; slot 0 of all starts at origin_ns, and it flies from there; it
+ * listens, and if it hears no frame slot 0 has started at origin_ns. */
+enum { DTSA_BEGINS_LISTENING, DTSA_BEGINS_TOGETHER, DTSA_BEGINS_LATE };
+
+/* Whether slots move: as the rules say, also to another time; a little, with frames that fit; never. */
+enum { DTSA_KEEPS_NOTHING, DTSA_KEEPS_NUMBERS, DTSA_KEEPS_STARTS };
 
 /* The agent behind a station. open: a slot opens; decide, return the length of the frame to send
  * (0: silent), and whom it expects to send. hovers: it is to stay where it is. */

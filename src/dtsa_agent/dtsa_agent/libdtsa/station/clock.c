@@ -121,11 +121,12 @@ int clock_hear(dtsa_station *s, int k, int64_t origin_ns, int64_t arrival_ns)
     const int near = is_near(s, origin_ns);
     if (near) p->near_ns = arrival_ns;
     if (is_same(s, origin_ns, s->origin_ns)) {
-        s->origin_ns += align(s, apart);
+        if (s->settings.keeps_time != DTSA_KEEPS_STARTS) s->origin_ns += align(s, apart);
         s->in_step_ns = arrival_ns;
         s->state = DTSA_JOINED;
         return IN_STEP;
     }
+    if (s->settings.keeps_time) return IN_STEP;
     if (!gives_way(s, origin_ns, arrival_ns)) {
         if (near) return IN_STEP;
         if (p->steady)

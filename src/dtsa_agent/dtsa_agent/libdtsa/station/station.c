@@ -11,6 +11,9 @@
  * leave until the next slot, since clocks differ. */
 enum { LEAD = 700, LATEST_LEAD = 200, BETWEEN = 200 };
 enum { LEAVES = 255 };
+/* Where tables have to be equal it waits so long beyond the start, in thousandths and ns at most: a late
+ * frame costs less than tables that differ. */
+enum { LONGEST_WAIT = 300, LONGEST_WAIT_NS = 3000000 };
 static const int64_t HALF_SECOND = 500000000;
 
 static int64_t share(int64_t slot_ns, int thousandths) { return slot_ns * thousandths / 1000; }
@@ -66,9 +69,10 @@ static void set_times(dtsa_station *s)
     s->resting_ns = c->resting_slots ? c->resting_slots * slot : larger(6 * mains, HALF_SECOND);
     s->patience_ns = larger(2 * mains, HALF_SECOND);
     s->lead_ns = share(slot, LEAD);
-    s->latest_lead_ns = share(slot, LATEST_LEAD);
+    s->latest_lead_ns = c->equal_tables ? -smaller(share(slot, LONGEST_WAIT), LONGEST_WAIT_NS)
+                                        : share(slot, LATEST_LEAD);
     s->latest_send_ns = larger(slot - c->link.flight_ns - share(slot, BETWEEN), slot / 10);
-    s->too_long_ns = larger(500 * slot, 3 * anchors);
+    s->too_long_ns = c->equal_tables ? INT64_MAX : larger(500 * slot, 3 * anchors);
 }
 
 /* A number that looks random. */
@@ -98,7 +102,7 @@ dtsa_station *dtsa_station_start(void *memory, size_t bytes, const dtsa_station_
     s->same_id_until = s->refused_since = s->earlier_ns = INT64_MIN;
     s->hovers = DTSA_HOVERS_LISTENING;
     s->heard_ns = now;
-    if (settings->begins) {
+    if (settings->begins == DTSA_BEGINS_TOGETHER) {
         s->state = DTSA_JOINED;
         s->origin_ns = settings->origin_ns;
         s->in_step_ns = now;
@@ -204,7 +208,8 @@ static void hear_early(dtsa_station *s)
 static int leaves_out(const dtsa_station *s, int64_t slot, int64_t now)
 {
     return (s->newcomer && now < s->same_id_until) ||
-           (now - s->heard_ns > s->patience_ns && draw(s, (uint64_t)slot) & 1);
+           (now - s->heard_ns > s->patience_ns && !s->settings.keeps_time &&
+            draw(s, (uint64_t)slot) & 1);
 }
 
 static void open_slot(dtsa_station *s, int64_t slot, int64_t now)
@@ -369,7 +374,7 @@ int64_t dtsa_station_step(dtsa_station *s, int64_t now, uint8_t *datagram, int *
     if (s->state == DTSA_LISTENING) {
         if (now < s->deadline_ns) return s->deadline_ns;
         /* Not slot 0: that is for agents that are told to begin together. */
-        s->origin_ns = now - s->round_ns;
+        s->origin_ns = s->settings.begins ? s->settings.origin_ns : now - s->round_ns;
         s->state = DTSA_ALONE;
         s->in_step_ns = now;
         restart(s, now);

@@ -70,6 +70,8 @@ struct dtsa_station {
 
 static inline int64_t larger(int64_t a, int64_t b) { return a > b ? a : b; }
 
+static inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
+
 static inline int64_t limited(int64_t value, int64_t limit)
 {
     return value < -limit ? -limit : value > limit ? limit : value;

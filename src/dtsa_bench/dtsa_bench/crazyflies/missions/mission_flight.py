@@ -16,8 +16,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from dtsa_agent.core import Scenario, SwarmConfig
-from dtsa_agent.core.agents.joining import check_slotted
 from dtsa_agent.core.errors import ConfigError, DtsaError
+from dtsa_agent.core.station import check_slotted
 from dtsa_agent.crazyflie.links.link import require_cflib
 from dtsa_agent.crazyflie.settings.config import SwarmSettings
 from dtsa_agent.keys import check_key

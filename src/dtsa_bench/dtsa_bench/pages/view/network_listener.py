@@ -14,11 +14,10 @@ from dtsa_agent.air.datagram import frame_in, link_of
 from dtsa_agent.air.port import PortSettings
 from dtsa_agent.air.ports import open_listener
 from dtsa_agent.core import SwarmConfig, make_scenario
-from dtsa_agent.core.agents.pacing import too_long_ns
 from dtsa_agent.core.errors import ConfigError, RemoteProtocolError
 from dtsa_agent.core.frame import decode_extended, decode_frame
 from dtsa_agent.core.plugins.entry_points import make_swarm
-from dtsa_agent.core.station import EARLY_COUNT, ParsedDatagram, StationSettings, check_joinable
+from dtsa_agent.core.station import EARLY_COUNT, ParsedDatagram, StationSettings, check_joinable, too_long_ns
 from dtsa_agent.keys import authenticator
 from dtsa_bench.pages.html import pack
 from dtsa_bench.recordings.merge.known_pairs import all_known_after
