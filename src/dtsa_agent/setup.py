@@ -27,8 +27,7 @@ COMPILE_FLAGS = [
 LIBRARY, SIMULATOR = "dtsa_agent/libdtsa", "dtsa_agent/libdtsa_sim"
 # What Python sees of both: all that these headers declare, in the order in which they include each other.
 HEADERS = [
-    f"{LIBRARY}/{name}.h"
-    for name in ("include/dtsa", "include/dtsa_station", "frame", "core", "avoider/avoider")
+    f"{LIBRARY}/{name}.h" for name in ("include/dtsa", "include/dtsa_station", "frame", "core", "avoider/avoider")
 ]
 HEADERS += [f"{SIMULATOR}/{name}.h" for name in ("vehicle", "swarm", "metrics", "live")]
 # What C calls in Python: an agent behind a station, and what is told of it (core/station.py).

@@ -3,12 +3,12 @@
 How a flight in real time works, and where each part stands ("channel": `dtsa_channel_sim/ros`):
 
 1. **The time line.** The channel calls all processes (`roll_call`), then sends START with the time of slot 0 on
-   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/driver.ClockMap`), off
-   by an offset and a drift.
+   CLOCK_MONOTONIC. Slot T lies at T slot lengths after it. Each agent has a clock of its own (`air/driver.ClockMap`),
+   off by an offset and a drift.
 2. **A slot here.** Each agent is a station (`core/station`, `realtime_agent`), and says when it is due:
-   :meth:`RealtimeNode._serve`. It ends the slot before, decides, and gives the frame to send. That is published with the
-   time at which its transmission starts, mostly some time ahead; then the vehicles move. A frame that would leave half a
-   slot late is not sent.
+   :meth:`RealtimeNode._serve`. It ends the slot before, decides, and gives the frame to send. That is published with
+   the time at which its transmission starts, mostly some time ahead; then the vehicles move. A frame that would leave
+   half a slot late is not sent.
 3. **On the air.** The channel (`realtime_channel`) puts each frame on the time line (`live_air`, `model/air`). Once no
    frame that overlaps it can come any more, it is settled: who heard it, by reach, overlap and losses. A RUN message
    delivers it to all processes with the receivers' bits.

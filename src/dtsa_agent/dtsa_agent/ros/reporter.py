@@ -75,7 +75,9 @@ class Reporter:
         self._last = slot if slot < names.FIRST_CALL else -1
         everybody = tuple(range(len(self._ids)))
         ready = sorted(there for there in self._rows if there <= slot)
-        groups = [(who, list(slots)) for who, slots in groupby(ready, key=lambda there: tuple(sorted(self._rows[there])))]
+        groups = [
+            (who, list(slots)) for who, slots in groupby(ready, key=lambda there: tuple(sorted(self._rows[there])))
+        ]
         if self._heard and everybody not in [who for who, _ in groups]:
             groups.append((everybody, []))
         for who, slots in groups:

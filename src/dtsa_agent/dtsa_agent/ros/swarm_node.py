@@ -50,9 +50,7 @@ class AgentsNode(ABC):
 
     mode: str
 
-    def __init__(
-        self, node: Node, config: SwarmConfig, ids: Sequence[int], swarm_namespace: str, waiting: int
-    ) -> None:
+    def __init__(self, node: Node, config: SwarmConfig, ids: Sequence[int], swarm_namespace: str, waiting: int) -> None:
         self.node, self.config, self.ids = node, config, tuple(ids)
         self.slot = -1  # the last slot that has begun here
         self._odometry: list[tuple[int, Publisher]] = []

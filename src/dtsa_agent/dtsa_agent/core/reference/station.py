@@ -67,7 +67,9 @@ class Settings:
     begins_ns: int | None = None  # start of slot 0, where all begin together
     late_ns: int | None = None  # start of slot 0, where it listens first and hears no frame
     keeps_time: int = KEEPS_NOTHING  # whatever it hears, its slots keep their numbers
-    equal_tables: bool = False  # the policy needs equal tables: it waits longer for frames, and never restarts by itself
+    equal_tables: bool = (
+        False  # the policy needs equal tables: it waits longer for frames, and never restarts by itself
+    )
 
 
 class Parsed(NamedTuple):

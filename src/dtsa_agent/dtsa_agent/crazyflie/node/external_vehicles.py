@@ -24,9 +24,7 @@ class ExternalVehicles:
     :param send: takes the place of a swarm and its agents' commanded velocities, m/s, frame map.
     """
 
-    def __init__(
-        self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None]
-    ) -> None:
+    def __init__(self, swarms: Sequence[Swarm], every: int, send: Callable[[int, NDArray[np.float64]], None]) -> None:
         self._swarms, self._every, self._send = swarms, every, send
         ends = np.cumsum([len(swarm.ids) for swarm in swarms]).tolist()
         self._columns = [slice(end - len(swarm.ids), end) for swarm, end in zip(swarms, ends, strict=True)]

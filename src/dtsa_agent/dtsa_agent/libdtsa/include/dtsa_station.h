@@ -53,7 +53,7 @@ typedef struct dtsa_station_settings {
     int key_length;
     uint64_t session;
     int early_count; /* frames of slots still to come that are kept, 1 or more */
-    int begins; /* DTSA_BEGINS_.. */
+    int begins;      /* DTSA_BEGINS_.. */
     int64_t origin_ns;
     int keeps_time;   /* DTSA_KEEPS_..: whatever it hears, its slots keep their numbers */
     int equal_tables; /* the policy needs equal tables: it waits longer for frames, and never restarts
