@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from drifting_clocks import ClockAligner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
