@@ -30,13 +30,13 @@
 #include "watch.h"
 
 enum {
-    AGENTS_MAX = 20,        /* N at most */
-    AGENT_BYTES = 8704,     /* of an agent with so many */
-    STATION_BYTES = 4096,   /* ... and its station */
-    EARLY_COUNT = 4,        /* frames of slots still to come */
-    QUEUE_LENGTH = 16,  /* datagrams between the radio's task and this one */
-    CONTROL_US = 10000, /* from one set-point to the next */
-    NEAR_US = 1500,     /* nearer than this to what is due it does not sleep */
+    AGENTS_MAX = 20,      /* N at most */
+    AGENT_BYTES = 8704,   /* of an agent with so many */
+    STATION_BYTES = 4096, /* ... and its station */
+    EARLY_COUNT = 4,      /* frames of slots still to come */
+    QUEUE_LENGTH = 16,    /* datagrams between the radio's task and this one */
+    CONTROL_US = 10000,   /* from one set-point to the next */
+    NEAR_US = 1500,       /* nearer than this to what is due it does not sleep */
     KEY_BYTES = 16
 };
 static const float DOWN_M_S = 0.4f; /* how fast it lands */
@@ -211,7 +211,8 @@ static const char *start(void)
  * join. Who comes later stays out: its slots are of another time. */
 static void begin_together(void)
 {
-    if (!awaitsBegin || status.state == DTSA_LISTENING || status.slot + 1 < (int64_t)beginSlot) return;
+    if (!awaitsBegin || status.state == DTSA_LISTENING || status.slot + 1 < (int64_t)beginSlot)
+        return;
     const int64_t origin = dtsa_station_slot_start(station, beginSlot);
     if (now_ns() < origin - (int64_t)slotUs * 200) return; /* the last frame before has come */
     awaitsBegin = 0;
@@ -430,8 +431,8 @@ static void steer(const double position[3], const double place[3], int64_t now, 
         const int gives_way = next == SAFETY_HOVER && guard.reason == SAFETY_OLD_NEWS;
         const double there[3] = {(double)hold[0], (double)hold[1],
                                  (double)hold[2] - (double)height}; /* frame map */
-        const int flies = gives_way ? stay(now, there, command)
-                                    : next == SAFETY_FLY && fly(now, command);
+        const int flies =
+            gives_way ? stay(now, there, command) : next == SAFETY_FLY && fly(now, command);
         set_point(flies ? command : NULL);
     } else if (next == SAFETY_LAND && before != SAFETY_LAND) {
         land(position);

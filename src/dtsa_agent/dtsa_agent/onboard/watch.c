@@ -51,7 +51,8 @@ static void opened(void *context, int64_t slot, int64_t start, int64_t now, int 
 static void note(char kind, int accepted, int sender, int64_t slot, const uint8_t *datagram,
                  int length, int64_t at)
 {
-    heard_note n = {(uint8_t)kind, (uint8_t)accepted, (uint8_t)sender, (uint8_t)length, slot, at, {0}};
+    heard_note n = {
+        (uint8_t)kind, (uint8_t)accepted, (uint8_t)sender, (uint8_t)length, slot, at, {0}};
     if (length) memcpy(n.data, datagram, (size_t)length);
     peerLabRecord(&n, sizeof n);
 }

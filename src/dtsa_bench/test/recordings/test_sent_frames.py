@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drifting_clocks import ClockAligner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
