@@ -149,7 +149,7 @@ class StationSettings:
         id: int = 1,
         quorum: str = "0",
         origin_ns: int | None = None,
-        listens: bool = True,
+        listens: bool = False,
         keeps_time: int = KEEPS_NOTHING,
     ) -> None:
         key, session = (b"", 0) if authenticator is None else authenticator.key_and_session

@@ -89,7 +89,7 @@ def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_
         values = {
             "id": 1, "agents": 2, "air": "udp", "interface": "lo", "group": group, "auth": False, "axis_x_m": 50.0,
             "vehicle": "odometry", "odometry_topic": "/uav1/local_position/odom", "odometry_origin": "[1.0, 2.0, 0.5]",
-            "command_topic": "/uav1/setpoint_velocity/cmd_vel", "slot_ms": 20.0,
+            "command_topic": "/uav1/setpoint_velocity/cmd_vel", "slot_ms": 20.0, "quorum": "0%",
         }  # fmt: skip
         process = graph.start(AGENT, *parameters(values))
         vehicle.until_commands(still=False)

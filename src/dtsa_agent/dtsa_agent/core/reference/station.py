@@ -402,9 +402,7 @@ class Station:
         if self.frame:
             self.said = b""
         self._close_slot()
-        slot = self._slot_at(now + self.lead_ns)
-        if not (slot < self.slot and (self.slot - slot) * self.settings.slot_ns < self.patience_ns):
-            self.slot = slot  # else this time lies a little behind, and catches up: no slot comes twice
+        self.slot = self._slot_at(now + self.lead_ns)
         self.first, self.newcomer, self.hovers = self.slot + 1, True, HOVERS_NEW
         self.awaits = self.has_sent = False
         self.early.clear()

@@ -143,11 +143,8 @@ static void close_slot(dtsa_station *s)
 /* From the next slot on it takes part, knowing nothing. */
 static void restart(dtsa_station *s, int64_t now)
 {
-    const int64_t before = s->slot, slot = clock_slot(s, now + s->lead_ns);
     close_slot(s);
-    /* A time that lies a little behind catches up: no slot comes twice. */
-    s->slot =
-        slot < before && (before - slot) * s->settings.slot_ns < s->patience_ns ? before : slot;
+    s->slot = clock_slot(s, now + s->lead_ns);
     s->first = s->slot + 1;
     s->awaits = s->has_sent = s->early_count = 0;
     s->newcomer = 1;
