@@ -112,9 +112,6 @@ class RealtimeAgent:
     def restarted(self, slot: int) -> None:
         """It restarts: nothing to do here."""
 
-    def sent(self, slot: int, datagram: bytes, now_ns: int) -> None:
-        """The frame is on its way: nothing to do here."""
-
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """A frame was heard in its slot."""
         if accepted:
