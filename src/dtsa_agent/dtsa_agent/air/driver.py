@@ -72,6 +72,7 @@ class LiveAgent:
     :param watcher: is told what happens; None: nobody is.
     :param vehicle: what it flies; None: a simulated one.
     :param say: prints a line in flight; None: nothing is printed.
+    :param show: shows a line in place of the one before; None: nobody looks.
     :raises ConfigError: for an id or a policy that cannot fly here, or a missing key or session.
     """
 
@@ -83,6 +84,7 @@ class LiveAgent:
         watcher: Watcher | None = None,
         vehicle: Vehicle | None = None,
         say: Callable[[str], None] | None = None,
+        show: Callable[[str], None] | None = None,
     ) -> None:
         if own.id > config.agents:
             raise ConfigError("id", own.id, f"1 to {config.agents}, the number of agents")
@@ -99,7 +101,7 @@ class LiveAgent:
         self.tally = Tally()
         self._vehicle = SimulatedVehicle() if vehicle is None else vehicle
         port.say = say
-        self._reports = Reports(own.id, config.slot_ms, say, time.monotonic_ns())
+        self._reports = Reports(own.id, config.slot_ms, say, time.monotonic_ns(), show)
         self._next_look_ns = 0
         self._flight_ns = link.flight_ns
         self._layout = port.properties.header(config.auth) if port.properties.varies else None

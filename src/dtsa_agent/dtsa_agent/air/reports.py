@@ -25,10 +25,19 @@ class Reports:
     :param slot_ms: length of a slot.
     :param say: prints a line; None: nothing is printed.
     :param now_ns: the present.
+    :param show: shows a line in place of the one before, once a second; None: nobody looks.
     """
 
-    def __init__(self, id: int, slot_ms: float, say: Callable[[str], None] | None, now_ns: int) -> None:
-        self._id, self._slot_ms, self._say = id, slot_ms, say
+    def __init__(
+        self,
+        id: int,
+        slot_ms: float,
+        say: Callable[[str], None] | None,
+        now_ns: int,
+        show: Callable[[str], None] | None = None,
+    ) -> None:
+        self._id, self._slot_ms, self._say, self._show = id, slot_ms, say, show
+        self._show_due_ns = now_ns
         self._state = self._printed = ""  # what it does, and what was printed last
         self._state_due_ns = now_ns + _STATE_NS
         self._foreign: Counter[str] = Counter()
@@ -62,7 +71,11 @@ class Reports:
             NO_QUORUM: f"hovers: {contact}", IS_NEW: f"is new, and hovers until the others know it: {contact}",
         }  # fmt: skip
         alone = status.hovers != FLIES and STATES[status.state] == "alone"
-        self.state("is alone, and hovers until it hears others" if alone else texts[status.hovers], now_ns)
+        text = "is alone, and hovers until it hears others" if alone else texts[status.hovers]
+        self.state(text, now_ns)
+        if self._show is not None and now_ns >= self._show_due_ns:
+            self._show_due_ns = now_ns + _SECOND
+            self._show(f"slot {status.slot}, {status.sent} sent, {status.heard} heard; {text}")
         self._check_lengths(status.timed, status.off)
         if self._foreign_due_ns and now_ns >= self._foreign_due_ns:
             counts = "; ".join(f"{count} of {_FOREIGN[why]}" for why, count in sorted(self._foreign.items()))

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.port import PortSettings
@@ -40,7 +42,7 @@ def check(job: AgentJob, seconds: float) -> int:
 
     duration = seconds or lasts_s(job.config)
     own = dataclasses.replace(job.own, duration_s=duration, quorum="0")  # it hovers anyway
-    say = _speaker(own.id)
+    say = _Terminal(own.id).say
     say(f"checks for {duration:.0f} s who is heard; its vehicle is held")
     watcher = Check(own.id, job.config, job.port.properties)
     with Stop() as stop, open_port(job.port) as port:
@@ -59,9 +61,10 @@ def fly(job: AgentJob) -> int:
     :raises BagError: if the record is not whole.
     """
     failure = ""
-    say = _speaker(job.own.id)
+    terminal = _Terminal(job.own.id)
+    say = terminal.say
     with Stop() as stop, open_port(job.port) as port:
-        agent = LiveAgent(job.own, job.config, port, say=say)
+        agent = LiveAgent(job.own, job.config, port, say=say, show=terminal.show if sys.stderr.isatty() else None)
         if job.out is None:
             agent.run(stop)
             summary = agent.summary()
@@ -72,9 +75,9 @@ def fly(job: AgentJob) -> int:
                 agent.run(stop)
             summary, failure = recorder.summary, recorder.failure
     from dtsa_bench.runs.hearing import of_datagrams
-    from dtsa_bench.runs.summary_text import describe
 
-    print(json.dumps(summary, indent=2) + "\n" if job.as_json else describe(summary), end="")
+    terminal.clear()
+    print(json.dumps(summary, indent=2) if job.as_json else brief(summary))
     not_taken_in = summary["not_taken_in"]
     # Two: this agent, and all others.
     hearing = of_datagrams(2, summary["slots"], summary["sent"], summary["heard"], not_taken_in)
@@ -89,10 +92,47 @@ def fly(job: AgentJob) -> int:
     return int(bool(problem))
 
 
-def _speaker(agent: int) -> Callable[[str], None]:
-    """Prints a line about an agent on standard error."""
+def brief(summary: Mapping[str, Any]) -> str:
+    """What came of an agent's flight, for people; ``--json`` and ``summary.json`` have all of it."""
 
-    def say(line: str) -> None:
-        print(f"dtsa: cf{agent}: {line}", file=sys.stderr, flush=True)
+    def reasons(counts: Mapping[str, int]) -> str:
+        return ", ".join(f"{count} {reason}" for reason, count in counts.items())
 
-    return say
+    share, late = summary["heard_share"], summary["send_late_ms"]["p99"]
+    rows = {
+        "state": f"{summary['state']}, {summary['slots']} slots of {summary['slot_ms']:g} ms",
+        "hovered": f"{summary['held_at_start_slots']} slots before it flew, {summary['held_slots']} after",
+        "sent": f"{summary['sent']} frames" + (f", at most {late:.2f} ms late (99 %)" if late is not None else ""),
+        "not sent": reasons(summary["unsent_because"]),
+        "heard": f"{summary['heard']} frames of {', '.join(f'cf{agent}' for agent in summary['heard_of']) or 'nobody'}"
+        + (f"; {share:.0%} of the others lately" if share is not None else ""),
+        "longest gap": f"{summary['oldest_heard_slots']} slots, of cf{summary['oldest_heard_of']}"
+        if summary["oldest_heard_of"]
+        else "",
+        "not taken in": reasons(summary["not_taken_in"]),
+    }
+    return "\n".join(f"{name:14}{text}" for name, text in rows.items() if text)
+
+
+class _Terminal:
+    """Standard error: lines about an agent, and on a terminal a last line that changes."""
+
+    def __init__(self, agent: int) -> None:
+        self._agent, self._shown = agent, False
+
+    def say(self, line: str) -> None:
+        """Prints a line that stays."""
+        self.clear()
+        print(f"dtsa: cf{self._agent}: {line}", file=sys.stderr, flush=True)
+
+    def show(self, line: str) -> None:
+        """Shows a line in place of the one before."""
+        columns = shutil.get_terminal_size().columns
+        print(f"\r\x1b[K{f'cf{self._agent}: {line}'[: columns - 1]}", end="", file=sys.stderr, flush=True)
+        self._shown = True
+
+    def clear(self) -> None:
+        """Takes that line away."""
+        if self._shown:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        self._shown = False
