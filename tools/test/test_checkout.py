@@ -249,7 +249,8 @@ def test_a_set_up_that_is_interrupted_at_any_moment_is_finished_by_the_same_comm
             os.killpg(process.pid, number)
             assert process.stderr is not None
             assert "Traceback" not in process.stderr.read()
-        assert process.returncode in (130, -signal.SIGKILL)
+        # -SIGINT: Python had not come to its own handler yet; a shell says 130, too.
+        assert process.returncode in (130, -signal.SIGINT, -signal.SIGKILL)
     result = call("setup", tool=command[0], **more)
     assert result.returncode == 0, result.stderr
     assert "ready" in result.stderr

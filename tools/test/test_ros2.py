@@ -61,7 +61,7 @@ def ros2(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros2]:
 def test_the_graph(ros2: Ros2) -> None:
     wait_for(lambda: ros2("node", "list") == (0, "/talker\n"))
     wait_for(lambda: "/words\n" in ros2("topic", "list")[1])
-    assert "/talker/get_parameters\n" in ros2("service", "list")[1]
+    wait_for(lambda: "/talker/get_parameters\n" in ros2("service", "list")[1])
     assert ros2("topic", "echo", "/words", "--once") == (0, "data: hello\n---\n")
     rate = float(ros2("topic", "hz", "/words", lines=1)[1].removeprefix("average rate: "))
     assert 1 < rate < 40

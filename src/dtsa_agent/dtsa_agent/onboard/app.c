@@ -186,7 +186,7 @@ static const char *begin(int which, int64_t begins_ns)
     const dtsa_station_agent ours = dtsa_station_agent_of(agent);
     station = dtsa_station_start(station_memory, sizeof station_memory, &settings, &ours, now_ns());
     if (!station) return "station";
-    observe(station, agent);
+    if (!awaitsBegin) observe(station, agent); /* what comes before is of another policy */
     fly_to(own_id - 1);
     dtsa_station_get_status(station, &status);
     return NULL;

@@ -1,4 +1,4 @@
-"""What a station does where it has been told what time it is; all else is proven on virtual time."""
+"""Integration: What a station does where it has been told what time it is; all else is proven on virtual time."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_one_that_keeps_its_slots_accepts_frames_however_far_they_are_off(far_ns
 
 
 def test_one_that_knows_when_slot_0_was_begins_there_if_it_hears_no_frame() -> None:
-    station = station_of(origin_ns=-7 * SLOT // 2)
+    station = station_of(origin_ns=-7 * SLOT // 2, listens=True)
     assert open_slot(station, 0) >= 5 * 4 * SLOT  # a round of anchors
     assert STATES[station.status.state] == "alone"
     assert station.slot_start_ns(0) == -7 * SLOT // 2

@@ -13,6 +13,8 @@ from fly_helpers import fly, readable, start_flight, summary_of, verified
 pytest.importorskip("dtsa_msgs.msg")
 
 
+from waiting import wait_for
+
 from dtsa_bench.recordings.bag.reader import Bag
 from dtsa_channel_sim import ClockConfig, make_clocks
 
@@ -126,7 +128,8 @@ def test_in_real_time_agents_keep_their_own_clocks(tmp_path: Path) -> None:
 @pytest.mark.realtime
 def test_in_real_time_the_others_fly_on_when_one_is_killed(tmp_path: Path) -> None:
     words = ("--agents", "5", "--moving", "4", "--policy", "lease", "--mode", "realtime", "--tail-s", "0.2")
-    with start_flight(tmp_path, *words, "--no-picture") as flight:
+    with start_flight(tmp_path, *words, "--no-picture", begun=False) as flight:
+        wait_for(lambda: flight.bag_bytes() > 20_000)  # it is under way
         victim = flight.pid_of(3)
         os.kill(victim, signal.SIGKILL)
         flight.assert_ends(0, f"cf3 (process {victim}) was killed by SIGKILL; the others fly on")

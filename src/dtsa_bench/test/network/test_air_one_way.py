@@ -140,7 +140,7 @@ def test_an_outage_is_seen_beside_the_mean_age(bags: list[Path]) -> None:
     assert after["heard_age_max_slots"] > (last - since) * 0.8
     assert after["heard_age_max_pair"] == [2, 1]
     assert after["heard_age_max_ms"] == after["heard_age_max_slots"] * CONFIG.slot_ms
-    assert before["pairs_known_share"] == 1.0
+    assert before["pairs_known_share"] > 0.95  # one that has heard nobody yet leaves out half of its frames
     assert 0.5 < after["pairs_known_share"] < 1.0
 
 

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dtsa_agent.core.authentication import Authenticator
 from dtsa_agent.core.errors import ConfigError
@@ -24,46 +22,6 @@ from dtsa_agent.core.swarm import Bytes, SlotOutcome, Swarm
 REFUSED = "reception refused"  # a frame that reached an agent and was not taken in; what processes call it
 
 
-class Newcomers:
-    """Local agents that hover because they are new: nobody knows where they are, and they do not know the others.
-
-    An agent flies from when it has spoken in a turn of its own and, where the policy has probation, is through with it:
-    then it has been heard; and after a whole round, in which it has heard everybody else where nothing is lost.
-
-    :param count: number of local agents L.
-    """
-
-    def __init__(self, count: int) -> None:
-        self._since: NDArray[np.int64] = np.full(count, -1, dtype=np.int64)  # first slot, -1: not new
-        self.some = False  # whether any is new; most processes never have any
-
-    def add(self, swarm: Swarm, index: Any, slot: int) -> None:
-        """An agent begins anew between two slots, knowing nothing; slot: its first one."""
-        swarm.restart(index)
-        self._since[index] = slot
-        self.some = True
-
-    def hold(self, swarm: Swarm, slot: int) -> None:
-        """Keeps those that are still new where they are, after ``scenario.advance`` for the slot that begins."""
-        if not self.some:
-            return
-        for index in np.flatnonzero(self._since >= 0):
-            swarm.active[index] = 0
-            if self._known(swarm, index, slot):
-                self._since[index] = -1
-                course = swarm.course
-                flies = swarm.scenario.moving[swarm.local] if course is None else course.active
-                swarm.active[index] = flies[index]
-        self.some = bool((self._since >= 0).any())
-
-    def _known(self, swarm: Swarm, index: Any, slot: int) -> bool:
-        config = swarm.config
-        since = self._since[index]
-        if slot < since + config.agents or swarm.sent_slot[index, swarm.local[index]] < since:
-            return False
-        return not config.policy_row.probation or not swarm.lease_status(index)["probation"]
-
-
 class AgentGroup:
     """The agents of one process. In every slot call ``on_slot``, ``on_frames``, ``on_slot_end``, in this order.
 
@@ -74,7 +32,6 @@ class AgentGroup:
     def __init__(self, swarm: Swarm) -> None:
         check_slotted(swarm.config.policy)
         self.swarm = swarm
-        self.newcomers = Newcomers(len(swarm.ids))
         self.refused = 0  # frames that reached an agent and were not taken in, over all agents
         self.slot = -1  # the present slot, -1: none
 
@@ -86,7 +43,6 @@ class AgentGroup:
         swarm = self.swarm
         self.slot = slot
         swarm.scenario.advance(slot, swarm)
-        self.newcomers.hold(swarm, slot)
         return swarm.begin(slot)
 
     def on_frames(self, slot: int, senders: Sequence[int], frames: Sequence[bytes], heard: Bytes) -> Bytes | None:
@@ -125,10 +81,6 @@ class AgentGroup:
         """
         self.swarm.end(self.slot, collided)
         self.slot = -1
-
-    def restart(self, local_index: int, slot: int) -> None:
-        """A local agent begins anew in a slot, knowing nothing; it hovers until the others know it."""
-        self.newcomers.add(self.swarm, local_index, slot)
 
 
 @dataclass(frozen=True, slots=True)

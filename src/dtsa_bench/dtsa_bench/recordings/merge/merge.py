@@ -43,7 +43,8 @@ class Merge:
         self.config = bags[0].swarm
         self.sent = sent_of(self.lives)
         self.strange, self._crossings = _crossings(self.lives, self.sent, not self.nothing_written)
-        self.line = fit(self._crossings, bags[0].flight_ns)
+        kept = [one for one in self._crossings if one.sender[1] >= 0 and one.receiver[1] >= 0]
+        self.line = fit(kept, bags[0].flight_ns)
         self.apart = _apart(self.lives, self.line)
         self.turns = _Turns(self.lives, self.line, self.config.slot_ns)
 
@@ -54,7 +55,7 @@ class Merge:
         """
         lives, line, common_slot = self.lives, self.line, self.turns.common_slot
         replays = {life: Replay(bag) for life, bag in lives.items()}
-        on_line = {life: lives[life] for life in line.clocks if life[1] >= 0}
+        on_line = {life: lives[life] for life in line.clocks}
         flown = ended(fly(on_line, replays, senders_of(lives, self.sent), common_slot))
         for life in lives.keys() - on_line.keys():  # slots of its own, which are nobody else's
             for record in lives[life].slots:
@@ -237,7 +238,7 @@ class _Turns:
     def __init__(self, lives: Mapping[Life, AgentBag], line: TimeLine, slot_ns: int) -> None:
         self._started = [line.clocks[life].common_ns(bag.started_ns) for life, bag in lives.items()
                          if life in line.clocks and life[1] == 0]  # fmt: skip
-        on_line = {life: bag for life, bag in lives.items() if life in line.clocks and bag.slots and life[1] >= 0}
+        on_line = {life: bag for life, bag in lives.items() if life in line.clocks and bag.slots}
         starts: dict[int, list[int]] = {}
         for life, bag in on_line.items():
             for record in bag.slots:

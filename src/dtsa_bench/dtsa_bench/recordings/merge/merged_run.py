@@ -95,9 +95,7 @@ def lay(merge: Merge, summary: Mapping[str, Any]) -> MergedRun:
         raise ConfigError("bags", len(merge.lives), f"bags of one flight on one time line; {clocks_apart(merge.apart)}")
     if first is None:
         raise ConfigError("bags", len(merge.lives), "bags of agents that hear each other and come to count slots alike")
-    on_line = {
-        life: bag for life, bag in merge.lives.items() if life in merge.line.clocks and bag.slots and life[1] >= 0
-    }
+    on_line = {life: bag for life, bag in merge.lives.items() if life in merge.line.clocks and bag.slots}
     zero, length = _slots(on_line, merge, first)
     slot_ns = merge.config.slot_ns
 

@@ -36,7 +36,7 @@ class Replay:
         """One slot."""
         swarm, slot = self.swarm, record.slot
         if record.anew:
-            self._group.restart(0, slot)
+            swarm.restart(0)
         self._hear(record.before)
         swarm.track[:, :, 0] = record.track
         swarm.position[:, 0] = record.track[-1]
