@@ -208,11 +208,7 @@ def slot_us(agents: int, policy: str, most_slots: int = 4000, least_s: float = 0
         scenario.advance(0, swarm)
         begun = time.perf_counter()
         for slot in range(count):
-            frames = [swarm.frame(index) for index in swarm.begin(slot)]
-            swarm.fly(slot)
-            for data in frames:
-                swarm.hear(slot, data)
-            swarm.end(slot)
+            swarm.complete(slot, swarm.begin(slot))
         times.append(time.perf_counter() - begun)
     return 1e6 * min(times) / count
 
