@@ -105,7 +105,7 @@ class LiveAgent:
         self._next_look_ns = 0
         self._flight_ns = link.flight_ns
         self._layout = port.properties.header(config.auth) if port.properties.varies else None
-        self._says_leaving = config.policy_row.says_leaving
+        self._says_leaving, self._frame_length = config.policy_row.says_leaving, config.frame_length
         self._record: SlotRecord | None = None  # of the present slot
         self._before: list[Heard] = []  # heard after it began anew and before its first slot
         self._no_priority = ""  # why it has none
@@ -138,7 +138,8 @@ class LiveAgent:
             time.sleep(_SIGNAL_POLL_S)
         station = self.station = self._start()
         local, receive, step, descriptor = self.clock.local_ns, self.port.receive, station.step, [self.port.fileno()]
-        while not ((stop.signal or end is not None) and self._has_ended(stop, end)):
+        now = began
+        while not ((stop.signal or (end is not None and now >= end)) and self._has_ended(stop, end)):
             arrived = receive(_BURST)
             for data, arrival_ns, own in arrived:
                 if not own:
@@ -231,7 +232,7 @@ class LiveAgent:
     def heard(self, sender: int, slot: int, datagram: bytes, arrival_ns: int, accepted: bool) -> None:
         """Count and record a frame."""
         if accepted:
-            frame = datagram[-self.config.frame_length :]
+            frame = datagram[-self._frame_length :]
             self.tally.hear(sender, slot, self._says_leaving and condition_in(frame)[0])
             if self._layout is not None:
                 start, late = self.station.slot_start_ns(slot), late_in(datagram, self._layout)
