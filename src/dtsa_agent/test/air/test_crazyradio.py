@@ -128,11 +128,7 @@ def test_a_datagram_comes_out_as_it_went_in_on_its_port_alone(data: bytes, sent_
 # -- stamps ----------------------------------------------------------------------------------------------------------
 
 
-@given(
-    st.integers(0, 2**32 - 1),
-    st.floats(-40e-6, 40e-6),
-    st.integers(1, 2**20),
-)
+@given(st.integers(0, 2**32 - 1), st.floats(-40e-6, 40e-6), st.integers(1, 2**20))
 def test_arrivals_follow_the_stamps_whatever_usb_does(first_us: int, drift: float, seed: int) -> None:
     """Over a turn of the stamps too, and after a pause of a quarter of a turn."""
     draw, clock = random.Random(seed), DongleClock()

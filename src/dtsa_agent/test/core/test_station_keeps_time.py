@@ -5,15 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dtsa_agent.core import Swarm, SwarmConfig
-from dtsa_agent.core.station import (
-    KEEPS_NOTHING,
-    KEEPS_NUMBERS,
-    KEEPS_STARTS,
-    STATES,
-    Link,
-    Station,
-    StationSettings,
-)
+from dtsa_agent.core.station import KEEPS_NOTHING, KEEPS_NUMBERS, KEEPS_STARTS, STATES, Link, Station, StationSettings
 
 MS = 1_000_000
 SLOT = 20 * MS
