@@ -59,26 +59,16 @@ def test_a_report_fills_accounts_and_only_what_was_delivered_counts_as_taken_in(
     assert made.missed == 2
 
 
-@pytest.mark.parametrize(
-    ("field", "values", "reason"),
-    [
-        ("agent", array("H", [3, 2]), "unknown agent"),
-        ("agent", array("H", [2, 6]), "unknown agent"),
-        ("agent", array("H"), "unknown agent"),
-        ("slot", array("I", [8, 7]), "slot"),
-        ("slot", array("I", [7, LATEST + 1]), "slot"),
-        ("slot", array("I", [7, 2**32 - 1]), "slot"),
-        ("heard_in", array("I", [2**32 - 1]), "slot"),
-        ("offset_ns", array("q", [0, 0, 0, 2**62]), "range"),
-        ("offset_ns", array("q", [0, -(2**63), 0, 0]), "range"),
-        ("steps", 2, "range"),
-        ("score", array("d", [float("nan")] * 4), "range"),
-        ("track", array("d", [float("inf")] * 12), "range"),
-        ("velocity", array("d", [1e300] * 12), "range"),
-        ("goal", array("d", [1.0] * 11), "sizes"),
-        ("heard_by", array("B", [3, 3]), "sizes"),
-    ],
-)
+@pytest.mark.parametrize(("field", "values", "reason"), [
+    ("agent", array("H", [3, 2]), "unknown agent"), ("agent", array("H", [2, 6]), "unknown agent"),
+    ("agent", array("H"), "unknown agent"), ("slot", array("I", [8, 7]), "slot"),
+    ("slot", array("I", [7, LATEST + 1]), "slot"), ("slot", array("I", [7, 2**32 - 1]), "slot"),
+    ("heard_in", array("I", [2**32 - 1]), "slot"), ("offset_ns", array("q", [0, 0, 0, 2**62]), "range"),
+    ("offset_ns", array("q", [0, -(2**63), 0, 0]), "range"), ("steps", 2, "range"),
+    ("score", array("d", [float("nan")] * 4), "range"), ("track", array("d", [float("inf")] * 12), "range"),
+    ("velocity", array("d", [1e300] * 12), "range"), ("goal", array("d", [1.0] * 11), "sizes"),
+    ("heard_by", array("B", [3, 3]), "sizes"),
+])  # fmt: skip
 def test_what_cannot_be_is_refused_and_changes_nothing(field: str, values: Any, reason: str) -> None:
     made = accounts()
     with pytest.raises(Unusable) as caught:

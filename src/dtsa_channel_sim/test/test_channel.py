@@ -138,12 +138,9 @@ def check_against_the_definition(rng):
     agents = int(rng.integers(2, 9))
     positions = rng.uniform(-6, 6, (3, agents))
     config = ChannelConfig(
-        agents=agents,
-        range_m=rng.uniform(1, 15),
-        interference_factor=rng.choice([1.0, 1.7]),
-        capture_db=rng.choice([0.0, rng.uniform(0.1, 20.0)]),
-        path_loss_exponent=rng.choice([2.0, 2.5]),
-    )
+        agents=agents, range_m=rng.uniform(1, 15), interference_factor=rng.choice([1.0, 1.7]),
+        capture_db=rng.choice([0.0, rng.uniform(0.1, 20.0)]), path_loss_exponent=rng.choice([2.0, 2.5]),
+    )  # fmt: skip
     split = int(rng.integers(0, agents)) * int(rng.integers(0, 2))
     partition = [tuple(range(1, split + 1)), tuple(range(split + 1, agents + 1))] if split else []
     channel = Channel(config)

@@ -107,11 +107,9 @@ def test_slots_are_transmissions_that_start_together(slots, medium, seed, length
 
 
 @given(
-    FRAMES,
-    st.integers(0, 31 * MS),
-    st.integers(1, 3),
+    FRAMES, st.integers(0, 31 * MS), st.integers(1, 3),
     st.sampled_from([{}, {"range_m": 4.0}, {"partition": [[1, 2, 3, 7], [4, 5, 6]]}]),
-)
+)  # fmt: skip
 @settings(max_examples=120, deadline=None)
 def test_a_radio_senses_what_would_destroy_a_frame_there(frames, when, listener, medium):
     """Agent 7, beside the listener, sends for a nanosecond: the listener receives that unless its air is busy."""

@@ -114,11 +114,9 @@ def walked(model, words, end):
 
 
 @given(
-    seed=st.integers(0, 2**32),
-    loss=st.floats(0.01, 0.6),
-    stretch=st.floats(1.0, 200.0),
+    seed=st.integers(0, 2**32), loss=st.floats(0.01, 0.6), stretch=st.floats(1.0, 200.0),
     order=st.randoms(use_true_random=False),
-)
+)  # fmt: skip
 @settings(max_examples=40, deadline=None)
 def test_chain_looked_at_anywhere_is_the_chain_walked(seed, loss, stretch, order):
     agents, end = 200, 900  # three blocks of words

@@ -54,20 +54,13 @@ def test_settings_come_back_from_plain_values():
     assert ChannelConfig(agents=4).to_dict()["losses"] == ""
 
 
-@pytest.mark.parametrize(
-    ("given_losses", "field"),
-    [
-        (3, "losses"),
-        ({}, "losses.enter"),
-        (losses(enter=0.5, leave=0.6), r"losses.leave\[0\]\[1\]"),
-        (losses(loss_bad=1.5), r"losses.loss_bad\[0\]\[1\]"),
-        ({**losses(), "leave": [[1.0]]}, r"losses.leave: got 'shape \(1, 1\)'"),
-        ({**losses(), "loss_good": "all"}, "losses.loss_good"),
-        (losses(format="dtsa-losses 1"), "losses.format"),
-        (losses(slot_ns=20_000_000), "slots of 20 ms"),
-        (losses(3), "of 3 agents"),
-    ],
-)
+@pytest.mark.parametrize(("given_losses", "field"), [
+    (3, "losses"), ({}, "losses.enter"), (losses(enter=0.5, leave=0.6), r"losses.leave\[0\]\[1\]"),
+    (losses(loss_bad=1.5), r"losses.loss_bad\[0\]\[1\]"),
+    ({**losses(), "leave": [[1.0]]}, r"losses.leave: got 'shape \(1, 1\)'"),
+    ({**losses(), "loss_good": "all"}, "losses.loss_good"), (losses(format="dtsa-losses 1"), "losses.format"),
+    (losses(slot_ns=20_000_000), "slots of 20 ms"), (losses(3), "of 3 agents"),
+])  # fmt: skip
 def test_what_cannot_be_used_is_named(given_losses, field):
     with pytest.raises(ConfigError, match=field):
         ChannelConfig(agents=4, slot_ns=SLOT_NS, losses=given_losses)

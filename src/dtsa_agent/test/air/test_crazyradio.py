@@ -254,17 +254,11 @@ def test_a_dongle_is_told_channel_rate_address_and_mode(plugged: list[Any]) -> N
     assert device.requests[-1] == (0x24, 0, b"")
 
 
-@pytest.mark.parametrize(
-    ("device", "allowed"),
-    [
-        (None, "plugged in; there are 0"),
-        (SimpleNamespace(bcdDevice=0x0301), "firmware 5.4"),
-        (SimpleNamespace(bcdDevice=0x0503), "firmware 5.4"),
-        ({"set_configuration": errno.EACCES}, "udev rule"),
-        ({"set_configuration": errno.EBUSY}, "no other program"),
-        ({"ctrl_transfer": errno.EPIPE}, "does what it is told"),
-    ],
-)
+@pytest.mark.parametrize(("device", "allowed"), [
+    (None, "plugged in; there are 0"), (SimpleNamespace(bcdDevice=0x0301), "firmware 5.4"),
+    (SimpleNamespace(bcdDevice=0x0503), "firmware 5.4"), ({"set_configuration": errno.EACCES}, "udev rule"),
+    ({"set_configuration": errno.EBUSY}, "no other program"), ({"ctrl_transfer": errno.EPIPE}, "does what it is told"),
+])  # fmt: skip
 def test_dongles_that_cannot_be_used_are_one_line(plugged: list[Any], device: Any, allowed: str) -> None:
     if isinstance(device, dict):
         device = FakeDevice(**{name: usb_error(number) for name, number in device.items()})

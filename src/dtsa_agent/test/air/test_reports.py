@@ -27,18 +27,10 @@ def needed(text: str, others: int) -> int:
     return int(station.status.needed)
 
 
-@pytest.mark.parametrize(
-    ("text", "by_others"),
-    [
-        (ALL_BUT_ONE, {1: 1, 2: 1, 3: 2, 11: 10}),
-        ("100%", {1: 1, 11: 11}),
-        ("80%", {1: 1, 5: 4, 10: 8, 11: 9}),
-        ("33.4%", {3: 2}),
-        ("0%", {11: 0}),
-        ("0", {11: 0}),
-        ("3", {3: 3, 11: 3}),
-    ],
-)
+@pytest.mark.parametrize(("text", "by_others"), [
+    (ALL_BUT_ONE, {1: 1, 2: 1, 3: 2, 11: 10}), ("100%", {1: 1, 11: 11}), ("80%", {1: 1, 5: 4, 10: 8, 11: 9}),
+    ("33.4%", {3: 2}), ("0%", {11: 0}), ("0", {11: 0}), ("3", {3: 3, 11: 3}),
+])  # fmt: skip
 def test_how_many_others_are_needed(text: str, by_others: dict[int, int]) -> None:
     assert {others: needed(text, others) for others in by_others} == by_others
 

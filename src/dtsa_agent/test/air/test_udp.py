@@ -35,35 +35,24 @@ KEY = bytes.fromhex("8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4")
 CONFIG = SwarmConfig(agents=3, policy="lease")
 
 
-@pytest.mark.parametrize(
-    ("field", "values"),
-    [
-        ("interface", {"interface": "none0"}),
-        ("interface", {}),
-        ("group", {"interface": "lo", "group": "10.0.0.1:7000"}),
-        ("group", {"interface": "lo", "group": "239.1.1.1"}),
-        ("group", {"interface": "lo", "group": "239.1.1.1:0"}),
-        ("group", {"interface": "lo", "group": "239.1.1.1:70000"}),
-        ("group", {"interface": "lo", "group": "239.1.1:7000"}),
-        ("ttl", {"interface": "lo", "ttl": 0}),
-    ],
-)
+@pytest.mark.parametrize(("field", "values"), [
+    ("interface", {"interface": "none0"}), ("interface", {}), ("group", {"interface": "lo", "group": "10.0.0.1:7000"}),
+    ("group", {"interface": "lo", "group": "239.1.1.1"}), ("group", {"interface": "lo", "group": "239.1.1.1:0"}),
+    ("group", {"interface": "lo", "group": "239.1.1.1:70000"}), ("group", {"interface": "lo", "group": "239.1.1:7000"}),
+    ("ttl", {"interface": "lo", "ttl": 0}),
+])  # fmt: skip
 def test_networks_that_cannot_be_used_are_refused_by_name(field: str, values: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as error:
         UdpSettings.from_dict(values)
     assert error.value.field == field
 
 
-@pytest.mark.parametrize(
-    ("field", "own", "config", "key"),
-    [
-        ("id", 4, CONFIG, ""),
-        ("policy", 1, dataclasses.replace(CONFIG, policy="dtsa"), ""),
-        ("DTSA_AUTH_KEY", 1, dataclasses.replace(CONFIG, auth=True, auth_session=1), ""),
-        ("auth_key", 1, dataclasses.replace(CONFIG, auth=True, auth_session=1), "00" * 16),
-        ("auth_session", 1, dataclasses.replace(CONFIG, auth=True), KEY.hex()),
-    ],
-)
+@pytest.mark.parametrize(("field", "own", "config", "key"), [
+    ("id", 4, CONFIG, ""), ("policy", 1, dataclasses.replace(CONFIG, policy="dtsa"), ""),
+    ("DTSA_AUTH_KEY", 1, dataclasses.replace(CONFIG, auth=True, auth_session=1), ""),
+    ("auth_key", 1, dataclasses.replace(CONFIG, auth=True, auth_session=1), "00" * 16),
+    ("auth_session", 1, dataclasses.replace(CONFIG, auth=True), KEY.hex()),
+])  # fmt: skip
 def test_agents_that_cannot_fly_are_refused_by_name(
     monkeypatch: pytest.MonkeyPatch, field: str, own: int, config: SwarmConfig, key: str
 ) -> None:

@@ -60,18 +60,10 @@ def test_the_key_is_never_shown() -> None:
     assert Authenticator.from_hex(RANDOM_KEY).seal(b"x", 1) == Authenticator(bytes.fromhex(RANDOM_KEY)).seal(b"x", 1)
 
 
-@pytest.mark.parametrize(
-    "key",
-    [
-        bytes(16),
-        b"\xa5" * 32,
-        b"secret" * 4,
-        b"swarmkey" * 2,
-        bytes(range(32)),
-        bytes(range(255, 239, -1)),
-        bytes(17 * k % 256 for k in range(16)),
-    ],
-)
+@pytest.mark.parametrize("key", [
+    bytes(16), b"\xa5" * 32, b"secret" * 4, b"swarmkey" * 2, bytes(range(32)), bytes(range(255, 239, -1)),
+    bytes(17 * k % 256 for k in range(16)),
+])  # fmt: skip
 def test_keys_that_are_a_pattern_are_refused(key: bytes) -> None:
     with pytest.raises(ConfigError, match="auth_key: got 'bytes in a pattern'; allowed: random ones"):
         Authenticator.from_hex(key.hex())

@@ -29,12 +29,9 @@ def make_case(seed: int, count: int, size: float, speed: float = 1.5) -> Case:
 
 
 cases = st.builds(
-    make_case,
-    seed=st.integers(0, 2**32 - 1),
-    count=st.integers(1, 45),
-    size=st.sampled_from([0.3, 0.8, 1.5, 3.0, 8.0]),
-    speed=st.sampled_from([0.0, 1.5, 3.0]),
-)
+    make_case, seed=st.integers(0, 2**32 - 1), count=st.integers(1, 45),
+    size=st.sampled_from([0.3, 0.8, 1.5, 3.0, 8.0]), speed=st.sampled_from([0.0, 1.5, 3.0]),
+)  # fmt: skip
 
 
 def command(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np.ndarray:
@@ -45,13 +42,9 @@ def command(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np
 # --- the compiled kernel computes what the formulas say -------------------------------------------
 
 orca_params = st.builds(
-    AvoiderParams,
-    radius=st.floats(0.2, 0.6),
-    horizon=st.floats(0.5, 3),
-    softness=st.sampled_from([1.0, 30.0, 300.0]),
-    bias=st.floats(-0.3, 0.3),
-    margin_rate=st.sampled_from([0.0, 0.05, 0.5]),
-)
+    AvoiderParams, radius=st.floats(0.2, 0.6), horizon=st.floats(0.5, 3), softness=st.sampled_from([1.0, 30.0, 300.0]),
+    bias=st.floats(-0.3, 0.3), margin_rate=st.sampled_from([0.0, 0.05, 0.5]),
+)  # fmt: skip
 
 
 def off_the_edges(model: FlightModel, case: Case, age: np.ndarray | None) -> bool:
@@ -174,20 +167,11 @@ def test_options_replace_values_of_all_groups() -> None:
     assert FLIGHT_MODELS["orca"].avoider.v_max == 1.5
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "field"),
-    [
-        ("orcas", {}, "avoider"),
-        ("orca", {"speed": 1.0}, "options.speed"),
-        ("orca", {"v_max": 0.0}, "v_max"),
-        ("orca", {"v_max": math.nan}, "v_max"),
-        ("orca", {"v_max": "fast"}, "v_max"),
-        ("orca", {"v_max": True}, "v_max"),
-        ("orca", {"tau": -1.0}, "tau"),
-        ("orca", {"spacing": 0.0}, "spacing"),
-        ("potential", {"core": 1.31}, "core"),
-    ],
-)
+@pytest.mark.parametrize(("name", "options", "field"), [
+    ("orcas", {}, "avoider"), ("orca", {"speed": 1.0}, "options.speed"), ("orca", {"v_max": 0.0}, "v_max"),
+    ("orca", {"v_max": math.nan}, "v_max"), ("orca", {"v_max": "fast"}, "v_max"), ("orca", {"v_max": True}, "v_max"),
+    ("orca", {"tau": -1.0}, "tau"), ("orca", {"spacing": 0.0}, "spacing"), ("potential", {"core": 1.31}, "core"),
+])  # fmt: skip
 def test_bad_settings_are_named(name: str, options: dict, field: str) -> None:
     with pytest.raises(ConfigError) as caught:
         flight_model(name, options)

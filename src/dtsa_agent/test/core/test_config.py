@@ -18,21 +18,12 @@ def test_all_but_one_of_an_odd_swarm_move_by_default() -> None:
     assert SwarmConfig(agents=1).moving == 0
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "allowed"),
-    [
-        ("agents", 0, "1 to 1024"),
-        ("moving", 13, "the number of agents"),
-        ("extent_m", 0.5, "1 to 10000 m"),
-        ("policy", 7, "tdma, dtsa"),
-        ("selection", "first", "candidates, pairwise"),
-        ("slot_ms", -10, "0.3 to 1000 ms"),
-        ("seed", -1, "0 to 9223372036854775807"),
-        ("epsilon", 1.5, "0 to 1"),
-        ("r_min", 0.0, "0.001 to 100 m"),
-        ("options", {"v_mx": 1.0}, "v_max"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "allowed"), [
+    ("agents", 0, "1 to 1024"), ("moving", 13, "the number of agents"), ("extent_m", 0.5, "1 to 10000 m"),
+    ("policy", 7, "tdma, dtsa"), ("selection", "first", "candidates, pairwise"), ("slot_ms", -10, "0.3 to 1000 ms"),
+    ("seed", -1, "0 to 9223372036854775807"), ("epsilon", 1.5, "0 to 1"), ("r_min", 0.0, "0.001 to 100 m"),
+    ("options", {"v_mx": 1.0}, "v_max"),
+])  # fmt: skip
 def test_errors_name_field_value_and_what_is_allowed(field: str, value: object, allowed: str) -> None:
     with pytest.raises(ConfigError) as caught:
         SwarmConfig(**{field: value})  # type: ignore[arg-type]

@@ -93,17 +93,14 @@ def test_gossip_at_the_codecs_limit_is_not_believed() -> None:
         assert swarm.sent_position[0, 0, 3] == pytest.approx(5.0, abs=0.002)
 
 
-@pytest.mark.parametrize(
-    ("settings", "reach"),
-    [
-        ({"axis_x_m": 64.0, "jitter_m": 0.0}, 64.0),
-        ({"axis_x_m": 10.0, "shape": "ellipsoid", "axis_z_m": 80.0, "jitter_m": 0.0}, 75.0),
-        ({"agents": 600, "jitter_m": 0.0}, 0.9 * 600 / (2 * np.pi)),
-        ({"agents": 4, "axis_x_m": 90.0, "scenario": "waypoints"}, 90.0),
-        ({"agents": 1000, "moving": 100, "scenario": "streams"}, 900 / (2 * np.pi)),
-        ({"agents": 1, "moving": 1, "axis_x_m": 63.0, "jitter_m": 0.0}, 63.9),
-    ],
-)
+@pytest.mark.parametrize(("settings", "reach"), [
+    ({"axis_x_m": 64.0, "jitter_m": 0.0}, 64.0),
+    ({"axis_x_m": 10.0, "shape": "ellipsoid", "axis_z_m": 80.0, "jitter_m": 0.0}, 75.0),
+    ({"agents": 600, "jitter_m": 0.0}, 0.9 * 600 / (2 * np.pi)),
+    ({"agents": 4, "axis_x_m": 90.0, "scenario": "waypoints"}, 90.0),
+    ({"agents": 1000, "moving": 100, "scenario": "streams"}, 900 / (2 * np.pi)),
+    ({"agents": 1, "moving": 1, "axis_x_m": 63.0, "jitter_m": 0.0}, 63.9),
+])  # fmt: skip
 def test_what_does_not_fit_is_refused_with_the_extent_that_does(settings: dict[str, object], reach: float) -> None:
     config = SwarmConfig(**settings)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"extent_m: got 65\.534; allowed: .* m or more: starts and goals") as caught:

@@ -22,14 +22,9 @@ from dtsa_agent.core.reference import frame_extended as plain
 
 OWN = Frame(3, 17, 1, (1.0, 2.0, -3.0), (0.5, -0.5, 0.0), (1.0, 0.0, 0.0))
 FULL = ExtendedFrame(
-    OWN,
-    2,
-    False,
-    True,
-    (Gossip(7, 5, True, (1.0, 1.0, 1.0), (0.0, 0.0, -1.0)),),
-    b"\x01\xff" + bytes(9),
+    OWN, 2, False, True, (Gossip(7, 5, True, (1.0, 1.0, 1.0), (0.0, 0.0, -1.0)),), b"\x01\xff" + bytes(9),
     ((1, 4), (24, 255)),
-)
+)  # fmt: skip
 FAR = ExtendedFrame(OWN, far=(25, 33, 104), far_lessee=9)
 GOLDEN = [
     (ExtendedFrame(OWN), "1203000111000000f401e80324fa32e0fc004006000000" + "00" * 33),
@@ -57,13 +52,9 @@ def frames(draw: st.DrawFn) -> ExtendedFrame:
     far = tuple(sorted(draw(fars))) if room else ()
     room -= bool(far)
     own = Frame(
-        draw(st.integers(1, 254)),
-        draw(st.integers(0, 2**32 - 1)),
-        draw(st.integers(0, 1)),
-        draw(vectors),
-        draw(velocities),
-        draw(velocities),
-    )
+        draw(st.integers(1, 254)), draw(st.integers(0, 2**32 - 1)), draw(st.integers(0, 1)), draw(vectors),
+        draw(velocities), draw(velocities),
+    )  # fmt: skip
     leaving = draw(st.booleans())
     c_s = 0 if leaving else draw(st.integers(0, 253))
     return ExtendedFrame(

@@ -161,15 +161,9 @@ def test_the_mailbox_wakes_its_worker() -> None:
 # -- safety rules -----------------------------------------------------------------------------------------------------
 def vehicle(name: str = "cf1", **changes: Any) -> Watched:
     values: dict[str, Any] = {
-        "name": name,
-        "state": State.FLYING,
-        "position": (0.0, 0.0, 0.0),
-        "battery": 3.9,
-        "battery_warning": 3.4,
-        "battery_critical": 3.2,
-        "log_age": 0.02,
-        "command_age": 0.02,
-    }
+        "name": name, "state": State.FLYING, "position": (0.0, 0.0, 0.0), "battery": 3.9, "battery_warning": 3.4,
+        "battery_critical": 3.2, "log_age": 0.02, "command_age": 0.02,
+    }  # fmt: skip
     return Watched(**(values | changes))
 
 

@@ -37,19 +37,14 @@ def offer(t: Tracker, place: Any, at: float, *, q: Any = LEVEL, frame: str = "wo
     return t.offer(place, q, frame, 1000.0 + at, at, flying=flying)
 
 
-@pytest.mark.parametrize(
-    ("pose", "kind", "words"),
-    [
-        ({"place": (math.nan, 0.0, 0.0)}, "not finite", "not finite"),
-        ({"place": (0.0, 0.0, math.inf)}, "not finite", "not finite"),
-        ({"place": (5.0, 0.0, 0.0)}, "outside", "3.50 m outside the room in x"),
-        ({"q": (0.0, 0.0, 0.0, 0.0)}, "quaternion", "length 0, not 1"),
-        ({"frame": "odom"}, "frame", "'odom' is neither world nor map"),
-        ({"at": 0.99}, "stamp", "0.010 s before"),
-        ({"at": 1.0}, "stamp", "0.000 s before"),
-        ({"place": (1.0, 0.0, 0.0)}, "jump", "jumps by 1.00 m"),
-    ],
-)
+@pytest.mark.parametrize(("pose", "kind", "words"), [
+    ({"place": (math.nan, 0.0, 0.0)}, "not finite", "not finite"),
+    ({"place": (0.0, 0.0, math.inf)}, "not finite", "not finite"),
+    ({"place": (5.0, 0.0, 0.0)}, "outside", "3.50 m outside the room in x"),
+    ({"q": (0.0, 0.0, 0.0, 0.0)}, "quaternion", "length 0, not 1"),
+    ({"frame": "odom"}, "frame", "'odom' is neither world nor map"), ({"at": 0.99}, "stamp", "0.010 s before"),
+    ({"at": 1.0}, "stamp", "0.000 s before"), ({"place": (1.0, 0.0, 0.0)}, "jump", "jumps by 1.00 m"),
+])  # fmt: skip
 def test_poses_that_cannot_be_are_refused_and_counted(pose: dict[str, Any], kind: str, words: str) -> None:
     t = tracker()
     assert offer(t, (0.0, 0.0, 0.0), 1.0) == ""
@@ -137,18 +132,13 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
 
 
 # -- estimates --------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("place", "variance", "seen", "words"),
-    [
-        ((5.0, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), "motion capture sees it 5.00 m away"),
-        ((0.0, 0.0, 0.0), 1e-5, "not", "motion capture does not see it"),
-        ((0.05, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), ""),
-        ((0.0, 0.0, 0.0), 100.0, None, "variance 100 m^2, limit 0.01 m^2"),
-        ((5.0, 0.0, 0.0), 1e-5, None, "believes to be outside"),
-        ((math.nan, 0.0, 0.0), 1e-5, None, "not finite"),
-        ((0.0, 0.0, 0.0), 1e-5, None, ""),
-    ],
-)
+@pytest.mark.parametrize(("place", "variance", "seen", "words"), [
+    ((5.0, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), "motion capture sees it 5.00 m away"),
+    ((0.0, 0.0, 0.0), 1e-5, "not", "motion capture does not see it"), ((0.05, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), ""),
+    ((0.0, 0.0, 0.0), 100.0, None, "variance 100 m^2, limit 0.01 m^2"),
+    ((5.0, 0.0, 0.0), 1e-5, None, "believes to be outside"), ((math.nan, 0.0, 0.0), 1e-5, None, "not finite"),
+    ((0.0, 0.0, 0.0), 1e-5, None, ""),
+])  # fmt: skip
 def test_settled_is_where_it_stands(place: Any, variance: float, seen: Any, words: str) -> None:
     settling = Settling(0.01, ORIGIN, ROOM, None if seen is None else 0.1)
     settling.restart()

@@ -62,28 +62,16 @@ def test_it_flies_when_all_has_been_well_for_a_while(library: Any) -> None:
     assert guard.step(0.2) == FLY
 
 
-@pytest.mark.parametrize(
-    ("seen", "mode", "reason"),
-    [
-        ({"oldest_s": 1.1}, HOVER, OLD_NEWS),
-        ({"oldest_s": -1.0}, HOVER, OLD_NEWS),
-        ({"oldest_s": float("nan")}, HOVER, OLD_NEWS),
-        ({"rests_s": 3.1}, HOVER, OLD_NEWS),
-        ({"rests_s": float("nan")}, HOVER, OLD_NEWS),
-        ({"unheard_s": 0.6}, HOVER, UNHEARD),
-        ({"unheard_s": -1.0}, HOVER, UNHEARD),
-        ({"newcomer": 1}, HOVER, NEWCOMER),
-        ({"ordered": 1}, LAND, ORDERED),
-        ({"battery_v": 3.0}, LAND, BATTERY),
-        ({"battery_v": float("nan")}, LAND, BATTERY),
-        ({"position": (0.0, 2.1, 1.0)}, LAND, OUTSIDE),
-        ({"position": (0.0, float("nan"), 1.0)}, LAND, OUTSIDE),
-        ({"enabled": 0}, OFF, DISABLED),
-        ({"ground": 1}, OFF, GROUND),
-        ({"can_fly": 0}, OFF, CANNOT_FLY),
-        ({"in_air": 0}, OFF, CANNOT_FLY),
-    ],
-)
+@pytest.mark.parametrize(("seen", "mode", "reason"), [
+    ({"oldest_s": 1.1}, HOVER, OLD_NEWS), ({"oldest_s": -1.0}, HOVER, OLD_NEWS),
+    ({"oldest_s": float("nan")}, HOVER, OLD_NEWS), ({"rests_s": 3.1}, HOVER, OLD_NEWS),
+    ({"rests_s": float("nan")}, HOVER, OLD_NEWS), ({"unheard_s": 0.6}, HOVER, UNHEARD),
+    ({"unheard_s": -1.0}, HOVER, UNHEARD), ({"newcomer": 1}, HOVER, NEWCOMER), ({"ordered": 1}, LAND, ORDERED),
+    ({"battery_v": 3.0}, LAND, BATTERY), ({"battery_v": float("nan")}, LAND, BATTERY),
+    ({"position": (0.0, 2.1, 1.0)}, LAND, OUTSIDE), ({"position": (0.0, float("nan"), 1.0)}, LAND, OUTSIDE),
+    ({"enabled": 0}, OFF, DISABLED), ({"ground": 1}, OFF, GROUND), ({"can_fly": 0}, OFF, CANNOT_FLY),
+    ({"in_air": 0}, OFF, CANNOT_FLY),
+])  # fmt: skip
 def test_each_trouble_has_its_reaction(library: Any, seen: dict[str, Any], mode: int, reason: int) -> None:
     guard = Guard(library)
     assert guard.step(0.5) == FLY

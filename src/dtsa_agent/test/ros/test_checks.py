@@ -50,57 +50,29 @@ def reason(check: Any, *arguments: Any) -> str:
     return ""
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({}, ""),
-        ({"sender": [2, 13]}, UNKNOWN),
-        ({"sender": [0, 2]}, UNKNOWN),
-        ({"sender": [2, 2]}, UNKNOWN),
-        ({"sender": [2]}, SIZES),
-        ({"sender": []}, SIZES),
-        ({"length": []}, SIZES),
-        ({"length": [2, 2]}, SIZES),
-        ({"length": [3, 0]}, SIZES),
-        ({"length": [61, 1], "data": [0] * 62}, SIZES),
-        ({"data": []}, SIZES),
-        ({"received": []}, SIZES),
-        ({"received": [1, 2, 3]}, SIZES),
-        ({"slot": 4_000_000_000}, SLOT),
-        ({"heard_slot": 2**32 - 1}, SLOT),
-        ({"phase": 9}, RANGE),
-        ({"phase": Slot.END}, SIZES),
-    ],
-)
+@pytest.mark.parametrize(("change", "expected"), [
+    ({}, ""), ({"sender": [2, 13]}, UNKNOWN), ({"sender": [0, 2]}, UNKNOWN), ({"sender": [2, 2]}, UNKNOWN),
+    ({"sender": [2]}, SIZES), ({"sender": []}, SIZES), ({"length": []}, SIZES), ({"length": [2, 2]}, SIZES),
+    ({"length": [3, 0]}, SIZES), ({"length": [61, 1], "data": [0] * 62}, SIZES), ({"data": []}, SIZES),
+    ({"received": []}, SIZES), ({"received": [1, 2, 3]}, SIZES), ({"slot": 4_000_000_000}, SLOT),
+    ({"heard_slot": 2**32 - 1}, SLOT), ({"phase": 9}, RANGE), ({"phase": Slot.END}, SIZES),
+])  # fmt: skip
 def test_slot_messages(change: dict[str, Any], expected: str) -> None:
     assert reason(check_slot, Slot(**{**HEARD, **change}), 12) == expected
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({}, ""),
-        ({"agent": []}, UNKNOWN),
-        ({"agent": [2, 1]}, UNKNOWN),
-        ({"agent": [4]}, UNKNOWN),
-        ({"dropped": [1]}, SIZES),
-        ({"settings": "x" * 100_000}, SIZES),
-    ],
-)
+@pytest.mark.parametrize(("change", "expected"), [
+    ({}, ""), ({"agent": []}, UNKNOWN), ({"agent": [2, 1]}, UNKNOWN), ({"agent": [4]}, UNKNOWN),
+    ({"dropped": [1]}, SIZES), ({"settings": "x" * 100_000}, SIZES),
+])  # fmt: skip
 def test_process_messages(change: dict[str, Any], expected: str) -> None:
     assert reason(check_process, Process(**{"agent": [1, 3], **change}), 3) == expected
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "expected"),
-    [
-        ("position.x", 3.0, ""),
-        ("position.x", math.nan, RANGE),
-        ("position.z", 1e6, RANGE),
-        ("orientation.w", 0.0, RANGE),
-        ("orientation.x", math.inf, RANGE),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "expected"), [
+    ("position.x", 3.0, ""), ("position.x", math.nan, RANGE), ("position.z", 1e6, RANGE), ("orientation.w", 0.0, RANGE),
+    ("orientation.x", math.inf, RANGE),
+])  # fmt: skip
 def test_odometry(field: str, value: float, expected: str) -> None:
     message = Odometry()
     part, axis = field.split(".")

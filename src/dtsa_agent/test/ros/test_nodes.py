@@ -196,20 +196,17 @@ def test_parameters_are_described_and_ctrl_c_ends_cleanly(tmp_path: Path) -> Non
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize(
-    ("module", "arguments", "said"),
-    [
-        (AGENT, ["policy:=fifo"], "agent: error: policy: got 'fifo'; allowed: tdma, dtsa"),
-        (AGENT, ["agents:=0"], "agent: error: agents: got 0; allowed: a whole number, 1 to 1024"),
-        (AGENT, ["id:=13"], "agent: error: id: got 13; allowed: 1 to 12"),
-        (AGENT, ["air:=smoke"], "agent: error: air: got 'smoke'"),
-        (AGENT, ["air:=udp", "auth:=false"], "agent: error: interface: got ''"),
-        (AGENT, ["air:=udp", "interface:=lo"], "agent: error: auth_session: got 0"),
-        (AGENT, ["air:=udp", "auth:=false", "interface:=lo", "id:=13"], "agent: error: id: got 13"),
-        (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
-        (HOST, ["policy:=aloha", "shared_table:=true"], "swarm_host: error: shared_table: got True; allowed: false"),
-    ],
-)
+@pytest.mark.parametrize(("module", "arguments", "said"), [
+    (AGENT, ["policy:=fifo"], "agent: error: policy: got 'fifo'; allowed: tdma, dtsa"),
+    (AGENT, ["agents:=0"], "agent: error: agents: got 0; allowed: a whole number, 1 to 1024"),
+    (AGENT, ["id:=13"], "agent: error: id: got 13; allowed: 1 to 12"),
+    (AGENT, ["air:=smoke"], "agent: error: air: got 'smoke'"),
+    (AGENT, ["air:=udp", "auth:=false"], "agent: error: interface: got ''"),
+    (AGENT, ["air:=udp", "interface:=lo"], "agent: error: auth_session: got 0"),
+    (AGENT, ["air:=udp", "auth:=false", "interface:=lo", "id:=13"], "agent: error: id: got 13"),
+    (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
+    (HOST, ["policy:=aloha", "shared_table:=true"], "swarm_host: error: shared_table: got True; allowed: false"),
+])  # fmt: skip
 def test_bad_parameters_are_one_line_and_exit_code_2(
     tmp_path: Path, module: str, arguments: list[str], said: str
 ) -> None:
