@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from waiting import wait_for
 
 from dtsa_agent.air import device_port
 from dtsa_agent.air.crazyradio import CrazyradioPort, CrazyradioSettings, port
@@ -25,11 +26,14 @@ from dtsa_agent.core import ConfigError, SwarmConfig
 
 URI = "radio://0/80/2M"
 SEALED = SwarmConfig(agents=5, policy="lease", slot_ms=20.0, auth=True, auth_session=7)
+WRONG = (
+    "udp://0/80/2M", "radio://0/80", "radio://0/101/2M", "radio://0/-1/2M", "radio://0/80/250K", "radio:///80/2M",
+    "radio://0/80/2M/E7E7E7E7E7", "radio://²/80/2M", "radio://0/8²/2M", "",
+)  # fmt: skip
 US, MS, SECOND = 1_000, 1_000_000, 1_000_000_000
 
 
 def heard(payload: bytes, stamp: int = 0, rssi: int = 45, pipe: int = 0) -> bytes:
-    """What the dongle gives of a packet."""
     return struct.pack("<BBBI", 7 + len(payload), rssi, pipe, stamp) + payload
 
 
@@ -38,26 +42,8 @@ def heard(payload: bytes, stamp: int = 0, rssi: int = 45, pipe: int = 0) -> byte
 
 @pytest.mark.parametrize(
     ("field", "values"),
-    [
-        ("uri", {}),
-        *(
-            ("uri", {"uri": uri})
-            for uri in (
-                "udp://0/80/2M",
-                "radio://0/80",
-                "radio://0/101/2M",
-                "radio://0/-1/2M",
-                "radio://0/80/250K",
-                "radio:///80/2M",
-                "radio://0/80/2M/E7E7E7E7E7",
-                "radio://²/80/2M",
-                "radio://0/8²/2M",
-                "",
-            )
-        ),
-        ("p2p_port", {"uri": URI, "p2p_port": 16}),
-        ("send_time_ns", {"uri": URI, "send_time_ns": -1}),
-    ],
+    [("uri", {}), ("p2p_port", {"uri": URI, "p2p_port": 16}), ("send_time_ns", {"uri": URI, "send_time_ns": -1})]
+    + [("uri", {"uri": uri}) for uri in WRONG],
 )
 def test_dongles_that_cannot_be_are_refused_by_name(field: str, values: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as error:
@@ -226,7 +212,6 @@ class FakeDevice:
 
 @pytest.fixture
 def plugged(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The devices that pyusb finds."""
     core = pytest.importorskip("usb.core")
     devices: list[Any] = []
     monkeypatch.setattr(core, "find", lambda **_: iter(devices))
@@ -284,29 +269,14 @@ def test_what_a_dongle_hears_reaches_the_port_and_what_others_say_is_counted(plu
     plugged.append(device)
     with CrazyradioPort(CrazyradioSettings(uri=URI)) as opened:
         found: list[Any] = []
-        wait(lambda: found.extend(opened.receive(16)) or (bool(found) and bool(opened.counts()["garbled_transfers"])))
+        wait_for(
+            lambda: found.extend(opened.receive(16)) or (bool(found) and bool(opened.counts()["garbled_transfers"]))
+        )
         assert [(one.data, one.own) for one in found] == [(b"ours", False)]
         assert opened.send(b"mine") == ""
         assert device.written == [broadcast(b"mine", 7)]
         counts = opened.counts()
         assert (counts["other_packets"], counts["dropped_by_dongle"]) == (2, 3)
-
-
-def test_hostile_transfers_neither_end_the_port_nor_fill_its_memory(plugged: list[Any]) -> None:
-    draw, device = random.Random(1), FakeDevice()
-    for _ in range(2000):
-        data = draw.randbytes(draw.randrange(129))
-        if draw.random() < 0.5:
-            data = heard(broadcast(data[:61], draw.choice((7, 8)))[5:], draw.getrandbits(32), pipe=draw.randrange(256))
-        device.transfers.append(data)
-    device.transfers.append(heard(broadcast(b"the last", 7)[5:], 5))
-    plugged.append(device)
-    with CrazyradioPort(CrazyradioSettings(uri=URI)) as opened:
-        found: list[Any] = []
-        wait(lambda: found.extend(opened.receive(16)) or not device.transfers)
-        assert opened.send(b"mine") == ""
-        wait(lambda: opened.counts()["strange_stamps"] > 0)
-    assert all(len(one.data) <= 61 and one.arrival_ns <= time.monotonic_ns() for one in found)
 
 
 def test_a_dongle_that_is_unplugged_is_used_again_when_it_is_back(
@@ -320,17 +290,17 @@ def test_a_dongle_that_is_unplugged_is_used_again_when_it_is_back(
     said: list[str] = []
     with CrazyradioPort(CrazyradioSettings(uri=URI)) as opened:
         opened.say = said.append
-        wait(lambda: opened.counts()["dropped_by_dongle"] == 2)
+        wait_for(lambda: opened.counts()["dropped_by_dongle"] == 2)
         plugged.clear()
         device.errors["read"] = device.errors["write"] = device.errors["ctrl_transfer"] = usb_error(errno.ENODEV)
-        wait(lambda: bool(said))
+        wait_for(lambda: bool(said))
         assert opened.send(b"lost") != ""
         again = FakeDevice()
         again.transfers = [heard(broadcast(b"back", 7)[5:], 5)]
         plugged.append(again)
-        wait(lambda: len(said) == 2)
+        wait_for(lambda: len(said) == 2)
         found: list[Any] = []
-        wait(lambda: found.extend(opened.receive(16)) or bool(found))
+        wait_for(lambda: found.extend(opened.receive(16)) or bool(found))
         assert opened.send(b"mine") == ""
         counts = opened.counts()
     assert "has gone" in said[0]
@@ -346,11 +316,3 @@ def test_a_dongle_that_does_not_take_a_packet_is_a_refusal(plugged: list[Any]) -
     with pytest.raises(DongleError):
         Dongle(CrazyradioSettings(uri=URI)).write(b"x")
     assert "crazyradio" not in {thread.name for thread in threading.enumerate()}
-
-
-def wait(condition: Any) -> None:
-    """Until something is so."""
-    end = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.002)
