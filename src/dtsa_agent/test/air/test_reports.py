@@ -9,10 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dtsa_agent.air.datagram import link_of
-from dtsa_agent.air.driver import LiveAgent
 from dtsa_agent.air.reports import Reports
 from dtsa_agent.air.settings import AgentSettings
-from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, Swarm, SwarmConfig
 from dtsa_agent.core.station import ALL_BUT_ONE, FLIES, IS_NEW, NO_QUORUM, STATES, Station, StationSettings
 
@@ -41,14 +39,6 @@ def test_other_words_are_refused(text: str) -> None:
         AgentSettings(id=1, quorum=text)
     assert error.value.field == "quorum"
     assert error.value.value == text
-
-
-def test_a_number_that_can_never_be_there_is_refused() -> None:
-    config = SwarmConfig(agents=3, policy="tdma")
-    with UdpPort(UdpSettings(interface="lo")) as port:
-        LiveAgent(AgentSettings(id=1, quorum="2"), config, port)
-        with pytest.raises(ConfigError, match="at most 2, the number of the others"):
-            LiveAgent(AgentSettings(id=1, quorum="3"), config, port)
 
 
 @given(percent=st.integers(0, 100), others=st.integers(1, 200))
