@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from slot_helpers import one_slot
 
-from dtsa_agent.core import Agent, AgentGroup, ConfigError, SlotOutcome, Swarm, SwarmConfig, decode_frame
+from dtsa_agent.core import REASONS, Agent, AgentGroup, ConfigError, SlotOutcome, Swarm, SwarmConfig
 from dtsa_agent.core.authentication import Authenticator
 
 
@@ -24,18 +24,10 @@ def test_agents_that_share_bytes_only_fly_like_the_swarm(policy: str) -> None:
             agent.on_slot_end(SlotOutcome.FRAME if frames else SlotOutcome.SILENCE)
         assert one_slot(swarm, slot) == frames
         for column, agent in enumerate(agents):
-            assert (agent.decision().chosen, agent.swarm.digest[0]) == (swarm.chosen[0], swarm.digest[column])
+            decision, reason = agent.decision(), REASONS[swarm.reason[column]]
+            assert (decision.chosen, decision.slot, decision.reason) == (swarm.chosen[0], slot, reason)
+            assert agent.swarm.digest[0] == swarm.digest[column]
             assert np.array_equal(agent.swarm.position[:, 0], swarm.position[:, column])
-
-
-def test_a_decision_says_why() -> None:
-    agent = Agent(1, SwarmConfig(agents=2, policy="tdma"))
-    frame = agent.on_slot(0)
-    assert frame is not None
-    assert decode_frame(frame).sender == 1
-    assert (agent.decision().chosen, agent.decision().reason, agent.decision().slot) == (1, "tdma", 0)
-    assert agent.on_slot(1) is None
-    assert agent.decision().chosen == 2
 
 
 def test_commands_lead_to_the_goal_at_any_instant_of_a_slot() -> None:

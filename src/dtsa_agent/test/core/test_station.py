@@ -17,7 +17,7 @@ from dtsa_agent.core.reference import station as reference
 from dtsa_agent.core.reference.agent import Agent
 from dtsa_agent.core.reference.rules import Rules
 from dtsa_agent.core.reference.table import Table
-from dtsa_agent.core.station import FLIES, STATES, VERDICTS, Link, Named, Station, StationSettings, parse_quorum
+from dtsa_agent.core.station import FLIES, STATES, VERDICTS, Link, Named, Station, StationSettings
 
 MS = 1_000_000
 NETWORK = Link(b"DT\x01\x00abcd", True, 4, 100_000, MS)  # UDP, a modem, a Crazyradio, nothing but frames
@@ -64,21 +64,15 @@ def link_fields(link: Link) -> tuple[Any, ...]:
 
 # Datagrams.
 
+NAMED = "0100 1900 0300 fdff 00000000 00000000"
+
 
 @pytest.mark.parametrize(
     ("link", "names", "head", "tag"),
     [
-        (
-            NETWORK,
-            (Named(1, 250_000), Named(3, -30_000)),
-            "4454 0100 61626364 0c00 0100 1900 0300 fdff 00000000 00000000",
-            "",
-        ),
-        (
-            NETWORK,
-            (Named(1, 250_000), Named(3, -30_000)),
-            "4454 0100 61626364 0c00 0100 1900 0300 fdff 00000000 00000000",
-            "d0479231",
+        *(
+            (NETWORK, (Named(1, 250_000), Named(3, -30_000)), f"4454 0100 61626364 0c00 {NAMED}", tag)
+            for tag in ("", "d0479231")
         ),
         (LINKS[1], (Named(5, 0),), "6162 0c00 0500 0000", ""),
         (LINKS[2], (), "61626364 0000 0000", "fc31df13"),
@@ -313,12 +307,6 @@ def test_settings_that_cannot_be_make_no_station(fault: dict[str, Any]) -> None:
         setattr(own.c, name, key if name == "key" else value)
     assert lib.dtsa_station_bytes(own.c) == 0
     assert not lib.dtsa_station_start(memory, 80_000, own.c, behind, 0)
-
-
-@given(st.integers(0, 100), st.integers(1, 254))
-def test_a_quorum_means_a_number_of_others(percent: int, number: int) -> None:
-    assert parse_quorum(f"{percent}%") == (lib.DTSA_QUORUM_SHARE, percent / 100)
-    assert parse_quorum(str(number)) == (number, 0.0)
 
 
 def test_a_quorum_of_more_than_the_others_is_refused() -> None:
