@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
-from dtsa_agent.core.reference.station import Station
 from dtsa_channel_sim import AgentClock
 
 _PPB = 1_000_000_000
@@ -19,14 +16,3 @@ def to_channel(clock: AgentClock, local_ns: int) -> int:
     """The first ns of the channel's time at which a clock shows a local time, or has passed it."""
     # to_local(c) >= l  <=>  c (1e9 + drift) >= (l - offset) 1e9, because floor(x) >= n <=> x >= n.
     return -(-(local_ns - clock.offset_ns) * _PPB // (_PPB + clock.drift_ppb))
-
-
-class ClockAligner:
-    """How an agent's slots move with frames that are off by 1 ms at most, as a station states it."""
-
-    def __init__(self) -> None:
-        self._state = SimpleNamespace(offsets=[])
-
-    def hear(self, offset_ns: int) -> int:
-        """By how much the slots move, ns; offset_ns: how much later than expected a frame came."""
-        return Station._align(self._state, offset_ns) if abs(offset_ns) <= 1_000_000 else 0

@@ -13,15 +13,10 @@ from dtsa_channel_sim.model.airtime import RADIOS
 MS = 1_000_000
 AIRTIME = RADIOS["crazyflie"].airtime
 TOTAL, BACK = AIRTIME.total_ns(56), AIRTIME.from_radio_ns(56)
-FRAMES = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 8 * MS), st.integers(1, 60)), min_size=1, max_size=40)
 
 
 def line(agents=6, **config):
     return Air(Channel(ChannelConfig(agents=agents, radio="crazyflie", **config)))
-
-
-def summary(verdicts):
-    return [(v.frame_id, v.start_ns, v.arrival_ns, v.received.tolist(), v.lost, v.collided) for v in verdicts]
 
 
 @pytest.mark.parametrize(("later_ns", "waits_ns"), [(-1, 0), (0, BACK), (1, BACK - 1), (BACK - 1, 1), (BACK, 0)])

@@ -6,7 +6,6 @@ import dataclasses
 import errno
 import math
 import re
-import threading
 from contextlib import nullcontext
 from typing import Any
 
@@ -146,16 +145,6 @@ def test_an_order_ends_the_stream_and_an_urgent_one_empties_the_box() -> None:
     box.close()
     assert box.get() is urgent
     assert box.get() is None
-
-
-def test_the_mailbox_wakes_its_worker() -> None:
-    box = Outbox()
-    got: list[object] = []
-    worker = threading.Thread(target=lambda: got.append(box.get()))
-    worker.start()
-    box.put_setpoint(Setpoint("position", (1,), 0.0))
-    worker.join(5)
-    assert got
 
 
 # -- safety rules -----------------------------------------------------------------------------------------------------
