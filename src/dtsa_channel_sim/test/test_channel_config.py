@@ -53,18 +53,14 @@ def test_bad_settings_name_the_field(settings, field):
 
 
 FULL = {
-    "agents": 12,
-    "slot_ms": 20,
-    "seed": 7,
-    "loss": 0.1,
-    "burst_length": 5,
+    "agents": 12, "slot_ms": 20, "seed": 7, "loss": 0.1, "burst_length": 5,
     "link_loss": [{"from": 1, "to": [2, 3], "loss": 0.4, "both_ways": True}],
     "schedule": [
         {"slot": 100, "until": 200, "jam": True},
         {"at_s": 5.01, "partition": [[1, 2, 3], [4, 5]]},
         {"at_s": 8, "until_s": 9, "loss": 0.3},
     ],
-}
+}  # fmt: skip
 
 
 def test_dict_round_trip_through_json():

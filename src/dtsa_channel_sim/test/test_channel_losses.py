@@ -222,11 +222,9 @@ def test_a_jam_does_not_disturb_the_draws_around_it():
 
 
 GOLDEN = {
-    "independent": "0362d9ed79b65cfc",
-    "bursts": "70d2a72610f651d7",
-    "links": "9da96351be9a63ce",
+    "independent": "0362d9ed79b65cfc", "bursts": "70d2a72610f651d7", "links": "9da96351be9a63ce",
     "mixed": "e3986e5b289480bd",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("model", MODELS)

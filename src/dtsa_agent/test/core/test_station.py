@@ -67,18 +67,14 @@ def link_fields(link: Link) -> tuple[Any, ...]:
 NAMED = "0100 1900 0300 fdff 00000000 00000000"
 
 
-@pytest.mark.parametrize(
-    ("link", "names", "head", "tag"),
-    [
-        *(
-            (NETWORK, (Named(1, 250_000), Named(3, -30_000)), f"4454 0100 61626364 0c00 {NAMED}", tag)
-            for tag in ("", "d0479231")
-        ),
-        (LINKS[1], (Named(5, 0),), "6162 0c00 0500 0000", ""),
-        (LINKS[2], (), "61626364 0000 0000", "fc31df13"),
-        (LINKS[3], (), "", ""),
-    ],
-)
+@pytest.mark.parametrize(("link", "names", "head", "tag"), [
+    *(
+        (NETWORK, (Named(1, 250_000), Named(3, -30_000)), f"4454 0100 61626364 0c00 {NAMED}", tag)
+        for tag in ("", "d0479231")
+    ),
+    (LINKS[1], (Named(5, 0),), "6162 0c00 0500 0000", ""), (LINKS[2], (), "61626364 0000 0000", "fc31df13"),
+    (LINKS[3], (), "", ""),
+])  # fmt: skip
 def test_golden_datagrams(link: Link, names: tuple[Named, ...], head: str, tag: str) -> None:
     """Written by hand from the layout in docs/reference/network.md, but for the tags."""
     station = settings_of("tdma", link, bool(tag))

@@ -28,20 +28,13 @@ def fly(slots: int, **settings: Any) -> tuple[Swarm, list[list[int]]]:
 def test_never_two_senders_and_everyone_agrees(policy: str, agents: int, data: st.DataObject) -> None:
     """Every agent has a table of its own here, fed by what it hears only."""
     moving = 2 * data.draw(st.integers(0, agents // 2))
-    swarm = Swarm(
-        SwarmConfig(
-            agents=agents,
-            moving=moving,
-            policy=policy,
-            seed=data.draw(st.integers(0, 10**6)),
-            estimator=data.draw(st.sampled_from(["hold", "linear", "intent"])),
-            selection=data.draw(st.sampled_from(["candidates", "pairwise"])),
-            epsilon=data.draw(st.sampled_from([0.0, 0.1, 0.5, 1.0])),
-            boot_round=data.draw(st.booleans()),
-            age_cap=data.draw(st.sampled_from([0.0, 1.0, 1.5, 10.0])),
-            return_every=data.draw(st.sampled_from([0, 1, 20])),
-        )
-    )
+    swarm = Swarm(SwarmConfig(
+        agents=agents, moving=moving, policy=policy, seed=data.draw(st.integers(0, 10**6)),
+        estimator=data.draw(st.sampled_from(["hold", "linear", "intent"])),
+        selection=data.draw(st.sampled_from(["candidates", "pairwise"])),
+        epsilon=data.draw(st.sampled_from([0.0, 0.1, 0.5, 1.0])), boot_round=data.draw(st.booleans()),
+        age_cap=data.draw(st.sampled_from([0.0, 1.0, 1.5, 10.0])), return_every=data.draw(st.sampled_from([0, 1, 20])),
+    ))  # fmt: skip
     for slot in range(min(700, 6 * agents + 250)):
         senders = list(one_slot(swarm, slot))
         assert len(senders) <= 1

@@ -41,27 +41,25 @@ def on_board(
 
 
 def test_robot_beats_type_beats_all() -> None:
-    settings = parse_swarm(
-        {
-            "robots": {
-                "cf2": {"uri": "radio://0/80/2M/E7E7E7E702", "type": "small", "log_rate_hz": 20},
-                "cf1": {"uri": "radio://0/80/2M/E7E7E7E701"},
-                "cf9": {"uri": "radio://0/80/2M/E7E7E7E709", "enabled": False},
+    settings = parse_swarm({
+        "robots": {
+            "cf2": {"uri": "radio://0/80/2M/E7E7E7E702", "type": "small", "log_rate_hz": 20},
+            "cf1": {"uri": "radio://0/80/2M/E7E7E7E701"},
+            "cf9": {"uri": "radio://0/80/2M/E7E7E7E709", "enabled": False},
+        },
+        "robot_types": {"small": {"command_rate_hz": 20, "battery": {"voltage_warning": 3.6}}},
+        "all": {
+            "command_rate_hz": 30,
+            "log_rate_hz": 30,
+            "battery": {"voltage_critical": 3.1},
+            "firmware_params": {"stabilizer": {"estimator": 2}},
+            "firmware_logging": {
+                "enabled": True,
+                "default_topics": {"pose": {"frequency": 10}},
+                "custom_topics": {"volts": {"frequency": 5, "vars": ["pm.vbat"]}},
             },
-            "robot_types": {"small": {"command_rate_hz": 20, "battery": {"voltage_warning": 3.6}}},
-            "all": {
-                "command_rate_hz": 30,
-                "log_rate_hz": 30,
-                "battery": {"voltage_critical": 3.1},
-                "firmware_params": {"stabilizer": {"estimator": 2}},
-                "firmware_logging": {
-                    "enabled": True,
-                    "default_topics": {"pose": {"frequency": 10}},
-                    "custom_topics": {"volts": {"frequency": 5, "vars": ["pm.vbat"]}},
-                },
-            },
-        }
-    )
+        },
+    })  # fmt: skip
     first, second = settings.robots
     assert (first.name, first.id, first.command_rate_hz, first.log_rate_hz) == ("cf1", 1, 30, 30)
     assert (second.command_rate_hz, second.log_rate_hz) == (20, 20)
@@ -73,49 +71,37 @@ def cf1(**more: Any) -> dict[str, Any]:
     return swarm(robots={"cf1": {"uri": "udp://h:1"} | more})
 
 
-@pytest.mark.parametrize(
-    ("data", "field"),
-    [
-        (None, "robots"),
-        ([], "config"),
-        (swarm(robotz={}), "config.robotz"),
-        (swarm(robots={}), "robots"),
-        (swarm(robots={"drone": {"uri": "udp://h:1"}}), "robots"),
-        (swarm(robots={"cf1": {}}), "robots.cf1.uri"),
-        (swarm(robots={"cf1": {"uri": "radio:/0"}}), "robots.cf1.uri"),
-        (cf1(type="big"), "robots.cf1.type"),
-        (cf1(colour=1), "robots.cf1.colour"),
-        (cf1(log_rate_hz=200), "robots.cf1.log_rate_hz"),
-        (cf1(group_mask=256), "robots.cf1.group_mask"),
-        *(
-            (cf1(initial_position=place), "robots.cf1.initial_position")
-            for place in ([1, 2], [math.nan, 0, 0], [0, math.inf, 0])
-        ),
-        *((cf1(uri=uri), "robots.cf1.uri") for uri in ("radio://0/200/2M/E7E7E7E701", "udp://h:99999", "udp://h:0")),
-        (cf1(firmware_params={"locSrv": {"extPosStdDev": math.nan}}), "robots.cf1.firmware_params.locSrv.extPosStdDev"),
-        (swarm(robots=["cf1", "cf2"]), "robots"),
-        (swarm(robots={"cf0": {"uri": "udp://h:1"}}), "robots.cf0.id"),
-        (swarm(robots={"cf1": {"uri": RADIO}, "cf2": {"uri": f"{RADIO}?rate_limit=100"}}), "robots.cf2.uri"),
-        (swarm(station={"safety": {"geofence_max": [1.5, math.inf, 1]}}), "station.safety.geofence_max"),
-        (swarm(robots={"cf1": {"uri": "udp://h:1"}, "cf2": {"uri": "udp://h:1"}}), "robots.cf2.uri"),
-        (swarm(robots={"cf1": {"uri": "udp://h:1"}, "a1": {"uri": "udp://h:2"}}), "robots.a1"),
-        (swarm(all={"battery": {"voltage_critical": 4.0}}), "robots.cf1.battery.voltage_critical"),
-        (swarm(station={"min_connected": 2}), "station.min_connected"),
-        (swarm(station={"safety": {"geofence_min": [2, 0, 0]}}), "station.safety.geofence_min"),
-        (swarm(station={"safety": {"command_age_s": 0.6}}), "station.safety.command_age_s"),
-        (swarm(station={"safety": {"geofenze": True}}), "station.safety.geofenze"),
-        (on_board(swarm={"policy": "lease", "agents": 3}), "station.on_board.swarm.agents"),
-        (on_board(swarm={"policy": "lease", "slots": 3}), "station.on_board.swarm.slots"),
-        (on_board(swarm={"policy": "sotdma"}), "station.on_board.swarm.policy"),
-        (on_board(polls_hz=5), "station.on_board.polls_hz"),
-        (on_board(rate=8), "robots.cf1.log_rate_hz"),
-        (on_board(ids=(1, 3)), "robots.cf3"),
-        (on_board(where=[0.5, 0.0, 0.0]), "robots.cf1.initial_position"),
-        (on_board(safety={}), "station.safety.min_distance_m"),
-        (on_board(positions={"source": "pose"}), "station.positions.source"),
-        (on_board(room_origin_in_world=[1, 0, 1]), "station.room_origin_in_world"),
-    ],
-)
+@pytest.mark.parametrize(("data", "field"), [
+    (None, "robots"), ([], "config"), (swarm(robotz={}), "config.robotz"), (swarm(robots={}), "robots"),
+    (swarm(robots={"drone": {"uri": "udp://h:1"}}), "robots"), (swarm(robots={"cf1": {}}), "robots.cf1.uri"),
+    (swarm(robots={"cf1": {"uri": "radio:/0"}}), "robots.cf1.uri"), (cf1(type="big"), "robots.cf1.type"),
+    (cf1(colour=1), "robots.cf1.colour"), (cf1(log_rate_hz=200), "robots.cf1.log_rate_hz"),
+    (cf1(group_mask=256), "robots.cf1.group_mask"),
+    *(
+        (cf1(initial_position=place), "robots.cf1.initial_position")
+        for place in ([1, 2], [math.nan, 0, 0], [0, math.inf, 0])
+    ),
+    *((cf1(uri=uri), "robots.cf1.uri") for uri in ("radio://0/200/2M/E7E7E7E701", "udp://h:99999", "udp://h:0")),
+    (cf1(firmware_params={"locSrv": {"extPosStdDev": math.nan}}), "robots.cf1.firmware_params.locSrv.extPosStdDev"),
+    (swarm(robots=["cf1", "cf2"]), "robots"), (swarm(robots={"cf0": {"uri": "udp://h:1"}}), "robots.cf0.id"),
+    (swarm(robots={"cf1": {"uri": RADIO}, "cf2": {"uri": f"{RADIO}?rate_limit=100"}}), "robots.cf2.uri"),
+    (swarm(station={"safety": {"geofence_max": [1.5, math.inf, 1]}}), "station.safety.geofence_max"),
+    (swarm(robots={"cf1": {"uri": "udp://h:1"}, "cf2": {"uri": "udp://h:1"}}), "robots.cf2.uri"),
+    (swarm(robots={"cf1": {"uri": "udp://h:1"}, "a1": {"uri": "udp://h:2"}}), "robots.a1"),
+    (swarm(all={"battery": {"voltage_critical": 4.0}}), "robots.cf1.battery.voltage_critical"),
+    (swarm(station={"min_connected": 2}), "station.min_connected"),
+    (swarm(station={"safety": {"geofence_min": [2, 0, 0]}}), "station.safety.geofence_min"),
+    (swarm(station={"safety": {"command_age_s": 0.6}}), "station.safety.command_age_s"),
+    (swarm(station={"safety": {"geofenze": True}}), "station.safety.geofenze"),
+    (on_board(swarm={"policy": "lease", "agents": 3}), "station.on_board.swarm.agents"),
+    (on_board(swarm={"policy": "lease", "slots": 3}), "station.on_board.swarm.slots"),
+    (on_board(swarm={"policy": "sotdma"}), "station.on_board.swarm.policy"),
+    (on_board(polls_hz=5), "station.on_board.polls_hz"), (on_board(rate=8), "robots.cf1.log_rate_hz"),
+    (on_board(ids=(1, 3)), "robots.cf3"), (on_board(where=[0.5, 0.0, 0.0]), "robots.cf1.initial_position"),
+    (on_board(safety={}), "station.safety.min_distance_m"),
+    (on_board(positions={"source": "pose"}), "station.positions.source"),
+    (on_board(room_origin_in_world=[1, 0, 1]), "station.room_origin_in_world"),
+])  # fmt: skip
 def test_bad_configuration_names_the_field(data: object, field: str) -> None:
     with pytest.raises(ConfigError) as error:
         parse_swarm(data)
