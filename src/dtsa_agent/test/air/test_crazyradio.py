@@ -37,9 +37,6 @@ def heard(payload: bytes, stamp: int = 0, rssi: int = 45, pipe: int = 0) -> byte
     return struct.pack("<BBBI", 7 + len(payload), rssi, pipe, stamp) + payload
 
 
-# -- settings --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("field", "values"),
     [("uri", {}), ("p2p_port", {"uri": URI, "p2p_port": 16}), ("send_time_ns", {"uri": URI, "send_time_ns": -1})]
@@ -63,9 +60,6 @@ def test_a_sealed_frame_fills_the_packet_and_others_have_room_for_two_bytes() ->
     assert trust_ns(SEALED, properties) == SEALED.slot_ns // 4, "a wrong send_time_ns is no other time"
     with pytest.raises(ConfigError, match="slot_ms"):
         check_fits(SwarmConfig(agents=5, policy="lease", slot_ms=9.9), properties)
-
-
-# -- bytes -----------------------------------------------------------------------------------------------------------
 
 
 @given(
@@ -109,9 +103,6 @@ def test_a_datagram_comes_out_as_it_went_in_on_its_port_alone(data: bytes, sent_
     assert transfer[:5] == BROADCAST == b"\xff\xe7\xe7\xe7\xe7"
     assert transfer[5:7] == bytes((0xFF, 0x80 | sent_on))
     assert datagram_in(transfer[5:], heard_on) == (data if sent_on == heard_on else None)
-
-
-# -- stamps ----------------------------------------------------------------------------------------------------------
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-40e-6, 40e-6), st.integers(1, 2**20))
@@ -163,9 +154,6 @@ def test_a_wrong_stamp_that_seems_early_misleads_the_clock_for_a_while_only() ->
         now += 10 * MS
         arrival = clock.arrival_ns(10_000 * k + (900_000 if k == 50 else 0), now)
     assert arrival == pytest.approx(now, abs=2 * US)
-
-
-# -- dongles ---------------------------------------------------------------------------------------------------------
 
 
 class FakeDevice:
@@ -279,9 +267,7 @@ def test_what_a_dongle_hears_reaches_the_port_and_what_others_say_is_counted(plu
         assert (counts["other_packets"], counts["dropped_by_dongle"]) == (2, 3)
 
 
-def test_a_dongle_that_is_unplugged_is_used_again_when_it_is_back(
-    plugged: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dongle_that_was_unplugged_is_used_again(plugged: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_port, "_LOOK_S", 0.01)
     monkeypatch.setattr(port, "_SECOND", 0)  # counts are asked for all the time
     device = FakeDevice()

@@ -57,9 +57,7 @@ def test_a_key_belongs_to_authenticated_swarms_and_only_there() -> None:
 
 @pytest.mark.parametrize("sealed", [False, True])
 @pytest.mark.parametrize(("policy", "scenario"), [("tdma", "exchange"), ("dtsa", "exchange"), ("age", "stop-and-go")])
-def test_a_group_shares_a_table_until_the_first_frame_that_not_all_have_heard(
-    policy: str, scenario: str, sealed: bool
-) -> None:
+def test_a_group_shares_a_table_until_not_all_have_heard_a_frame(policy: str, scenario: str, sealed: bool) -> None:
     config = SwarmConfig(agents=5, policy=policy, scenario=scenario, seed=6)
     group, plain = AgentGroup(Swarm(config, shared_table=True)), Swarm(config)
     random = np.random.default_rng(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import plain_avoiders
@@ -39,8 +40,6 @@ def command(model: FlightModel, case: Case, age: np.ndarray | None = None) -> np
     return avoid(model, i, case.position[:, i], case.velocity[:, i], case.goal, case.position, case.velocity, age)
 
 
-# --- the compiled kernel computes what the formulas say -------------------------------------------
-
 MARGINS = st.fixed_dictionaries({"margin_rate": st.sampled_from([0.0, 0.1])})
 ORCA = st.fixed_dictionaries({
     "radius": st.floats(0.2, 0.6), "horizon": st.floats(0.5, 3), "softness": st.sampled_from([1.0, 30.0, 300.0]),
@@ -59,17 +58,12 @@ def off_the_edges(model: FlightModel, case: Case, age: np.ndarray | None) -> boo
 @pytest.mark.parametrize(("name", "options"), [*((name, MARGINS) for name in MODELS), ("orca", ORCA)])
 @settings(max_examples=150, deadline=None)
 @given(case=cases, aged=st.booleans(), data=st.data())
-def test_avoiders_command_what_the_formulas_say(
-    name: str, options: st.SearchStrategy[dict[str, float]], case: Case, aged: bool, data: st.DataObject
-) -> None:
+def test_commands_are_what_formulas_say(name: str, options: Any, case: Case, aged: bool, data: st.DataObject) -> None:
     model, age = flight_model(name, data.draw(options)), case.age if aged else None
     assume(off_the_edges(model, case, age))
     # Stiff penalties multiply what rounding does, the walls of bvc by 1e6.
     tolerance = 1e-9 if "bvc" in name or options is ORCA else 1e-12
     assert command(model, case, age) == pytest.approx(plain_avoiders.command(model, case, age), abs=tolerance)
-
-
-# --- what all avoiders promise --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -152,9 +146,6 @@ def test_exchange_with_perfect_knowledge_is_safe(name: str, shortest: float) -> 
     else:
         pytest.fail("did not arrive within 12 s")
     assert nearest > shortest
-
-
-# --- named models and bad input -------------------------------------------------------------------
 
 
 def test_options_replace_values_of_all_groups() -> None:

@@ -8,16 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dtsa_agent.core.errors import LocalProtocolError, RemoteProtocolError
-from dtsa_agent.core.frame import (
-    EXTENDED_LENGTH,
-    ExtendedFrame,
-    Frame,
-    Gossip,
-    decode_extended,
-    encode_extended,
-    encode_frame,
-)
+from dtsa_agent.core import Frame, LocalProtocolError, RemoteProtocolError, encode_frame
+from dtsa_agent.core.frame import EXTENDED_LENGTH, ExtendedFrame, Gossip, decode_extended, encode_extended
 from dtsa_agent.core.reference import frame_extended as plain
 
 OWN = Frame(3, 17, 1, (1.0, 2.0, -3.0), (0.5, -0.5, 0.0), (1.0, 0.0, 0.0))

@@ -32,9 +32,7 @@ def test_all_moving_is_tdma_bit_for_bit(loss: float, statement: Any) -> None:
 @pytest.mark.parametrize(
     ("movers", "share", "some"), [(0, 0.75, False), (12, 0.75, False), (8, 0.5, False), (6, 0.5, True)]
 )
-def test_nothing_to_give_nobody_to_take_or_too_many_that_move(
-    movers: int, share: float, some: bool, statement: Any
-) -> None:
+def test_nothing_to_give_nobody_to_take_or_many_moving(movers: int, share: float, some: bool, statement: Any) -> None:
     air = Air(make(12, movers, lease_share=share, statement=statement)).run(600)
     assert bool(air.leases(0, 600)) is some
 

@@ -93,9 +93,7 @@ def handed_on(flight: Air) -> int:
 
 @STATEMENTS
 @pytest.mark.parametrize("without", [{}, {"open_every": 0}, {"adoption": False}], ids=["", "OPEN turns", "adoption"])
-def test_turns_are_handed_on_but_to_their_owners_and_not_without_open_turns_or_adoption(
-    statement: Any, without: dict[str, Any]
-) -> None:
+def test_turns_are_handed_on_with_open_turns_and_adoption_only(statement: Any, without: dict[str, Any]) -> None:
     handed = handed_on(fly(statement, 12, 6, **without))
     assert handed == 0 if without else handed > 20
 

@@ -170,9 +170,7 @@ def test_a_restarted_agent_and_a_reset_swarm_begin_with_new_parts() -> None:
     assert fly(swarm, range(20)) == first
 
 
-def test_more_bytes_than_fit_are_refused_and_a_broken_promise_is_the_plug_ins_fault(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_bytes_that_do_not_fit_are_refused_and_broken_promises_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match=r"own_bytes of counting and initials: got 6; allowed: 0 to 4 with"):
         config(frame="extended")
     assert config(frame="extended", estimator="linear").own_bytes == 4

@@ -62,8 +62,6 @@ def link_fields(link: Link) -> tuple[Any, ...]:
     return link.header, link.says_late, link.names, link.flight_ns, link.trust_ns
 
 
-# Datagrams.
-
 NAMED = "0100 1900 0300 fdff 00000000 00000000"
 
 
@@ -159,9 +157,6 @@ def test_any_bytes_are_refused_or_accepted_alike(
             assert station.status.refused[verdict] == 1
 
 
-# Slots.
-
-
 @dataclass
 class Recorder:
     """Records the slots of frames that a station hears."""
@@ -211,9 +206,6 @@ def test_a_frame_with_another_number_shows_another_time(policy: str) -> None:
         data = own.write(frame_of(policy, slot), slot)
         assert VERDICTS[station.receive(data, 10 * MS)] == "other time"
     assert station.status.restarts == 0
-
-
-# Use without I/O, as the header says.
 
 
 class CompiledAgent:

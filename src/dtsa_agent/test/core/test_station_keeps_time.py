@@ -48,9 +48,7 @@ def hear_late(station: Station, late_ns: int) -> int:
     (KEEPS_NUMBERS, MS // 2, MS // 4, MS // 2), (KEEPS_NUMBERS, 3 * MS, 0, 0), (KEEPS_STARTS, MS // 2, 0, 0),
     (KEEPS_NOTHING, 3 * MS, 3 * MS, 3 * MS),
 ])  # fmt: skip
-def test_one_that_has_been_told_the_time_moves_only_a_little_or_never(
-    keeps: int, late_ns: int, least: int, most: int
-) -> None:
+def test_one_that_was_told_the_time_moves_little_or_never(keeps: int, late_ns: int, least: int, most: int) -> None:
     assert least <= hear_late(station_of(origin_ns=0, listens=False, keeps_time=keeps), late_ns) <= most
 
 

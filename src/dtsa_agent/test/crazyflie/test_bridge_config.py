@@ -126,7 +126,6 @@ def test_examples_are_usable(name: str) -> None:
         assert all(low <= p - o <= high for p, o, low, high in inside)
 
 
-# -- radio budget -----------------------------------------------------------------------------------------------------
 def robots(count: int, rate: float, radio: str = "0", bits: str = "2M") -> list[tuple[str, str, float, float]]:
     return [(f"cf{k}", f"radio://{radio}/80/{bits}/E7E7E7E7{k:02X}", rate, rate) for k in range(1, count + 1)]
 
@@ -150,7 +149,6 @@ def test_budget_counts_each_radio_and_no_udp() -> None:
     assert radio_of("radio://0/80/2M/E7E7E7E701?rate_limit=100") == "0"
 
 
-# -- one bridge -------------------------------------------------------------------------------------------------------
 def test_a_crazyflie_belongs_to_one_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     first = Ownership([("cf1", "radio://0/80/2M/E7E7E7E701"), ("cf2", "radio://0/80/2M/E7E7E7E702")])

@@ -25,7 +25,6 @@ from dtsa_agent.crazyflie.state.conversions import Setpoint
 from dtsa_agent.crazyflie.state.state_machine import State, StateMachine
 
 
-# -- state machine ----------------------------------------------------------------------------------------------------
 def machine(*bits: int) -> StateMachine:
     result = StateMachine(lambda before, state, reason: None)
     result.go(State.CONNECTING, "")
@@ -122,7 +121,6 @@ def test_any_sequence_of_events_keeps_to_the_table(events: list[Any]) -> None:
             assert m.state in (State.EMERGENCY, State.LOST)
 
 
-# -- outbox ----------------------------------------------------------------------------------------------------------
 def test_only_the_latest_command_is_sent_and_orders_go_first() -> None:
     box = Outbox()
     order = lambda: None  # noqa: E731
@@ -147,7 +145,6 @@ def test_an_order_ends_the_stream_and_an_urgent_one_empties_the_box() -> None:
     assert box.get() is None
 
 
-# -- safety rules -----------------------------------------------------------------------------------------------------
 def vehicle(name: str = "cf1", **changes: Any) -> Watched:
     values: dict[str, Any] = {
         "name": name, "state": State.FLYING, "position": (0.0, 0.0, 0.0), "battery": 3.9, "battery_warning": 3.4,
@@ -253,7 +250,6 @@ def test_a_rule_speaks_again_after_it_had_ceased() -> None:
     assert [len(monitor.check(t, [vehicle(command_age=a)], None)) for t, a in enumerate(ages)] == [1, 0, 0, 1]
 
 
-# -- limits of what is flown ------------------------------------------------------------------------------------------
 def test_places_outside_the_fence_and_speeds_that_nobody_means_are_refused() -> None:
     station = StationSettings()
     assert outside_fence((1.5, 0.0, 1.0), station) == ""

@@ -28,7 +28,6 @@ ORIGIN = (0.0, 0.0, 0.95)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
-# -- what is believed -------------------------------------------------------------------------------------------------
 def tracker(**changes: Any) -> Tracker:
     return Tracker(PositionSettings(source="pose", **changes), ORIGIN, ROOM)
 
@@ -131,7 +130,6 @@ def test_a_pose_goes_over_the_air_as_one_packet_that_nothing_waits_for() -> None
         assert "not seen by motion capture (no pose comes)" in captured.disagrees((1.0, 2.0, 0.5), late)
 
 
-# -- estimates --------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("place", "variance", "seen", "words"), [
     ((5.0, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), "motion capture sees it 5.00 m away"),
     ((0.0, 0.0, 0.0), 1e-5, "not", "motion capture does not see it"), ((0.05, 0.0, 0.0), 100.0, (0.0, 0.0, 0.0), ""),
@@ -177,7 +175,6 @@ def test_jumps_standstill_and_errors_in_flight_are_noticed() -> None:
     assert flown([(0.0, 0.0, 0.03)] * 50).wrong == ""  # it may be about to stand
 
 
-# -- settings ---------------------------------------------------------------------------------------------------------
 def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy")
     from dtsa_agent.crazyflie.node.inputs import _named, named_pose_array
@@ -202,7 +199,6 @@ def test_settings_name_topics_and_the_missing_package(monkeypatch: pytest.Monkey
     assert got == [((1.0, 2.0, 3.0), LEVEL, "world", 5.5)]
 
 
-# -- flights ----------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.ros
 @pytest.mark.realtime

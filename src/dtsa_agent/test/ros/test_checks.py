@@ -22,20 +22,8 @@ from nav_msgs.msg import Odometry
 
 from dtsa_agent.ros.common.process.peers import ProcessName
 from dtsa_agent.ros.common.process.runs import Call, Run
-from dtsa_agent.ros.common.wire.checks import (
-    RANGE,
-    SIZES,
-    SLOT,
-    UNKNOWN,
-    OnePublisher,
-    Unusable,
-    check_odometry,
-    check_process,
-    check_slot,
-    check_start,
-    parse_json,
-    plain,
-)
+from dtsa_agent.ros.common.wire import checks
+from dtsa_agent.ros.common.wire.checks import RANGE, SIZES, SLOT, UNKNOWN, OnePublisher, Unusable, check_slot
 from dtsa_agent.ros.common.wire.intake import Intake
 
 HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1, 2, 3, 4]}
@@ -66,7 +54,7 @@ def test_slot_messages(change: dict[str, Any], expected: str) -> None:
     ({"dropped": [1]}, SIZES), ({"settings": "x" * 100_000}, SIZES),
 ])  # fmt: skip
 def test_process_messages(change: dict[str, Any], expected: str) -> None:
-    assert reason(check_process, Process(**{"agent": [1, 3], **change}), 3) == expected
+    assert reason(checks.check_process, Process(**{"agent": [1, 3], **change}), 3) == expected
 
 
 @pytest.mark.parametrize(("field", "value", "expected"), [
@@ -77,12 +65,12 @@ def test_odometry(field: str, value: float, expected: str) -> None:
     message = Odometry()
     part, axis = field.split(".")
     setattr(getattr(message.pose.pose, part), axis, value)
-    assert reason(check_odometry, message) == expected
+    assert reason(checks.check_odometry, message) == expected
 
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**50))
 def test_transmissions_start_about_now(start_ns: int, now_ns: int) -> None:
-    assert (reason(check_start, start_ns, now_ns) == "") == (-60e9 <= start_ns - now_ns <= 10e9)
+    assert (reason(checks.check_start, start_ns, now_ns) == "") == (-60e9 <= start_ns - now_ns <= 10e9)
 
 
 @given(st.lists(st.integers(1, 900), min_size=2, max_size=20), st.integers(-(10**6), 10**6))
@@ -149,9 +137,9 @@ def test_calls_of_nobody(data: bytes) -> None:
 
 
 def test_texts_from_outside_stand_in_one_line_and_are_never_too_deep() -> None:
-    assert plain("/cf1/agent\n\x1b[2J" + "x" * 5000) == "/cf1/agent??[2J" + "x" * 185
+    assert checks.plain("/cf1/agent\n\x1b[2J" + "x" * 5000) == "/cf1/agent??[2J" + "x" * 185
     with pytest.raises(ValueError, match="nested"):
-        parse_json("[" * 60_000)
+        checks.parse_json("[" * 60_000)
 
 
 def test_what_is_dropped_is_counted_by_reason_and_said_once_in_a_while() -> None:

@@ -15,15 +15,8 @@ from rclpy.node import Node
 
 from dtsa_agent.core.errors import DtsaError, LocalProtocolError, RemoteProtocolError
 from dtsa_agent.ros.common.process.node_process import SUPERVISOR, in_real_time
-from dtsa_agent.ros.common.workarounds.dds import (
-    PEERS,
-    PROFILE,
-    PROFILES,
-    PUNCTUAL,
-    RANGE,
-    clean_shared_memory,
-    limit_to_machine,
-)
+from dtsa_agent.ros.common.workarounds import dds
+from dtsa_agent.ros.common.workarounds.dds import PROFILE, PROFILES, RANGE, clean_shared_memory, limit_to_machine
 from dtsa_agent.ros.common.workarounds.kept_nodes import ending
 
 SHARED_MEMORY = Path("/dev/shm")
@@ -38,22 +31,20 @@ def test_localhost_becomes_our_profile_and_other_wishes_stay() -> None:
         {RANGE: "SUBNET"},
         {RANGE: "LOCALHOST", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
         {RANGE: "LOCALHOST", PROFILES[0]: "/mine.xml"},
-        {RANGE: "LOCALHOST", PEERS: "10.0.0.2;10.0.0.3"},
+        {RANGE: "LOCALHOST", dds.PEERS: "10.0.0.2;10.0.0.3"},
     ):
         before = dict(other)
         limit_to_machine(other)
         assert other == before
     # Supervisor and node may have it otherwise.
     limit_to_machine(plain, shared_memory=False)
-    assert plain == {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(PUNCTUAL), PROFILES[1]: str(PUNCTUAL)}
+    assert plain == {RANGE: "SYSTEM_DEFAULT", PROFILES[0]: str(dds.PUNCTUAL), PROFILES[1]: str(dds.PUNCTUAL)}
     limit_to_machine(plain)
     assert plain[PROFILES[0]] == str(PROFILE)
 
 
 @pytest.mark.parametrize(("error", "lasts"), [(LocalProtocolError, True), (RemoteProtocolError, False)])
-def test_a_node_lasts_as_long_as_its_process_where_others_are_dead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[DtsaError], lasts: bool
-) -> None:
+def test_a_node_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[DtsaError], lasts: bool) -> None:
     kept: list[Node] = []
     monkeypatch.setattr("dtsa_agent.ros.common.workarounds.kept_nodes._KEPT", kept)
     with ros_graph(tmp_path) as graph:
@@ -105,7 +96,7 @@ def test_a_node_shares_memory_only_if_its_supervisor_does(tmp_path: Path) -> Non
     """Where many processes do, they wait for each other's ports for minutes."""
     with ros_graph(tmp_path) as graph:
         graph.environment |= {SUPERVISOR: str(os.getpid()), RANGE: "SYSTEM_DEFAULT"}
-        for profile in (PROFILE, PUNCTUAL):
+        for profile in (PROFILE, dds.PUNCTUAL):
             graph.environment |= dict.fromkeys(PROFILES, str(profile))
             node = graph.start("dtsa_agent.ros.swarm_host", "-r", f"__node:={profile.stem}", "-p", "agents:=2")
             graph.until(lambda profile=profile: profile.stem in graph.node.get_node_names())

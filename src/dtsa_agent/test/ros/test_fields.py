@@ -119,9 +119,7 @@ places, bits = st.integers(0, 10_000), st.integers(0, 255)
 
 
 @given(transmissions() | slots() | reports(), st.integers(0, 40) | st.just(0), places, bits)
-def test_what_is_damaged_says_what_it_says_by_rclpy_or_is_left_to_it(
-    message: Transmission | Slot | Report, cut: int, at: int, value: int
-) -> None:
+def test_what_is_damaged_is_read_alike(message: Transmission | Slot | Report, cut: int, at: int, value: int) -> None:
     data = damaged(bytes(serialize_message(message)), cut, at, value)
     found: TransmissionFields | SlotFields | None
     if isinstance(message, Report):

@@ -57,9 +57,7 @@ def test_a_hang_up_that_is_ignored_stays_ignored(before: signal.Handlers) -> Non
         ("with Stop(0.0) as stop, stop.in_time():\n    holds_the_lock(0.5)", 0, ""),
     ],
 )
-def test_what_does_not_end_after_a_signal_or_stands_still_says_where_and_is_ended(
-    program: str, code: int, said: str
-) -> None:
+def test_what_does_not_end_or_stands_still_says_where_and_is_ended(program: str, code: int, said: str) -> None:
     head = (
         "import ctypes, os, signal, time\nfrom dtsa_agent.stop import Stop\n"
         "def interrupt():\n    os.kill(os.getpid(), signal.SIGINT)\n"

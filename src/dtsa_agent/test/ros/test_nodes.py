@@ -201,9 +201,7 @@ def test_parameters_are_described_and_ctrl_c_ends_cleanly(tmp_path: Path) -> Non
     (HOST, ["ids:=[1, 1]"], "swarm_host: error: ids: got [1, 1]; allowed: different ids from 1 to 12"),
     (HOST, ["policy:=aloha", "shared_table:=true"], "swarm_host: error: shared_table: got True; allowed: false"),
 ])  # fmt: skip
-def test_bad_parameters_are_one_line_and_exit_code_2(
-    tmp_path: Path, module: str, arguments: list[str], said: str
-) -> None:
+def test_bad_parameters_are_one_line_and_code_2(tmp_path: Path, module: str, arguments: list[str], said: str) -> None:
     with ros_graph(tmp_path) as graph:
         code, error = end_of(graph.start(module, *[word for value in arguments for word in ("-p", value)]))
         assert code == 2
