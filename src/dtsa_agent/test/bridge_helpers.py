@@ -28,8 +28,6 @@ from dtsa_bench.crazyflies.simulated.truth import read_truth
 
 @dataclass
 class FakeFleet:
-    """Simulated Crazyflies that run."""
-
     process: subprocess.Popen[str]
     base_port: int
     count: int
@@ -43,7 +41,6 @@ class FakeFleet:
         return float(send_fault(("127.0.0.1", self.base_port - 1), fault=name, cf=cf, **numbers)["t"])
 
     def events(self, cf: int | None = None, name: str | None = None) -> list[dict[str, Any]]:
-        """What has happened so far."""
         found = read_truth(self.truth)[2]
         return [e for e in found if (cf is None or e["cf"] == cf) and (name is None or e["event"] == name)]
 
@@ -62,7 +59,6 @@ def fake_fleet(
     folder: Path, count: int, *options: str, environment: dict[str, str] | None = None,
     module: str = "dtsa_bench.crazyflies.simulated.cli",
 ) -> Iterator[FakeFleet]:  # fmt: skip
-    """Simulated Crazyflies in a process of their own."""
     base = free_base_port(count)
     truth = folder / f"truth-{base}.jsonl"
     command = [sys.executable, "-m", module, "--count", str(count), "--base-port", str(base)]
@@ -95,7 +91,6 @@ def bridge_process(
 
 
 def end_process(process: subprocess.Popen[str]) -> None:
-    """Whatever it does, it ends now."""
     process.kill()
     process.wait()
     if process.stdout is not None:
@@ -149,7 +144,6 @@ def settings(fleet: FakeFleet, station: dict[str, Any] | None = None, **common: 
 
 @contextlib.contextmanager
 def flight(data: dict[str, Any]) -> Iterator[Flight]:
-    """A bridge that is closed at the end."""
     lines: list[tuple[float, str, str]] = []
     bridge = Bridge(parse_swarm(data), lambda level, line: lines.append((time.monotonic(), level, line)))
     result = Flight(bridge, lines)

@@ -15,8 +15,6 @@ COUNT = 3  # Crazyflies
 
 
 class Graph(ServedNode):
-    """A node of the test that listens, calls and commands."""
-
     def __init__(self, domain: int) -> None:
         super().__init__(domain, "test")
         self.last: dict[str, Any] = {}

@@ -19,7 +19,6 @@ STATEMENTS = pytest.mark.parametrize("statement", [Swarm, ReferenceSwarm], ids=[
 
 
 def still(agents: int) -> Scenario:
-    """Agents that stay where they are."""
     places = np.round(np.random.default_rng(agents).uniform(-6, 6, (3, agents)), 3)
     return Scenario(places, places.copy(), np.zeros(agents, dtype=np.bool_), goals_known=False)
 
@@ -80,14 +79,11 @@ class Air:
         return self
 
     def own(self, agent: int, first: int) -> list[int]:
-        """Slots from the first on in which an agent sent."""
         return [slot for slot in range(first, self.slot) if self.sent[slot] == (agent,)]
 
     def leases(self, first: int, last: int) -> int:
-        """Lease bytes said in slots first .. last - 1."""
         return sum(sum(b > 0 for b in self.frames[t].leases) for t in range(first, last) if t in self.frames)
 
 
 def is_anchor(slot: int, agents: int, every: int = 5) -> bool:
-    """Whether a slot is an anchor of its owner."""
     return Memory(Rules(agents=agents, slot_s=0.01, anchor_every=every)).is_anchor(slot)

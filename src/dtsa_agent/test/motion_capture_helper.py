@@ -127,7 +127,6 @@ class TrackedFleet(Fleet):
 
 
 def main() -> int:
-    """Fly the fleet until Ctrl-C."""
     world.Estimate = HostEstimate  # type: ignore[misc]
     cli.Fleet = TrackedFleet  # type: ignore[misc]
     process.FAULTS["unseen"] = "motion capture does not see it"

@@ -46,7 +46,6 @@ class Graph:
         self.processes: list[subprocess.Popen[str]] = []
 
     def start(self, module: str, *arguments: str, logs: bool = False) -> subprocess.Popen[str]:
-        """Starts :func:`node_command`."""
         command = node_command(module, *arguments, logs=logs)
         process = subprocess.Popen(
             command, env=self.environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
@@ -90,7 +89,6 @@ class ServedNode:
         self._serving.start()
 
     def client(self, kind: Any, name: str) -> Client:
-        """A client whose service has been found."""
         if name not in self._clients:
             began = time.monotonic()
             client = self.node.create_client(kind, name)
@@ -101,13 +99,11 @@ class ServedNode:
         return self._clients[name]
 
     def call(self, kind: Any, name: str, **fields: Any) -> Any:
-        """Answer of a service."""
         future = self.client(kind, name).call_async(kind.Request(**fields))
         wait_for(future.done, what=f"{name} does not answer")
         return future.result()
 
     def close(self) -> None:
-        """Ends it."""
         self._serving.close()
         _ended(self.node)
 

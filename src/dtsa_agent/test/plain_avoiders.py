@@ -26,11 +26,9 @@ class Case:
 
     @property
     def others(self) -> list[int]:
-        """The other agents that are somewhere."""
         return [k for k in range(self.age.size) if k != self.index and np.isfinite(self.position[:, k]).all()]
 
     def away(self, k: int) -> Array:
-        """Way to another agent, (3,) m."""
         return self.position[:, k] - self.position[:, self.index]
 
 
@@ -43,7 +41,6 @@ def command(model: FlightModel, case: Case, age: Array | None = None) -> Array:
 
 
 def limited(v: Array, v_max: float) -> Array:
-    """A velocity shortened to v_max."""
     return v * min(1.0, v_max / max(np.linalg.norm(v), 1e-300))
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 
 def open_files(pid: int) -> Iterator[str]:
-    """What a process has open; it may close some of it meanwhile."""
     for entry in Path(f"/proc/{pid}/fd").iterdir():
         with suppress(FileNotFoundError):
             yield os.readlink(entry)
@@ -36,12 +35,10 @@ def segments_of(pid: int) -> set[str]:
 
 
 def real_time(pid: int) -> bool:
-    """Whether a process goes before everything ordinary."""
     return os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR
 
 
 def may_be_real_time() -> bool:
-    """Whether this process might."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))

@@ -157,8 +157,6 @@ def test_a_wrong_stamp_that_seems_early_misleads_the_clock_for_a_while_only() ->
 
 
 class FakeDevice:
-    """A device of pyusb that does what a test says."""
-
     bcdDevice = 0x0504
     serial_number = "51D0000000"
 

@@ -50,7 +50,6 @@ def test_a_share_is_never_less_than_said(percent: int, others: int) -> None:
 
 
 def status(hovers: int, hears: int, heard_by: int, state: int = 2) -> SimpleNamespace:
-    """What a station of a swarm of six says."""
     return SimpleNamespace(
         hovers=hovers, others=5, hears=hears, heard_by=heard_by, needed=4, state=state, timed=0, off=0
     )

@@ -75,7 +75,6 @@ def test_keys_that_are_a_pattern_are_refused(key: bytes) -> None:
 )  # fmt: skip
 @pytest.mark.parametrize("policy", ["tdma", "lease"])
 def test_damaged_frames(policy: str, pick: int, changes: list[tuple[int, int]], cut: int, tail: bytes) -> None:
-    """A longer trial: the soak `fuzz`."""
     auth, swarm = Authenticator(KEY), Swarm(SwarmConfig(agents=12, moving=6, policy=policy, avoider="none"))
     frames = [auth.seal(*one_slot(swarm, slot).values(), slot) for slot in range(12)]
     data = bytearray(frames[pick])

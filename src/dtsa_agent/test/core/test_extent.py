@@ -40,7 +40,6 @@ def test_what_lies_within_the_extent_comes_back_to_half_a_step(
 
 
 def far_swarm(extent: float, **more: object) -> Swarm:
-    """Six agents on a circle of 50 m that fly to its other side."""
     given: dict[str, object] = {"agents": 6, "policy": "lease", "axis_x_m": 50.0, "seed": 3, "extent_m": extent, **more}
     return Swarm(SwarmConfig(**given))  # type: ignore[arg-type]
 

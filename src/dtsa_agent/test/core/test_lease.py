@@ -302,7 +302,6 @@ def test_who_rests_is_thought_dead_later(rests: bool) -> None:
 
 
 def test_turns_are_spread_evenly_over_those_that_move() -> None:
-    """Half move: each has about every sixth slot, and never waits for longer than a round."""
     air = Air(make(12, 6)).run(3000)
     gaps = [np.diff([slot for slot in range(1500, 3000) if air.sent[slot] == (agent,)]) for agent in range(1, 7)]
     assert max(each.max() for each in gaps) <= 12

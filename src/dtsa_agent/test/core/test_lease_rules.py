@@ -55,7 +55,6 @@ def test_who_was_claimed_waits_until_everybody_has_spoken_twice(statement: Any) 
 
 @STATEMENTS
 def test_who_missed_four_turns_is_given_none(statement: Any) -> None:
-    """Long before it is thought dead."""
     flight = fly(statement, 12, 3).run(600)
     assert any(1 in frame.leases for slot, frame in flight.frames.items() if slot > 500)
     flight.swarm.present[0] = 0

@@ -94,7 +94,6 @@ def scenario(**changes: Any) -> Scenario:
 
 
 def closest(points: np.ndarray) -> float:
-    """Smallest distance between two columns of (3, N)."""
     distance = np.linalg.norm(points[:, :, None] - points[:, None, :], axis=0)
     return float(distance[~np.eye(points.shape[1], dtype=bool)].min(initial=np.inf))
 

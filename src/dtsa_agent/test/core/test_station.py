@@ -159,8 +159,6 @@ def test_any_bytes_are_refused_or_accepted_alike(
 
 @dataclass
 class Recorder:
-    """Records the slots of frames that a station hears."""
-
     slots: list[int] = field(default_factory=list)
 
     def opened(self, *unused: Any) -> None: ...

@@ -38,7 +38,6 @@ MESSAGES = importlib.util.find_spec("crazyflie_interfaces") is not None
 
 
 def bare(kind: type[Inputs]) -> Any:
-    """Inputs without a node."""
     inputs = kind.__new__(kind)
     inputs._origin = (0.0, 0.0, 0.95)
     return inputs
@@ -100,8 +99,6 @@ def test_without_its_messages_the_bridge_says_so_and_ends(
 
 
 class Program(ServedNode):
-    """What a program of Crazyswarm2's does on the graph."""
-
     def __init__(self, domain: int) -> None:
         super().__init__(domain, "program")
 

@@ -208,7 +208,6 @@ def test_after_a_gap_that_the_firmware_survives_they_fly_on_or_land_under_contro
 
 
 def check_parameters(one: Vehicle, two: Vehicle) -> None:
-    """By an unmodified cflib, with their types."""
     known = one.onboard.parameters()
     assert (known["ring.effect"].value, known["hlCommander.vland"].value) == (6, 0.5)
     for name, value, problem in (

@@ -227,7 +227,6 @@ def test_two_too_close_both_land_and_the_third_flies_on() -> None:
 
 
 def test_what_is_exactly_at_a_limit_is_still_allowed() -> None:
-    """All numbers are ones that a float holds exactly."""
     hold, land = Action.HOLD, Action.LAND
     fence = {"geofence_tolerance_m": 0.25, "geofence_hard_m": 0.5}
     for x, actions in ((1.75, []), (1.7501, [land]), (2.0, [land]), (2.0001, [land, Action.STOP])):

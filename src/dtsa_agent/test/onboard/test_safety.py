@@ -30,15 +30,12 @@ GOOD: dict[str, Any] = {
 
 
 class Guard:
-    """The rules, compiled."""
-
     def __init__(self, library: Any) -> None:
         self._library, self.state = library, RULES.new("safety *")
         box = {"low": (-2.0, -2.0, 0.2), "high": (2.0, 2.0, 2.0)}
         self._settings = RULES.new("safety_settings *", LIMITS | box)
 
     def step(self, seconds: float = STEP_S, **changed: Any) -> int:
-        """What it does in the end, after so long."""
         view = RULES.new("safety_view *", GOOD | changed)
         for _ in range(round(seconds / STEP_S)):
             self._library.safety_step(self.state, self._settings, view, STEP_S)

@@ -30,7 +30,6 @@ HEARD = {"sender": [2, 12], "length": [2, 1], "data": [1, 2, 3], "received": [1,
 
 
 def reason(check: Any, *arguments: Any) -> str:
-    """Why something is unusable; empty: it is not."""
     try:
         check(*arguments)
     except Unusable as error:

@@ -41,7 +41,6 @@ def sequences(draw: Any, count: Any, **kinds: str) -> dict[str, array[Any]]:
 
 @st.composite
 def transmissions(draw: Any) -> Transmission:
-    """Answers as agents give them in lockstep."""
     n = draw(st.integers(1, MOST))
     lengths = draw(st.lists(st.integers(0, 9), min_size=n, max_size=n))
     fields = sequences(draw, n, H="agent chosen", B="reason", I="digest", d="score")
@@ -54,7 +53,6 @@ def transmissions(draw: Any) -> Transmission:
 
 @st.composite
 def slots(draw: Any) -> Slot:
-    """Slot messages as channels send them."""
     fields = sequences(draw, draw(st.integers(0, 4)), H="sender", B="length")
     fields |= sequences(draw, st.integers(0, 20), B="data received")
     numbers = {name: draw(words) for name in ("run", "slot", "heard_slot")}
@@ -77,14 +75,12 @@ def told_by(fields: ReportFields) -> list[Any]:
 
 
 def fields_of(message: Transmission) -> TransmissionFields:
-    """What a message says, by rclpy."""
     values = {name: getattr(message, name) for name in TransmissionFields._fields[4:]}
     told = {name: value.tobytes() for name, value in values.items()}
     return TransmissionFields(ns_of(message.header.stamp), message.run, message.slot, message.agent, **told)
 
 
 def damaged(data: bytes, cut: int, at: int, value: int) -> bytes:
-    """A message with another byte somewhere, or cut short."""
     changed = bytearray(data)
     changed[at % len(data)] ^= value
     return bytes(changed[: len(data) - cut])

@@ -35,7 +35,6 @@ def test_a_signal_ends_what_looks_at_no_flag_and_is_a_flag_elsewhere() -> None:
 
 @pytest.mark.parametrize("before", [signal.SIG_IGN, signal.SIG_DFL])
 def test_a_hang_up_that_is_ignored_stays_ignored(before: signal.Handlers) -> None:
-    """As under nohup."""
     usual = signal.signal(signal.SIGHUP, before)
     try:
         with Stop() as stop:

@@ -35,8 +35,6 @@ AGENT, HOST = "dtsa_agent.ros.agent_node", "dtsa_agent.ros.swarm_host"
 
 
 class Channel:
-    """The channel, played by the test."""
-
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.answers: list[Transmission] = []
@@ -231,7 +229,6 @@ class RealtimeChannel(Channel):
 
 
 def realtime_agent(graph: Graph, *options: str) -> subprocess.Popen[str]:
-    """An agent with slots of 20 ms and a clock of its own."""
     words = ("mode:=realtime", "slot_ms:=20.0", *options)
     return graph.start(AGENT, *(word for option in words for word in ("-p", option)))
 

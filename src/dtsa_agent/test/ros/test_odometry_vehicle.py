@@ -47,7 +47,6 @@ class Vehicle:
         self.commands.append(self.velocity)
 
     def act(self) -> None:
-        """Time goes on."""
         if time.monotonic() < self._next:
             return
         self._next = time.monotonic() + STEP_S
@@ -72,7 +71,6 @@ class Vehicle:
 
 
 def parameters(values: Mapping[str, object]) -> list[str]:
-    """Words that give parameters to a node."""
     return [word for name, value in values.items() for word in ("-p", f"{name}:={str(value).lower()}")]
 
 

@@ -16,8 +16,6 @@ IDS = (2, 5, 11)
 
 
 class Publisher:
-    """Keeps what is published."""
-
     def __init__(self) -> None:
         self.reports: list[ReportFields] = []
 

@@ -142,7 +142,6 @@ def test_late_subscribers_get_settings_and_status(graph: Graph) -> None:
 
 @contextmanager
 def attached_agents(graph: Graph, space: str) -> Iterator[tuple[SwarmNode, Future, Callable[[], None]]]:
-    """Two agents in a node that an ordinary executor serves when it is told to."""
     node = Node("agents", context=graph.node.context, enable_rosout=False, start_parameter_services=False)
     agents = SwarmNode(node, Swarm(SwarmConfig(agents=2)), space)
     executor = SingleThreadedExecutor(context=graph.node.context)
