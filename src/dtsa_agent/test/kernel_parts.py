@@ -33,15 +33,9 @@ def select(
 
 
 def avoid(
-    model: FlightModel,
-    index: int,
-    position: ArrayLike,
-    velocity: ArrayLike,
-    goal: ArrayLike,
-    others_position: ArrayLike,
-    others_velocity: ArrayLike,
-    age: ArrayLike | None = None,
-) -> NDArray[np.float64]:
+    model: FlightModel, index: int, position: ArrayLike, velocity: ArrayLike, goal: ArrayLike,
+    others_position: ArrayLike, others_velocity: ArrayLike, age: ArrayLike | None = None,
+) -> NDArray[np.float64]:  # fmt: skip
     """Commanded velocity of one agent, (3,), from its state and goal, and where it believes all to be, (3, N)."""
     given = (position, velocity, goal, others_position, others_velocity, [] if age is None else age)
     arrays = [np.ascontiguousarray(values, dtype=np.float64) for values in given]

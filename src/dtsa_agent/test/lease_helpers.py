@@ -50,11 +50,7 @@ class Air:
         self, slots: int, jam: bool = False, deaf: dict[int, set[int]] | None = None,
         changed: Callable[[int, ExtendedFrame], ExtendedFrame] = lambda slot, frame: frame,
     ) -> Air:  # fmt: skip
-        """Let some slots pass.
-
-        :param deaf: ids of those that each agent does not hear, by id.
-        :param changed: makes another frame of a slot's frame, for all that hear it.
-        """
+        """Let slots pass; deaf: ids that each does not hear, by id; changed: makes another frame of a slot's."""
         swarm = self.swarm
         for slot in range(self.slot, self.slot + slots):
             if self.flying:

@@ -71,9 +71,6 @@ def test_gossip_never_replaces_a_right_state_by_a_wrong_one(extent: float, polic
 
 
 def test_gossip_at_the_codecs_limit_is_not_believed() -> None:
-    swarm = far_swarm(EXTENT_M)
-    swarm.begin(0)
-    swarm.end(0)
     own = Frame(2, 1, 1, (1.0, 2.0, 0.0), (0.0, 0.0, 0.0))
     for bad in ((40.0, 0.0, 0.0), (0.0, -33.0, 0.0)):
         told = (Gossip(3, 1, True, bad, (0.0, 0.0, 0.0)), Gossip(4, 1, True, (5.0, 0.0, 0.0), (0.0, 0.0, 0.0)))

@@ -54,12 +54,9 @@ def plain_station(policy: str, link: Link, is_signed: bool, id: int = 1) -> refe
         open_every=c.open_period,
     )  # fmt: skip
     places = [(0.0, 0.0, 0.0)] * 5
-    own = reference.Settings(id, 10 * MS, 3, reference.Link(*link_fields(link)), 0, 0.0, KEY if is_signed else b"", 77)
+    fields = reference.Link(link.header, link.says_late, link.names, link.flight_ns, link.trust_ns)
+    own = reference.Settings(id, 10 * MS, 3, fields, 0, 0.0, KEY if is_signed else b"", 77)
     return reference.Station(own, rules, Agent(id - 1, rules, Table(id, places, places)), 0, c.main_every)
-
-
-def link_fields(link: Link) -> tuple[Any, ...]:
-    return link.header, link.says_late, link.names, link.flight_ns, link.trust_ns
 
 
 NAMED = "0100 1900 0300 fdff 00000000 00000000"
