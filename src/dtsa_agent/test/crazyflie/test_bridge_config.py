@@ -49,13 +49,10 @@ def test_robot_beats_type_beats_all() -> None:
         },
         "robot_types": {"small": {"command_rate_hz": 20, "battery": {"voltage_warning": 3.6}}},
         "all": {
-            "command_rate_hz": 30,
-            "log_rate_hz": 30,
-            "battery": {"voltage_critical": 3.1},
+            "command_rate_hz": 30, "log_rate_hz": 30, "battery": {"voltage_critical": 3.1},
             "firmware_params": {"stabilizer": {"estimator": 2}},
             "firmware_logging": {
-                "enabled": True,
-                "default_topics": {"pose": {"frequency": 10}},
+                "enabled": True, "default_topics": {"pose": {"frequency": 10}},
                 "custom_topics": {"volts": {"frequency": 5, "vars": ["pm.vbat"]}},
             },
         },

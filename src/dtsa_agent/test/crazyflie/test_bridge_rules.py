@@ -34,22 +34,6 @@ def machine(*bits: int) -> StateMachine:
     return result
 
 
-def test_a_flight_goes_through_all_states() -> None:
-    seen: list[State] = []
-    m = StateMachine(lambda before, state, reason: seen.append(state))
-    m.go(State.CONNECTING, "")
-    m.go(State.READY, "")
-    m.observe(sm.CAN_BE_ARMED)
-    m.observe(sm.IS_ARMED)
-    m.takeoff("up")
-    m.observe(sm.IS_ARMED | sm.IS_FLYING)
-    m.land("down")
-    m.observe(sm.IS_ARMED | sm.IS_FLYING)
-    m.observe(sm.IS_ARMED)
-    m.observe(sm.CAN_BE_ARMED)
-    assert seen == [1, 2, 3, 4, 5, 3, 2]
-
-
 def test_one_that_arms_itself_is_ready_until_it_is_told_and_again_once_it_has_landed() -> None:
     m = machine(sm.AUTO_ARM | sm.IS_ARMED)
     on_ground, in_air = sm.AUTO_ARM | sm.IS_ARMED, sm.AUTO_ARM | sm.IS_ARMED | sm.IS_FLYING

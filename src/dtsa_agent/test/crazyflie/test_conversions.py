@@ -76,12 +76,8 @@ def test_full_state_is_in_rad_per_second_and_never_overflows() -> None:
     setpoint = conversions.full_state(
         (40.0, -40.0, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0, 0, 2.0, 0), (0.1, 99.0, -0.2), 0
     )
-    place, velocity, acceleration, orientation, roll, pitch, yaw = setpoint.arguments
-    assert place == (32.767, -32.767, 1.0)
-    assert velocity == (1.0, 2.0, 3.0)
-    assert acceleration == (0.0, 0.0, 9.0)
-    assert orientation == (0, 0, 1.0, 0)
-    assert (roll, pitch, yaw) == (0.1, 32.767, -0.2)
+    vectors = (32.767, -32.767, 1.0), (1.0, 2.0, 3.0), (0.0, 0.0, 9.0), (0, 0, 1.0, 0)
+    assert setpoint.arguments == (*vectors, 0.1, 32.767, -0.2)
 
 
 def test_full_state_without_attitude_means_level() -> None:
