@@ -20,12 +20,10 @@ pytest.importorskip("dtsa_msgs.msg")
 from builtin_interfaces.msg import Time
 from dtsa_msgs.msg import Decision, Frame, Process, Report, Slot, Transmission
 from nav_msgs.msg import Odometry
-from rcl_interfaces.srv import DescribeParameters, GetParameters
 from std_msgs.msg import Header
 
 from dtsa_agent.core import REASONS, SwarmConfig, decode_frame, make_scenario
 from dtsa_agent.core.frame import decode_extended
-from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.process.runs import Run
 from dtsa_agent.ros.common.wire.packing import split_frames
@@ -165,29 +163,6 @@ def test_strange_slots_and_forged_ends_change_nothing_and_a_node_ends_when_its_c
         graph.node.destroy_publisher(channel.publisher)
         said = "agent: error: the channel has gone after slot 1 without ending the run\n"
         assert end_of(agent) == (1, said)
-
-
-@pytest.mark.ros
-def test_parameters_are_described_and_ctrl_c_ends_cleanly(tmp_path: Path) -> None:
-    with ros_graph(tmp_path) as graph:
-        agent = graph.start(AGENT, "-p", "id:=3", "-p", "agents:=4", "-p", "slot_ms:=20")
-        describe = graph.node.create_client(DescribeParameters, "/cf3/agent/describe_parameters")
-        get = graph.node.create_client(GetParameters, "/cf3/agent/get_parameters")
-        graph.until(lambda: describe.service_is_ready() and get.service_is_ready())
-        fields = [setting for setting in settings_of(SwarmConfig) if setting.kind != "structure"]
-        described = graph.ask(describe, DescribeParameters.Request(names=[setting.name for setting in fields]))
-        values = graph.ask(get, GetParameters.Request(names=["slot_ms", "id"]))
-        for setting, found in zip(fields, described.descriptors, strict=True):
-            assert setting.help in found.description
-            assert found.read_only
-            if setting.kind == "int":
-                assert found.integer_range
-            if setting.kind == "float":
-                assert found.floating_point_range[0].from_value == setting.minimum
-            if setting.choices:
-                assert ", ".join(setting.choices) in found.additional_constraints
-        assert values.values[1].integer_value == 3
-        assert end_of(agent, signal.SIGINT) == (0, "")
 
 
 @pytest.mark.ros

@@ -17,12 +17,14 @@ pytest.importorskip("dtsa_msgs.msg")
 
 from dtsa_msgs.msg import Configuration, RunStatus, Slot, Transmission
 from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import DescribeParameters, GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 
 from dtsa_agent.core import Swarm, SwarmConfig
 from dtsa_agent.core.errors import ConfigError, LocalProtocolError
+from dtsa_agent.core.settings.declaration import settings_of
 from dtsa_agent.ros.common.graph import names
 from dtsa_agent.ros.common.graph.parameters import check_parameters
 from dtsa_agent.ros.common.process.node_process import log_where_possible
@@ -104,7 +106,7 @@ def test_names_of_the_default_swarm_are_short(swarm: str, before: str) -> None:
 
 
 @pytest.mark.ros
-def test_an_agent_that_waits_says_for_whom_and_where_it_lives(graph: Graph) -> None:
+def test_an_agent_that_waits_says_for_whom_and_where_it_lives_and_describes_its_parameters(graph: Graph) -> None:
     heard: list[Log] = []
     graph.node.create_subscription(Log, "/rosout", heard.append, 10)
     agent = graph.start(AGENT, "-p", "id:=2", "-p", "agents:=3", "-p", "swarm_namespace:=/north", logs=True)
@@ -112,6 +114,18 @@ def test_an_agent_that_waits_says_for_whom_and_where_it_lives(graph: Graph) -> N
     line = next(line for line in heard if "waiting" in line.msg)
     assert line.name == "north.cf2.agent"
     assert line.level in (Log.INFO, Log.WARN)
+    describe = graph.node.create_client(DescribeParameters, "/north/cf2/agent/describe_parameters")
+    get = graph.node.create_client(GetParameters, "/north/cf2/agent/get_parameters")
+    graph.until(lambda: describe.service_is_ready() and get.service_is_ready())
+    fields = [setting for setting in settings_of(SwarmConfig) if setting.kind != "structure"]
+    described = graph.ask(describe, DescribeParameters.Request(names=[setting.name for setting in fields]))
+    for setting, found in zip(fields, described.descriptors, strict=True):
+        assert setting.help in found.description
+        assert found.read_only
+        assert setting.kind != "int" or found.integer_range
+        assert setting.kind != "float" or found.floating_point_range[0].from_value == setting.minimum
+        assert ", ".join(setting.choices or ()) in found.additional_constraints
+    assert graph.ask(get, GetParameters.Request(names=["id"])).values[0].integer_value == 2
     code, said = end_of(agent, signal.SIGINT)
     assert code == 0
     assert "ends after slot -1: stopped by a signal" in said
