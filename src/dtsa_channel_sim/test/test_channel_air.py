@@ -136,15 +136,6 @@ def test_a_frame_is_not_sensed_before_its_first_bit_and_not_after_its_last():
         line.busy(2, 1 * MS)
 
 
-def test_nothing_is_settled_before_it_has_left_the_air():
-    line = arbiter()
-    line.begin(0, 1, 0, 24)
-    assert line.settle(270_499) == []
-    assert line.pending == 1
-    assert len(line.settle(270_500)) == 1
-    assert line.settle(10 * MS) == []
-
-
 def test_late_frames_are_dropped_and_counted():
     line = arbiter()
     line.begin(0, 1, 0, 24)

@@ -157,15 +157,13 @@ def test_a_wrong_stamp_that_seems_early_misleads_the_clock_for_a_while_only() ->
 
 
 class FakeDevice:
-    bcdDevice = 0x0504
-    serial_number = "51D0000000"
+    bcdDevice, serial_number = 0x0504, "51D0000000"
 
     def __init__(self, **errors: Exception) -> None:
-        self.errors = errors
+        self.errors, self.dropped = errors, 0
         self.requests: list[tuple[int, int, bytes]] = []
         self.written: list[bytes] = []
         self.transfers: list[bytes] = []
-        self.dropped = 0
 
     def _do(self, name: str) -> None:
         if name in self.errors:
@@ -185,10 +183,8 @@ class FakeDevice:
         self._do("read")
         if self.transfers:
             return self.transfers.pop(0)
-        import usb.core
-
         time.sleep(0.001)
-        raise usb.core.USBTimeoutError("no answer", None, errno.ETIMEDOUT)
+        raise pytest.importorskip("usb.core").USBTimeoutError("no answer", None, errno.ETIMEDOUT)
 
     def write(self, endpoint: int, data: bytes, timeout: int) -> int:
         self._do("write")
@@ -206,11 +202,8 @@ def plugged(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return devices
 
 
-def usb_error(number: int) -> Exception:
-    import usb.core
-
-    error: Exception = usb.core.USBError("it does not", None, number)
-    return error
+def usb_error(number: int) -> Any:
+    return pytest.importorskip("usb.core").USBError("it does not", None, number)
 
 
 def test_a_dongle_is_told_channel_rate_address_and_mode(plugged: list[Any]) -> None:

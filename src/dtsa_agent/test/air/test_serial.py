@@ -153,12 +153,7 @@ def line(tmp_path: Path) -> Iterator[Line]:
 def heard(port: SerialPort, count: int) -> list[ReceivedDatagram]:
     """What has arrived, when so much has."""
     found: list[ReceivedDatagram] = []
-
-    def enough() -> bool:
-        found.extend(port.receive(16))
-        return len(found) >= count
-
-    wait_for(enough)
+    wait_for(lambda: found.extend(port.receive(16)) or len(found) >= count)
     return found
 
 
