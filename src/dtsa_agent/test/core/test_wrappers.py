@@ -75,9 +75,9 @@ def test_external_vehicles_get_the_commands_that_simulated_ones_would_and_nothin
 
 
 def closest_once_told_to_stop(seed: int, slot: int, *, stop_here: bool) -> tuple[float, float, float]:
-    """Twelve exchange places; smallest distance after a slot, m; 4 s later smallest horizontal distance, largest speed.
+    """Smallest distance (m) of twelve after a slot, where they stop or commands break off for 0.4 s before they brake;
 
-    :param stop_here: they are told to come to rest; otherwise their commands break off for 0.4 s, and then they brake.
+    4 s later the smallest horizontal distance (m) and the largest speed (m/s).
     """
     config = SwarmConfig(
         agents=12, moving=12, policy="tdma", estimator="linear", avoider="crazyflie", seed=seed, slot_ms=20.0,

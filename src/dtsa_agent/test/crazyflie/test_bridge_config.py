@@ -43,8 +43,7 @@ def on_board(
 def test_robot_beats_type_beats_all() -> None:
     settings = parse_swarm({
         "robots": {
-            "cf2": {"uri": "radio://0/80/2M/E7E7E7E702", "type": "small", "log_rate_hz": 20},
-            "cf1": {"uri": "radio://0/80/2M/E7E7E7E701"},
+            "cf2": {"uri": "radio://0/80/2M/E7E7E7E702", "type": "small", "log_rate_hz": 20}, "cf1": {"uri": RADIO},
             "cf9": {"uri": "radio://0/80/2M/E7E7E7E709", "enabled": False},
         },
         "robot_types": {"small": {"command_rate_hz": 20, "battery": {"voltage_warning": 3.6}}},

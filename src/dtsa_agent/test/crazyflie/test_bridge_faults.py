@@ -236,6 +236,7 @@ def test_one_that_begins_to_listen_later_is_waited_for_and_a_lossy_link_still_co
 
 PILOT = """
 import sys, time, json
+sys.path.insert(0, {helpers!r})
 from bridge_helpers import flight
 data = json.loads(sys.argv[1])
 with flight(data) as pilot:
@@ -256,9 +257,9 @@ def test_killed_bridge_leaves_it_to_the_firmware(tmp_path: Path) -> None:
         for cf, watchdog in ((1, True), (2, False)):
             one: dict[str, Any] = data | {"robots": {f"cf{cf}": data["robots"][f"cf{cf}"]}}
             one["station"] = data["station"] | {"safety": {"emergency_watchdog": watchdog}}
-            command = [sys.executable, "-c", PILOT, json.dumps(one)]  # finds helpers in its current folder
-            here = Path(__file__).parents[1]
-            processes.append(subprocess.Popen(command, cwd=here, stdout=subprocess.PIPE, text=True))
+            code = PILOT.format(helpers=str(Path(__file__).parents[1]))
+            command = [sys.executable, "-c", code, json.dumps(one)]
+            processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
         try:
             for process in processes:
                 assert process.stdout is not None

@@ -45,17 +45,14 @@ def test_a_hang_up_that_is_ignored_stays_ignored(before: signal.Handlers) -> Non
         signal.signal(signal.SIGHUP, usual)
 
 
-@pytest.mark.parametrize(
-    ("program", "code", "said"),
-    [
-        ("with Stop(0.3) as stop:\n    interrupt()\n    stands_still(60)", 1, "in stands_still"),
-        ("with Stop(0.3) as stop:\n    interrupt()\ntime.sleep(0.6)", 0, ""),
-        # With the interpreter's lock: nobody sees a signal then, and no other thread runs.
-        ("with Stop(0.3) as stop, stop.in_time():\n    holds_the_lock(50)", 1, "in holds_the_lock"),
-        ("with Stop(30) as stop, stop.in_time():\n    holds_the_lock(0.1)", 0, ""),
-        ("with Stop(0.0) as stop, stop.in_time():\n    holds_the_lock(0.5)", 0, ""),
-    ],
-)
+@pytest.mark.parametrize(("program", "code", "said"), [
+    ("with Stop(0.3) as stop:\n    interrupt()\n    stands_still(60)", 1, "in stands_still"),
+    ("with Stop(0.3) as stop:\n    interrupt()\ntime.sleep(0.6)", 0, ""),
+    # With the interpreter's lock: nobody sees a signal then, and no other thread runs.
+    ("with Stop(0.3) as stop, stop.in_time():\n    holds_the_lock(50)", 1, "in holds_the_lock"),
+    ("with Stop(30) as stop, stop.in_time():\n    holds_the_lock(0.1)", 0, ""),
+    ("with Stop(0.0) as stop, stop.in_time():\n    holds_the_lock(0.5)", 0, ""),
+])  # fmt: skip
 def test_what_does_not_end_or_stands_still_says_where_and_is_ended(program: str, code: int, said: str) -> None:
     head = (
         "import ctypes, os, signal, time\nfrom dtsa_agent.stop import Stop\n"

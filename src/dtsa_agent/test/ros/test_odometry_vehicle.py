@@ -6,7 +6,6 @@ import math
 import random
 import signal
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -70,10 +69,6 @@ class Vehicle:
         self.graph.until(there, self.act)
 
 
-def parameters(values: Mapping[str, object]) -> list[str]:
-    return [word for name, value in values.items() for word in ("-p", f"{name}:={str(value).lower()}")]
-
-
 def test_axes_of_the_body_are_turned_into_those_of_the_map() -> None:
     assert turned(ATTITUDE, np.array((1.0, 0.0, 0.0))) == pytest.approx((0.0, 1.0, 0.0))
     assert turned(ATTITUDE, np.array((0.0, 1.0, 3.0))) == pytest.approx((-1.0, 0.0, 3.0))
@@ -89,7 +84,8 @@ def test_an_agent_flies_a_vehicle_and_holds_it_without_odometry_that_can_be(tmp_
             "vehicle": "odometry", "odometry_topic": "/uav1/local_position/odom", "odometry_origin": "[1.0, 2.0, 0.5]",
             "command_topic": "/uav1/setpoint_velocity/cmd_vel", "slot_ms": 20.0, "quorum": "0%",
         }  # fmt: skip
-        process = graph.start(AGENT, *parameters(values))
+        words = [word for name, value in values.items() for word in ("-p", f"{name}:={str(value).lower()}")]
+        process = graph.start(AGENT, *words)
         vehicle.until_commands(still=False)
         first = vehicle.position.copy()
         graph.until(lambda: float(np.linalg.norm(vehicle.position - first)) > 0.3, vehicle.act)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -15,17 +17,14 @@ CONFIG = SwarmConfig(agents=12, slot_ms=10.0)
 IDS = (2, 5, 11)
 
 
-class Publisher:
-    def __init__(self) -> None:
-        self.reports: list[ReportFields] = []
-
-    def publish(self, data: bytes) -> None:
-        self.reports.append(read_report(data))
+def make_reporter() -> tuple[Reporter, list[ReportFields]]:
+    """One that publishes into a list."""
+    reports: list[ReportFields] = []
+    return Reporter(SimpleNamespace(publish=lambda data: reports.append(read_report(data))), CONFIG, IDS), reports
 
 
 def test_slots_of_different_agents_are_told_apart_and_what_was_heard_once() -> None:
-    publisher = Publisher()
-    reporter = Reporter(publisher, CONFIG, IDS)
+    reporter, reports = make_reporter()
     swarms = [Swarm(CONFIG, local=[id]) for id in IDS]
     for slot in range(6):
         for index, swarm in enumerate(swarms):
@@ -38,11 +37,11 @@ def test_slots_of_different_agents_are_told_apart_and_what_was_heard_once() -> N
         reporter.add_heard(index, 7, 1, 2, 20_000_000)
     reporter.publish(9, 4)
     reporter.publish(9, 5)
-    told = [(report.agent.tolist(), report.slot.tolist()) for report in publisher.reports]
+    told = [(report.agent.tolist(), report.slot.tolist()) for report in reports]
     assert told == [([2, 11], [0, 1, 2]), ([2, 5, 11], [3, 4]), ([2, 5, 11], [5])]
-    heard = [(report.heard_sender.tolist(), report.heard_by.tolist()) for report in publisher.reports]
+    heard = [(report.heard_sender.tolist(), report.heard_by.tolist()) for report in reports]
     assert heard == [([], []), ([7], [0b101]), ([], [])]
-    for report in publisher.reports:
+    for report in reports:
         count = len(report.agent)
         track = report.track.reshape(len(report.slot), -1, count)
         for row, slot in enumerate(report.slot.tolist()):
@@ -54,11 +53,10 @@ def test_slots_of_different_agents_are_told_apart_and_what_was_heard_once() -> N
 
 
 def test_what_was_heard_is_told_even_if_nobody_has_begun_a_slot() -> None:
-    publisher = Publisher()
-    reporter = Reporter(publisher, CONFIG, IDS)
+    reporter, reports = make_reporter()
     reporter.add_slot(1, 4, 0, 0, Swarm(CONFIG, local=[IDS[1]]))
     reporter.add_heard(1, 7, 3, 3, 30_000_000)
     reporter.publish(9, 4)
-    alone, everybody = publisher.reports
+    alone, everybody = reports
     assert (alone.agent.tolist(), alone.heard_sender.tolist()) == ([5], [])
     assert (everybody.agent.tolist(), everybody.slot.tolist(), everybody.heard_by.tolist()) == ([2, 5, 11], [], [0b10])
