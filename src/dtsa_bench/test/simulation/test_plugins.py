@@ -188,25 +188,13 @@ def gives(method: str, answer: Any) -> type:
 @pytest.mark.parametrize(
     ("kind", "wrong", "said"),
     [
-        (
-            "policy",
-            lambda *_: {}["no such option"],
-            r"^policy wrong: KeyError: 'no such option' \(.*plugins.py:\d",
-        ),
-        (
-            "policy",
-            gives("choose", RuntimeError("lost")),
-            r"^policy wrong, choose: RuntimeError: lost \(.*plugins.py",
-        ),
+        ("policy", lambda *_: {}["no such option"], r"^policy wrong: KeyError: 'no such option' \(.*plugins.py:\d"),
+        ("policy", gives("choose", RuntimeError("lost")), r"^policy wrong, choose: RuntimeError: lost \(.*plugins.py"),
         ("policy", gives("choose", SystemExit(0)), r"^policy wrong, choose: SystemExit: 0 \(.*test_plugins.py"),
         ("policy", gives("choose", None), r"chose agent None in slot 0; allowed: an integer, 0 \(nobody\) to 4"),
         ("policy", gives("choose", 3.0), "wrong, choose: chose agent 3.0 in slot 0; allowed: an integer, 0"),
         ("policy", gives("choose", -1), "policy wrong, choose: chose agent -1 in slot 0"),
-        (
-            "policy",
-            gives("choose", Odd()),
-            r"^policy wrong, choose: chose agent <Odd> in slot 0; allowed: an int",
-        ),
+        ("policy", gives("choose", Odd()), r"^policy wrong, choose: chose agent <Odd> in slot 0; allowed: an int"),
         ("policy", gives("senders", None), r"^policy wrong, senders: gave None in slot 0; allowed: a list of the ids"),
         ("policy", gives("senders", Odd()), r"^policy wrong, senders: gave <Odd> in slot 0; allowed: a list"),
         ("policy", gives("wake", Odd()), r"^policy wrong, wake: gave <Odd> ns; allowed: whole numbers above 0"),

@@ -143,8 +143,7 @@ def test_dtsa_chooses_for_the_reasons_that_it_has() -> None:
 
 @pytest.mark.ros
 @pytest.mark.parametrize(
-    ("agents", "processes", "loss"),
-    [(4, None, 0.0), (4, None, 0.25), (12, 2, 0.0), (12, 3, 0.1), (18, 2, 0.15)],
+    ("agents", "processes", "loss"), [(4, None, 0.0), (4, None, 0.25), (12, 2, 0.0), (12, 3, 0.1), (18, 2, 0.15)]
 )
 def test_simulate_and_fly_agree_bit_for_bit(tmp_path: Path, agents: int, processes: int | None, loss: float) -> None:
     pytest.importorskip("rclpy")
