@@ -75,10 +75,8 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert len(found) == 4
     text = (checkout.ROOT / "CITATION.cff").read_text(encoding="utf-8")
     versions = {
-        *found.values(),
-        *re.findall(r"^version: (.*)$", text, re.MULTILINE),
-        importlib.metadata.version("dtsa"),
-    }
+        *found.values(), *re.findall(r"^version: (.*)$", text, re.MULTILINE), importlib.metadata.version("dtsa"),
+    }  # fmt: skip
     assert versions == {dtsa_bench.__version__}
 
 

@@ -13,14 +13,11 @@ from dtsa_channel_sim import ChannelConfig
 
 # Columns: settings of the swarm by name.
 PROTOCOLS: dict[str, dict[str, Any]] = {
-    "tdma": {"policy": "tdma"},
-    "tdma+gossip": {"policy": "tdma", "frame": "extended"},
-    "dtsa": {"policy": "dtsa"},
+    "tdma": {"policy": "tdma"}, "tdma+gossip": {"policy": "tdma", "frame": "extended"}, "dtsa": {"policy": "dtsa"},
     "genie (age)": {"policy": "genie-age", "frame": "extended"},
     "genie (error)": {"policy": "genie-error", "frame": "extended"},
-    "lease S=0": {"policy": "lease", "open_every": 0, "adoption": False},
-    "lease": {"policy": "lease"},
-}
+    "lease S=0": {"policy": "lease", "open_every": 0, "adoption": False}, "lease": {"policy": "lease"},
+}  # fmt: skip
 FLYING = 1000  # slots, mean time of flight between two pauses
 
 
@@ -62,20 +59,11 @@ def test_all_moving_without_loss_is_exactly_tdma() -> None:
     assert all(age > 5.5 for age in by_content.values())
 
 
-@pytest.mark.parametrize(
-    ("agents", "movers", "warmup", "more", "ceiling"),
-    [
-        (12, 6, 600, {}, 0.56),
-        (12, 6, 600, {"loss": 0.3}, 0.4),
-        (12, 2, 600, {}, 0.15),
-        (12, 2, 600, {"loss": 0.1}, 0.2),
-        (12, 12, 600, {"loss": 0.1}, 0.9),
-        (70, 35, 700, {"loss": 0.1}, 0.64),
-        (70, 0, 2000, {"pause": 3000}, 0.8),
-        (70, 0, 2000, {"pause": 1000}, 1.02),
-        (70, 0, 2000, {"pause": 300, "loss": 0.1}, 1.02),
-    ],
-)
+@pytest.mark.parametrize(("agents", "movers", "warmup", "more", "ceiling"), [
+    (12, 6, 600, {}, 0.56), (12, 6, 600, {"loss": 0.3}, 0.4), (12, 2, 600, {}, 0.15), (12, 2, 600, {"loss": 0.1}, 0.2),
+    (12, 12, 600, {"loss": 0.1}, 0.9), (70, 35, 700, {"loss": 0.1}, 0.64), (70, 0, 2000, {"pause": 3000}, 0.8),
+    (70, 0, 2000, {"pause": 1000}, 1.02), (70, 0, 2000, {"pause": 300, "loss": 0.1}, 1.02),
+])  # fmt: skip
 def test_lease_is_younger_than_tdma(
     agents: int, movers: int, warmup: int, more: dict[str, Any], ceiling: float
 ) -> None:

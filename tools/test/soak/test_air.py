@@ -33,14 +33,12 @@ LINKS = Links(delay_ns=200_000, jitter_ns=500_000, double=0.1)
 #: What goes wrong in a flight, and what it does to it.
 FAULTS = {
     "kill": "an agent's process is killed, and started again after 1 s",
-    "freeze": "an agent's process stands still for 3 s",
-    "partition": "the air is cut in two for 3 s",
-    "jam": "no agent hears any other for 3 s",
-    "stall": "the switch stands still for 1 s",
+    "freeze": "an agent's process stands still for 3 s", "partition": "the air is cut in two for 3 s",
+    "jam": "no agent hears any other for 3 s", "stall": "the switch stands still for 1 s",
     "groups": "the air is cut in two from the start: two groups that count differently meet",
     "intruder": "a stranger without the key answers each frame: played again, changed, made up, floods of twenty",
     "links": "frames are 0.2 to 0.7 ms longer under way, and every tenth arrives twice",
-}
+}  # fmt: skip
 
 
 def _disturb(flight: Any, fault: str) -> None:

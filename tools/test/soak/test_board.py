@@ -37,15 +37,10 @@ SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
 ALL = "all but a brown-out, with sanitizers"
 #: Faults by name: settings of the laboratory.
 FAULTS: dict[str, dict[str, float]] = {
-    "clocks off by 50 ppm": {},
-    "30 % lost": {"loss": 0.3},
-    "polls, 10 a second each": {"polls": 10.0},
-    "polls, 50 a second each": {"polls": 50.0},
-    "an app that is reset": {},
-    "a brown-out in flight": {},
-    "a foreign sender": {},
-    ALL: {"loss": 0.1, "polls": 10.0},
-}
+    "clocks off by 50 ppm": {}, "30 % lost": {"loss": 0.3}, "polls, 10 a second each": {"polls": 10.0},
+    "polls, 50 a second each": {"polls": 50.0}, "an app that is reset": {}, "a brown-out in flight": {},
+    "a foreign sender": {}, ALL: {"loss": 0.1, "polls": 10.0},
+}  # fmt: skip
 ITEMS = [(fault, part, 100.0 if fault == ALL else 300.0) for fault in FAULTS for part in (1, 2)]
 
 

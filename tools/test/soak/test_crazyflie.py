@@ -135,12 +135,10 @@ def random_faults(seed: int) -> list[VehicleFault]:
         request: dict[str, Any] = {
             "silence": {"name": "freeze", "seconds": seconds},
             "loss": {"name": "drop", "rate": rate, "direction": direction, "seconds": seconds},
-            "bounce": {"name": "close", "seconds": seconds},
-            "battery": {"name": "battery", "voltage": 3.0},
+            "bounce": {"name": "close", "seconds": seconds}, "battery": {"name": "battery", "voltage": 3.0},
             "estimate jumps": {"name": "estimate_jump", "distance": 2.0 * sign},
-            "estimate freezes": {"name": "estimate_freeze"},
-            "tumbles": {"name": "tumble"},
-        }[kind]
+            "estimate freezes": {"name": "estimate_freeze"}, "tumbles": {"name": "tumble"},
+        }[kind]  # fmt: skip
         faults.append(VehicleFault(cf, round(after_s, 2), kind, request))
     return sorted(faults, key=lambda fault: fault.after_s)
 

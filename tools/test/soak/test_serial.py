@@ -20,13 +20,11 @@ FAULT_S = 6.0
 SLOW = {"v_max": 0.25, "a_max": 1.0, "radius": 0.35}  # m/s, m/s^2, m: slots are long
 #: What goes wrong in a flight, and what it does to it.
 FAULTS = {
-    "kill": "an agent's process is killed, and started again after 2 s",
-    "partition": "the air is cut in two for 6 s",
+    "kill": "an agent's process is killed, and started again after 2 s", "partition": "the air is cut in two for 6 s",
     "unplug": "a modem is unplugged for 6 s, and is another device then",
     "garbage": "other bytes come out of modems before a fifth of the packets",
-    "latency": "USB adapters keep bytes for 16 to 32 ms",
-    "echo": "modems give back what they are given",
-}
+    "latency": "USB adapters keep bytes for 16 to 32 ms", "echo": "modems give back what they are given",
+}  # fmt: skip
 MODEMS: dict[str, dict[str, Any]] = {
     "garbage": {"garbage": 0.2}, "latency": {"latency_ms": 16.0, "jitter_ms": 16.0}, "echo": {"echo": True},
 }  # fmt: skip

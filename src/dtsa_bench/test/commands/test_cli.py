@@ -34,14 +34,11 @@ def test_exit_code_and_arguments_reach_the_command(monkeypatch: pytest.MonkeyPat
     assert cli.main(["probe"]) == 0
 
 
-@pytest.mark.parametrize(
-    ("error", "code", "said"),
-    [
-        (ConfigError("agents", 0, "2 to 1000"), 2, "dtsa: error: agents: got 0; allowed: 2 to 1000\n"),
-        (RemoteProtocolError("frame of agent 3:\n  too short"), 1, "dtsa: error: frame of agent 3: too short\n"),
-        (KeyboardInterrupt(), 130, ""),
-    ],
-)
+@pytest.mark.parametrize(("error", "code", "said"), [
+    (ConfigError("agents", 0, "2 to 1000"), 2, "dtsa: error: agents: got 0; allowed: 2 to 1000\n"),
+    (RemoteProtocolError("frame of agent 3:\n  too short"), 1, "dtsa: error: frame of agent 3: too short\n"),
+    (KeyboardInterrupt(), 130, ""),
+])  # fmt: skip
 def test_an_error_is_one_line_and_an_exit_code(
     error: BaseException, code: int, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

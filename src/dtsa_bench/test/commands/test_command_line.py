@@ -44,20 +44,16 @@ def test_help_ends_with_examples_that_the_command_takes(command: str, capsys: py
         assert f"tools/dtsa {command} {words}".rstrip() + f"\n      {text}\n" in shown
 
 
-@pytest.mark.parametrize(
-    ("words", "meant"),
-    [
-        (["simulate", "--agnets", "3"], "option --agnets: unknown; did you mean --agents?"),
-        (["simulate", "--polic", "tdma"], "option --polic: unknown; did you mean --policy?"),
-        (["simulate", "--sed=3"], "option --sed=3: unknown; did you mean --seed?"),
-        (["simulate", "--policy", "dsta"], "; did you mean dtsa?"),
-        (["simulate", "--scenario", "way-points"], "did you mean waypoints?"),
-        (["fly", "--ot", "a"], "option --ot: unknown; did you mean --out?"),
-        (["bridge", "--config", "a", "--backend", "cflb"], "did you mean cflib?"),
-        (["sweep", "--preset", "papr-12"], "did you mean paper-12?"),
-        (["simulat"], "did you mean simulate?"),
-    ],
-)
+@pytest.mark.parametrize(("words", "meant"), [
+    (["simulate", "--agnets", "3"], "option --agnets: unknown; did you mean --agents?"),
+    (["simulate", "--polic", "tdma"], "option --polic: unknown; did you mean --policy?"),
+    (["simulate", "--sed=3"], "option --sed=3: unknown; did you mean --seed?"),
+    (["simulate", "--policy", "dsta"], "; did you mean dtsa?"),
+    (["simulate", "--scenario", "way-points"], "did you mean waypoints?"),
+    (["fly", "--ot", "a"], "option --ot: unknown; did you mean --out?"),
+    (["bridge", "--config", "a", "--backend", "cflb"], "did you mean cflib?"),
+    (["sweep", "--preset", "papr-12"], "did you mean paper-12?"), (["simulat"], "did you mean simulate?"),
+])  # fmt: skip
 def test_the_nearest_word_is_named(words: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert meant in refused(words, capsys)
 
@@ -72,18 +68,10 @@ def test_the_tool_names_the_nearest_command(capsys: pytest.CaptureFixture[str]) 
     assert "did you mean fly?" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("line", "wanted"),
-    [
-        ("dtsa ex", {"export"}),
-        ("dtsa se", {"setup"}),
-        ("dtsa fly --poli", {"--policy"}),
-        ("dtsa fly --policy ls", set()),
-        ("dtsa fly --policy l", {"lease"}),
-        ("dtsa bridge --backend ", {"cflib", "sim"}),
-        ("dtsa completion z", {"zsh"}),
-    ],
-)
+@pytest.mark.parametrize(("line", "wanted"), [
+    ("dtsa ex", {"export"}), ("dtsa se", {"setup"}), ("dtsa fly --poli", {"--policy"}), ("dtsa fly --policy ls", set()),
+    ("dtsa fly --policy l", {"lease"}), ("dtsa bridge --backend ", {"cflib", "sim"}), ("dtsa completion z", {"zsh"}),
+])  # fmt: skip
 def test_bash_completes(line: str, wanted: set[str], completions: Path) -> None:
     words = line.split(" ")
     test = (

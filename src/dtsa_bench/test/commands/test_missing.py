@@ -22,20 +22,17 @@ sys.exit(entry.recorded_channel() if words == ["recorded_channel"] else cli.main
 """
 
 
-@pytest.mark.parametrize(
-    ("package", "words", "said"),
-    [
-        ("mcap", "verify x", "dtsa: error: the Python package mcap is missing: pip"),
-        ("yaml", "verify x", "yaml is missing: apt install python3-yaml"),
-        ("pyarrow", "export x", "pyarrow is missing: pip install pyarrow"),
-        ("aiohttp", "view x", "aiohttp is missing: pip install aiohttp"),
-        ("serial", "sniff --air serial --device x --no-seal", "serial is missing: pip install pyserial cobs"),
-        ("cobs", "sniff --air serial --device x --no-seal", "cobs is missing: pip install pyserial cobs"),
-        ("rclpy", "demo", "rclpy is missing: source an installation of ROS 2"),
-        ("mcap", "recorded_channel", "recorded_channel: error: the Python package mcap"),
-        ("dtsa_msgs", "recorded_channel", "dtsa_msgs is missing: build the workspace"),
-    ],
-)
+@pytest.mark.parametrize(("package", "words", "said"), [
+    ("mcap", "verify x", "dtsa: error: the Python package mcap is missing: pip"),
+    ("yaml", "verify x", "yaml is missing: apt install python3-yaml"),
+    ("pyarrow", "export x", "pyarrow is missing: pip install pyarrow"),
+    ("aiohttp", "view x", "aiohttp is missing: pip install aiohttp"),
+    ("serial", "sniff --air serial --device x --no-seal", "serial is missing: pip install pyserial cobs"),
+    ("cobs", "sniff --air serial --device x --no-seal", "cobs is missing: pip install pyserial cobs"),
+    ("rclpy", "demo", "rclpy is missing: source an installation of ROS 2"),
+    ("mcap", "recorded_channel", "recorded_channel: error: the Python package mcap"),
+    ("dtsa_msgs", "recorded_channel", "dtsa_msgs is missing: build the workspace"),
+])  # fmt: skip
 def test_a_missing_package_is_named(package: str, words: str, said: str) -> None:
     program = WITHOUT.format(package=package, words=words)
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

@@ -60,17 +60,11 @@ def test_without_a_file_all_is_as_the_options_say(monkeypatch: pytest.MonkeyPatc
     assert swarm == SwarmConfig(policy="lease", auth=True, auth_session=4)
 
 
-@pytest.mark.parametrize(
-    ("line", "field", "allowed"),
-    [
-        ("slot_ms: 0", "slot_ms", "ms"),
-        ("slot_ms: fast", "slot_ms", "ms"),
-        ("slotms: 5", "slotms", "did you mean slot_ms?"),
-        ("air: carrier pigeon", "air", "udp"),
-        ("id: 3", "id", "each has an --id of its own"),
-        ("agents: 5\nagents: 6", "agents", "once"),
-    ],
-)
+@pytest.mark.parametrize(("line", "field", "allowed"), [
+    ("slot_ms: 0", "slot_ms", "ms"), ("slot_ms: fast", "slot_ms", "ms"),
+    ("slotms: 5", "slotms", "did you mean slot_ms?"), ("air: carrier pigeon", "air", "udp"),
+    ("id: 3", "id", "each has an --id of its own"), ("agents: 5\nagents: 6", "agents", "once"),
+])  # fmt: skip
 def test_an_error_names_file_and_setting(tmp_path: Path, line: str, field: str, allowed: str) -> None:
     path = tmp_path / "swarm.yaml"
     path.write_text(line)

@@ -101,17 +101,11 @@ def test_two_that_meet_fall() -> None:
     assert all(f.supervisor.state == "crashed" for f in fleet.firmware)
 
 
-@pytest.mark.parametrize(
-    ("request_", "field"),
-    [
-        ({"fault": "explode"}, "fault"),
-        ({"fault": "drop", "cf": 3}, "cf"),
-        ({"fault": "drop", "cf": "one"}, "cf"),
-        ({"fault": "drop", "rate": 1.5}, "rate"),
-        ({"fault": "drop", "direction": "left"}, "direction"),
-        ({"fault": "battery", "voltage": 9}, "voltage"),
-    ],
-)
+@pytest.mark.parametrize(("request_", "field"), [
+    ({"fault": "explode"}, "fault"), ({"fault": "drop", "cf": 3}, "cf"), ({"fault": "drop", "cf": "one"}, "cf"),
+    ({"fault": "drop", "rate": 1.5}, "rate"), ({"fault": "drop", "direction": "left"}, "direction"),
+    ({"fault": "battery", "voltage": 9}, "voltage"),
+])  # fmt: skip
 def test_bad_faults_are_refused(request_: dict[str, Any], field: str) -> None:
     with closing(Fleet(FleetConfig(count=2, base_port=free_base_port(2)))) as fleet:
         with pytest.raises(ConfigError) as error:

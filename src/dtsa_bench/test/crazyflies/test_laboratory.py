@@ -311,16 +311,12 @@ def test_an_app_that_fails_is_named(write, code: str, said: str) -> None:
     assert "agent 1" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("code", "settings", "error", "said"),
-    [
-        ("void appMain(void) { nonsense(); } syntax", "{}", CompileError, "error"),
-        ("void eventQueueSend(void); void appMain(void) { eventQueueSend(); }", "{}", CompileError, "eventQueueSend"),
-        ("int other;", "{}", AppError, "appMain"),
-        ("", "parameters: {own.go: fast}", ConfigError, "parameters"),
-        ("", "sorces: [x.c]", ConfigError, "sorces"),
-    ],
-)
+@pytest.mark.parametrize(("code", "settings", "error", "said"), [
+    ("void appMain(void) { nonsense(); } syntax", "{}", CompileError, "error"),
+    ("void eventQueueSend(void); void appMain(void) { eventQueueSend(); }", "{}", CompileError, "eventQueueSend"),
+    ("int other;", "{}", AppError, "appMain"), ("", "parameters: {own.go: fast}", ConfigError, "parameters"),
+    ("", "sorces: [x.c]", ConfigError, "sorces"),
+])  # fmt: skip
 def test_bad_input_is_said_in_a_line(write, code: str, settings: str, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         fly(write(code, settings), 1.5)

@@ -35,10 +35,8 @@ from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.merge import Merge, verified
 
 pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.ros,
-    pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler"),
-]
+    pytest.mark.slow, pytest.mark.ros, pytest.mark.skipif(shutil.which(compiler()[0]) is None, reason="no C compiler"),
+]  # fmt: skip
 
 NAMES = ("cf1", "cf2", "cf3")
 SWARM = {"policy": "lease", "slot_ms": 20.0, "axis_x_m": 0.8, "axis_y_m": 0.8, "jitter_m": 0.0, "permute": False}

@@ -31,15 +31,11 @@ def merged(folder: Path) -> dict[str, Any]:
     return Merge([read(path) for path in sorted(folder.glob("cf*.mcap"))]).judge()
 
 
-@pytest.mark.parametrize(
-    ("swarm", "lab"),
-    [
-        (LEASE, LabSettings(drift_ppm=50.0)),
-        (LEASE, LabSettings(loss=0.1, seed=2)),
-        (SwarmConfig(agents=5, policy="tdma", slot_ms=5.0, estimator="hold"), LabSettings(loss=0.1)),
-        (SwarmConfig(agents=5, policy="lease", auth=True, auth_session=3), LabSettings()),
-    ],
-)
+@pytest.mark.parametrize(("swarm", "lab"), [
+    (LEASE, LabSettings(drift_ppm=50.0)), (LEASE, LabSettings(loss=0.1, seed=2)),
+    (SwarmConfig(agents=5, policy="tdma", slot_ms=5.0, estimator="hold"), LabSettings(loss=0.1)),
+    (SwarmConfig(agents=5, policy="lease", auth=True, auth_session=3), LabSettings()),
+])  # fmt: skip
 def test_apps_decide_what_agents_on_computers_decide(swarm: SwarmConfig, lab: LabSettings, tmp_path: Path) -> None:
     with OnBoard(swarm, lab, tmp_path, key=bytes(range(16)) if swarm.auth else b"", enable_s=6.0) as flight:
         assert flight.lab.warnings == ""
@@ -179,14 +175,11 @@ def test_an_agent_that_stays_for_old_news_gives_way_to_those_that_it_hears() -> 
     assert min(nearest) > 0.3
 
 
-@pytest.mark.parametrize(
-    ("swarm", "said"),
-    [
-        (SwarmConfig(agents=21, policy="lease"), "agents: got 21; allowed: 1 to 20"),
-        (SwarmConfig(agents=4, policy="lease", auth=True, auth_session=1), "key: got 'none'"),
-        (SwarmConfig(agents=4, policy="tdma", estimator="intent"), "estimator: got 'intent'; allowed: hold, linear"),
-    ],
-)
+@pytest.mark.parametrize(("swarm", "said"), [
+    (SwarmConfig(agents=21, policy="lease"), "agents: got 21; allowed: 1 to 20"),
+    (SwarmConfig(agents=4, policy="lease", auth=True, auth_session=1), "key: got 'none'"),
+    (SwarmConfig(agents=4, policy="tdma", estimator="intent"), "estimator: got 'intent'; allowed: hold, linear"),
+])  # fmt: skip
 def test_a_swarm_that_cannot_fly_on_board_is_refused(swarm: SwarmConfig, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         OnBoard(swarm, LabSettings())

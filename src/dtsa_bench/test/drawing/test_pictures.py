@@ -20,13 +20,10 @@ def dtsa(directory: Path, *words: str, **environment: str) -> subprocess.Complet
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "picture"),
-    [
-        (["simulate", "--agents", "4", "--timeout-s", "0.5", "--picture", "a.png"], "a.png"),
-        pytest.param(FLY, "run/trajectories.png", marks=pytest.mark.ros),
-    ],
-)
+@pytest.mark.parametrize(("words", "picture"), [
+    (["simulate", "--agents", "4", "--timeout-s", "0.5", "--picture", "a.png"], "a.png"),
+    pytest.param(FLY, "run/trajectories.png", marks=pytest.mark.ros),
+])  # fmt: skip
 def test_a_users_latex_does_not_reach_a_picture_and_a_broken_matplotlib_costs_the_picture_alone(
     tmp_path: Path, words: list[str], picture: str
 ) -> None:

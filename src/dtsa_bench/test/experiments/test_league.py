@@ -103,25 +103,17 @@ def test_a_plug_in_in_a_directory_of_its_own_enters(
     assert "1 of 1 flights flown again; 0 differences" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["enter", "tdmaa"], "POLICY: got 'tdmaa'"),
-        (["enter", "lease", "--cells", "moon"], "cells: got 'moon'"),
-        (["enter", "lease", "--sample", "0"], "sample: got '0'"),
-        (["enter", "lease", "--set", "loss=0"], "set.loss: got 0"),
-        (["enter", "lease", "--set", "frame"], "set: got 'frame'"),
-        (["enter", "lease", "--set", "options={v_max: 9}"], "set.options.v_max: got 9"),
-        (["enter", "lease", "--name", "A b"], "name: got 'A b'"),
-        (["enter", "lease", "--all"], "option --all: unknown"),
-        (["enter"], "POLICY"),
-        (["check", "/nowhere"], "FILE: got '/nowhere'"),
-        (["check", str(Path(__file__))], "FILE: got"),
-        (["check", str(PUBLISHED), "moon"], "NAME: got 'moon'"),
-        (["table"], "FILE"),
-        (["cells", "all"], "argument all: unknown"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (["enter", "tdmaa"], "POLICY: got 'tdmaa'"), (["enter", "lease", "--cells", "moon"], "cells: got 'moon'"),
+    (["enter", "lease", "--sample", "0"], "sample: got '0'"),
+    (["enter", "lease", "--set", "loss=0"], "set.loss: got 0"),
+    (["enter", "lease", "--set", "frame"], "set: got 'frame'"),
+    (["enter", "lease", "--set", "options={v_max: 9}"], "set.options.v_max: got 9"),
+    (["enter", "lease", "--name", "A b"], "name: got 'A b'"), (["enter", "lease", "--all"], "option --all: unknown"),
+    (["enter"], "POLICY"), (["check", "/nowhere"], "FILE: got '/nowhere'"),
+    (["check", str(Path(__file__))], "FILE: got"), (["check", str(PUBLISHED), "moon"], "NAME: got 'moon'"),
+    (["table"], "FILE"), (["cells", "all"], "argument all: unknown"),
+])  # fmt: skip
 def test_wrong_input_is_refused_in_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert said in refused(["league", *words], capsys)
 
@@ -135,14 +127,11 @@ def test_an_entry_of_a_policy_that_is_not_here_is_not_checked(
     assert capsys.readouterr().out.startswith("lease: not checked: policy: got 'moon'; allowed: ")
 
 
-@pytest.mark.parametrize(
-    "broken",
-    [
-        {"fields": ["k"]}, {"frozen": "0" * 16}, {"entries": []}, {"entries": [{"name": 3}]},
-        {"flights": {"moon": []}}, {"flights": {"few": [[0, 1]]}}, {"flights": {"few": 7}},
-        {"flights": {"few": [["completed", math.nan, 1, 1, 1, 1, 1, ""]]}},
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("broken", [
+    {"fields": ["k"]}, {"frozen": "0" * 16}, {"entries": []}, {"entries": [{"name": 3}]}, {"flights": {"moon": []}},
+    {"flights": {"few": [[0, 1]]}}, {"flights": {"few": 7}},
+    {"flights": {"few": [["completed", math.nan, 1, 1, 1, 1, 1, ""]]}},
+])  # fmt: skip
 def test_what_is_no_entry_is_refused(broken: dict[str, Any], flown: Path, tmp_path: Path) -> None:
     content = json.loads((flown / "lease" / "entry.json").read_text())
     if "flights" in broken:
@@ -181,12 +170,10 @@ def made_up(name: str, ages: list[float], crashed: int = 0, bound: bool = False)
 
 def test_the_order_is_by_lost_flights_times_age_and_bounds_have_no_rank() -> None:
     entries = [
-        made_up("all-knowing", [1.0] * 4, bound=True),
-        made_up("many lost", [50.0] * 4, crashed=3),
-        made_up("slow", [300.0] * 4, crashed=1),
-        made_up("none lost, slow", [900.0] * 4),
+        made_up("all-knowing", [1.0] * 4, bound=True), made_up("many lost", [50.0] * 4, crashed=3),
+        made_up("slow", [300.0] * 4, crashed=1), made_up("none lost, slow", [900.0] * 4),
         made_up("none lost", [100.0] * 4),
-    ]
+    ]  # fmt: skip
     table = LeagueTable(LEAGUE, entries)
     assert [line[:2] for line in table.lines()] == [
         ["1", "none lost"], ["2", "none lost, slow"], ["3", "slow"], ["4", "many lost"], ["bound", "all-knowing"],

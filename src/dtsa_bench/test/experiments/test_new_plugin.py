@@ -18,12 +18,8 @@ def test_the_package_installs_passes_its_test_and_flies(tmp_path: Path) -> None:
     simulated = ["simulate", "--agents", "4", "--policy", "my-policy", "--options", "my-policy.tdma_every=3"]
     files = write_package("my-policy", tmp_path / "package")
     assert {path.name for path in files} == {
-        "README.md",
-        "__init__.py",
-        "pyproject.toml",
-        "sweep.yaml",
-        "test_policy.py",
-    }
+        "README.md", "__init__.py", "pyproject.toml", "sweep.yaml", "test_policy.py",
+    }  # fmt: skip
     assert not any("@" in path.read_text() for path in files)
     (tmp_path / "conftest.py").write_text("import no_such_module  # what a checkout's tests need, users may not have")
     (tmp_path / "pyproject.toml").write_text("[tool.pytest.ini_options]\nminversion = '1'\n")

@@ -90,10 +90,8 @@ def test_the_papers_figures_have_its_settings() -> None:
         assert {run.agents for run in runs} == {agents}
         assert sorted({run.movers for run in runs}) == movers
         assert {(run.policy, run.estimator) for run in runs} == {
-            ("tdma", "hold"),
-            ("tdma", "linear"),
-            ("dtsa", "linear"),
-        }
+            ("tdma", "hold"), ("tdma", "linear"), ("dtsa", "linear"),
+        }  # fmt: skip
         assert {(run.epsilon, run.r_min, run.slot_ms) for run in runs} == {(0.5, 0.3, 10.0)}
 
 

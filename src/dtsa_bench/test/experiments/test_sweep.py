@@ -30,12 +30,10 @@ from dtsa_bench.experiments.tables import SweepTable
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 CONTENT: dict[str, Any] = {
-    "title": "small",
-    "seeds": 6,
-    "base": {"agents": 6, "timeout_s": 0.6},
+    "title": "small", "seeds": 6, "base": {"agents": 6, "timeout_s": 0.6},
     "axes": {"policy": ["tdma", "dtsa"], "channel": {"clear": {}, "lossy": {"loss": 0.2}}},
     "figures": [{"kind": "matrix", "rows": "policy", "columns": "channel", "y": ["crashed"]}],
-}
+}  # fmt: skip
 
 
 def sweep(**changes: Any) -> spec.Sweep:
@@ -72,23 +70,14 @@ def test_axes_are_combined_and_names_may_be_of_any_section() -> None:
     assert spec.make_sweep(CONTENT, "s", seeds=2, first_seed=50).seeds == (50, 51)
 
 
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
-        ({"axes": {"color": ["red"]}}, "axes.color"),
-        ({"axes": {"policy": []}}, "axes.policy"),
-        ({"axes": {"agents": [6, -3]}}, "agents"),
-        ({"axes": {"x": {"a": {"nothing": 1}}}}, "nothing"),
-        ({"axes": {"channel": {"a": {"loss": 1.5}}}}, "loss"),
-        ({"base": {"timeout": 3}}, "timeout"),
-        ({"base": []}, "base"),
-        ({"seeds": 0}, "seeds"),
-        ({"seeds": ["a"]}, "seeds"),
-        ({"figures": [{"kind": "pie"}]}, "figures[0].kind"),
-        ({"figures": [{"kind": "bars", "x": "moving", "y": []}]}, "figures[0].x"),
-        ({"color": "red"}, "color"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "field"), [
+    ({"axes": {"color": ["red"]}}, "axes.color"), ({"axes": {"policy": []}}, "axes.policy"),
+    ({"axes": {"agents": [6, -3]}}, "agents"), ({"axes": {"x": {"a": {"nothing": 1}}}}, "nothing"),
+    ({"axes": {"channel": {"a": {"loss": 1.5}}}}, "loss"), ({"base": {"timeout": 3}}, "timeout"),
+    ({"base": []}, "base"), ({"seeds": 0}, "seeds"), ({"seeds": ["a"]}, "seeds"),
+    ({"figures": [{"kind": "pie"}]}, "figures[0].kind"),
+    ({"figures": [{"kind": "bars", "x": "moving", "y": []}]}, "figures[0].x"), ({"color": "red"}, "color"),
+])  # fmt: skip
 def test_what_is_wrong_is_named_before_anything_flies(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(ConfigError) as caught:
         sweep(**changes)
@@ -196,11 +185,9 @@ def test_failures_are_rows_with_a_reason_and_are_tried_again(tmp_path: Path, mon
 
 
 def test_crashes_and_timeouts_are_left_out_of_means_and_counted(tmp_path: Path) -> None:
-    plan = sweep(
-        base={"agents": 12, "slot_ms": 20.0, "estimator": "hold", "timeout_s": 20.0},
-        seeds=12,
-        axes={"agents": [8, 14], "timeout_s": [0.5, 20.0]},
-    )
+    plan = sweep(base={"agents": 12, "slot_ms": 20.0, "estimator": "hold", "timeout_s": 20.0}, seeds=12, axes={
+        "agents": [8, 14], "timeout_s": [0.5, 20.0],
+    })  # fmt: skip
     table = fly(tmp_path, plan)
     late = table.where(agents=8, timeout_s=0.5)[0]
     assert late.left_out == {"timed out": 12}
@@ -240,18 +227,12 @@ def test_the_command_writes_everything(tmp_path: Path, capsys: pytest.CaptureFix
     assert (out / "figures" / "matrix.png").read_bytes()[:4] == b"\x89PNG"
 
 
-@pytest.mark.parametrize(
-    ("words", "field"),
-    [
-        (["--preset", "nothing"], "preset"),
-        (["--preset", "idle", "--seeds", "0"], "seeds"),
-        (["--preset", "idle", "--jobs", "many"], "jobs"),
-        (["--preset", "idle", "--set", "loss"], "set"),
-        (["--preset", "idle", "--set", "loss=2"], "loss"),
-        (["--preset", "estimate", "--cluster", "tcp://127.0.0.1:1"], "cluster"),
-        ([], ""),
-    ],
-)
+@pytest.mark.parametrize(("words", "field"), [
+    (["--preset", "nothing"], "preset"), (["--preset", "idle", "--seeds", "0"], "seeds"),
+    (["--preset", "idle", "--jobs", "many"], "jobs"), (["--preset", "idle", "--set", "loss"], "set"),
+    (["--preset", "idle", "--set", "loss=2"], "loss"),
+    (["--preset", "estimate", "--cluster", "tcp://127.0.0.1:1"], "cluster"), ([], ""),
+])  # fmt: skip
 def test_wrong_words_end_with_one_line_and_code_2(
     words: list[str], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -196,15 +196,12 @@ def test_messages_of_every_kind_end_and_freeze_nobody_in_real_time_and_are_not_b
 # -- the handshake
 
 
-@pytest.mark.parametrize(
-    ("second", "said"),
-    [
-        ("seed:=7", r"seed of /cf[12]/agent: got [17]; allowed: [17], as /cf[12]/agent has it"),
-        ("slot_ms:=20", r"slot_ms of /cf2/agent: got 20\.0; allowed: 10\.0, as /swarm/channel has it"),
-        ("mode:=realtime", r"mode of /cf2/agent: got 'realtime'; allowed: 'lockstep', as /swarm"),
-        ("policy:=aloha", r"policy of /cf[12]/agent: got '\w+'; allowed: '\w+', as /cf[12]/agent"),
-    ],
-)
+@pytest.mark.parametrize(("second", "said"), [
+    ("seed:=7", r"seed of /cf[12]/agent: got [17]; allowed: [17], as /cf[12]/agent has it"),
+    ("slot_ms:=20", r"slot_ms of /cf2/agent: got 20\.0; allowed: 10\.0, as /swarm/channel has it"),
+    ("mode:=realtime", r"mode of /cf2/agent: got 'realtime'; allowed: 'lockstep', as /swarm"),
+    ("policy:=aloha", r"policy of /cf[12]/agent: got '\w+'; allowed: '\w+', as /cf[12]/agent"),
+])  # fmt: skip
 def test_settings_that_differ_are_refused_before_slot_0(tmp_path: Path, second: str, said: str) -> None:
     with ros_graph(tmp_path) as graph:
         for words in (["-p", "id:=1"], ["-p", "id:=2", "-p", second]):

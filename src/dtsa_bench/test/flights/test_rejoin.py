@@ -97,14 +97,10 @@ def begins_at_an_anchor(found: list[Report], agent: int) -> bool:
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize(
-    ("argument", "agents", "words"),
-    [
-        ("__ns:=/cf2", [2], LEASE),
-        ("__node:=swarm_host_2", [3, 4], ("--processes", "2", *LEASE)),
-        ("__ns:=/cf2", [2], ("--policy", "tdma", "--frame", "extended")),
-    ],
-)
+@pytest.mark.parametrize(("argument", "agents", "words"), [
+    ("__ns:=/cf2", [2], LEASE), ("__node:=swarm_host_2", [3, 4], ("--processes", "2", *LEASE)),
+    ("__ns:=/cf2", [2], ("--policy", "tdma", "--frame", "extended")),
+])  # fmt: skip
 @pytest.mark.alone
 @pytest.mark.realtime
 def test_a_killed_process_comes_back_and_its_agents_are_heard_again(tmp_path, argument, agents, words):

@@ -22,13 +22,11 @@ from dtsa_agent.ros.common.graph import names
 SHARE = Path(__file__).resolve().parents[2]
 LAYOUTS = Path(__file__).resolve().parents[4] / "layouts"
 TYPES = {
-    "/swarm/slot": "dtsa_msgs/msg/Slot",
-    "/swarm/transmission": "dtsa_msgs/msg/Transmission",
-    "/swarm/reception": "dtsa_msgs/msg/Reception",
-    "/swarm/decision": "dtsa_msgs/msg/Decision",
+    "/swarm/slot": "dtsa_msgs/msg/Slot", "/swarm/transmission": "dtsa_msgs/msg/Transmission",
+    "/swarm/reception": "dtsa_msgs/msg/Reception", "/swarm/decision": "dtsa_msgs/msg/Decision",
     "/swarm/markers": "visualization_msgs/msg/MarkerArray",
     **{f"/cf{k}/odom": "nav_msgs/msg/Odometry" for k in range(1, 13)},
-}
+}  # fmt: skip
 
 pytestmark = pytest.mark.skipif(not LAYOUTS.is_dir(), reason="the layouts are part of the source tree only")
 

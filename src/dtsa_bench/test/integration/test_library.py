@@ -184,22 +184,14 @@ def test_a_sweep_has_a_row_a_combination_and_a_row_a_flight(swept: dtsa.SweepRes
     assert (tmp_path / "s" / "results.csv").read_text().count("\n") == 5
 
 
-@pytest.mark.parametrize(
-    ("use", "arguments", "field"),
-    [
-        (dtsa.simulate, {"agents": -1}, "agents"),
-        (dtsa.simulate, {"color": "red"}, "color"),
-        (dtsa.simulate, {"loss": 2.0}, "loss"),
-        (dtsa.simulate, {"observer": 99}, "observer"),
-        (dtsa.sweep, {}, "sweep"),
-        (dtsa.sweep, {"preset": "loss", "axes": {"loss": [0]}}, "sweep"),
-        (dtsa.sweep, {"preset": "nothing"}, "preset"),
-        (dtsa.sweep, {"axes": {"cell": [0]}}, "axes.cell"),
-        (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": 0}, "seeds"),
-        (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": []}, "seeds"),
-        (dtsa.sweep, {"axes": {"loss": [0]}, "jobs": 0}, "jobs"),
-    ],
-)
+@pytest.mark.parametrize(("use", "arguments", "field"), [
+    (dtsa.simulate, {"agents": -1}, "agents"), (dtsa.simulate, {"color": "red"}, "color"),
+    (dtsa.simulate, {"loss": 2.0}, "loss"), (dtsa.simulate, {"observer": 99}, "observer"), (dtsa.sweep, {}, "sweep"),
+    (dtsa.sweep, {"preset": "loss", "axes": {"loss": [0]}}, "sweep"), (dtsa.sweep, {"preset": "nothing"}, "preset"),
+    (dtsa.sweep, {"axes": {"cell": [0]}}, "axes.cell"), (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": 0}, "seeds"),
+    (dtsa.sweep, {"axes": {"loss": [0]}, "seeds": []}, "seeds"),
+    (dtsa.sweep, {"axes": {"loss": [0]}, "jobs": 0}, "jobs"),
+])  # fmt: skip
 def test_wrong_settings_are_named_before_anything_flies(use: Any, arguments: dict[str, object], field: str) -> None:
     with pytest.raises(dtsa.ConfigError) as caught:
         use(**arguments)

@@ -176,10 +176,8 @@ def test_sweeps_survive(name: str) -> None:
 def test_bags_of_before_are_read() -> None:
     """Lockstep runs once recorded no mode, and whole numbers stood where floats are meant."""
     old = {
-        "swarm": {"agents": 4, "slot_ms": 20},
-        "channel": {"agents": 4, "slot_ns": 20_000_000},
-        "limits": {"tail_s": 2},
-    }
+        "swarm": {"agents": 4, "slot_ms": 20}, "channel": {"agents": 4, "slot_ns": 20_000_000}, "limits": {"tail_s": 2},
+    }  # fmt: skip
     run = RunConfig.from_dict(old)
     assert (run.mode, run.align, run.clocks) == (LOCKSTEP, True, ClockConfig())
     assert run == RunConfig(SwarmConfig(agents=4, slot_ms=20.0), limits=RunLimits(tail_s=2.0), channel=run.channel)
@@ -199,42 +197,35 @@ def make(name: str, **fields: tuple[str, Any]) -> type[Settings]:
 
 PART = make("Part", size=("float", setting(1.0, "size", unit="m", minimum=0, maximum=2)))
 WHOLE = make(
-    "Whole",
-    count=("int", setting(REQUIRED, "count", minimum=1, maximum=9)),
-    share=("float", setting(0.5, "share", minimum=0, maximum=1)),
-    on=("bool", setting(True, "on")),
+    "Whole", count=("int", setting(REQUIRED, "count", minimum=1, maximum=9)),
+    share=("float", setting(0.5, "share", minimum=0, maximum=1)), on=("bool", setting(True, "on")),
     color=("str", setting("red", "color", choices=words)),
     plug=("str", setting("a", "plug", choices=("a", "b"), open_choices=True)),
     place=("Vector", setting((0.0, 0.0, 0.0), "place", unit="m")),
     level=("int | None", setting(None, "level", minimum=0, maximum=3)),
-    values=("Mapping[str, float]", setting({}, "values")),
-    part=("Part", nested(PART, "part")),
-)
+    values=("Mapping[str, float]", setting({}, "values")), part=("Part", nested(PART, "part")),
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({}, "count: got None; allowed: a whole number, 1 to 9"),
-        ({"count": 10}, "count: got 10; allowed: 1 to 9"),
-        ({"count": 1.5}, "count: got 1.5; allowed: a whole number, 1 to 9"),
-        ({"count": True}, "count: got True; allowed: a whole number, 1 to 9"),
-        ({"count": None}, "count: got None; allowed: a whole number, 1 to 9"),
-        ({"count": 1, "share": 2}, "share: got 2; allowed: a number from 0 to 1"),
-        ({"count": 1, "share": float("nan")}, "share: got nan; allowed: a number from 0 to 1"),
-        ({"count": 1, "on": 1}, "on: got 1; allowed: true or false"),
-        ({"count": 1, "color": "blue"}, "color: got 'blue'; allowed: red, green"),
-        ({"count": 1, "plug": 7}, "plug: got 7; allowed: a, b"),
-        ({"count": 1, "place": [1, 2]}, "place: got [1, 2]; allowed: three numbers: x, y, z in m"),
-        ({"count": 1, "level": -1}, "level: got -1; allowed: 0 to 3"),
-        ({"count": 1, "values": {"a": "b"}}, "values.a: got 'b'; allowed: a number"),
-        ({"count": 1, "values": 3}, "values: got 3; allowed: names with values"),
-        ({"count": 1, "part": {"size": 3}}, "part.size: got 3; allowed: 0 to 2 m"),
-        ({"count": 1, "part": {"size": "x"}}, "part.size: got 'x'; allowed: a number, 0 to 2 m"),
-        ({"count": 1, "part": 3}, "part: got 3; allowed: names with values"),
-        ({"count": 1, "cuont": 1}, "cuont: got 1; allowed: one of the settings count, share"),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    ({}, "count: got None; allowed: a whole number, 1 to 9"), ({"count": 10}, "count: got 10; allowed: 1 to 9"),
+    ({"count": 1.5}, "count: got 1.5; allowed: a whole number, 1 to 9"),
+    ({"count": True}, "count: got True; allowed: a whole number, 1 to 9"),
+    ({"count": None}, "count: got None; allowed: a whole number, 1 to 9"),
+    ({"count": 1, "share": 2}, "share: got 2; allowed: a number from 0 to 1"),
+    ({"count": 1, "share": float("nan")}, "share: got nan; allowed: a number from 0 to 1"),
+    ({"count": 1, "on": 1}, "on: got 1; allowed: true or false"),
+    ({"count": 1, "color": "blue"}, "color: got 'blue'; allowed: red, green"),
+    ({"count": 1, "plug": 7}, "plug: got 7; allowed: a, b"),
+    ({"count": 1, "place": [1, 2]}, "place: got [1, 2]; allowed: three numbers: x, y, z in m"),
+    ({"count": 1, "level": -1}, "level: got -1; allowed: 0 to 3"),
+    ({"count": 1, "values": {"a": "b"}}, "values.a: got 'b'; allowed: a number"),
+    ({"count": 1, "values": 3}, "values: got 3; allowed: names with values"),
+    ({"count": 1, "part": {"size": 3}}, "part.size: got 3; allowed: 0 to 2 m"),
+    ({"count": 1, "part": {"size": "x"}}, "part.size: got 'x'; allowed: a number, 0 to 2 m"),
+    ({"count": 1, "part": 3}, "part: got 3; allowed: names with values"),
+    ({"count": 1, "cuont": 1}, "cuont: got 1; allowed: one of the settings count, share"),
+])  # fmt: skip
 def test_errors_name_the_setting_the_value_and_what_is_allowed(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         WHOLE.from_dict(values)
@@ -248,16 +239,10 @@ def test_values_are_stored_as_their_kind() -> None:
     assert WHOLE.from_dict(whole.to_dict()) == whole
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "value"),
-    [
-        ("count", "7", 7),
-        ("share", "1", 1.0),
-        ("on", "no", False),
-        ("color", "green", "green"),
-        ("values", "a=1, b=-2.5", {"a": 1.0, "b": -2.5}),
-    ],
-)
+@pytest.mark.parametrize(("name", "text", "value"), [
+    ("count", "7", 7), ("share", "1", 1.0), ("on", "no", False), ("color", "green", "green"),
+    ("values", "a=1, b=-2.5", {"a": 1.0, "b": -2.5}),
+])  # fmt: skip
 def test_texts_are_read(name: str, text: str, value: Any) -> None:
     spec = next(spec for spec in settings_of(WHOLE) if spec.name == name)
     assert spec.read(text) == value

@@ -204,15 +204,12 @@ def test_echoes_garbage_and_late_bytes_lose_no_frame(tmp_path: Path) -> None:
         assert other.counts()["garbled_pieces"] >= 5
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--device=/dev/nothing"], "device: got '/dev/nothing'; allowed: a device that is there"),
-        (["--device=/dev/null"], "device: got '/dev/null'; allowed: a serial device"),
-        ([], "device: got None; allowed: the serial device of the modem, as /dev/ttyUSB0"),
-        (["--device=/dev/null", "--interface=lo"], "interface: got 'lo'; allowed: one of the settings device, baud"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (["--device=/dev/nothing"], "device: got '/dev/nothing'; allowed: a device that is there"),
+    (["--device=/dev/null"], "device: got '/dev/null'; allowed: a serial device"),
+    ([], "device: got None; allowed: the serial device of the modem, as /dev/ttyUSB0"),
+    (["--device=/dev/null", "--interface=lo"], "interface: got 'lo'; allowed: one of the settings device, baud"),
+])  # fmt: skip
 def test_what_cannot_be_is_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sniff", "--air=serial", "--no-seal", "--modem=sik-64k", *words]) == 2
     err = capsys.readouterr().err

@@ -424,19 +424,9 @@ def test_the_command_flies_until_a_signal_and_merges(tmp_path: Path) -> None:
     helpers.need_multicast()
     out = tmp_path / "cf2"
     words = [
-        "agent",
-        "--id",
-        "2",
-        "--agents",
-        "2",
-        "--interface",
-        "lo",
-        "--group",
-        helpers.own_group(),
-        "--no-seal",
-        "--quorum",
-        "0",
-    ]
+        "agent", "--id", "2", "--agents", "2", "--interface", "lo", "--group", helpers.own_group(), "--no-seal",
+        "--quorum", "0",
+    ]  # fmt: skip
     with subprocess.Popen(_command(*words, "--json", "--out", str(out)), stdout=subprocess.PIPE, text=True) as process:
         wait_for(lambda: (out / "cf2.mcap").exists() and (out / "cf2.mcap").stat().st_size > 4000)
         process.send_signal(signal.SIGTERM)

@@ -111,17 +111,11 @@ def test_animation_is_small_and_moves(flights: dict[str, FinishedFlight], tmp_pa
     assert (first != last).any(axis=2).mean() > 0.02
 
 
-@pytest.mark.parametrize(
-    ("environment", "platform", "looks"),
-    [
-        ({"DISPLAY": ":0"}, "linux", True),
-        ({"WAYLAND_DISPLAY": "wayland-0"}, "linux", True),
-        ({}, "linux", False),
-        ({}, "darwin", True),
-        ({"DISPLAY": "localhost:10.0", "SSH_CONNECTION": "1 2 3 4"}, "linux", False),
-        ({"DISPLAY": ":0", "CI": "true"}, "linux", False),
-    ],
-)
+@pytest.mark.parametrize(("environment", "platform", "looks"), [
+    ({"DISPLAY": ":0"}, "linux", True), ({"WAYLAND_DISPLAY": "wayland-0"}, "linux", True), ({}, "linux", False),
+    ({}, "darwin", True), ({"DISPLAY": "localhost:10.0", "SSH_CONNECTION": "1 2 3 4"}, "linux", False),
+    ({"DISPLAY": ":0", "CI": "true"}, "linux", False),
+])  # fmt: skip
 def test_a_page_opens_where_somebody_looks(environment: dict[str, str], platform: str, looks: bool) -> None:
     assert command.has_display(environment, platform) is looks
 

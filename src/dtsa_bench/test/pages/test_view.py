@@ -220,14 +220,10 @@ def test_orders_are_checked() -> None:
     assert read_order({"kind": "partition", "value": ""}) == Order("partition", value="")
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["view", "runs/a"], "a recorded run is shown by `tools/dtsa report runs/a`"),
-        (["view", "--port", "99999"], "port: got"),
-        (["view", "--listen", "0.0.0.0"], "listen: got"),
-    ],
-)
+@pytest.mark.parametrize(("words", "text"), [
+    (["view", "runs/a"], "a recorded run is shown by `tools/dtsa report runs/a`"),
+    (["view", "--port", "99999"], "port: got"), (["view", "--listen", "0.0.0.0"], "listen: got"),
+])  # fmt: skip
 def test_unusable_settings_are_one_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert text in refused(words, capsys)
 

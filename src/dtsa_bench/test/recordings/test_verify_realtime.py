@@ -132,25 +132,15 @@ other_sender = first_of("sender", lambda message, was: was % 4 + 1 if len(messag
 other_choice = first_of("chosen", lambda _, was: was + 1)
 
 
-@pytest.mark.parametrize(
-    ("topic", "change", "what"),
-    [
-        ("transmission", frame_byte, "frame.|slot.data|transmission.data"),
-        ("transmission", sending_time, "transmission.offset_ns"),
-        ("frame", frame_byte, "frame.|transmission.data"),
-        ("frame", frame_time, "transmission.offset_ns"),
-        ("report", heard_early, "report.heard_ns"),
-        ("report", other_choice, "report.chosen"),
-        ("report", not_heard, "report."),
-        ("report", heard_by_all, "report.heard_by"),
-        ("slot", frame_byte, "slot.data"),
-        ("slot", own_bit, "slot.received"),
-        ("slot", no_receiver, "reception.received"),
-        ("slot", other_sender, "slot.sender"),
-        ("reception", no_receiver, "reception.received"),
-        ("decision", other_choice, "decision"),
-    ],
-)
+@pytest.mark.parametrize(("topic", "change", "what"), [
+    ("transmission", frame_byte, "frame.|slot.data|transmission.data"),
+    ("transmission", sending_time, "transmission.offset_ns"), ("frame", frame_byte, "frame.|transmission.data"),
+    ("frame", frame_time, "transmission.offset_ns"), ("report", heard_early, "report.heard_ns"),
+    ("report", other_choice, "report.chosen"), ("report", not_heard, "report."),
+    ("report", heard_by_all, "report.heard_by"), ("slot", frame_byte, "slot.data"), ("slot", own_bit, "slot.received"),
+    ("slot", no_receiver, "reception.received"), ("slot", other_sender, "slot.sender"),
+    ("reception", no_receiver, "reception.received"), ("decision", other_choice, "decision"),
+])  # fmt: skip
 def test_a_changed_message_is_named(flown: Path, tmp_path: Path, topic: str, change: Any, what: str) -> None:
     result = rewritten(flown, tmp_path / "changed", once(f"/swarm/{topic}", change))
     assert any(result.difference.what.startswith(part) for part in what.split("|")), result.difference

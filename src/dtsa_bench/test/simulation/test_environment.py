@@ -76,16 +76,13 @@ def assert_same(summary: dict[str, Any], wanted: dict[str, Any], left_out: set[s
     }
 
 
-@pytest.mark.parametrize(
-    ("policy", "rule", "settings"),
-    [
-        ("tdma", tdma, {"loss": 0.2, "seed": 3}),
-        ("tdma", tdma, {"estimator": "intent", "scenario": "waypoints", "seed": 4, "slot_ms": 20.0}),
-        ("tdma", tdma, {"estimator": "ahead", "seed": 6, "moving": 4}),
-        ("age", oldest, {"return_every": 0, "moving": 4, "seed": 5}),
-        ("tdma", tdma, {"agents": 12, "slot_ms": 100.0, "seed": 1, "collision_m": 1.0, "timeout_s": 9.0}),
-    ],
-)
+@pytest.mark.parametrize(("policy", "rule", "settings"), [
+    ("tdma", tdma, {"loss": 0.2, "seed": 3}),
+    ("tdma", tdma, {"estimator": "intent", "scenario": "waypoints", "seed": 4, "slot_ms": 20.0}),
+    ("tdma", tdma, {"estimator": "ahead", "seed": 6, "moving": 4}),
+    ("age", oldest, {"return_every": 0, "moving": 4, "seed": 5}),
+    ("tdma", tdma, {"agents": 12, "slot_ms": 100.0, "seed": 1, "collision_m": 1.0, "timeout_s": 9.0}),
+])  # fmt: skip
 def test_a_scripted_policy_flies_what_simulate_flies(policy: str, rule: Rule, settings: dict[str, Any]) -> None:
     class Ahead:
         def __init__(self, config: dtsa.SwarmConfig, agent: int) -> None:

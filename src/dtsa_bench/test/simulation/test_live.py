@@ -275,14 +275,11 @@ def test_other_seeds_are_refused(seed: Any) -> None:
         draw_flight(seed)
 
 
-@pytest.mark.parametrize(
-    ("settings", "field"),
-    [
-        ({"agents": 0}, "agents"), ({"agents": 63}, "agents"), ({"policy": "aloha"}, "policy"), ({"names": 5}, "names"),
-        ({"slot_ns": 0}, "slot_ns"), ({"faults": (fault("mute", 1, 1, 4),)}, r"faults\[0\].agent"),
-        ({"faults": (fault("quiet", 1, 1),)}, "kind"), ({"faults": (fault("mute", 1, 1),) * 65}, "faults"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("settings", "field"), [
+    ({"agents": 0}, "agents"), ({"agents": 63}, "agents"), ({"policy": "aloha"}, "policy"), ({"names": 5}, "names"),
+    ({"slot_ns": 0}, "slot_ns"), ({"faults": (fault("mute", 1, 1, 4),)}, r"faults\[0\].agent"),
+    ({"faults": (fault("quiet", 1, 1),)}, "kind"), ({"faults": (fault("mute", 1, 1),) * 65}, "faults"),
+])  # fmt: skip
 def test_flights_that_cannot_be_are_refused(settings: dict[str, Any], field: str) -> None:
     with pytest.raises(ConfigError, match=f"^{field}: got"):
         LiveFlight(1, **settings)

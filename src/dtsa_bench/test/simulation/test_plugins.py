@@ -185,32 +185,29 @@ def gives(method: str, answer: Any) -> type:
     return type("Wrong", (Empty,), {method: call})
 
 
-@pytest.mark.parametrize(
-    ("kind", "wrong", "said"),
-    [
-        ("policy", lambda *_: {}["no such option"], r"^policy wrong: KeyError: 'no such option' \(.*plugins.py:\d"),
-        ("policy", gives("choose", RuntimeError("lost")), r"^policy wrong, choose: RuntimeError: lost \(.*plugins.py"),
-        ("policy", gives("choose", SystemExit(0)), r"^policy wrong, choose: SystemExit: 0 \(.*test_plugins.py"),
-        ("policy", gives("choose", None), r"chose agent None in slot 0; allowed: an integer, 0 \(nobody\) to 4"),
-        ("policy", gives("choose", 3.0), "wrong, choose: chose agent 3.0 in slot 0; allowed: an integer, 0"),
-        ("policy", gives("choose", -1), "policy wrong, choose: chose agent -1 in slot 0"),
-        ("policy", gives("choose", Odd()), r"^policy wrong, choose: chose agent <Odd> in slot 0; allowed: an int"),
-        ("policy", gives("senders", None), r"^policy wrong, senders: gave None in slot 0; allowed: a list of the ids"),
-        ("policy", gives("senders", Odd()), r"^policy wrong, senders: gave <Odd> in slot 0; allowed: a list"),
-        ("policy", gives("wake", Odd()), r"^policy wrong, wake: gave <Odd> ns; allowed: whole numbers above 0"),
-        ("policy", Empty, r"^policy wrong: Empty has no method choose\(table, slot\)$"),
-        ("policy", lambda config, agent: None, r"^policy wrong: NoneType has no method choose"),
-        ("policy", Mute, r"Mute has no method say\(table, slot\) and heard\(table, slot, sender, data\)$"),
-        ("policy", type("Args", (), {}), r"^policy wrong: TypeError: Args\(\) takes no arguments"),
-        ("estimator", Endless, "estimator wrong, estimate: wrote a number that is not finite in slot 0"),
-        ("estimator", Empty, r": Empty has no method estimate\(table, slot, step, position, velocity\)$"),
-        ("avoider", gives("command", (1.0, 2.0)), r"wrong, command: gave \(1.0, 2.0\) in slot 0; allowed: three"),
-        ("avoider", gives("command", (1.0, 2.0, float("inf"))), "avoider wrong, command: gave"),
-        ("avoider", gives("command", "fast"), "avoider wrong, command: gave 'fast'"),
-        ("avoider", gives("command", Odd()), r"^avoider wrong, command: gave <Odd> in slot 0; allowed: three finite"),
-        ("avoider", Empty, r"^avoider wrong: Empty has no method command\(table, slot, step\)$"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "wrong", "said"), [
+    ("policy", lambda *_: {}["no such option"], r"^policy wrong: KeyError: 'no such option' \(.*plugins.py:\d"),
+    ("policy", gives("choose", RuntimeError("lost")), r"^policy wrong, choose: RuntimeError: lost \(.*plugins.py"),
+    ("policy", gives("choose", SystemExit(0)), r"^policy wrong, choose: SystemExit: 0 \(.*test_plugins.py"),
+    ("policy", gives("choose", None), r"chose agent None in slot 0; allowed: an integer, 0 \(nobody\) to 4"),
+    ("policy", gives("choose", 3.0), "wrong, choose: chose agent 3.0 in slot 0; allowed: an integer, 0"),
+    ("policy", gives("choose", -1), "policy wrong, choose: chose agent -1 in slot 0"),
+    ("policy", gives("choose", Odd()), r"^policy wrong, choose: chose agent <Odd> in slot 0; allowed: an int"),
+    ("policy", gives("senders", None), r"^policy wrong, senders: gave None in slot 0; allowed: a list of the ids"),
+    ("policy", gives("senders", Odd()), r"^policy wrong, senders: gave <Odd> in slot 0; allowed: a list"),
+    ("policy", gives("wake", Odd()), r"^policy wrong, wake: gave <Odd> ns; allowed: whole numbers above 0"),
+    ("policy", Empty, r"^policy wrong: Empty has no method choose\(table, slot\)$"),
+    ("policy", lambda config, agent: None, r"^policy wrong: NoneType has no method choose"),
+    ("policy", Mute, r"Mute has no method say\(table, slot\) and heard\(table, slot, sender, data\)$"),
+    ("policy", type("Args", (), {}), r"^policy wrong: TypeError: Args\(\) takes no arguments"),
+    ("estimator", Endless, "estimator wrong, estimate: wrote a number that is not finite in slot 0"),
+    ("estimator", Empty, r": Empty has no method estimate\(table, slot, step, position, velocity\)$"),
+    ("avoider", gives("command", (1.0, 2.0)), r"wrong, command: gave \(1.0, 2.0\) in slot 0; allowed: three"),
+    ("avoider", gives("command", (1.0, 2.0, float("inf"))), "avoider wrong, command: gave"),
+    ("avoider", gives("command", "fast"), "avoider wrong, command: gave 'fast'"),
+    ("avoider", gives("command", Odd()), r"^avoider wrong, command: gave <Odd> in slot 0; allowed: three finite"),
+    ("avoider", Empty, r"^avoider wrong: Empty has no method command\(table, slot, step\)$"),
+])  # fmt: skip
 def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(kind: str, wrong: Any, said: str) -> None:
     dtsa.register(kind, "wrong", wrong)
     settings = {"agents": 4, "timeout_s": 0.2, kind: "wrong"}
@@ -221,21 +218,11 @@ def test_what_a_plugin_does_wrong_is_named_with_type_message_and_place(kind: str
     assert row["reason"].startswith(f"PluginError: {kind} wrong")
 
 
-@pytest.mark.parametrize(
-    ("kind", "attribute", "value"),
-    [
-        ("policy", "port", "send"),
-        ("policy", "port", 3),
-        ("policy", "port", (["send"],)),
-        ("policy", "own_bytes", "3"),
-        ("policy", "may_join", 1),
-        ("policy", "own_bytes", Odd()),
-        ("estimator", "needs_intent", Odd()),
-        ("avoider", "model", []),
-        ("policy", "options", "error_m"),
-        ("estimator", "options", (1,)),
-    ],
-)
+@pytest.mark.parametrize(("kind", "attribute", "value"), [
+    ("policy", "port", "send"), ("policy", "port", 3), ("policy", "port", (["send"],)), ("policy", "own_bytes", "3"),
+    ("policy", "may_join", 1), ("policy", "own_bytes", Odd()), ("estimator", "needs_intent", Odd()),
+    ("avoider", "model", []), ("policy", "options", "error_m"), ("estimator", "options", (1,)),
+])  # fmt: skip
 def test_attributes_that_mean_nothing_are_named(kind: str, attribute: str, value: Any) -> None:
     wrong = type("Wrong", (Empty,), {attribute: value})
     name = f"wrong-{kind}"
@@ -248,16 +235,10 @@ def test_attributes_that_mean_nothing_are_named(kind: str, attribute: str, value
         use()
 
 
-@pytest.mark.parametrize(
-    ("option", "near"),
-    [
-        ("event-tdma.eror_m", "event-tdma.error_m"),
-        ("event-tmda.error_m", "event-tdma"),
-        ("damped.rest", "damped.rest_s"),
-        ("least-known.every", ""),
-        ("lease.probation", ""),
-    ],
-)
+@pytest.mark.parametrize(("option", "near"), [
+    ("event-tdma.eror_m", "event-tdma.error_m"), ("event-tmda.error_m", "event-tdma"), ("damped.rest", "damped.rest_s"),
+    ("least-known.every", ""), ("lease.probation", ""),
+])  # fmt: skip
 def test_an_option_that_no_plug_in_has_is_refused_with_the_nearest(option, near, tmp_path, capsys):
     for policy in ("event-tdma", "tdma"):
         file = tmp_path / "sweep.yaml"

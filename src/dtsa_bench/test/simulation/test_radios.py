@@ -67,14 +67,10 @@ def test_a_radio_that_turns_to_sending_is_not_heard() -> None:
     assert collided == {1: 2, 3: 2}
 
 
-@pytest.mark.parametrize(
-    ("answer", "said"),
-    [
-        (0, "sensed: gave 0 ns; allowed: whole numbers from 1, as the air is in use"),
-        (None, "sensed: gave None ns"),
-        (1, "sensed: listened 10000 times for one frame"),
-    ],
-)
+@pytest.mark.parametrize(("answer", "said"), [
+    (0, "sensed: gave 0 ns; allowed: whole numbers from 1, as the air is in use"), (None, "sensed: gave None ns"),
+    (1, "sensed: listened 10000 times for one frame"),
+])  # fmt: skip
 def test_rules_that_cannot_be_are_named(answer: Any, said: str) -> None:
     class Wrong(Waits):
         def sensed(self, busy: bool, now_ns: int, sent_ns: int) -> Any:

@@ -32,15 +32,12 @@ def plain(flight: Flight) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "more",
     [
-        {"estimator": "linear"},
-        {"estimator": "hold", "avoider": "potential"},
-        {"estimator": "intent", "slot_ms": 25.0},
-        {"frame": "extended", "moving": 6},
-        {"scenario": "stop-and-go", "pause_slots": 10},
-        {"scenario": "staggered", "stagger_slots": 30, "moving": 6},
+        {"estimator": "linear"}, {"estimator": "hold", "avoider": "potential"},
+        {"estimator": "intent", "slot_ms": 25.0}, {"frame": "extended", "moving": 6},
+        {"scenario": "stop-and-go", "pause_slots": 10}, {"scenario": "staggered", "stagger_slots": 30, "moving": 6},
     ],
     ids=["linear", "hold", "intent", "extended", "stop-and-go", "staggered"],
-)
+)  # fmt: skip
 def test_without_loss_one_table_for_all_makes_no_difference(policy: str, more: dict[str, Any]) -> None:
     config = run(agents=9, policy=policy, timeout_s=2.0, **{"moving": 8, **more})
     assert may_share(config)
@@ -57,17 +54,10 @@ def test_without_loss_one_table_for_all_makes_no_difference(policy: str, more: d
     assert error[0] == pytest.approx(error[1], rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"loss": 0.1},
-        {"policy": "aloha"},
-        {"jam": True},
-        {"range_m": 3.0},
-        {"partition": [[1, 2, 3], [4, 5, 6]]},
-        {"burst_length": 3.0, "loss": 0.1},
-    ],
-)
+@pytest.mark.parametrize("more", [
+    {"loss": 0.1}, {"policy": "aloha"}, {"jam": True}, {"range_m": 3.0}, {"partition": [[1, 2, 3], [4, 5, 6]]},
+    {"burst_length": 3.0, "loss": 0.1},
+])  # fmt: skip
 def test_where_views_may_differ_everyone_has_a_table(more: dict[str, Any]) -> None:
     config = run(agents=6, timeout_s=0.5, **more)
     assert not may_share(config)
