@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import random
@@ -9,7 +10,8 @@ import socket
 import threading
 import time
 from collections import Counter, deque
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +27,17 @@ from dtsa_agent.air.udp import UdpPort, UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_agent.stop import Stop
 from dtsa_bench.network.sniffer import Sniffer
+from dtsa_bench.pages.view.network_listener import NetworkListener
+from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
+from dtsa_bench.recordings.merge.agent_bag import read
 from dtsa_bench.recordings.merge.agent_recorder import AgentRecorder
+from dtsa_bench.recordings.merge.merge import Merge, verified
+from dtsa_bench.recordings.merge.merged_run import MergedRun, lay
+from dtsa_bench.recordings.merge.merged_writer import write
+from dtsa_bench.recordings.verify import verify_bag
 
 _PATIENCE_S = 60.0
+Own = Callable[[int], dict[str, Any]]  # settings of an agent, by its id
 
 
 def own_group() -> str:
@@ -67,7 +77,6 @@ class Flying:
         self._thread.start()
 
     def slot(self, record: SlotRecord) -> None:
-        """See Watcher."""
         if record.anew:
             self.heard.clear()
         self.heard.update(frame.sender for frame in record.heard)
@@ -76,7 +85,6 @@ class Flying:
         self.recorder.slot(record)
 
     def other(self, reason: str, data: bytes, arrival_ns: int) -> None:
-        """See Watcher."""
         self.recorder.other(reason, data, arrival_ns)
 
     def _run(self) -> None:
@@ -100,7 +108,6 @@ class Sniffing:
         self._thread = threading.Thread(target=self.sniffer.run, args=(self._stop,))
 
     def start(self) -> None:
-        """Begins."""
         self._thread.start()
 
     def end(self) -> dict[str, Any]:
@@ -120,7 +127,6 @@ class Stranger:
         self.socket = UdpPort(UdpSettings(interface="lo", group=group))
 
     def hear(self, count: int) -> list[bytes]:
-        """Datagrams of others."""
         found: list[bytes] = []
 
         def enough() -> bool:
@@ -131,70 +137,95 @@ class Stranger:
         return found
 
     def close(self) -> None:
-        """Leaves."""
         with suppress(socket.error):
             self.socket.close()
 
 
-class TwoWays:
-    """Carries datagrams between two groups of the loopback interface, either way while that is not cut.
+class Carrier:
+    """Carries datagrams between two groups of the loopback interface, late, either way while that is not cut."""
 
-    :param near: a group.
-    :param far: another one.
-    """
-
-    def __init__(self, near: str, far: str) -> None:
+    def __init__(self, near: str, far: str, delay_s: float = 0.0, back: bool = True) -> None:
         self._ends = [UdpPort(UdpSettings(interface="lo", group=group)) for group in (near, far)]
-        self.to_far = self.to_near = True
-        self._stopped = False
+        self.to_far, self.to_near, self._delay_s, self._stopped = True, back, delay_s, False
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
+        waiting: deque[tuple[float, UdpPort, bytes]] = deque()
         near, far = self._ends
         while not self._stopped:
-            for source, target, carries in ((near, far, self.to_far), (far, near, self.to_near)):
-                for datagram in source.receive(100):
-                    if carries and not datagram.own:
-                        target.send(datagram.data)
-            time.sleep(0.0005)
-
-    def end(self) -> None:
-        """Carries nothing any more."""
-        self._stopped = True
-        self._thread.join(_PATIENCE_S)
-        for end in self._ends:
-            end.close()
-
-
-class OneWay:
-    """Carries datagrams from one group of the loopback interface to another one, late, and none back.
-
-    :param source: the group that is heard.
-    :param target: the group that hears it.
-    :param delay_s: s, how long each is under way.
-    """
-
-    def __init__(self, source: str, target: str, delay_s: float) -> None:
-        self._ends = [UdpPort(UdpSettings(interface="lo", group=group)) for group in (source, target)]
-        self._delay_s = delay_s
-        self._stopped = False
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        waiting: deque[tuple[float, bytes]] = deque()
-        source, target = self._ends
-        while not self._stopped:
             now = time.monotonic()
-            waiting.extend((now + self._delay_s, datagram.data) for datagram in source.receive(100))
+            for source, target, carries in ((near, far, self.to_far), (far, near, self.to_near)):
+                found = [datagram.data for datagram in source.receive(100) if carries and not datagram.own]
+                waiting.extend((now + self._delay_s, target, data) for data in found)
             while waiting and waiting[0][0] <= now:
-                target.send(waiting.popleft()[1])
+                _, target, data = waiting.popleft()
+                target.send(data)
             time.sleep(0.0005)
 
     def end(self) -> None:
-        """Carries nothing any more."""
         self._stopped = True
         self._thread.join(_PATIENCE_S)
         for end in self._ends:
             end.close()
+
+
+@contextmanager
+def flying(
+    config: SwarmConfig, ports: Iterable[PortSettings], directory: Path, own: Own = lambda _: {}
+) -> Iterator[list[Flying]]:
+    """Agents 1, 2, ... at ports, one started after the other, with bags in a directory; `own` gives their settings."""
+    agents: list[Flying] = []
+    try:
+        for id, port in enumerate(ports, 1):
+            agents.append(Flying(AgentSettings(id=id, **own(id)), config, port, directory / f"cf{id}.mcap"))
+        yield agents
+    finally:
+        for one in agents:
+            one.end()
+
+
+def go_on(agents: Sequence[Flying], slots: int) -> None:
+    """All go on for so many slots."""
+    seen = [len(one.slots) for one in agents]
+    wait_for(lambda: all(len(one.slots) > before + slots for one, before in zip(agents, seen, strict=True)))
+
+
+def hear_each_other(agents: Sequence[Flying], frames: int) -> None:
+    """Wait until each has heard more frames than that of every other one."""
+    wait_for(lambda: all(len(o.heard) == len(agents) - 1 and min(o.heard.values()) > frames for o in agents))
+
+
+@contextmanager
+def listening(config: SwarmConfig, settings: PortSettings) -> Iterator[Callable[[], list[dict[str, Any]]]]:
+    """A page's listener; what is given are the moments that it has told so far."""
+    track = Track("listener")
+    source = NetworkListener(track, config, settings)
+    thread = threading.Thread(target=source.run)
+    thread.start()
+    try:
+        yield lambda: [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
+    finally:
+        source.stopped = True
+        thread.join()
+
+
+def merge_bags(paths: Iterable[Path], whole: Path) -> tuple[MergedRun, dict[str, Any]]:
+    """The merged run, and what was found of it; its bag is written to `whole`."""
+    together = Merge([read(path) for path in paths])
+    merged = together.judge()
+    run = lay(together, merged)
+    write(whole, run, merged)
+    return run, merged
+
+
+def check_merged(merged: dict[str, Any], whole: Path, decisions: int) -> None:
+    """No slot had two senders, and the same receptions give the same decisions, more than so many."""
+    assert merged["common_slot"] is not None
+    assert merged["slots_with_two_senders"] == merged["frames_heard_not_as_sent"] == 0
+    assert merged["frames_sent"] > 60
+    again = merged["decisions_again"]
+    assert again["differences"] == []
+    assert again["equal"] == again["of"] > decisions
+    assert verified(merged)
+    assert verify_bag(whole).to_dict()["difference"] is None

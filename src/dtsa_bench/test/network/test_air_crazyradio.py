@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ pytest.importorskip("usb")
 from dtsa_agent.air.crazyradio import CrazyradioSettings
 from dtsa_agent.air.crazyradio.packets import broadcast, datagram_in
 from dtsa_agent.air.datagram import link_of
-from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_agent.core.station import StationSettings
 from dtsa_agent.keys import authenticator
@@ -29,13 +28,8 @@ from dtsa_bench.crazyflies.peer_lab.app import LabSettings
 from dtsa_bench.crazyflies.peer_lab.compiling import compiler
 from dtsa_bench.crazyflies.peer_lab.onboard import OnBoard
 from dtsa_bench.crazyflies.simulated.process import running_fleet
-from dtsa_bench.pages.view.network_listener import NetworkListener
-from dtsa_bench.pages.view.track import MOST_MOMENTS, Track
 from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, verified
-from dtsa_bench.recordings.merge.merged_run import lay
-from dtsa_bench.recordings.merge.merged_writer import write
-from dtsa_bench.recordings.verify import verify_bag
+from dtsa_bench.recordings.merge.merge import Merge
 
 KEY = "8f3c1d5e7a9b2460c1e3f5a7b9d8c6e4"
 # Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
@@ -81,59 +75,35 @@ def flight(tmp_path_factory: pytest.TempPathFactory, key: None) -> Flight:
     """Agents start one after the other, with clocks that differ."""
     directory = tmp_path_factory.mktemp("crazyradio")
     radio, heard = directory / "radio", directory / "sniffed.mcap"
-    paths = [directory / f"cf{agent}.mcap" for agent in AGENTS]
-    flying: list[helpers.Flying] = []
-    with dongles(radio, "--radio-dongles", "6"):
-        track = Track("listener")
-        source = NetworkListener(track, CONFIG, settings(radio, 5))
-        listening = threading.Thread(target=source.run)
-        listening.start()
+    ports = [settings(radio, agent - 1) for agent in AGENTS]
+    with dongles(radio, "--radio-dongles", "6"), helpers.listening(CONFIG, settings(radio, 5)) as told:
         sniffing = helpers.Sniffing(CONFIG, settings(radio, 4), heard)
         sniffing.start()
         try:
-            for agent, path in zip(AGENTS, paths, strict=True):
-                own = AgentSettings(id=agent, clock_offset_ns=OFFSET_NS * agent, clock_drift_ppb=20_000 * (agent - 2))
-                flying.append(helpers.Flying(own, CONFIG, settings(radio, agent - 1), path))
-            wait_for(lambda: all(len(one.heard) == 3 and min(one.heard.values()) > 10 for one in flying))
-            seen = [len(one.slots) for one in flying]
-            wait_for(lambda: all(len(one.slots) > before + 100 for one, before in zip(flying, seen, strict=True)))
+            with helpers.flying(CONFIG, ports, directory, own) as flying:
+                helpers.hear_each_other(flying, 10)
+                helpers.go_on(flying, 100)
         finally:
-            for one in flying:
-                one.end()
             sniffed = sniffing.end()
-            source.stopped = True
-            listening.join()
-    together = Merge([read(path) for path in reversed(paths)])
-    merged, whole = together.judge(), directory / "whole"
-    write(whole, lay(together, merged), merged)
+    paths = [directory / f"cf{agent}.mcap" for agent in AGENTS]
+    _, merged = helpers.merge_bags(reversed(paths), directory / "whole")
     summaries = {one.agent.own.id: one.agent.summary() for one in flying}
     said = [line for one in flying for line in one.said]
-    told = [json.loads(moment.text) for moment in track.since(0, MOST_MOMENTS)[1]]
-    return Flight(paths, summaries, said, merged, whole, sniffed, heard, told)
+    return Flight(paths, summaries, said, merged, directory / "whole", sniffed, heard, told())
+
+
+def own(agent: int) -> dict[str, int]:
+    return {"clock_offset_ns": OFFSET_NS * agent, "clock_drift_ppb": 20_000 * (agent - 2)}
 
 
 def test_agents_become_one_group_and_hear_each_other(flight: Flight) -> None:
-    assert flight.merged["common_slot"] is not None
+    helpers.check_merged(flight.merged, flight.whole, 300)
     assert flight.merged["missing"] == []
     for agent, summary in flight.summaries.items():
-        assert summary["state"] == "joined"
-        assert summary["heard_of"] == [other for other in AGENTS if other != agent]
+        assert (summary["state"], summary["heard_of"]) == ("joined", [k for k in AGENTS if k != agent])
         assert (summary["dropped_by_dongle"], summary["garbled_transfers"], summary["strange_stamps"]) == (0, 0, 0)
     assert [line for line in flight.said if not line.startswith(("flies: ", "is new", "listens"))] == []
-
-
-def test_nobody_speaks_in_the_turn_of_another(flight: Flight) -> None:
-    assert flight.merged["slots_with_two_senders"] == 0
-    assert flight.merged["frames_sent"] > 60
-
-
-def test_the_same_receptions_give_the_same_decisions(flight: Flight) -> None:
-    again = flight.merged["decisions_again"]
-    assert again["differences"] == []
-    assert again["equal"] == again["of"] > 300
-    assert flight.merged["frames_heard_not_as_sent"] == 0
-    assert verified(flight.merged)
-    assert verify_bag(flight.whole).to_dict()["difference"] is None
+    assert {read(path).port.name for path in flight.bags} == {"crazyradio"}
 
 
 def test_stamps_of_the_dongles_tell_when_frames_arrived(flight: Flight) -> None:
@@ -145,18 +115,11 @@ def test_stamps_of_the_dongles_tell_when_frames_arrived(flight: Flight) -> None:
     assert line["residual_us"]["p50"] < 1000
 
 
-def test_bags_say_by_what_port(flight: Flight) -> None:
-    assert {read(path).port.name for path in flight.bags} == {"crazyradio"}
-
-
 def test_who_only_listens_finds_that_all_keep_the_rules(flight: Flight) -> None:
     found = flight.sniffed
     assert found["heard"].keys() == {f"cf{agent}" for agent in AGENTS}
     assert (found["rules_broken"], found["slots_with_two_senders"]) == (0, 0), found["which"]
     assert found["dropped_by_dongle"] == 0
-
-
-def test_a_page_is_told_who_is_heard(flight: Flight) -> None:
     words = "\n".join(event[2] for moment in flight.told for event in moment["events"])
     assert all(f"cf{agent} is heard" in words for agent in AGENTS)
 
@@ -186,23 +149,17 @@ def test_a_computer_reads_what_the_app_on_board_says(auth: bool, tmp_path: Path)
 
 def test_a_dongle_that_goes_and_is_back_is_said_and_flies_on(tmp_path: Path) -> None:
     radio = tmp_path / "radio"
-    flying: list[helpers.Flying] = []
-    try:
+    with ExitStack() as stack:
         with dongles(radio, "--radio-dongles", "2"):
-            for agent in (1, 2):
-                path = tmp_path / f"cf{agent}.mcap"
-                flying.append(helpers.Flying(AgentSettings(id=agent), CONFIG, settings(radio, agent - 1), path))
+            ports = [settings(radio, 0), settings(radio, 1)]
+            flying = stack.enter_context(helpers.flying(CONFIG, ports, tmp_path))
             wait_for(lambda: all(one.heard.total() > 10 for one in flying))
         wait_for(lambda: all(any("has gone" in line for line in one.said) for one in flying))
         with dongles(radio, "--radio-dongles", "2"):
             wait_for(lambda: all(any("is back" in line for line in one.said) for one in flying))
             before = [one.heard.total() for one in flying]
             wait_for(lambda: all(one.heard.total() > b + 10 for one, b in zip(flying, before, strict=True)))
-            for one in flying:
-                one.end()
-    finally:
-        for one in flying:
-            one.end()
+            stack.close()
     assert {one.agent.summary()["times_unplugged"] for one in flying} == {1}
     assert "crazyradio" not in {thread.name for thread in threading.enumerate()}
     merged = Merge([read(tmp_path / f"cf{agent}.mcap") for agent in (1, 2)]).judge()

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
@@ -33,24 +32,16 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     helpers.need_multicast()
     directory = tmp_path_factory.mktemp("one_way")
     near, far = helpers.own_group(), helpers.own_group()
-    paths = [directory / f"cf{agent}" / f"cf{agent}.mcap" for agent in (1, 2, 3)]
-    flying: list[helpers.Flying] = []
-    carrier = helpers.OneWay(near, far, DELAY_S)
+    ports = [UdpSettings(interface="lo", group=group) for group in (near, near, far)]
+    carrier = helpers.Carrier(near, far, DELAY_S, back=False)
     try:
-        for agent, path in enumerate(paths, 1):
-            path.parent.mkdir()
-            udp = UdpSettings(interface="lo", group=far if agent == 3 else near)
-            flying.append(helpers.Flying(AgentSettings(id=agent), CONFIG, udp, path))
-        first, second, third = flying
-        heard = (first.heard, 2), (second.heard, 1), (third.heard, 1), (third.heard, 2)
-        wait_for(lambda: all(frames[sender] > 20 for frames, sender in heard), 60.0)
-        seen = len(third.slots)
-        wait_for(lambda: len(third.slots) > seen + 100, 60.0)
+        with helpers.flying(CONFIG, ports, directory) as (first, second, third):
+            heard = (first.heard, 2), (second.heard, 1), (third.heard, 1), (third.heard, 2)
+            wait_for(lambda: all(frames[sender] > 20 for frames, sender in heard), 60.0)
+            helpers.go_on([third], 100)
     finally:
-        for one in flying:
-            one.end()
         carrier.end()
-    return paths
+    return [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
 
 
 def _merged(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, dict[str, Any], str]:
@@ -100,7 +91,7 @@ def test_an_agent_that_wrote_nothing_is_named_and_the_others_are_merged(
     killed.mkdir()
     (killed / "cf3.mcap").touch()
     whole = tmp_path / "whole"
-    code, found, said = _merged(capsys, bags[0].parent, empty, bags[1].parent, killed, "--out", whole)
+    code, found, said = _merged(capsys, bags[0], empty, bags[1], killed, "--out", whole)
     assert code == 0, said
     assert found["nothing_written"] == [str(empty), str(killed)]
     assert (found["bags"], found["missing"], found["not_determined"]) == (2, [3], [])

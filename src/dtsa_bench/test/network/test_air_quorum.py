@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import air_helpers as helpers
 import pytest
 from waiting import wait_for
 
-from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.recordings.merge.agent_bag import read
@@ -26,34 +24,17 @@ def groups() -> tuple[str, str]:
     return helpers.own_group(), helpers.own_group()
 
 
-@contextmanager
-def flying(
-    groups: tuple[str, str], directory: Path, config: SwarmConfig = CONFIG, quorum: str = "all-but-one"
-) -> Iterator[list[helpers.Flying]]:
+def flying(groups: tuple[str, str], directory: Path) -> AbstractContextManager[list[helpers.Flying]]:
     """Agents of the first group, and the last agent in the second group."""
-    agents: list[helpers.Flying] = []
-    try:
-        for agent in range(1, config.agents + 1):
-            udp = UdpSettings(interface="lo", group=groups[agent == config.agents])
-            own = AgentSettings(id=agent, quorum=quorum)
-            agents.append(helpers.Flying(own, config, udp, directory / f"cf{agent}.mcap"))
-        yield agents
-    finally:
-        for one in agents:
-            one.end()
-
-
-def go_on(agent: helpers.Flying, slots: int) -> None:
-    """An agent goes on for so many slots."""
-    seen = len(agent.slots)
-    wait_for(lambda: len(agent.slots) > seen + slots)
+    ports = [UdpSettings(interface="lo", group=groups[agent == CONFIG.agents]) for agent in range(1, CONFIG.agents + 1)]
+    return helpers.flying(CONFIG, ports, directory, lambda _: {"quorum": "all-but-one"})
 
 
 @pytest.mark.parametrize("deaf", [True, False])
 def test_an_agent_whose_frames_are_lost_one_way_hovers_in_flight_and_flies_on_when_they_come(
     groups: tuple[str, str], tmp_path: Path, deaf: bool
 ) -> None:
-    link = helpers.TwoWays(*groups)
+    link = helpers.Carrier(*groups)
     try:
         with flying(groups, tmp_path) as agents:
             *others, cut = agents
@@ -86,13 +67,13 @@ def test_an_agent_whose_frames_are_lost_one_way_hovers_in_flight_and_flies_on_wh
 
 def test_an_agent_that_nobody_has_heard_does_not_begin_to_fly(groups: tuple[str, str], tmp_path: Path) -> None:
     """It hears the others after 100 ms, and they do not hear it."""
-    link = helpers.OneWay(*groups, 0.1)
+    link = helpers.Carrier(*groups, 0.1, back=False)
     try:
         with flying(groups, tmp_path) as agents:
             *others, far = agents
             wait_for(lambda: all(agent.speed > FAST for agent in others))
             wait_for(lambda: any(line.startswith("hovers: ") for line in far.said))
-            go_on(far, 50)
+            helpers.go_on([far], 50)
             assert far.speed < 1e-9
     finally:
         link.end()
@@ -108,12 +89,9 @@ def test_an_agent_that_is_alone_flies_only_where_nobody_has_to_be_there(
     groups: tuple[str, str], tmp_path: Path, quorum: str, flies: bool
 ) -> None:
     udp = UdpSettings(interface="lo", group=groups[0])
-    alone = helpers.Flying(AgentSettings(id=1, quorum=quorum), CONFIG, udp, tmp_path / "cf1.mcap")
-    try:
+    with helpers.flying(CONFIG, [udp], tmp_path, lambda _: {"quorum": quorum}) as (alone,):
         if flies:
             wait_for(lambda: alone.speed > FAST)
         else:
             wait_for(lambda: "is alone, and hovers until it hears others" in alone.said)
             assert alone.speed < SLOW
-    finally:
-        alone.end()

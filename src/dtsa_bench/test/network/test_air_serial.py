@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,17 +19,12 @@ from waiting import wait_for
 from dtsa_agent.air.serial import SerialSettings
 from dtsa_agent.air.serial.frames import to_line
 from dtsa_agent.air.serial.port import SerialPort
-from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.core import SwarmConfig
 from dtsa_bench.commands.cli import main
 from dtsa_bench.pages.report.data import run_data
 from dtsa_bench.pages.view.network_listener import NetworkListener
 from dtsa_bench.pages.view.track import Track
 from dtsa_bench.recordings.merge.agent_bag import read
-from dtsa_bench.recordings.merge.merge import Merge, verified
-from dtsa_bench.recordings.merge.merged_run import lay
-from dtsa_bench.recordings.merge.merged_writer import write
-from dtsa_bench.recordings.verify import verify_bag
 
 # Nothing but an owner or its one lessee may send: no two in a slot, whatever is lost.
 CONFIG = SwarmConfig(agents=3, policy="lease", slot_ms=50.0, open_every=0, adoption=False)
@@ -54,7 +49,6 @@ def port_settings(made: FakeModems, number: int) -> SerialSettings:
 class Flight:
     """Three agents; the second one's modem was unplugged, and the third one was cut off for a while."""
 
-    bags: list[Path]
     agents: list[helpers.Flying]
     sniffed: dict[str, Any]
     shown: str
@@ -65,50 +59,40 @@ class Flight:
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     directory = tmp_path_factory.mktemp("serial")
-    paths = [directory / f"cf{agent}.mcap" for agent in (1, 2, 3)]
-    flying: list[helpers.Flying] = []
     with modems(QUICK, directory, loss=0.05, seed=3) as made:
+        ports = [port_settings(made, agent) for agent in (1, 2, 3)]
         sniffing = helpers.Sniffing(CONFIG, port_settings(made, LISTENER))
         try:
-            for agent, path in enumerate(paths, 1):
-                own = AgentSettings(id=agent, clock_offset_ns=agent * 10**9, clock_drift_ppb=30_000 * (agent - 2))
-                flying.append(helpers.Flying(own, CONFIG, port_settings(made, agent), path))
-            wait_for(lambda: all(len(one.heard) == 2 and min(one.heard.values()) > 5 for one in flying))
-            sniffing.start()
-            go_on(flying, 60)
-            made.unplug(2)
-            wait_for(lambda: any("has gone" in line for line in flying[1].said))
-            go_on(flying, 20)
-            made.plug(2)
-            wait_for(lambda: any("is back" in line for line in flying[1].said))
-            made.set(partition=[[1, 2, 4], [3]])
-            go_on(flying, 30)
-            made.set(partition="")
-            go_on(flying, 100)
+            with helpers.flying(CONFIG, ports, directory, own) as flying:
+                helpers.hear_each_other(flying, 5)
+                sniffing.start()
+                helpers.go_on(flying, 60)
+                made.unplug(2)
+                wait_for(lambda: any("has gone" in line for line in flying[1].said))
+                helpers.go_on(flying, 20)
+                made.plug(2)
+                wait_for(lambda: any("is back" in line for line in flying[1].said))
+                made.set(partition=[[1, 2, 4], [3]])
+                helpers.go_on(flying, 30)
+                made.set(partition="")
+                helpers.go_on(flying, 100)
         finally:
-            for one in flying:
-                one.end()
             sniffed = sniffing.end()
         track = Track("listener")
         source = NetworkListener(track, CONFIG, port_settings(made, LISTENER))
         source.stopped = True
         source.run()
-    together = Merge([read(path) for path in paths])
-    merged, whole = together.judge(), directory / "whole"
-    write(whole, lay(together, merged), merged)
-    return Flight(paths, flying, sniffed, track.name, merged, whole)
+    _, merged = helpers.merge_bags([directory / f"cf{agent}.mcap" for agent in (1, 2, 3)], directory / "whole")
+    return Flight(flying, sniffed, track.name, merged, directory / "whole")
 
 
-def go_on(flying: list[helpers.Flying], slots: int) -> None:
-    """All go on for so many slots."""
-    seen = [len(one.slots) for one in flying]
-    wait_for(lambda: all(len(one.slots) > before + slots for one, before in zip(flying, seen, strict=True)))
+def own(agent: int) -> dict[str, int]:
+    return {"clock_offset_ns": agent * 10**9, "clock_drift_ppb": 30_000 * (agent - 2)}
 
 
-def test_groups_become_one_and_no_slot_has_two_senders(flight: Flight) -> None:
-    assert flight.merged["common_slot"] is not None
-    assert flight.merged["slots_with_two_senders"] == 0
-    assert flight.merged["frames_sent"] > 60
+def test_groups_become_one_flight_whose_decisions_are_made_again(flight: Flight) -> None:
+    helpers.check_merged(flight.merged, flight.whole, 200)
+    assert run_data(flight.whole)["slots"]["count"] > 100
     for one in flight.agents:
         found = one.agent.summary()
         assert found["state"] == "joined"
@@ -124,31 +108,23 @@ def test_who_listens_by_a_modem_finds_that_all_keep_the_rules(flight: Flight) ->
     assert flight.shown == "listener"
 
 
-def test_the_bags_are_one_flight_whose_decisions_are_made_again(flight: Flight) -> None:
-    again = flight.merged["decisions_again"]
-    assert verified(flight.merged)
-    assert again["equal"] == again["of"] > 200
-    checked = verify_bag(flight.whole)
-    assert checked.ok, checked.difference
-    assert run_data(flight.whole)["slots"]["count"] > 100
+@contextmanager
+def three_ports(made: FakeModems) -> Iterator[list[SerialPort]]:
+    with ExitStack() as stack:
+        yield [stack.enter_context(SerialPort(port_settings(made, number))) for number in (1, 2, 3)]
 
 
 def test_packets_that_overlap_are_lost_and_a_modem_that_sends_is_deaf(tmp_path: Path) -> None:
-    with modems(FakeModemSettings(modem="e22-19k", count=3), tmp_path) as made:
-        ends = [SerialPort(port_settings(made, number)) for number in (1, 2, 3)]
-        try:
-            assert ends[0].send(b"one") == ""
-            wait_for(lambda: made.counts["received"] == 2)
-            with made._lock:  # both are read at one time
-                assert ends[0].send(b"two") == ends[1].send(b"three") == ""
-            wait_for(lambda: made.counts["packets"] == 3)
-            wait_for(lambda: made.counts["collided"] == 4)
-            assert made.counts["received"] == 2
-            got: list[list[bytes]] = [[], [], []]
-            wait_for(lambda: gather(ends, got) == [[], [b"one"], [b"one"]])
-        finally:
-            for end in ends:
-                end.close()
+    with modems(FakeModemSettings(modem="e22-19k", count=3), tmp_path) as made, three_ports(made) as ends:
+        assert ends[0].send(b"one") == ""
+        wait_for(lambda: made.counts["received"] == 2)
+        with made._lock:  # both are read at one time
+            assert ends[0].send(b"two") == ends[1].send(b"three") == ""
+        wait_for(lambda: made.counts["packets"] == 3)
+        wait_for(lambda: made.counts["collided"] == 4)
+        assert made.counts["received"] == 2
+        got: list[list[bytes]] = [[], [], []]
+        wait_for(lambda: gather(ends, got) == [[], [b"one"], [b"one"]])
 
 
 def gather(ends: list[SerialPort], got: list[list[bytes]]) -> list[list[bytes]]:
@@ -159,17 +135,12 @@ def gather(ends: list[SerialPort], got: list[list[bytes]]) -> list[list[bytes]]:
 
 
 def test_modems_with_a_time_division_of_their_own_take_turns(tmp_path: Path) -> None:
-    with modems(FakeModemSettings(modem="sik-64k", count=3), tmp_path) as made:
-        ends = [SerialPort(port_settings(made, number)) for number in (1, 2, 3)]
-        try:
-            with made._lock:
-                for number, end in enumerate(ends):
-                    assert end.send(bytes([number]) * 60) == ""
-            wait_for(lambda: made.counts["received"] == 6)
-            assert (made.counts["packets"], made.counts["collided"]) == (3, 0)
-        finally:
-            for end in ends:
-                end.close()
+    with modems(FakeModemSettings(modem="sik-64k", count=3), tmp_path) as made, three_ports(made) as ends:
+        with made._lock:
+            for number, end in enumerate(ends):
+                assert end.send(bytes([number]) * 60) == ""
+        wait_for(lambda: made.counts["received"] == 6)
+        assert (made.counts["packets"], made.counts["collided"]) == (3, 0)
 
 
 def test_a_line_of_another_speed_garbles_what_goes_over_it(tmp_path: Path) -> None:
@@ -238,19 +209,18 @@ def test_a_device_that_may_not_be_opened_is_named(
 
 def test_bytes_of_mavlink_are_told_and_the_bag_is_whole(tmp_path: Path) -> None:
     config = SwarmConfig(agents=2, policy="lease", slot_ms=50.0)
-    with modems(FakeModemSettings(modem="esp-now", count=2), tmp_path) as made:
-        one = helpers.Flying(AgentSettings(id=1), config, port_settings(made, 1), tmp_path / "cf1.mcap")
-        try:
-            heartbeat = bytes.fromhex("fd09000000010100000000000000000203045103")
-            for _ in range(40):
-                made.inject(1, heartbeat * 10)
-                time.sleep(0.005)
-            wait_for(lambda: any("MAVLink" in line for line in one.said))
-            made.inject(1, to_line(b"a stranger's"))
-            wait_for(lambda: one.agent.tally.refused.total() > 0)
-            go_on([one], 10)
-        finally:
-            one.end()
+    with (
+        modems(FakeModemSettings(modem="esp-now", count=2), tmp_path) as made,
+        helpers.flying(config, [port_settings(made, 1)], tmp_path) as (one,),
+    ):
+        heartbeat = bytes.fromhex("fd09000000010100000000000000000203045103")
+        for _ in range(40):
+            made.inject(1, heartbeat * 10)
+            time.sleep(0.005)
+        wait_for(lambda: any("MAVLink" in line for line in one.said))
+        made.inject(1, to_line(b"a stranger's"))
+        wait_for(lambda: one.agent.tally.refused.total() > 0)
+        helpers.go_on([one], 10)
     bag = read(tmp_path / "cf1.mcap")
     assert not bag.broken_off
     assert len(bag.slots) > 10

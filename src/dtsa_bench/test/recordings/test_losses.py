@@ -9,9 +9,7 @@ from types import SimpleNamespace
 import air_helpers as helpers
 import numpy as np
 import pytest
-from waiting import wait_for
 
-from dtsa_agent.air.settings import AgentSettings
 from dtsa_agent.air.udp import UdpSettings
 from dtsa_agent.core import ConfigError, SwarmConfig
 from dtsa_bench.commands.cli import main
@@ -160,16 +158,9 @@ def test_agents_over_udp(tmp_path):
     helpers.need_multicast()
     config = SwarmConfig(agents=3, policy="lease", slot_ms=20.0)
     udp = UdpSettings(interface="lo", group=helpers.own_group())
-    paths = [tmp_path / f"cf{agent}.mcap" for agent in (1, 2, 3)]
-    flying = []
-    try:
-        for agent, path in enumerate(paths, 1):
-            flying.append(helpers.Flying(AgentSettings(id=agent), config, udp, path))
-        wait_for(lambda: all(len(one.heard) == 2 and min(one.heard.values()) > 60 for one in flying))
-    finally:
-        for one in flying:
-            one.end()
-    bags = [read(path) for path in paths]
+    with helpers.flying(config, [udp] * 3, tmp_path) as flying:
+        helpers.hear_each_other(flying, 60)
+    bags = [read(tmp_path / f"cf{agent}.mcap") for agent in (1, 2, 3)]
     draw = np.random.default_rng(1)
     for record in bags[1].slots:
         record.heard[:] = [one for one in record.heard if one.sender != 1 or draw.random() > 0.4]
