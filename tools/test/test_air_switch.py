@@ -35,7 +35,6 @@ CONFIG = SwarmConfig(agents=3, policy="tdma")
 
 
 def ethernet(payload: bytes, group: tuple[str, int] = GROUP, protocol: int = 17) -> bytes:
-    """A datagram as it is on a cable."""
     udp = struct.pack("!HHHH", 5000, group[1], 8 + len(payload), 0) + payload
     head = struct.pack("!BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 1, protocol, 0, b"\x0a\0\0\1",
                        socket.inet_aton(group[0]))  # fmt: skip
@@ -66,7 +65,6 @@ class Cables:
         self.switch.run(lambda: False, longer_s)
 
     def heard(self, host: int) -> list[bytes]:
-        """What has arrived at a host."""
         found: list[bytes] = []
         with suppress(BlockingIOError):
             while True:

@@ -212,7 +212,6 @@ def test_a_folder_that_cannot_be_made_is_replaced(monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture
 def foreign(tmp_path: Path) -> Path:
-    """A folder with modules that have the names of ours."""
     for name in ("numpy", "yaml", "dtsa_bench", "rclpy"):
         (tmp_path / f"{name}.py").write_text(NO_FURTHER)
     return tmp_path

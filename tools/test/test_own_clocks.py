@@ -58,7 +58,6 @@ class OwnClocks:
         return Station(swarm, StationSettings(config, self._link, id=k + 1, origin_ns=origin), local_ns)
 
     def run(self, until_ns: int) -> None:
-        """Run until a moment of the channel's time."""
         probe = len(self.spread_ns) * S
         while self._events[0][0] < until_ns:
             now, k = heapq.heappop(self._events)

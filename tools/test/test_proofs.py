@@ -17,7 +17,6 @@ from dtsa_dev.prove import build as build_prover
 
 @contextmanager
 def skipped_if_not_here() -> Iterator[None]:
-    """Skip the test where a compiler or an emulator is missing."""
     try:
         yield
     except NotHere as error:

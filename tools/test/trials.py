@@ -92,7 +92,6 @@ class AgentFlight:
         raise NotImplementedError
 
     def start(self, agent: int) -> None:
-        """Start the process of an agent, for the first time or again."""
         life = self._lives[agent] = self._lives.get(agent, 0) + 1
         options = {
             "id": agent, "clock-offset-ns": self.random.randrange(10**12),
@@ -160,7 +159,6 @@ class AgentFlight:
         return [read(path) for path in sorted(self.directory.glob("cf*-*")) if path.is_dir()]
 
     def stderr(self, agent: int) -> str:
-        """What an agent's last process has printed on its standard error."""
         path = self.directory / f"cf{agent}-{self._lives[agent]}.err"
         return " ".join(path.read_text(encoding="utf-8").split())
 
@@ -184,8 +182,6 @@ class AgentFlight:
 
 
 class UdpFlight(AgentFlight):
-    """Agents on hosts of their own, joined by a switch."""
-
     def __init__(self, trial: Trial, joined: Sequence[Host], directory: Path) -> None:
         super().__init__(trial, directory)
         self.hosts = {host.number: host for host in joined}
@@ -223,8 +219,6 @@ class UdpFlight(AgentFlight):
 
 
 class SerialFlight(AgentFlight):
-    """Agents with a simulated modem each."""
-
     def __init__(self, trial: Trial, modems: FakeModems, directory: Path) -> None:
         super().__init__(trial, directory)
         self.modems = modems
@@ -301,12 +295,10 @@ def fly(trial: Trial, directory: Path, disturb: Callable[[Any], None], **simulat
 
 
 def apart(agents: int) -> list[list[int]]:
-    """Two groups of agents that do not hear each other."""
     return [list(range(1, agents // 2 + 1)), list(range(agents // 2 + 1, agents + 1))]
 
 
 def simulated(swarm: SwarmConfig, seconds: float, **channel: Any) -> dict[str, Any]:
-    """The summary of the same flight in the simulator."""
     limits = RunLimits(timeout_s=max(1.0, seconds), tail_s=3600.0, stop_on_crash=False)
     config = SwarmConfig.from_dict({**swarm.to_dict(), "auth": False, "auth_session": 0})
     summary = simulate(RunConfig(config, ChannelConfig(**channel, **from_swarm(config)), limits)).summary()

@@ -93,15 +93,12 @@ class Flying:
             self.recorder.finish(self.agent.summary())
 
     def end(self) -> None:
-        """As by a signal."""
         self.stop.signal = self.stop.count = 1
         self._thread.join(_PATIENCE_S)
         assert not self._thread.is_alive()
 
 
 class Sniffing:
-    """Somebody who listens, in a thread."""
-
     def __init__(self, config: SwarmConfig, settings: PortSettings, *files: Path) -> None:
         self.sniffer = Sniffer(config, settings, *files)
         self._stop = Stop()

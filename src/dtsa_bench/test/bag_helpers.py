@@ -49,7 +49,6 @@ def definition(name: str) -> schema.Definition:
 
 
 def cdr(kind: str, **fields: Any) -> bytes:
-    """A message as CDR by rosbags' own serialiser."""
     store = typestore()
     return bytes(store.serialize_cdr(store.types[kind](**fields), kind))
 
@@ -160,7 +159,6 @@ def synthetic_run(directory: Path, agents: int = 4, **options: Any) -> Synthetic
 
 
 def synthetic_bag(directory: Path, slots: int = 100, **options: Any) -> SyntheticRun:
-    """A closed bag of a synthetic run."""
     run = synthetic_run(directory, **options)
     with run.writer:
         for slot in range(slots):
@@ -202,7 +200,6 @@ def listen(graph: Any, bag: Path) -> dict[str, list[tuple[int, str]]]:
 
 
 def clock_ns(data: str) -> int:
-    """The time of a message on `/clock`."""
     seconds, nanoseconds = struct.unpack_from("<iI", bytes.fromhex(data), 4)
     return seconds * SECOND + nanoseconds
 

@@ -28,8 +28,6 @@ _OPTIONS = ("--enable-unsafe-swiftshader", "--disable-gpu", "--disable-dev-shm-u
 
 
 class Browser:
-    """One page of a browser."""
-
     def __init__(self, page: Page) -> None:
         self._page = page
         self._tools = page.context.new_cdp_session(page)
@@ -42,7 +40,6 @@ class Browser:
             self._said.append(message.text)
 
     def open(self, url: str) -> None:
-        """Goes to a page."""
         self._page.goto(url)
 
     def run(self, script: str) -> Any:
@@ -61,11 +58,9 @@ class Browser:
             self._page.wait_for_timeout(50)
 
     def picture(self) -> bytes:
-        """A picture of the window as PNG."""
         return self._page.screenshot()
 
     def paper(self) -> bytes:
-        """The page printed as PDF."""
         return self._page.pdf()
 
     def complaints(self) -> list[str]:
@@ -75,7 +70,6 @@ class Browser:
 
 
 def colours(picture: bytes, directory: Path) -> int:
-    """How many different colours a picture has."""
     from matplotlib.image import imread
 
     path = directory / "picture.png"

@@ -56,7 +56,6 @@ def readable(out: Path) -> int:
 
 
 def verified(bag: Path) -> Result:
-    """The verification of a bag that is what the protocol gives."""
     result = verify_bag(bag)
     assert result.ok, result.difference
     return result
@@ -92,7 +91,6 @@ def children(supervisor: int) -> list[int]:
 
 
 def process_with(supervisor: int, argument: str) -> int:
-    """The process of a flight that was started with an argument, the whole word."""
     for pid in children(supervisor):
         with contextlib.suppress(OSError):
             if argument.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
@@ -101,7 +99,6 @@ def process_with(supervisor: int, argument: str) -> int:
 
 
 def end_all(process: subprocess.Popen[Any]) -> None:
-    """Kill a flight and all that it has started."""
     left = children(process.pid)
     if process.poll() is None:
         process.kill()
@@ -114,7 +111,6 @@ def end_all(process: subprocess.Popen[Any]) -> None:
 
 
 def pid_of(supervisor: int, agent: int) -> int:
-    """Process of one agent, in flights with a process each."""
     return process_with(supervisor, f"__ns:=/cf{agent}")
 
 
@@ -136,7 +132,6 @@ class FlightProcess:
         return (self.out.parent / "stderr.txt").read_text(errors="replace")
 
     def pid_of(self, agent: int) -> int:
-        """Process of one agent, in flights with a process each."""
         return pid_of(self.process.pid, agent)
 
     def until_says(self, *texts: str) -> None:
@@ -155,7 +150,6 @@ class FlightProcess:
         return code
 
     def assert_no_process_left(self) -> None:
-        """Wait until no process of the flight is left."""
         wait_for(lambda: not children(self.process.pid), 20.0, "a process of the flight stays")
 
     def assert_ends(self, code: int, *messages: str) -> None:
@@ -169,7 +163,6 @@ class FlightProcess:
         self.assert_no_process_left()
 
     def assert_flies_on(self) -> None:
-        """The flight goes on: its bag grows."""
         size = self.bag_bytes()
         wait_for(
             lambda: self.process.poll() is not None or self.bag_bytes() > size + _GROWTH_BYTES, PATIENCE_S, "no growth"

@@ -16,7 +16,6 @@ from node_helpers import Graph
 
 
 def children_of(process: int) -> list[int]:
-    """Processes that one has started itself."""
     tasks = Path(f"/proc/{process}/task").iterdir()
     return [int(child) for task in tasks for child in (task / "children").read_text().split()]
 
@@ -39,20 +38,17 @@ class Operator:
         self.graph.until(lambda: tuple(map(self.states.get, self.names)) == wanted)
 
     def call(self, kind: Any, name: str, **fields: Any) -> None:
-        """Call a service, which succeeds."""
         client = self.graph.node.create_client(kind, name)
         self.graph.until(client.service_is_ready)
         answer = self.graph.ask(client, kind.Request(**fields))
         assert getattr(answer, "success", True), answer
 
     def arm(self) -> None:
-        """Arm all that are ready."""
         self.until("ready")
         self.call(Arm, "/all/arm", arm=True)
         self.until("armed")
 
     def take_off(self, height: float = 0.5, seconds: float = 2.0) -> None:
-        """Arm all, and let them take off."""
         self.arm()
         duration = Duration(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
         self.call(Takeoff, "/all/takeoff", height=height, duration=duration)
@@ -88,7 +84,6 @@ class Bridge:
         return code
 
     def child(self) -> int:
-        """Id of the process that it has started."""
         return children_of(self.process.pid)[0]
 
 

@@ -26,7 +26,6 @@ PATIENCE_S = 60.0
 
 
 def lossy_bag(directory: Path) -> Path:
-    """A flight on a channel that loses frames."""
     bag = directory / "lossy" / "bag"
     flight_bag(bag, slots=SLOTS, loss=0.2, agents=AGENTS, moving=5, policy="tdma", seed=2)
     return bag
@@ -80,7 +79,6 @@ def numbers(text: str, kind: str) -> np.ndarray:
 
 @contextmanager
 def viewed_flight(out: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A flight with a page, and the address of that."""
     command = [sys.executable, "-m", "dtsa_bench", "fly", "--out", str(out), "--view", *words]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL, text=True
@@ -101,7 +99,6 @@ def viewed_flight(out: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str
 
 @contextmanager
 def on_graph(track: Track, domain: int) -> Iterator[Any]:
-    """A track that follows a ROS graph, in a thread; its source."""
     from dtsa_bench.pages.view.graph import GraphSource  # needs ROS
 
     source = GraphSource(track, domain, control=True)

@@ -24,8 +24,6 @@ _LINE = "one line that names setting and value, and code 2"
 
 
 class Nodes:
-    """Node processes in a domain of their own."""
-
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
 
@@ -64,7 +62,6 @@ def _by_hand(what: str, reaction: str, *, sample: bool = False) -> Callable[[Act
 
 
 def _assert_ends(process: subprocess.Popen[str], code: int, *messages: str, patience_s: float = PATIENCE_S) -> None:
-    """A node ends by itself with a code and messages, without a traceback."""
     _, text = process.communicate(timeout=patience_s)
     assert process.returncode == code, text[-300:]
     assert "Traceback" not in text, text[-300:]

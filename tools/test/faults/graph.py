@@ -105,7 +105,6 @@ def bag_replayed(directory: Path) -> None:
 
 
 def random_message(kind: Any, pick: random.Random) -> Any:
-    """A well-formed message of a class with fields of random length and value."""
     message = kind()
     for name, spec in kind.get_fields_and_field_types().items():
         setattr(message, name, _random_value(spec, getattr(message, name), pick))

@@ -42,7 +42,6 @@ def _ends(
 
 
 def _pause(flight: FlightProcess, *pids: int, seconds: float = 1.0) -> None:
-    """Processes of a flight stand still for a while, and it flies on."""
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     time.sleep(seconds)

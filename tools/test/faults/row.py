@@ -28,7 +28,6 @@ FAULTS: list[Fault] = []
 
 
 def fault(what: str, reaction: str, *, sample: bool = False) -> Callable[[Run], Run]:
-    """Declare a function as the row of a fault."""
 
     def declare(run: Run) -> Run:
         FAULTS.append(Fault(what, reaction, run, run.__name__, sample))
@@ -38,7 +37,6 @@ def fault(what: str, reaction: str, *, sample: bool = False) -> Callable[[Run], 
 
 
 def in_flight(what: str, reaction: str, *words: str, sample: bool = False, begun: bool = True) -> Callable[[Act], Act]:
-    """Declare a function as the row of a fault that befalls a flight with these options."""
 
     def declare(act: Act) -> Act:
         def run(directory: Path) -> None:

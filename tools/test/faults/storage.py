@@ -76,7 +76,6 @@ def directory_impossible(directory: Path) -> None:
 
 
 def _fly(directory: Path) -> Path:
-    """The file of a short flight's bag."""
     done = run_dtsa("fly", "--out", str(directory / "out"), *LOCKSTEP, "--processes", "1", *_SHORT)
     assert done.returncode == 0, done.stderr[-300:]
     return directory / "out" / "bag" / "bag_0.mcap"

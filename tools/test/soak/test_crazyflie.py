@@ -82,7 +82,6 @@ MISSIONS = [
 @pytest.mark.parametrize("seed", range(1, 6))
 @pytest.mark.parametrize(("over", "arming", "flights"), MISSIONS)
 def test_mission(over: str, arming: str, flights: int, seed: int, tmp_path: Path, record: list[dict[str, Any]]) -> None:
-    """A mission, or three in a row, on a machine with one core busy."""
     pytest.importorskip("cflib")
     options = ["--arming", arming, "--seed", str(seed), "--radio-seed", str(seed)]
     # What follows each other without a restart of the Crazyflies must not be locked by the first one's end.
@@ -121,7 +120,6 @@ class VehicleFault:
 
 
 def random_faults(seed: int) -> list[VehicleFault]:
-    """Faults at random, in the order of time."""
     chance = random.Random(f"faults {seed}")
     first = chance.uniform(0.2, FIRST_S)
     faults = []
@@ -145,7 +143,6 @@ def random_faults(seed: int) -> list[VehicleFault]:
 
 @pytest.mark.parametrize("seed", range(1, 16))
 def test_random_faults(seed: int, tmp_path: Path, record: list[dict[str, Any]]) -> None:
-    """Fifteen missions with four faults each."""
     pytest.importorskip("cflib")
     faults = random_faults(seed)
     with fleet_of_twelve(tmp_path, None, "--arming", "mixed", "--seed", str(seed)) as fleet:

@@ -36,7 +36,6 @@ def test_both_statements_are_equal(seed: int, record: list[dict[str, Any]]) -> N
 
 
 def summarise(found: list[dict[str, Any]]) -> tuple[list[str], list[list[object]]]:
-    """The rows of the record."""
     shares, both = ([row for row in found if name in row] for name in ("agent_s", "calls"))
     agent_s, slowest = sum(row["agent_s"] for row in shares), max((row["slowest"] for row in shares), default=0.0)
     flown = [f"{len(shares) * SEEDS:,}", f"{agent_s:,.0f}", f"{slowest:.0%}"]

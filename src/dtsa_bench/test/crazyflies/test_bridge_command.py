@@ -42,7 +42,6 @@ PATIENT = {"link_age_s": 3.0, "command_age_s": 0.45}  # not what is tested here
 
 @contextmanager
 def bridge(folder: Path, config: Path, *options: str) -> Iterator[Bridge]:
-    """That of `dtsa bridge`, in a graph of its own."""
     command = [sys.executable, "-m", "dtsa_bench", "bridge", "--config", str(config), *options]
     with ros_graph(folder) as graph, running(graph, command, NAMES) as started:
         yield started

@@ -71,7 +71,6 @@ def written(data: dict[str, Any], folder: Path) -> Path:
 
 @contextmanager
 def mission(*words: str) -> Iterator[subprocess.Popen[str]]:
-    """A flight that takes long; it is killed in the end."""
     command = [*FLY, "--tail-s", "60", *words]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

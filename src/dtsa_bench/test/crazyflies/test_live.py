@@ -52,7 +52,6 @@ def live(tmp_path: Path) -> Iterator[LiveLaboratory]:
 
 
 def sniff(live: LiveLaboratory) -> list[bytes]:
-    """The first dongle in sniffer mode; what it hears."""
     dongle, heard = live.side.dongles[0], []
 
     def give(transfer: bytes) -> None:

@@ -27,8 +27,6 @@ def station(number: int, channel: int = 80, rate: str = "2M") -> Station:
 
 @dataclass
 class Room:
-    """Dongles and Crazyflies on one air."""
-
     settings: RadioSettings = TWO
     stations: tuple[Station, ...] = (station(1), station(2))
     heard: list[tuple[int, bytes]] = field(default_factory=list)

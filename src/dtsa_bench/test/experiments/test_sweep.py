@@ -143,7 +143,6 @@ def test_rows_of_other_code_and_of_other_sweeps_are_never_mixed_in(
 
 
 def test_all_code_that_flies_is_in_the_digest() -> None:
-    """What a run imports of this project is in its packages."""
     text = f"""
 import sys
 from dtsa_bench.experiments import sweep
@@ -243,7 +242,6 @@ def test_wrong_words_end_with_one_line_and_code_2(
 
 
 def run_python(code: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """Code, then the command with words, in a process of its own."""
     code = f"{code}\nimport sys\nfrom dtsa_bench.commands.cli import main\nsys.exit(main({list(words)!r}))"
     return subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
 

@@ -60,8 +60,6 @@ def malformed(pick: Random, cls: Any, run: int, slot: int) -> bytes:
 
 
 class Stranger:
-    """Somebody in the flight's domain who hears its slot messages."""
-
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.last = Slot()
@@ -90,7 +88,6 @@ class Stranger:
 
 
 def two_in_flight(graph: Graph, *parameters: str) -> tuple[Stranger, subprocess.Popen[str], subprocess.Popen[str]]:
-    """Somebody who hears two agents fly in lockstep, their process, and their channel's."""
     stranger = Stranger(graph)
     host = graph.start(HOST, "-p", "agents:=2")
     channel = graph.start(CHANNEL, *(word for given in ("agents:=2", *parameters) for word in ("-p", given)))

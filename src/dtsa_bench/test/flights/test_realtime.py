@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fly_helpers import fly, readable, start_flight, summary_of, verified
+from fly_helpers import fly, readable, verified
 
 pytest.importorskip("dtsa_msgs.msg")
 
@@ -31,7 +29,6 @@ TIGHT = (
 
 
 def drifts(seconds: float) -> list[float]:
-    """ms that each clock gains in a time."""
     clocks = make_clocks(ClockConfig(drift_ppm=DRIFT_PPM, seed=9), AGENTS)
     return [clock.drift_ppb * seconds * 1e-6 for clock in clocks]
 

@@ -32,7 +32,6 @@ LEASE = ("--policy", "lease", "--open-every", "0", "--no-adoption")
 
 
 def fly_on(flight: FlightProcess, slots: int) -> None:
-    """Waits for so many slots, each of 10 ms by the clock."""
     time.sleep(slots * 0.01)
     assert flight.process.poll() is None, flight.stderr()
 
@@ -82,7 +81,6 @@ def before_and_after(out: Path, agent: int) -> tuple[list[Report], list[Report]]
 
 
 def first_turn(found: list[Report], agent: int) -> Report:
-    """When an agent first takes a turn for its own, even if it is not ready to speak in time."""
     return next(report for report in found if report.speaker == agent)
 
 

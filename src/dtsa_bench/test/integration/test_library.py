@@ -267,7 +267,6 @@ def test_types_work_from_outside(tmp_path: Path) -> None:
 
 
 def test_the_document_is_true(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All examples of docs/how-to/python.md, one after the other, beside a recorded run."""
     document = ROOT / "docs" / "how-to" / "python.md"
     if not document.exists():
         pytest.skip("not in the source tree")

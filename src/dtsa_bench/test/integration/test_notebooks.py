@@ -23,7 +23,6 @@ pytestmark = pytest.mark.skipif(not EXAMPLES.is_dir(), reason="the examples are 
 
 
 def run_cells(path: Path) -> tuple[dict[str, Any], list[Any]]:
-    """All cells one after the other, as Jupyter runs them."""
     names: dict[str, Any] = {"__name__": "__main__"}
     shown: list[Any] = []
     for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,6 @@ from dtsa_agent.core.errors import ConfigError
 from dtsa_bench.recordings.bag import schema
 from dtsa_bench.recordings.bag.errors import BagError
 from dtsa_bench.recordings.bag.reader import Bag
-from dtsa_bench.recordings.bag.recover import recover
 from dtsa_bench.recordings.bag.writer import BagWriter
 
 INFINITE = {"sec": 9223372036, "nsec": 854775807}
@@ -176,36 +173,3 @@ def test_wrong_messages_are_refused(tmp_path: Path) -> None:
             writer.add_topic("/other", kind, "perhaps", definition(kind))
     with Bag(tmp_path / "bag") as bag:
         assert bag.message_count == 0
-
-
-FULL_DISK = """
-import resource, sys
-sys.path.insert(0, sys.argv[2])
-from pathlib import Path
-from bag_helpers import synthetic_run
-from dtsa_bench.recordings.bag.errors import BagError
-resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # what a full disk does, without one
-run = synthetic_run(Path(sys.argv[1]), compression="none", chunk_size=20_000)
-try:
-    with run.writer:
-        for slot in range(10_000):
-            run.slot(slot)
-except BagError as error:
-    print(error)
-    print(run.writer.message_count)
-    sys.exit(7)
-"""
-
-
-def test_a_full_disk_is_said_at_once_and_what_was_saved_can_be_recovered(tmp_path: Path) -> None:
-    child = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(tmp_path / "bag"), str(HERE)], capture_output=True, text=True
-    )
-    assert child.returncode == 7, child.stderr
-    message, count = child.stdout.strip().splitlines()
-    assert "recover" in message
-    assert "not saved" in message
-    assert not (tmp_path / "bag" / "metadata.yaml").exists()
-    result = recover(tmp_path / "bag")
-    assert 0 < result.count <= int(count)
-    assert int(count) - result.count < 200  # at most the chunk that did not fit

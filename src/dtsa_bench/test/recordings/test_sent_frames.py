@@ -108,17 +108,6 @@ def test_spread_and_lateness_come_from_the_right_agents() -> None:
     assert ClockStatistics(3).summary()["clock_spread_max_ms"] is None
 
 
-@pytest.mark.parametrize("earlier", [True, False])
-def test_no_sender_hears_what_is_on_the_air_meanwhile(earlier: bool) -> None:
-    """Neither the one that began first nor the other."""
-    sent = SentFrames(ChannelConfig(agents=3), own_clocks=True)
-    for sender, start_ns in ((1, 0), (2, 100_000)):
-        sent.send(0, sender, start_ns, bytes(24))
-    sent.deliver(0, 2 if earlier else 1, bytes(24), np.array([earlier, not earlier, False]))
-    with pytest.raises(Mismatch, match="who sends does not hear"):
-        sent.check_overlaps()
-
-
 @pytest.mark.parametrize(("verdicts", "not_judged", "collided"), [((), 3, 0), (((0, 2), (1, 0)), 1, 1)])
 def test_frames_without_a_verdict_are_counted(verdicts, not_judged, collided):
     frames = SentFrames(ChannelConfig(agents=3), own_clocks=True)

@@ -175,7 +175,6 @@ class Endless(Empty):
 
 
 def gives(method: str, answer: Any) -> type:
-    """A plug-in with a method that gives an answer, or raises it."""
 
     def call(self: object, *_: object) -> Any:
         if isinstance(answer, BaseException):
